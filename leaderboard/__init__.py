@@ -1,0 +1,1 @@
+"""Run records and the leaderboard generated from them (no torch, no simulator)."""
