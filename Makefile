@@ -1,0 +1,50 @@
+# Everything runs in .venv; `make setup` makes it once and costs nothing afterwards.
+PYTHON ?= python3.11
+UV_VERSION := 0.9.30
+BIN := .venv/bin
+# One thread a process: runs and tests share the cores as processes.
+export OMP_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+
+.PHONY: help setup demo test test-slow lint requirements clean
+
+help:
+	@echo "make setup         create .venv with the pinned packages"
+	@echo "make demo          demonstrations -> policy -> steering -> leaderboard, on the CPU, in minutes"
+	@echo "make test          the test suite (make test-slow: the long tests)"
+	@echo "make lint          ruff, format check, types, import contract"
+	@echo "make requirements  compile requirements.txt from pyproject.toml"
+
+setup: .venv/.complete
+
+.venv/.complete: requirements.txt pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || \
+	  { echo "SymSteer needs Python 3.11; name it with: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)" >&2; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps -r requirements.txt
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .
+	@$(BIN)/symsteer doctor --quiet
+	@touch $@
+
+demo: setup
+	$(BIN)/symsteer demo
+
+test: setup
+	$(BIN)/python -m pytest -n 2 -m "not slow and not gpu"
+
+test-slow: setup
+	$(BIN)/python -m pytest -n 2 -m "slow"
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+requirements:
+	$(BIN)/uv pip compile pyproject.toml --extra dev --python-version 3.11 --no-header \
+	  --no-emit-index-url --no-annotate --upgrade --output-file requirements.txt
+
+clean:
+	rm -rf .venv build *.egg-info

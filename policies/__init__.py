@@ -1,0 +1,1 @@
+"""Geometry, diffusion policies and their training."""

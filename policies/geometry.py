@@ -1,0 +1,346 @@
+"""How vectors split into geometric parts, and how planar symmetries act on them.
+
+A :class:`Layout` is the only place that knows which numbers of an observation, an action or a
+noise vector are horizontal vectors, scalars or higher frequencies. Normaliser, networks, audit
+and tests ask it; nobody else slices by index.
+
+A planar symmetry is a pair ``(angle, reflect)``: first the reflection (x, y) -> (x, -y) if
+``reflect``, then the rotation by ``angle`` about the vertical axis. An irrep block of frequency
+``k >= 1`` turns ``k`` times as fast as the plane; frequency 0 is a scalar. ``odd`` blocks change
+sign under reflections in addition (yaw, axial vectors, mirrored rotation columns).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from policies.errors import UserError
+
+if TYPE_CHECKING:
+    import escnn.nn
+
+
+@dataclass(frozen=True)
+class Field:
+    """A named run of equal irrep blocks in a vector.
+
+    Args:
+        name: unique within its layout.
+        frequency: 0 for scalars (one number each), k >= 1 for pairs that turn by ``k * angle``.
+        multiplicity: how many blocks stand side by side.
+        odd: whether the blocks change sign under reflections in addition.
+    """
+
+    name: str
+    frequency: int
+    multiplicity: int = 1
+    odd: bool = False
+
+    def __post_init__(self) -> None:
+        if self.frequency < 0 or self.multiplicity < 1:
+            raise UserError(
+                f"field {self.name!r} needs frequency >= 0 and multiplicity >= 1, "
+                f"not {self.frequency} and {self.multiplicity}"
+            )
+
+    @property
+    def block_dim(self) -> int:
+        """Numbers in one irrep block: 1 for scalars, 2 for vectors."""
+        return 1 if self.frequency == 0 else 2
+
+    @property
+    def dim(self) -> int:
+        """Numbers in the whole field."""
+        return self.block_dim * self.multiplicity
+
+
+class Layout:
+    """An ordered list of fields: the geometry of one vector.
+
+    Raises:
+        UserError: if the list is empty or a name occurs twice.
+    """
+
+    def __init__(self, fields: Sequence[Field]):
+        self.fields = tuple(fields)
+        if not self.fields:
+            raise UserError("a layout needs at least one field")
+        self._slices: dict[str, slice] = {}
+        start = 0
+        for field in self.fields:
+            if field.name in self._slices:
+                raise UserError(f"the field name {field.name!r} occurs twice in a layout")
+            self._slices[field.name] = slice(start, start + field.dim)
+            start += field.dim
+        self.dim = start
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Layout) and self.fields == other.fields
+
+    def __hash__(self) -> int:
+        return hash(self.fields)
+
+    def __repr__(self) -> str:
+        parts = (f"{f.name}:{f.multiplicity}x{f.frequency}{'-' * f.odd}" for f in self.fields)
+        return f"Layout({', '.join(parts)})"
+
+    def slice(self, name: str) -> slice:
+        """Where the field lies in the vector.
+
+        Raises:
+            UserError: if the layout has no such field.
+        """
+        if name not in self._slices:
+            raise UserError(f"no field {name!r} in this layout; it has {', '.join(self._slices)}")
+        return self._slices[name]
+
+    @functools.cached_property
+    def blocks(self) -> tuple[slice, ...]:
+        """One slice per irrep block, in order; each of size 1 or 2."""
+        return tuple(
+            slice(start, start + field.block_dim)
+            for field in self.fields
+            for start in range(
+                self._slices[field.name].start, self._slices[field.name].stop, field.block_dim
+            )
+        )
+
+    @functools.cached_property
+    def block_index(self) -> torch.Tensor:
+        """For each number the index of its irrep block, ``[dim]`` int64."""
+        sizes = torch.tensor([block.stop - block.start for block in self.blocks])
+        return torch.repeat_interleave(torch.arange(len(self.blocks)), sizes)
+
+    def invariant_mask(self, reflections: bool = False) -> torch.Tensor:
+        """Which numbers no rotation (and no reflection, if asked) changes, ``[dim]`` bool."""
+        return torch.cat(
+            [
+                torch.full((f.dim,), f.frequency == 0 and not (reflections and f.odd))
+                for f in self.fields
+            ]
+        )
+
+    def repeat(self, count: int) -> Layout:
+        """The layout of ``count`` such vectors flattened one after the other."""
+        return Layout(
+            [
+                Field(f"{f.name}[{i}]", f.frequency, f.multiplicity, f.odd)
+                for i in range(count)
+                for f in self.fields
+            ]
+        )
+
+    def matrix(
+        self, angle: float, reflect: bool = False, dtype: torch.dtype = torch.float64
+    ) -> torch.Tensor:
+        """The representation of (angle, reflect), ``[dim, dim]``; angle in radians."""
+        blocks = []
+        for field in self.fields:
+            sign = -1.0 if field.odd and reflect else 1.0
+            if field.frequency == 0:
+                block = torch.tensor([[sign]], dtype=torch.float64)
+            else:
+                c, s = _cos_sin(field.frequency * angle)
+                flip = -1.0 if reflect else 1.0
+                block = sign * torch.tensor([[c, -s * flip], [s, c * flip]], dtype=torch.float64)
+            blocks += [block] * field.multiplicity
+        return torch.block_diag(*blocks).to(dtype)
+
+    def transform(self, x: torch.Tensor, angle: float, reflect: bool = False) -> torch.Tensor:
+        """Act with (angle, reflect) on the last axis of ``x [..., dim]``."""
+        return x @ self.matrix(angle, reflect, x.dtype).to(x.device).T
+
+    def field_type(self, group: Group) -> escnn.nn.FieldType:
+        """escnn's field type over a point, in the same basis as :meth:`matrix`."""
+        import escnn.nn
+        from escnn import gspaces
+
+        space = gspaces.no_base_space(group.escnn_group(max(f.frequency for f in self.fields)))
+        representations = [
+            _escnn_representation(space.fibergroup, group, field)
+            for field in self.fields
+            for _ in range(field.multiplicity)
+        ]
+        return escnn.nn.FieldType(space, representations)
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """A JSON-ready description; :meth:`from_json` reads it."""
+        return [
+            {
+                "name": f.name,
+                "frequency": f.frequency,
+                "multiplicity": f.multiplicity,
+                "odd": f.odd,
+            }
+            for f in self.fields
+        ]
+
+    @classmethod
+    def from_json(cls, data: Sequence[Mapping[str, Any]]) -> Layout:
+        """Rebuild a layout.
+
+        Raises:
+            UserError: if the description is not one that :meth:`to_json` writes.
+        """
+        try:
+            fields = [
+                Field(str(f["name"]), int(f["frequency"]), int(f["multiplicity"]), bool(f["odd"]))
+                for f in data
+            ]
+        except (TypeError, KeyError, ValueError) as error:
+            raise UserError(
+                f"a layout description is damaged ({error!r}); it needs a list of "
+                "{name, frequency, multiplicity, odd}"
+            ) from error
+        return cls(fields)
+
+
+@dataclass(frozen=True)
+class Group:
+    """A planar symmetry group: C_n, D_n (with the reflection of y), or SO(2).
+
+    Args:
+        rotations: n of C_n or D_n; 0 stands for SO(2).
+        reflections: whether the group is dihedral.
+    """
+
+    rotations: int
+    reflections: bool = False
+
+    @classmethod
+    def parse(cls, name: str) -> Group:
+        """Read a name such as ``C8``, ``D4`` or ``SO2``.
+
+        Raises:
+            UserError: if it names no planar group.
+        """
+        if name == "SO2":
+            return cls(0)
+        match = re.fullmatch(r"([CD])([1-9]\d?)", name)
+        if match is None or (match[1] == "D" and match[2] == "1"):
+            raise UserError(
+                f"{name!r} names no symmetry group; use C1 to C99, D2 to D99 or SO2, e.g. C8"
+            )
+        return cls(int(match[2]), match[1] == "D")
+
+    def __str__(self) -> str:
+        return (
+            "SO2"
+            if self.rotations == 0
+            else f"{'D' if self.reflections else 'C'}{self.order_of_rotations}"
+        )
+
+    @property
+    def order_of_rotations(self) -> int:
+        """n of C_n or D_n.
+
+        Raises:
+            UserError: for SO(2), which is not finite.
+        """
+        if self.rotations == 0:
+            raise UserError("SO2 is not finite; choose C_n or D_n here, e.g. C8")
+        return self.rotations
+
+    @property
+    def order(self) -> int:
+        """Number of elements."""
+        return self.order_of_rotations * (2 if self.reflections else 1)
+
+    @property
+    def elements(self) -> tuple[tuple[float, bool], ...]:
+        """All (angle in radians, reflect), the identity first, rotations before reflections."""
+        n = self.order_of_rotations
+        return tuple(
+            (2 * math.pi * i / n, reflect)
+            for reflect in ((False, True) if self.reflections else (False,))
+            for i in range(n)
+        )
+
+    @property
+    def multiplication(self) -> torch.Tensor:
+        """``table[g, h]`` is the index of the product g h, ``[order, order]`` int64."""
+        n = self.order_of_rotations
+        index = torch.arange(self.order)
+        rotation, flip = index % n, index // n
+        turned = rotation[:, None] + torch.where(flip[:, None] == 1, -1, 1) * rotation[None, :]
+        return turned % n + n * ((flip[:, None] + flip[None, :]) % 2)
+
+    @property
+    def inverse(self) -> torch.Tensor:
+        """Index of each element's inverse, ``[order]`` int64."""
+        return (self.multiplication == 0).int().argmax(dim=1)
+
+    def representation(
+        self,
+        layout: Layout,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> torch.Tensor:
+        """Every element's matrix on ``layout``, ``[order, dim, dim]``; computed in float64."""
+        return _representation(self, layout, dtype, torch.device(device))
+
+    def escnn_group(self, maximum_frequency: int = 1):
+        """The same group in escnn."""
+        from escnn import group
+
+        if self.rotations == 0:
+            return group.so2_group(max(maximum_frequency, 1))
+        if self.reflections:
+            return group.dihedral_group(self.rotations)
+        return group.cyclic_group(self.rotations)
+
+
+@functools.lru_cache(maxsize=256)
+def _representation(
+    group: Group, layout: Layout, dtype: torch.dtype, device: torch.device
+) -> torch.Tensor:
+    matrices = [layout.matrix(angle, reflect) for angle, reflect in group.elements]
+    return torch.stack(matrices).to(dtype=dtype, device=device)
+
+
+def _cos_sin(angle: float) -> tuple[float, float]:
+    """Cosine and sine, exact at multiples of 90 degrees so that C4 permutes axes exactly."""
+    quarter = angle / (math.pi / 2)
+    if abs(quarter - round(quarter)) < 1e-12:
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarter) % 4]
+    return math.cos(angle), math.sin(angle)
+
+
+def _escnn_representation(fibergroup, group: Group, field: Field):
+    """One irrep block of ``field`` as an escnn representation in the layout's basis."""
+    import numpy as np
+    from escnn.group import Representation
+
+    n, k = group.rotations, field.frequency
+    if n == 0:
+        return fibergroup.irrep(k)
+    k = k % n
+    basis = np.eye(field.block_dim)
+    conjugate = 2 * k > n
+    if conjugate:
+        k = n - k
+    two_dimensional = 0 < 2 * k < n
+    if field.frequency == 0:
+        irreps = [(int(field.odd), 0)] if group.reflections else [(0,)]
+    elif two_dimensional:
+        irreps = [(1, k)] if group.reflections else [(k,)]
+        if conjugate:
+            basis = np.diag([1.0, -1.0])
+        if group.reflections and field.odd:
+            basis = np.array([[0.0, 1.0], [-1.0, 0.0]]) @ basis
+    elif group.reflections:
+        irreps = [(int(field.odd), k), (int(not field.odd), k)]
+    else:
+        irreps = [(k,), (k,)]
+    name = f"frequency{field.frequency}{'odd' if field.odd else ''}"
+    known = fibergroup.representations
+    if name not in known:
+        known[name] = Representation(fibergroup, name, irreps, basis)
+    return known[name]

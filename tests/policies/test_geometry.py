@@ -1,0 +1,146 @@
+"""Layouts and groups: representations, agreement with escnn, serialisation, user mistakes."""
+
+import math
+
+import escnn.nn
+import pytest
+import torch
+
+from policies.equivariant import Lift, Project, RegularLinear
+from policies.errors import UserError
+from policies.geometry import Field, Group, Layout
+
+LAYOUT = Layout(
+    [
+        Field("xy", 1),
+        Field("z", 0),
+        Field("tilt", 1, odd=True),
+        Field("yaw", 0, odd=True),
+        Field("square", 4, 2),
+        Field("rod", 2, odd=True),
+        Field("third", 3),
+    ]
+)
+GROUPS = ["C1", "C2", "C3", "C4", "C6", "C8", "D2", "D3", "D4", "D8"]
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_representation_is_a_homomorphism(name):
+    group = Group.parse(name)
+    rho = group.representation(LAYOUT)
+    product = torch.einsum("gij,hjk->ghik", rho, rho)
+    assert torch.allclose(product, rho[group.multiplication], atol=1e-12)
+    inverse = rho[group.inverse]
+    assert torch.allclose(inverse, rho.transpose(1, 2), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_field_type_is_escnns_in_the_same_basis(name):
+    group = Group.parse(name)
+    field_type = LAYOUT.field_type(group)
+    assert field_type.size == LAYOUT.dim
+    n = group.rotations
+    for index, (angle, reflect) in enumerate(group.elements):
+        value = (int(reflect), index % n) if group.reflections else index
+        element = field_type.gspace.fibergroup.element(value)
+        theirs = torch.tensor(field_type.representation(element))
+        assert torch.allclose(theirs, LAYOUT.matrix(angle, reflect), atol=1e-9)
+
+
+def test_field_type_over_so2():
+    field_type = LAYOUT.field_type(Group.parse("SO2"))
+    element = field_type.gspace.fibergroup.element(0.37)
+    theirs = torch.tensor(field_type.representation(element))
+    assert torch.allclose(theirs, LAYOUT.matrix(0.37), atol=1e-9)
+
+
+def test_transform_rotates_each_frequency():
+    x = torch.zeros(LAYOUT.dim, dtype=torch.float64)
+    x[LAYOUT.slice("xy")] = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    x[LAYOUT.slice("rod")] = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    x[LAYOUT.slice("z")] = 3.0
+    turned = LAYOUT.transform(x, math.radians(45))
+    expected = torch.tensor([math.sqrt(0.5)] * 2, dtype=torch.float64)
+    assert torch.allclose(turned[LAYOUT.slice("xy")], expected)
+    assert torch.allclose(turned[LAYOUT.slice("rod")], torch.tensor([0.0, 1.0]).double())
+    assert turned[LAYOUT.slice("z")] == 3.0
+
+
+def test_reflection_of_odd_fields():
+    x = torch.ones(LAYOUT.dim, dtype=torch.float64)
+    mirrored = LAYOUT.transform(x, 0.0, reflect=True)
+    assert mirrored[LAYOUT.slice("xy")].tolist() == [1.0, -1.0]
+    assert mirrored[LAYOUT.slice("tilt")].tolist() == [-1.0, 1.0]
+    assert mirrored[LAYOUT.slice("yaw")].tolist() == [-1.0]
+    assert mirrored[LAYOUT.slice("z")].tolist() == [1.0]
+
+
+def test_blocks_cover_the_vector_once():
+    covered = torch.cat([torch.arange(LAYOUT.dim)[b] for b in LAYOUT.blocks])
+    assert covered.tolist() == list(range(LAYOUT.dim))
+    assert [b.stop - b.start for b in LAYOUT.blocks] == [2, 1, 2, 1, 2, 2, 2, 2]
+    assert LAYOUT.block_index.tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 5, 5, 6, 6, 7, 7]
+    assert LAYOUT.invariant_mask().nonzero().flatten().tolist() == [2, 5]
+    assert LAYOUT.invariant_mask(reflections=True).nonzero().flatten().tolist() == [2]
+
+
+def test_json_round_trip_and_repeat():
+    assert Layout.from_json(LAYOUT.to_json()) == LAYOUT
+    chunk = LAYOUT.repeat(3)
+    x = torch.randn(3, LAYOUT.dim, dtype=torch.float64)
+    flat = chunk.transform(x.flatten(), 0.9, True).view(3, -1)
+    assert torch.allclose(flat, LAYOUT.transform(x, 0.9, True))
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        lambda: Layout([]),
+        lambda: Layout([Field("a", 0), Field("a", 1)]),
+        lambda: Field("a", -1),
+        lambda: LAYOUT.slice("nothing"),
+        lambda: Layout.from_json([{"name": "a"}]),
+        lambda: Group.parse("E8"),
+        lambda: Group.parse("D1"),
+        lambda: Group.parse("SO2").order,
+    ],
+)
+def test_mistakes_raise_user_errors(mistake):
+    with pytest.raises(UserError):
+        mistake()
+
+
+@pytest.mark.parametrize("name", ["C1", "C4", "C8", "D4"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+def test_layers_commute_with_the_group(name, dtype, tolerance):
+    torch.manual_seed(0)
+    group = Group.parse(name)
+    lift = Lift(LAYOUT, group, 5).to(dtype)
+    linear = RegularLinear(group, 5, 6).to(dtype)
+    project = Project(group, 6, LAYOUT).to(dtype)
+    x = torch.randn(7, LAYOUT.dim, dtype=dtype)
+    regular = lift(x)
+    hidden = torch.relu(linear(regular))
+    out = project(hidden)
+    for index, (angle, reflect) in enumerate(group.elements):
+        permutation = group.multiplication[group.inverse[index]]
+        moved = LAYOUT.transform(x, angle, reflect)
+        assert torch.allclose(lift(moved), regular[:, permutation], atol=tolerance)
+        moved_hidden = torch.relu(linear(lift(moved)))
+        assert torch.allclose(moved_hidden, hidden[:, permutation], atol=tolerance)
+        moved_out = project(moved_hidden)
+        assert torch.allclose(moved_out, LAYOUT.transform(out, angle, reflect), atol=tolerance)
+
+
+@pytest.mark.parametrize("name", ["C3", "C8", "D4"])
+def test_layers_span_all_of_escnns_equivariant_maps(name):
+    group = Group.parse(name)
+    irreps = LAYOUT.field_type(group)
+    space = irreps.gspace
+    regular = escnn.nn.FieldType(space, [space.regular_repr] * 2)
+    lift = Lift(LAYOUT, group, 2)
+    assert lift.weight.numel() == escnn.nn.Linear(irreps, regular, bias=False).weights.numel()
+    linear = RegularLinear(group, 2, 2)
+    assert linear.weight.numel() == escnn.nn.Linear(regular, regular, bias=False).weights.numel()
+    project = Project(group, 2, LAYOUT)
+    assert project.weight.numel() == escnn.nn.Linear(regular, irreps, bias=False).weights.numel()
