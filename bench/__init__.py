@@ -1,0 +1,1 @@
+"""Simulation, tasks, symmetry breaking, runs and the command line."""
