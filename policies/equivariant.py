@@ -5,6 +5,9 @@ the ``order`` axis, (u f)(g) = f(u^-1 g). Any linear equivariant map between irr
 fields has one of the three forms below (group convolution; Cohen & Welling, arXiv 1602.07576;
 the lift per group element follows EDP, arXiv 2407.01812). ``tests/policies`` compares their
 number of free parameters with escnn's basis.
+
+Every layer also gives itself as one ordinary matrix, ``dense()``, so that several uses of the
+same weights pay for their expansion once and several networks can be stacked into one product.
 """
 
 from __future__ import annotations
@@ -30,11 +33,16 @@ class Lift(nn.Module):
         self.weight = nn.Parameter(torch.empty(channels, layout.dim).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(channels).uniform_(-bound, bound))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The map as (matrix ``[order * channels, dim]``, bias ``[order * channels]``)."""
         # rho is orthogonal, so rho(g)^-1 is its transpose.
-        rho = self.group.representation(self.layout, x.dtype, x.device)
+        rho = self.group.representation(self.layout, self.weight.dtype, self.weight.device)
         stacked = torch.einsum("cd,ged->gce", self.weight, rho).flatten(0, 1)
-        return (x @ stacked.T).unflatten(-1, (self.group.order, self.channels)) + self.bias
+        return stacked, self.bias.repeat(self.group.order)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        out = nn.functional.linear(x, *self.dense())
+        return out.unflatten(-1, (self.group.order, self.channels))
 
 
 class RegularLinear(nn.Module):
@@ -56,12 +64,18 @@ class RegularLinear(nn.Module):
         # index[g, h] = g^-1 h
         self.register_buffer("index", group.multiplication[group.inverse], persistent=False)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The map as (matrix ``[order * out, order * in]``, bias ``[order * out]``)."""
         order = self.group.order
-        dense = self.weight[self.index].permute(0, 2, 1, 3)
-        dense = dense.reshape(order * self.out_channels, order * self.in_channels)
-        out = x.flatten(-2) @ dense.T
-        return out.unflatten(-1, (order, self.out_channels)) + self.bias
+        blocks = self.weight.index_select(0, self.index.flatten()).unflatten(0, (order, order))
+        circulant = blocks.permute(0, 2, 1, 3).reshape(
+            order * self.out_channels, order * self.in_channels
+        )
+        return circulant, self.bias.repeat(order)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        out = nn.functional.linear(x.flatten(-2), *self.dense())
+        return out.unflatten(-1, (self.group.order, self.out_channels))
 
 
 class Project(nn.Module):
@@ -78,7 +92,11 @@ class Project(nn.Module):
         self.weight = nn.Parameter(torch.empty(layout.dim, channels).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(layout.dim).uniform_(-bound, bound))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        rho = self.group.representation(self.layout, x.dtype, x.device)
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The map as (matrix ``[dim, order * in]``, bias ``[dim]``)."""
+        rho = self.group.representation(self.layout, self.weight.dtype, self.weight.device)
         stacked = torch.einsum("gde,ec->dgc", rho, self.weight).flatten(1) / self.group.order
-        return x.flatten(-2) @ stacked.T + rho.mean(0) @ self.bias
+        return stacked, rho.mean(0) @ self.bias
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return nn.functional.linear(x.flatten(-2), *self.dense())
