@@ -1,0 +1,10 @@
+"""Experts to demonstrations and back: ManiSkill trajectory files (`.h5` with `.json`).
+
+- `collect(...)` runs the scripted experts and writes their successes.
+- `load(...)` reads such files, ours and ManiSkill's published ones.
+"""
+
+from bench.demos.collect import CLEAN, DIVERSE, MODES, Diversity, collect
+from bench.demos.load import Demonstrations, load
+
+__all__ = ["CLEAN", "DIVERSE", "MODES", "Demonstrations", "Diversity", "collect", "load"]

@@ -1,0 +1,284 @@
+"""Run the scripted experts and write their successful episodes as ManiSkill trajectories.
+
+A base policy trained on clean demonstrations hardly depends on its noise and cannot be steered;
+diverse demonstrations carry correlated action noise of a strength drawn per demonstration and an
+offset of the point that is grasped or pushed, and only successes are kept.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+from bench.tasks import make
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import Expert
+from policies.errors import UserError
+
+
+@dataclass(frozen=True)
+class Diversity:
+    """How demonstrations differ from one another beyond their initial states."""
+
+    noise: float = 0.3
+    """Standard deviation of the action noise, in normalized action units."""
+    correlation: float = 0.8
+    """Correlation of the noise from one step to the next (first-order autoregressive)."""
+    scale: tuple[float, float] = (0.3, 1.7)
+    """The noise of each demonstration is multiplied by a uniform draw from this range."""
+    offset: float = 0.0125
+    """Radius of the disc from which the grasp or contact offset is drawn, metres."""
+
+
+CLEAN = Diversity(noise=0.0, scale=(1.0, 1.0), offset=0.0)
+DIVERSE = Diversity()
+MODES = {"clean": CLEAN, "diverse": DIVERSE}
+"""Named kinds of demonstrations."""
+
+ATTEMPTS_PER_DEMO = 20
+"""Give up when the experts need more attempts than this for each demonstration."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class _Attempt:
+    """One successful episode, arrays over time."""
+
+    seed: int
+    obs: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    states: dict[str, Any]
+
+
+def collect(
+    task: str,
+    embodiment: str,
+    count: int,
+    mode: str,
+    seed: int,
+    out_path: str | os.PathLike[str],
+    *,
+    num_envs: int = 32,
+    variant: str = "none",
+    sim: str = "cpu",
+    diversity: Diversity | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write ``count`` successful expert episodes to ``out_path`` (``.h5``) and its ``.json``.
+
+    Episodes end at their first success. The same arguments give the same demonstrations for
+    every ``num_envs``: an attempt depends on its own seed only, and attempts are kept in the
+    order of their seeds.
+
+    Args:
+        task: name of a task.
+        embodiment: ``floating`` or ``panda``.
+        count: how many demonstrations.
+        mode: ``clean`` or ``diverse``.
+        seed: of the whole file.
+        out_path: ends in ``.h5``.
+        num_envs: attempts that run side by side.
+        variant: symmetry-breaking variant in which the expert acts.
+        sim: ``cpu`` or ``cuda``.
+        diversity: replaces the settings of ``mode``.
+        progress: called with (demonstrations so far, count).
+
+    Returns:
+        The path of the ``.h5`` file.
+
+    Raises:
+        UserError: for a bad argument, or if the expert fails too often.
+    """
+    path = Path(out_path)
+    if path.suffix != ".h5":
+        raise UserError(f"demonstrations are written to a file ending in .h5, not {path.name!r}")
+    if count < 1:
+        raise UserError(f"the number of demonstrations must be at least 1; it is {count}")
+    if mode not in MODES:
+        raise UserError(f"there is no mode {mode!r}; valid: {', '.join(MODES)}")
+    settings = diversity or MODES[mode]
+    env = make(
+        task, num_envs=min(num_envs, 2 * count), embodiment=embodiment, variant=variant, sim=sim
+    )
+    seeds = np.random.RandomState(seed)
+    kept: list[_Attempt] = []
+    tried = 0
+    while len(kept) < count:
+        if tried >= ATTEMPTS_PER_DEMO * count:
+            raise UserError(
+                f"the expert of {task!r} ({embodiment}, variant {variant}) succeeded only "
+                f"{len(kept)} times in {tried} attempts; ask for less diversity or a milder variant"
+            )
+        batch = [int(s) for s in seeds.randint(2**31, size=env.num_envs)]
+        kept += _run(env, batch, settings)
+        tried += len(batch)
+        if progress is not None:
+            progress(min(len(kept), count), count)
+    _write(path, env, kept[:count], mode, settings, seed, tried, variant)
+    env.close()
+    return path
+
+
+def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[_Attempt]:
+    """Attempt one episode per seed side by side; return the successful ones in order."""
+    obs, _ = env.reset(seed=seeds)
+    expert = Expert(env)
+    steps, count = env.max_episode_steps, env.num_envs
+    noise, expert.offset = _disturbances(seeds, steps, settings, env)
+    observations, states = [_numpy(obs)], [_numpy(env.get_state_dict())]
+    actions: list[np.ndarray] = []
+    rewards: list[np.ndarray] = []
+    length = np.zeros(count, dtype=int)
+    for step in range(steps):
+        action = env.body.bound(expert.act() + noise[step])
+        obs, reward, _, _, info = env.step(action)
+        actions.append(_numpy(action))
+        rewards.append(_numpy(reward).astype(np.float32))
+        observations.append(_numpy(obs))
+        states.append(_numpy(env.get_state_dict()))
+        length[(length == 0) & _numpy(info["success"])] = step + 1
+        if (length > 0).all():
+            break
+    return [
+        _Attempt(
+            seed=seeds[i],
+            obs=np.stack([o[i] for o in observations[: end + 1]]),
+            actions=np.stack([a[i] for a in actions[:end]]),
+            rewards=np.stack([r[i] for r in rewards[:end]]),
+            states=_stack_row([s for s in states[: end + 1]], i),
+        )
+        for i, end in enumerate(length)
+        if end > 0
+    ]
+
+
+def _disturbances(
+    seeds: list[int], steps: int, settings: Diversity, env: SymmetricTask
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Action noise ``[steps, N, 7]`` and offsets ``[N, 3]``, one generator per seed."""
+    dim = env.action_layout.dim
+    noise = np.zeros((steps, len(seeds), dim))
+    offsets = np.zeros((len(seeds), 3))
+    innovation = np.sqrt(1 - settings.correlation**2)
+    for i, seed in enumerate(seeds):
+        # A stream of its own: the environment seeds another generator with the same number.
+        rng = np.random.default_rng([seed, 1])
+        scale = settings.noise * rng.uniform(*settings.scale)
+        radius, bearing = settings.offset * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+        offsets[i, :2] = radius * np.cos(bearing), radius * np.sin(bearing)
+        draws = rng.standard_normal((steps, dim))
+        level = draws[0]
+        for step in range(steps):
+            if step > 0:
+                level = settings.correlation * level + innovation * draws[step]
+            noise[step, i] = scale * level
+    # A noisy finger command would drop the object; a noisy tilt does not help to steer.
+    for name in ("gripper", "tilt"):
+        noise[:, :, env.action_layout.slice(name)] = 0.0
+    return tuple(
+        torch.as_tensor(array, dtype=torch.float32, device=env.device)
+        for array in (noise, offsets)
+    )
+
+
+def _write(
+    path: Path,
+    env: SymmetricTask,
+    attempts: list[_Attempt],
+    mode: str,
+    settings: Diversity,
+    seed: int,
+    tried: int,
+    variant: str,
+) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Written aside first: an interrupted run leaves no half file under the final name.
+    partial = path.with_name(path.name + ".partial")
+    episodes = []
+    with h5py.File(partial, "w") as file:
+        for i, attempt in enumerate(attempts):
+            group = file.create_group(f"traj_{i}", track_order=True)
+            end = len(attempt.actions)
+            last = np.arange(end) == end - 1
+            group.create_dataset("obs", data=attempt.obs, dtype=np.float32)
+            group.create_dataset("actions", data=attempt.actions, dtype=np.float32)
+            group.create_dataset("terminated", data=last)
+            group.create_dataset("truncated", data=last & (end >= env.max_episode_steps))
+            group.create_dataset("success", data=last)
+            group.create_dataset("rewards", data=attempt.rewards, dtype=np.float32)
+            _write_tree(group.create_group("env_states", track_order=True), attempt.states)
+            episodes.append(
+                {
+                    "episode_id": i,
+                    "episode_seed": attempt.seed,
+                    "control_mode": env.control_mode,
+                    "elapsed_steps": end,
+                    "reset_kwargs": {"seed": attempt.seed},
+                    "success": True,
+                }
+            )
+    description = {
+        "env_info": {
+            "env_id": f"SymSteer/{env.task_id}",
+            "env_kwargs": {
+                "obs_mode": "state",
+                "control_mode": env.control_mode,
+                "embodiment": env.embodiment,
+                "variant": variant,
+                "reward_mode": env.reward_mode,
+                "sim_backend": "physx_cpu" if env.device.type == "cpu" else "physx_cuda",
+                "num_envs": 1,
+            },
+            "max_episode_steps": env.max_episode_steps,
+        },
+        "episodes": episodes,
+        "source_type": "scripted",
+        "source_desc": f"SymSteer's scripted expert, {mode} demonstrations",
+        "symsteer": {
+            "mode": mode,
+            "diversity": dataclasses.asdict(settings),
+            "seed": seed,
+            "attempts": tried,
+            "observation_layout": env.observation_layout.to_json(),
+            "action_layout": env.action_layout.to_json(),
+        },
+    }
+    text = json.dumps(description, indent=2)
+    path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            _write_tree(group.create_group(key, track_order=True), value)
+        else:
+            group.create_dataset(key, data=value, dtype=np.float32)
+
+
+def _numpy(tree: Any) -> Any:
+    """A copy on the host: the simulation reuses its buffers."""
+    if isinstance(tree, dict):
+        return {key: _numpy(value) for key, value in tree.items()}
+    return tree.detach().cpu().numpy().copy()
+
+
+def _stack_row(states: list[dict[str, Any]], row: int) -> dict[str, Any]:
+    """States of environment ``row`` over time, ``[T + 1, ...]`` arrays."""
+    return {
+        key: _stack_row([state[key] for state in states], row)
+        if isinstance(value, dict)
+        else np.stack([state[key][row] for state in states])
+        for key, value in states[0].items()
+    }

@@ -1,0 +1,138 @@
+"""ManiSkill tasks with their geometry.
+
+- `make(task, num_envs=...)`: N parallel environments of a task.
+- `gym.make("SymSteer/PickCube-v1", num_envs=...)`: the same for users of gymnasium.
+- `task_class(task)`: layouts, limits and feasible returns without making an environment.
+- `task_names()`, `embodiments()`: what there is.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
+
+from bench.sim import create
+from bench.tasks.base import SymmetricTask
+from bench.tasks.embodiments import EMBODIMENTS
+from bench.tasks.pick_cube import PickCube
+from bench.tasks.push_cube import PushCube
+from bench.tasks.stack_cube import StackCube
+from bench.variants import Strength
+from policies.errors import UserError
+
+__all__ = ["SymmetricTask", "embodiments", "make", "task_class", "task_names"]
+
+_TASKS: dict[str, type[SymmetricTask]] = {
+    task.task_id: task for task in (PushCube, PickCube, StackCube)
+}
+
+
+def task_names() -> list[str]:
+    """Names of all tasks, easiest first."""
+    return list(_TASKS)
+
+
+def embodiments() -> list[str]:
+    """Names of all embodiments."""
+    return list(EMBODIMENTS)
+
+
+def task_class(task: str) -> type[SymmetricTask]:
+    """The class of a task, which knows its layouts without a simulation.
+
+    Raises:
+        UserError: if there is no such task.
+    """
+    task = task.removeprefix("SymSteer/")
+    if task not in _TASKS:
+        raise UserError(_unknown("task", task, task_names()))
+    return _TASKS[task]
+
+
+def make(
+    task: str,
+    *,
+    num_envs: int,
+    embodiment: str = "floating",
+    variant: str = "none",
+    strength: Strength | None = None,
+    sim: str = "cpu",
+    obs_mode: str = "state",
+    reward_mode: str = "sparse",
+    render: bool = False,
+    **kwargs: Any,
+) -> SymmetricTask:
+    """Make N parallel environments of a task.
+
+    Args:
+        task: one of :func:`task_names`.
+        num_envs: how many.
+        embodiment: ``floating`` (near-exact symmetry) or ``panda`` (the stock arm).
+        variant: symmetry-breaking variants, e.g. ``action_gain:0.5+...``; ``none`` for none.
+        strength: of a single variant named without one; one number or one per environment.
+        sim: ``cpu`` (batched CPU physics) or ``cuda``.
+        obs_mode: ManiSkill's; ``state`` is what ``observation_layout`` describes.
+        reward_mode: ManiSkill's.
+        render: whether ``env.render()`` must work.
+        kwargs: further arguments of ManiSkill's task class.
+
+    Raises:
+        UserError: unknown task, embodiment, variant or simulator, or a strength out of range.
+    """
+    env_class = task_class(task)
+    if embodiment not in EMBODIMENTS:
+        raise UserError(_unknown("embodiment", embodiment, embodiments()))
+    return create(
+        env_class,
+        num_envs=num_envs,
+        sim=sim,
+        render=render,
+        embodiment=embodiment,
+        variant=variant,
+        strength=strength,
+        obs_mode=obs_mode,
+        reward_mode=reward_mode,
+        **kwargs,
+    )
+
+
+def _make_for_gym(task: str, num_envs: int = 1, **kwargs: Any) -> SymmetricTask:
+    """Entry point of ``gym.make``: ManiSkill's way of naming a simulator is understood too."""
+    backend = str(kwargs.pop("sim_backend", "auto"))
+    kwargs.pop("render_backend", None)
+    if "cuda" in backend or "gpu" in backend:
+        kwargs.setdefault("sim", "cuda")
+    return make(task, num_envs=num_envs, **kwargs)
+
+
+def _unknown(kind: str, name: str, valid: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.4)
+    hint = f", did you mean {near[0]!r}?" if near else "."
+    return f"there is no {kind} {name!r}{hint} Valid: {', '.join(valid)}"
+
+
+def _register() -> None:
+    for name, task in _TASKS.items():
+        gym.register(
+            f"SymSteer/{name}",
+            entry_point="bench.tasks:_make_for_gym",
+            max_episode_steps=task.max_episode_steps,
+            # Batched torch observations and rewards are not what gymnasium's checker expects.
+            disable_env_checker=True,
+            order_enforce=False,
+            kwargs={"task": name},
+            additional_wrappers=(
+                gym.envs.registration.WrapperSpec(
+                    "MSTimeLimit",
+                    entry_point="mani_skill.utils.registration:TimeLimitWrapper",
+                    kwargs={"max_episode_steps": task.max_episode_steps},
+                ),
+            ),
+        )
+
+
+_register()

@@ -1,0 +1,391 @@
+"""What every SymSteer task adds to its ManiSkill class: geometry, symmetric resets, variants.
+
+Success, reward and assets stay ManiSkill's. The observation is an ordered dictionary of named
+geometric fields whose concatenation is ``observation_layout``; it is a function of poses and
+finger positions alone (no velocities, contacts or joint angles), so that it can be rebuilt from
+stored states. Positions are relative to the workspace centre, the origin of the world's x-y plane.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.utils import common
+from mani_skill.utils.structs import Pose
+
+from bench.tasks.embodiments import EMBODIMENTS, Embodiment
+from bench.tasks.floating import ACTION_LAYOUT
+from bench.tasks.rotations import (
+    planar_matrix,
+    quaternion_to_matrix,
+    transform_angular,
+    transform_quaternion,
+)
+from bench.variants import Strength, parse
+from policies.errors import UserError
+from policies.geometry import Field, Layout
+
+GRIPPER_FIELDS = (
+    Field("tcp_xy", 1),
+    Field("tcp_z", 0),
+    # Horizontal parts of the tool frame's three axes. The hand is its own mirror image across
+    # its x-z plane, so a mirrored hand's y axis is minus the mirrored y axis.
+    Field("tcp_x_axis", 1),
+    Field("tcp_y_axis", 1, odd=True),
+    Field("tcp_z_axis", 1),
+    Field("gripper_width", 0),
+)
+
+
+class SymmetricTask(BaseEnv):
+    """Mixin; list it before the ManiSkill task class.
+
+    Args:
+        embodiment: ``floating`` or ``panda``.
+        variant: which symmetry-breaking variants act, e.g. ``action_gain:0.5`` (``none``: none).
+        strength: strength of a single variant named without one; a float or one per environment.
+        kwargs: as for ManiSkill's class.
+    """
+
+    SUPPORTED_ROBOTS = [e.robot_uid for e in EMBODIMENTS.values()]
+
+    task_id: ClassVar[str]
+    max_episode_steps: ClassVar[int]
+    task_fields: ClassVar[tuple[Field, ...]]
+    action_layout: ClassVar[Layout] = ACTION_LAYOUT
+    workspace_center: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    observation_layout: ClassVar[Layout]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "task_fields" in cls.__dict__:
+            cls.observation_layout = Layout([*GRIPPER_FIELDS, *cls.task_fields])
+
+    def __init__(
+        self,
+        *args: Any,
+        embodiment: str = "floating",
+        variant: str = "none",
+        strength: Strength | None = None,
+        **kwargs: Any,
+    ):
+        self.embodiment = embodiment
+        self.body: Embodiment = EMBODIMENTS[embodiment]
+        self.variants = parse(variant, strength)
+        self._reset_rows: torch.Tensor | None = None
+        kwargs.setdefault("control_mode", self.body.control_mode)
+        kwargs.setdefault("robot_uids", self.body.robot_uid)
+        super().__init__(*args, **kwargs)
+
+    # ------------------------------------------------------------------ scene
+
+    def _load_agent(self, options: dict) -> None:
+        BaseEnv._load_agent(self, options, sapien.Pose(p=self.body.root_position))
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        with torch.device(self.device):
+            rng = self._batched_episode_rng[env_idx]
+            self.table_scene.table.set_pose(self.table_scene.table.initial_pose)
+            qpos = self.body.initial_qpos(rng, len(env_idx))
+            self.agent.reset(torch.as_tensor(qpos, device=self.device))
+            self.agent.robot.set_pose(sapien.Pose(p=self.body.root_position))
+            self._place_objects(rng, len(env_idx))
+
+    def _place_objects(self, rng: BatchedRNG, count: int) -> None:
+        """Sample objects and goal of ``count`` environments, one generator each."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------- observation
+
+    def _get_obs_agent(self) -> dict[str, torch.Tensor]:
+        tcp = self.agent.tcp_pose
+        axes = quaternion_to_matrix(tcp.q)
+        width = self.agent.robot.get_qpos()[:, -2:].sum(dim=1, keepdim=True)
+        return {
+            "tcp_xy": tcp.p[:, :2],
+            "tcp_z": tcp.p[:, 2:],
+            "tcp_x_axis": axes[:, :2, 0],
+            "tcp_y_axis": axes[:, :2, 1],
+            "tcp_z_axis": axes[:, :2, 2],
+            "gripper_width": width,
+        }
+
+    def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
+        fields = self._observe_task()
+        expected = [field.name for field in self.task_fields]
+        assert list(fields) == expected, f"fields {list(fields)} are not the layout's {expected}"
+        return fields
+
+    def _observe_task(self) -> dict[str, torch.Tensor]:
+        """The task's own fields ``[N, dim]``, in the order of ``task_fields``."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------- step
+
+    def step(self, action: Any) -> tuple:
+        """As ManiSkill's; ``truncated`` is set after ``max_episode_steps``."""
+        obs, reward, terminated, _, info = super().step(action)
+        return obs, reward, terminated, self.elapsed_steps >= self.max_episode_steps, info
+
+    def _step_action(self, action: Any) -> Any:
+        if self.variants and isinstance(action, np.ndarray | torch.Tensor):
+            action = common.to_tensor(action, device=self.device)
+            action = self.body.bound(action.reshape(self.num_envs, -1))
+            for variant in self.variants:
+                action = variant.action(action)
+        return super()._step_action(action)
+
+    # ------------------------------------------------------------------ resets
+
+    def reset(self, seed: Any = None, options: dict | None = None) -> tuple:
+        """As ManiSkill's, with one seed per environment that is reset.
+
+        Args:
+            seed: a list with one seed per environment being reset (each alone determines its
+                environment's initial state), one integer (expanded as ManiSkill does), or None.
+            options: ``env_idx`` selects the environments to reset; the others are untouched.
+
+        Raises:
+            UserError: if the list of seeds has another length.
+        """
+        options = dict(options or {})
+        partial = options.get("env_idx")
+        if partial is not None:
+            partial = torch.as_tensor(partial, dtype=torch.long, device=self.device)
+            options["env_idx"] = partial
+            if len(partial) == self.num_envs:
+                partial = None
+        if seed is not None:
+            seed = [int(s) for s in np.atleast_1d(common.to_numpy(seed))]
+            count = self.num_envs if partial is None else len(partial)
+            if len(seed) not in (1, count):
+                raise UserError(
+                    f"{len(seed)} seeds were given for {count} environments; give one each"
+                )
+            if partial is None and "env_idx" in options:
+                # A full reset in another order: ManiSkill reads seeds by environment.
+                if len(seed) > 1:
+                    seed = [seed[int(i)] for i in torch.argsort(options["env_idx"])]
+                options.pop("env_idx")
+        kept = None
+        if partial is not None and self.agent is not None:
+            # ManiSkill resets the controllers of all environments after a partial reset.
+            kept = _clone(self.agent.get_controller_state())
+        self._reset_rows = partial
+        try:
+            obs, info = super().reset(seed=seed, options=options)
+        finally:
+            self._reset_rows = None
+        if kept:
+            fresh = self.agent.get_controller_state()
+            _copy_rows(fresh, kept, partial)
+            self.agent.set_controller_state(kept)
+        return obs, info
+
+    def _set_main_rng(self, seed: list[int] | None) -> None:
+        if seed is not None and self._reset_rows is not None:
+            rows = self._reset_rows.tolist()
+            seeds = _expand(seed, len(rows))
+            for row, value in zip(rows, seeds, strict=True):
+                self._main_seed[row] = value
+            self._batched_main_rng[rows] = BatchedRNG.from_seeds(seeds)
+        else:
+            super()._set_main_rng(seed)
+            self._main_seed = list(self._main_seed)
+
+    def _set_episode_rng(self, seed: list[int] | None, env_idx: torch.Tensor) -> None:
+        if seed is not None and self._reset_rows is not None:
+            rows = self._reset_rows.tolist()
+            seeds = _expand(seed, len(rows))
+            self._episode_seed[rows] = seeds
+            self._batched_episode_rng[rows] = BatchedRNG.from_seeds(seeds)
+            self._episode_rng = self._batched_episode_rng[0]
+        else:
+            super()._set_episode_rng(seed, env_idx)
+
+    # ------------------------------------------------------------------- state
+
+    def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
+        """As ManiSkill's, and restores the controller's targets too.
+
+        States may be tensors or arrays, batched or (for one environment) not. A state without
+        controller targets makes the present pose the target.
+        """
+        state = _as_batched(state, self.device)
+        super().set_state_dict(
+            {key: state[key] for key in ("actors", "articulations") if key in state}, env_idx
+        )
+        if env_idx is None:
+            self.agent.set_controller_state(state.get("controller", {}))
+        else:
+            targets = _clone(self.agent.get_controller_state())
+            if targets:
+                _copy_rows_from_subset(targets, state["controller"], env_idx)
+                self.agent.set_controller_state(targets)
+
+    def transform_state(self, state: dict, angle: float, reflect: bool = False) -> dict:
+        """Turn a whole simulation state about the workspace centre.
+
+        Args:
+            state: as returned by ``get_state_dict``, ``[N, ...]`` tensors.
+            angle: rotation about the vertical axis, radians.
+            reflect: whether (x, y) -> (x, -y) comes first.
+
+        Raises:
+            UserError: for an embodiment whose states do not turn with the world (``panda``).
+        """
+        fixed = {self.table_scene.table.name}
+        robot = self.agent.robot.name
+        turned = {
+            "actors": {
+                name: value if name in fixed else _transform_body(value, angle, reflect)
+                for name, value in state["actors"].items()
+            },
+            "articulations": {
+                name: self.body.transform_robot(value, angle, reflect) if name == robot else value
+                for name, value in state["articulations"].items()
+            },
+        }
+        if "controller" in state:
+            turned["controller"] = self.body.transform_controller(
+                state["controller"], angle, reflect
+            )
+        return turned
+
+    # ------------------------------------------------------------------ returns
+
+    @classmethod
+    def feasible_return(
+        cls, gamma: float, steps_per_decision: int = 1, bootstrap_truncation: bool = True
+    ) -> tuple[float, float]:
+        """Bounds of the discounted return of -1 a step until success, 0 from then on.
+
+        The discount is per decision of ``steps_per_decision`` steps, whose rewards are summed:
+        [-c (1 - gamma^N) / (1 - gamma), 0] with c steps a decision and N decisions an episode
+        (DSRL, arXiv 2506.15799).
+
+        Args:
+            gamma: discount per decision, in [0, 1].
+            steps_per_decision: executed steps of an action chunk.
+            bootstrap_truncation: values bootstrap through time-outs, so that N is infinite.
+
+        Returns:
+            (lowest, highest).
+
+        Raises:
+            UserError: if gamma is out of range, or 1 with an infinite horizon.
+        """
+        if not 0 <= gamma <= 1 or (gamma == 1 and bootstrap_truncation):
+            raise UserError(
+                f"gamma must lie in [0, 1), or [0, 1] without bootstrapping; it is {gamma}"
+            )
+        if bootstrap_truncation:
+            return -steps_per_decision / (1 - gamma), 0.0
+        decisions = math.ceil(cls.max_episode_steps / steps_per_decision)
+        return -steps_per_decision * sum(gamma**i for i in range(decisions)), 0.0
+
+
+# ---------------------------------------------------------------------- features
+
+
+def fourfold_yaw(q: torch.Tensor) -> torch.Tensor:
+    """Yaw of a cube up to its symmetry, ``[N, 2]``: a frequency-4 vector.
+
+    Half the sum over the body's axes of (x + i y)^4 of their horizontal parts: (cos 4 yaw,
+    sin 4 yaw) for a cube that lies flat, and the same for all 24 ways to name a cube's axes.
+    """
+    axes = quaternion_to_matrix(q)[:, :2]
+    return _fourth_power(axes[:, 0], axes[:, 1]).sum(dim=1) / 2
+
+
+def grasp_yaw(tcp_q: torch.Tensor, cube_q: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Cosine and sine ``[N, 1]`` of four times the yaw from the fingers to the cube's faces."""
+    axis = quaternion_to_matrix(tcp_q)[:, :2, 0]
+    gripper, cube = _fourth_power(axis[:, 0], axis[:, 1]), fourfold_yaw(cube_q)
+    cosine = (gripper * cube).sum(dim=1, keepdim=True)
+    sine = gripper[:, :1] * cube[:, 1:] - gripper[:, 1:] * cube[:, :1]
+    return {"grasp_yaw_cos": cosine, "grasp_yaw_sin": sine}
+
+
+def _fourth_power(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Real and imaginary part of (x + i y)^4 along a new last axis."""
+    re, im = x * x - y * y, 2 * x * y
+    return torch.stack([re * re - im * im, 2 * re * im], dim=-1)
+
+
+def disc(u: np.ndarray, radius: float) -> np.ndarray:
+    """Points ``[N, 2]`` uniform in a disc about the centre, from uniform numbers ``u [N, 2]``."""
+    r, bearing = radius * np.sqrt(u[:, 0]), 2 * np.pi * u[:, 1]
+    return np.stack([r * np.cos(bearing), r * np.sin(bearing)], axis=1)
+
+
+def flat_pose(xy: np.ndarray, z: np.ndarray | float, yaw: np.ndarray, device: Any) -> Pose:
+    """Poses upright at ``xy [N, 2]``, height ``z`` (m), turned by ``yaw [N]`` (rad)."""
+    zero = np.zeros_like(yaw)
+    p = np.concatenate([xy, np.broadcast_to(z, yaw.shape)[:, None]], axis=1)
+    q = np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1)
+    return Pose.create_from_pq(
+        torch.as_tensor(p, dtype=torch.float32, device=device),
+        torch.as_tensor(q, dtype=torch.float32, device=device),
+    )
+
+
+# ------------------------------------------------------------------------- helpers
+
+
+def _transform_body(state: torch.Tensor, angle: float, reflect: bool) -> torch.Tensor:
+    """Act on rigid-body states ``[N, 13]``: position, quaternion, velocity, angular velocity."""
+    world = planar_matrix(angle, reflect, state)
+    return torch.cat(
+        [
+            state[:, :3] @ world.T,
+            transform_quaternion(state[:, 3:7], angle, reflect),
+            state[:, 7:10] @ world.T,
+            transform_angular(state[:, 10:13], angle, reflect),
+        ],
+        dim=1,
+    )
+
+
+def _expand(seed: list[int], count: int) -> list[int]:
+    """ManiSkill's expansion of a single seed to ``count`` environments."""
+    if len(seed) == count:
+        return seed
+    return seed + np.random.RandomState(seed[0]).randint(2**31, size=count - 1).tolist()
+
+
+def _clone(tree: Any) -> Any:
+    return {k: _clone(v) for k, v in tree.items()} if isinstance(tree, dict) else tree.clone()
+
+
+def _copy_rows(source: Any, target: Any, rows: torch.Tensor) -> None:
+    """Copy ``rows`` of every tensor of ``source`` into ``target``."""
+    for key, value in target.items():
+        if isinstance(value, dict):
+            _copy_rows(source[key], value, rows)
+        else:
+            value[rows] = source[key][rows]
+
+
+def _copy_rows_from_subset(target: Any, source: Any, rows: torch.Tensor) -> None:
+    """Write ``source``, whose tensors have one row per entry of ``rows``, into those rows."""
+    for key, value in target.items():
+        if isinstance(value, dict):
+            _copy_rows_from_subset(value, source[key], rows)
+        else:
+            value[rows] = torch.as_tensor(source[key], device=value.device, dtype=value.dtype)
+
+
+def _as_batched(tree: Any, device: Any) -> Any:
+    """Tensors on ``device`` with a leading axis of environments."""
+    if isinstance(tree, dict):
+        return {key: _as_batched(value, device) for key, value in tree.items()}
+    value = torch.as_tensor(np.asarray(tree) if not torch.is_tensor(tree) else tree)
+    value = value.to(device=device, dtype=torch.float32)
+    return value[None] if value.ndim == 1 else value
