@@ -6,15 +6,19 @@ pair. A pair's impulse acts on its first body; a body's impulse is what all othe
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import sapien.physx as physx
 import torch
 
+# Row and sign with which a contact's impulse enters a result.
+_Entries = list[tuple[int, int]]
 
-class _Impulses:
+
+class Impulses:
     """Result of a query: float32 [n, 3], with the ``.torch()`` of SAPIEN's CudaArray."""
 
     def __init__(self, n: int) -> None:
@@ -22,6 +26,7 @@ class _Impulses:
         self._tensor = torch.from_numpy(self.array)
 
     def torch(self) -> torch.Tensor:
+        """The impulses as a tensor; shares memory with the array."""
         return self._tensor
 
 
@@ -29,53 +34,78 @@ class PairImpulseQuery:
     """Asks for the impulse on the first body of each pair by the second one."""
 
     def __init__(self, body_pairs: Sequence[tuple[Any, Any]]) -> None:
-        self.row = {pair: i for i, pair in enumerate(body_pairs)}
-        self.cuda_impulses = _Impulses(len(body_pairs))
+        self.cuda_impulses = Impulses(len(body_pairs))
+        self._entries: dict[tuple[Any, Any], _Entries] = defaultdict(list)
+        for row, (first, second) in enumerate(body_pairs):
+            self._entries[first, second].append((row, 1))
+            self._entries[second, first].append((row, -1))
+
+    def entries(self, first: Any, second: Any) -> _Entries:
+        """Rows and signs for a contact between two bodies; empty when it is none of ours."""
+        return self._entries.get((first, second), [])
 
 
 class BodyImpulseQuery:
     """Asks for the net contact impulse on each body."""
 
     def __init__(self, bodies: Sequence[Any]) -> None:
-        self.row = {body: i for i, body in enumerate(bodies)}
-        self.cuda_impulses = _Impulses(len(bodies))
+        self.cuda_impulses = Impulses(len(bodies))
+        self._rows: dict[Any, list[int]] = defaultdict(list)
+        for row, body in enumerate(bodies):
+            self._rows[body].append(row)
+
+    def entries(self, first: Any, second: Any) -> _Entries:
+        """Rows and signs for a contact between two bodies; empty when it is none of ours."""
+        on_first = [(row, 1) for row in self._rows.get(first, ())]
+        return on_first + [(row, -1) for row in self._rows.get(second, ())]
+
+
+Query = TypeVar("Query", PairImpulseQuery, BodyImpulseQuery)
 
 
 class ContactReader:
-    """Reads the contacts of every scene at most once a substep and answers all queries."""
+    """Walks through the contacts of all scenes at most once a substep, for all queries."""
 
     def __init__(self, systems: Sequence[physx.PhysxCpuSystem]) -> None:
         self._systems = systems
-        self._pairs: list[tuple[Any, Any, np.ndarray]] | None = None
+        self._queries: list[PairImpulseQuery | BodyImpulseQuery] = []
+        self._answered = False
+        self._forgotten: set[int] = set(range(len(systems)))
+
+    def register(self, query: Query) -> Query:
+        """Answer this query too from now on."""
+        self._queries.append(query)
+        self._answered = False
+        return query
 
     def invalidate(self) -> None:
-        """Forget what was read: the scenes have moved on."""
-        self._pairs = None
+        """All scenes have taken a substep."""
+        self._answered = False
+        self._forgotten.clear()
 
-    def _read(self) -> list[tuple[Any, Any, np.ndarray]]:
-        if self._pairs is None:
-            self._pairs = []
-            for system in self._systems:
-                for contact in system.get_contacts():
-                    first, second = contact.bodies
-                    impulse = np.sum([p.impulse for p in contact.points], axis=0, dtype=np.float64)
-                    self._pairs.append((first, second, impulse))
-        return self._pairs
+    def forget(self, scene: int) -> None:
+        """A scene was set to another state: it has no contacts until its next substep."""
+        self._answered = False
+        self._forgotten.add(scene)
 
-    def read_pairs(self, query: PairImpulseQuery) -> None:
-        out = np.zeros(query.cuda_impulses.array.shape)
-        for first, second, impulse in self._read():
-            if (row := query.row.get((first, second))) is not None:
-                out[row] += impulse
-            elif (row := query.row.get((second, first))) is not None:
-                out[row] -= impulse
-        query.cuda_impulses.array[:] = out
+    def answer(self, query: PairImpulseQuery | BodyImpulseQuery) -> None:
+        """Bring a query's result up to date."""
+        if not self._answered:
+            self._read()
 
-    def read_bodies(self, query: BodyImpulseQuery) -> None:
-        out = np.zeros(query.cuda_impulses.array.shape)
-        for first, second, impulse in self._read():
-            if (row := query.row.get(first)) is not None:
-                out[row] += impulse
-            if (row := query.row.get(second)) is not None:
-                out[row] -= impulse
-        query.cuda_impulses.array[:] = out
+    def _read(self) -> None:
+        totals = [np.zeros(q.cuda_impulses.array.shape) for q in self._queries]
+        for scene, system in enumerate(self._systems):
+            if scene in self._forgotten:
+                continue
+            for contact in system.get_contacts():
+                first, second = contact.bodies
+                impulse = None
+                for query, total in zip(self._queries, totals):
+                    for row, sign in query.entries(first, second):
+                        if impulse is None:
+                            impulse = np.sum([p.impulse for p in contact.points], axis=0)
+                        total[row] += sign * impulse
+        for query, total in zip(self._queries, totals):
+            query.cuda_impulses.array[:] = total
+        self._answered = True

@@ -8,6 +8,8 @@ from typing import Any, Literal
 
 import sapien
 import sapien.physx as physx
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.system.backend import BackendInfo
 
@@ -71,6 +73,26 @@ class BatchedCpuMixin:
             backend=self.backend,
         )
         self.scene.timestep = 1.0 / self._sim_freq
+
+    def _step_action(self, action: Any) -> Any:
+        if self._code_runs_between_substeps():
+            return super()._step_action(action)
+        with self.scene.px.deferred_substeps():
+            return super()._step_action(action)
+
+    def _after_control_step(self) -> None:
+        self.scene.px.finish_substeps()
+        super()._after_control_step()
+
+    def _code_runs_between_substeps(self) -> bool:
+        """Whether the task or the robot overrides a hook that may touch SAPIEN's objects."""
+        agent = type(self.agent)
+        return not (
+            type(self)._before_simulation_step is BaseEnv._before_simulation_step
+            and type(self)._after_simulation_step is BaseEnv._after_simulation_step
+            and agent.before_simulation_step
+            in (BaseAgent.before_simulation_step, MultiAgent.before_simulation_step)
+        )
 
 
 class CudaMixin:

@@ -90,6 +90,8 @@ def _install_stand_ins() -> None:
     import sapien
     import sapien.render
     import sapien.wrapper.urdf_loader as urdf_loader
+    from mani_skill.utils.building import _mjcf_loader as mjcf_loader
+    from mani_skill.utils.building.actor_builder import ActorBuilder
 
     def add_nothing(self: Any, *args: Any, **kwargs: Any) -> Any:
         return self
@@ -98,8 +100,8 @@ def _install_stand_ins() -> None:
     sapien.render.RenderTexture2D = InertTexture
     urdf_loader.RenderMaterial = InertMaterial
     urdf_loader.RenderTexture2D = InertTexture
+    mjcf_loader.RenderMaterial = InertMaterial
+    mjcf_loader.RenderTexture2D = InertTexture
     for name in _VISUAL_METHODS:
         setattr(sapien.ActorBuilder, name, add_nothing)
-    from mani_skill.utils.building.actor_builder import ActorBuilder
-
     ActorBuilder.add_plane_repeated_visual = add_nothing

@@ -3,22 +3,25 @@
 ManiSkill's GPU branch is batched torch code that reads and writes a few large buffers and asks
 the physics system to *fetch* them from, or *apply* them to, the simulation. `BatchedPhysx`
 offers the same buffers and calls over N ``PhysxCpuSystem`` scenes: torch tensors on the CPU that
-share memory with numpy arrays. Two rules differ from the GPU, both invisible to task code:
+share memory with numpy arrays. What differs from the GPU is invisible to task code:
 
 - *Apply writes only what changed* since the last fetch. A partial reset therefore leaves the
   other scenes untouched to the last bit: writing a fetched value back could move a body, wake
   it or reset its solver state.
-- *Fetch reads only what may have changed* (scenes stepped or written since) and only links that
-  somebody has asked for by their index.
+- *Fetch reads only scenes that may have changed*, most of it in one call per scene
+  (``PhysxCpuSystem.pack``), and the poses of only those links whose row somebody has asked for.
+- *Contacts are forgotten when a scene is reset*, so what a reset reports depends on the state
+  it sets and not on the episode before.
 
-Rows: rigid bodies first (dynamic and kinematic, scene by scene), then articulation links.
-Columns of the body buffer: position (3), quaternion wxyz (4), linear velocity (3), angular
+Rows of the body buffer: rigid bodies first (dynamic and kinematic, scene by scene), then
+articulation links. Columns: position (3), quaternion wxyz (4), linear velocity (3), angular
 velocity (3), in metres, radians and seconds, in the world frame.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -31,19 +34,32 @@ from bench.sim.contacts import BodyImpulseQuery, ContactReader, PairImpulseQuery
 _POSE = slice(0, 7)
 _VELOCITY = slice(7, 13)
 
+# Where `pack` puts a body's 13 numbers: quaternion first, then position, then velocities.
+_PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
+
 
 class Buffer:
-    """A float32 array that numpy and torch share, with the ``.torch()`` of SAPIEN's CudaArray."""
+    """A float32 array that numpy and torch share, with the ``.torch()`` of SAPIEN's CudaArray.
 
-    def __init__(self, *shape: int) -> None:
-        self.array = np.zeros(shape, dtype=np.float32)
-        self._tensor = torch.from_numpy(self.array)
+    Args:
+        array: what to share.
+        fill: called before each ``.torch()``, for buffers that are read on demand.
+    """
+
+    def __init__(self, array: np.ndarray, fill: Callable[[], None] | None = None) -> None:
+        self.array = array
+        self._tensor = torch.from_numpy(array)
+        self._fill = fill
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
         return self.array.shape
 
     def torch(self) -> torch.Tensor:
+        """The array as a tensor; both share memory."""
+        if self._fill is not None:
+            self._fill()
         return self._tensor
 
 
@@ -61,12 +77,14 @@ class BatchedPhysx:
     def __init__(self, scenes: Sequence[sapien.Scene]) -> None:
         self.scenes = list(scenes)
         self.systems: list[physx.PhysxCpuSystem] = [s.physx_system for s in self.scenes]
-        self._step_calls = [system.step for system in self.systems]
+        self._pending_substeps = 0
+        self._deferring = False
         self._initialized = False
 
     # ------------------------------------------------------------------ plain system surface
     @property
     def timestep(self) -> float:
+        """Duration of a substep in seconds."""
         return self.systems[0].timestep
 
     @timestep.setter
@@ -75,28 +93,36 @@ class BatchedPhysx:
             system.timestep = value
 
     def get_timestep(self) -> float:
+        """Duration of a substep in seconds."""
         return self.timestep
 
     def set_timestep(self, value: float) -> None:
+        """Set the duration of a substep in seconds."""
         self.timestep = value
 
     @property
     def config(self) -> physx.PhysxSceneConfig:
+        """The scene configuration, the same for all scenes."""
         return self.systems[0].config
 
     @property
     def rigid_dynamic_components(self) -> list[physx.PhysxRigidDynamicComponent]:
+        """Dynamic and kinematic bodies of all scenes."""
         return [c for system in self.systems for c in system.rigid_dynamic_components]
 
     @property
     def rigid_static_components(self) -> list[physx.PhysxRigidStaticComponent]:
+        """Static bodies of all scenes."""
         return [c for system in self.systems for c in system.rigid_static_components]
 
     @property
     def articulation_link_components(self) -> list[physx.PhysxArticulationLinkComponent]:
+        """Articulation links of all scenes."""
         return [c for system in self.systems for c in system.articulation_link_components]
 
     def get_contacts(self) -> list[physx.PhysxContact]:
+        """Contacts of the last substep in all scenes."""
+        self.finish_substeps()
         return [contact for system in self.systems for contact in system.get_contacts()]
 
     def get_scene_offset(self, scene: sapien.Scene) -> np.ndarray:
@@ -105,60 +131,142 @@ class BatchedPhysx:
 
     # ------------------------------------------------------------------ setup
     def gpu_init(self) -> None:
-        """Index every body and articulation, allocate the buffers and fill them."""
-        self._bodies: list[Any] = []
-        self._body_scene: list[int] = []
-        for i, system in enumerate(self.systems):
-            for body in system.rigid_dynamic_components:
-                self._bodies.append(body)
-                self._body_scene.append(i)
-        self._n_rigid = len(self._bodies)
-        self._articulations: list[physx.PhysxArticulation] = []
-        self._articulation_scene: list[int] = []
-        for i, system in enumerate(self.systems):
-            for link in system.articulation_link_components:
-                self._bodies.append(link)
-                self._body_scene.append(i)
-                if link.is_root:
-                    self._articulations.append(link.articulation)
-                    self._articulation_scene.append(i)
-        self._body_row = {body: row for row, body in enumerate(self._bodies)}
-        self._articulation_row = {a: row for row, a in enumerate(self._articulations)}
-        self._dof = [a.dof for a in self._articulations]
-        self._joints = [a.active_joints for a in self._articulations]
-        self._root_row = np.array(
-            [self._body_row[a.root] for a in self._articulations], dtype=np.int64
-        )
-        self._fixed_root = [a.root.joint.type == "fixed" for a in self._articulations]
-        n, m, d = len(self._bodies), len(self._articulations), max(self._dof, default=0)
-        n_links = max((len(a.links) for a in self._articulations), default=0)
-        self.cuda_rigid_body_data = Buffer(n, 13)
-        self.cuda_rigid_body_force = Buffer(n, 4)
-        self.cuda_rigid_body_torque = Buffer(n, 4)
-        self.cuda_articulation_qpos = Buffer(m, d)
-        self.cuda_articulation_qvel = Buffer(m, d)
-        self.cuda_articulation_qf = Buffer(m, d)
-        self.cuda_articulation_qacc = Buffer(m, d)
-        self.cuda_articulation_target_qpos = Buffer(m, d)
-        self.cuda_articulation_target_qvel = Buffer(m, d)
-        self.cuda_articulation_link_incoming_joint_forces = Buffer(m, n_links, 6)
-        # What the simulation is known to hold, to tell which rows a task has written.
-        self._known_body = np.zeros((n, 13), dtype=np.float32)
-        self._known = {
+        """Index every body and articulation, allocate the buffers and fill them.
+
+        Raises:
+            RuntimeError: SAPIEN packs a scene in another order than this module expects.
+        """
+        self._index_scenes()
+        n, m = len(self._bodies), len(self._articulations)
+        d = max(self._dof, default=0)
+        # What the simulation holds, to tell which rows a task has written.
+        self._body_state = np.zeros((n, 13), dtype=np.float32)
+        self._joint_state = {
             name: np.zeros((m, d), dtype=np.float32)
             for name in ("qpos", "qvel", "qf", "target_qpos", "target_qvel")
         }
+        self._body_buffer = np.zeros((n, 13), dtype=np.float32)
+        self._joint_buffer = {k: np.zeros_like(v) for k, v in self._joint_state.items()}
+        self.cuda_rigid_body_data = Buffer(self._body_buffer)
+        self.cuda_rigid_dynamic_data = Buffer(self._body_buffer[: self._n_rigid])
+        self.cuda_rigid_body_force = Buffer(np.zeros((n, 4), dtype=np.float32))
+        self.cuda_rigid_body_torque = Buffer(np.zeros((n, 4), dtype=np.float32))
+        self.cuda_articulation_qpos = Buffer(self._joint_buffer["qpos"])
+        self.cuda_articulation_qvel = Buffer(self._joint_buffer["qvel"])
+        self.cuda_articulation_qf = Buffer(self._joint_buffer["qf"])
+        self.cuda_articulation_target_qpos = Buffer(self._joint_buffer["target_qpos"])
+        self.cuda_articulation_target_qvel = Buffer(self._joint_buffer["target_qvel"])
+        self.cuda_articulation_qacc = Buffer(
+            np.zeros((m, d), dtype=np.float32), fill=self._read_qacc
+        )
+        links = max((len(a.links) for a in self._articulations), default=0)
+        self.cuda_articulation_link_data = Buffer(
+            np.zeros((m, links, 13), dtype=np.float32), fill=self._read_link_data
+        )
+        self.cuda_articulation_link_incoming_joint_forces = Buffer(
+            np.zeros((m, links, 6), dtype=np.float32)
+        )
         self._contacts = ContactReader(self.systems)
+        self._stale = np.ones(len(self.systems), dtype=bool)
+        self._qacc_stale = True
+        # Articulations whose drives a controller sets: their targets are written at each control
+        # step, as stock ManiSkill does, which also keeps PhysX from putting them to sleep.
+        self._driven = np.zeros(m, dtype=bool)
         self._initialized = True
-        self.gpu_fetch_rigid_dynamic_data()
-        self.gpu_fetch_articulation_link_pose()
-        self.gpu_fetch_articulation_link_velocity()
-        for name in ("qpos", "qvel", "qacc", "target_qpos", "target_qvel"):
-            getattr(self, f"gpu_fetch_articulation_{name}")()
+        self._refresh()
+        self._check_packing()
+        self.fetch_all()
+
+    def _index_scenes(self) -> None:
+        """Number bodies and articulations, and find their numbers in the packed scenes."""
+        rigid: list[Any] = []
+        links: list[Any] = []
+        rigid_scene: list[int] = []
+        link_scene: list[int] = []
+        self._articulations: list[physx.PhysxArticulation] = []
+        self._articulation_scene: list[int] = []
+        self._pack_calls = [system.pack for system in self.systems]
+        self._step_calls = [system.step for system in self.systems]
+        # Offsets of each scene in the concatenation of all packed scenes.
+        self._pack_start = [0]
+        rigid_at: list[int] = []
+        articulation_at: list[int] = []
+        for i, system in enumerate(self.systems):
+            at = self._pack_start[-1]
+            for body in system.rigid_dynamic_components:
+                rigid.append(body)
+                rigid_scene.append(i)
+                rigid_at.append(at)
+                at += 13
+            for link in system.articulation_link_components:
+                links.append(link)
+                link_scene.append(i)
+                if link.is_root:
+                    self._articulations.append(link.articulation)
+                    self._articulation_scene.append(i)
+                    articulation_at.append(at)
+                    # Root pose and velocity; per joint: position, velocity, two drive targets.
+                    at += 13 + 4 * link.articulation.dof
+            self._pack_start.append(at)
+        self._n_rigid = len(rigid)
+        self._bodies = rigid + links
+        self._body_scene = np.array(rigid_scene + link_scene, dtype=np.int64)
+        self._body_row = {body: row for row, body in enumerate(self._bodies)}
+        self._articulation_row = {a: row for row, a in enumerate(self._articulations)}
+        self._kinematic = np.array([body.kinematic for body in rigid], dtype=bool)
+        self._dof = [a.dof for a in self._articulations]
+        self._joints = [a.active_joints for a in self._articulations]
+        self._set_target_calls = [[j.set_drive_target for j in js] for js in self._joints]
+        self._set_target_velocity_calls = [
+            [j.set_drive_velocity_target for j in js] for js in self._joints
+        ]
+        self._fixed_root = [a.root.joint.type == "fixed" for a in self._articulations]
+        self._root_row = np.array([self._body_row[a.root] for a in self._articulations], int)
+        self._live_links: list[list[int]] = [[] for _ in self.systems]
+        self._live = set(range(self._n_rigid)) | set(self._root_row.tolist())
+        # The last number of the flat array is a zero that padded joints point to.
+        total = self._pack_start[-1]
+        self._packed = np.zeros(total + 1, dtype=np.float32)
+        self._rigid_at = np.array(rigid_at, int).reshape(-1, 1) + _PACKED_BODY
+        self._root_at = np.array(articulation_at, int).reshape(-1, 1) + _PACKED_BODY
+        d = max(self._dof, default=0)
+        self._joint_at = {
+            name: np.full((len(self._articulations), d), total, dtype=np.int64)
+            for name in ("qpos", "qvel", "target_qpos", "target_qvel")
+        }
+        for row, (at, dof) in enumerate(zip(articulation_at, self._dof)):
+            joints = np.arange(dof)
+            self._joint_at["qpos"][row, :dof] = at + 13 + joints
+            self._joint_at["qvel"][row, :dof] = at + 13 + dof + joints
+            self._joint_at["target_qpos"][row, :dof] = at + 13 + 2 * dof + 2 * joints
+            self._joint_at["target_qvel"][row, :dof] = at + 14 + 2 * dof + 2 * joints
+
+    def _check_packing(self) -> None:
+        """Compare what was unpacked with what SAPIEN's objects say, once per scene set-up."""
+        for row, body in enumerate(self._bodies[: self._n_rigid]):
+            if tuple(self._body_state[row, :7].tolist()) != body.entity.pose.__getstate__():
+                raise RuntimeError(f"SAPIEN packs the pose of {body.name} in an unknown order")
+        for row, articulation in enumerate(self._articulations):
+            dof, state = self._dof[row], self._joint_state
+            root = self._body_state[self._root_row[row], :7]
+            targets = [float(j.drive_target[0]) for j in self._joints[row]]
+            if (
+                tuple(root.tolist()) != articulation.root.entity.pose.__getstate__()
+                or (state["qpos"][row, :dof] != articulation.qpos).any()
+                or (state["qvel"][row, :dof] != articulation.qvel).any()
+                or state["target_qpos"][row, :dof].tolist() != targets
+            ):
+                raise RuntimeError(f"SAPIEN packs {articulation.name} in an unknown order")
 
     def body_index(self, body: Any) -> int:
-        """Row of a rigid body or link in the body buffer."""
-        return self._body_row[body]
+        """Row of a rigid body or link in the body buffer, which is kept up to date from now on."""
+        row = self._body_row[body]
+        if row not in self._live:
+            self._live.add(row)
+            self._live_links[self._body_scene[row]].append(row)
+            self._body_state[row] = self._read_link(row)
+            self._body_buffer[row] = self._body_state[row]
+        return row
 
     def articulation_index(self, articulation: physx.PhysxArticulation) -> int:
         """Row of an articulation in the joint buffers."""
@@ -167,140 +275,289 @@ class BatchedPhysx:
     # ------------------------------------------------------------------ simulation
     def step(self) -> None:
         """One substep of every scene."""
+        self._pending_substeps += 1
+        if not self._deferring:
+            self.finish_substeps()
+
+    @contextmanager
+    def deferred_substeps(self) -> Iterator[None]:
+        """Substeps in this block are taken scene by scene at its end.
+
+        A scene's data then stays in the processor's cache for all substeps of a control step,
+        which makes them a third faster. Any call of this object that depends on the simulation
+        takes the outstanding substeps first, so only code that reads or writes SAPIEN's own
+        objects between substeps would see a difference.
+        """
+        self._deferring = True
+        try:
+            yield
+        finally:
+            self._deferring = False
+            self.finish_substeps()
+
+    def finish_substeps(self) -> None:
+        """Take the substeps that have been asked for and not taken yet."""
+        count, self._pending_substeps = self._pending_substeps, 0
+        if count == 0:
+            return
+        substeps = range(count)
         for step in self._step_calls:
-            step()
-        self._contacts.invalidate()
+            for _ in substeps:
+                step()
+        if self._initialized:
+            self._stale[:] = True
+            self._contacts.invalidate()
 
     # ------------------------------------------------------------------ fetch
-    def _fetch_bodies(self, rows: Any, columns: slice) -> None:
-        data = self.cuda_rigid_body_data.array
-        for row in rows:
-            body = self._bodies[row]
-            if columns is _POSE:
-                data[row, _POSE] = body.entity.pose.__getstate__()
-            elif not (row < self._n_rigid and body.kinematic):
-                data[row, 7:10] = body.linear_velocity
-                data[row, 10:13] = body.angular_velocity
-        self._known_body[rows, columns] = data[rows, columns]
+    def _read_link(self, row: int) -> tuple[float, ...]:
+        link = self._bodies[row]
+        return (
+            *link.entity.pose.__getstate__(),
+            *link.linear_velocity.tolist(),
+            *link.angular_velocity.tolist(),
+        )
+
+    def _refresh(self) -> None:
+        """Read the scenes that may have changed since they were last read."""
+        self.finish_substeps()
+        if not self._stale.any():
+            return
+        self._qacc_stale = True
+        stale = np.flatnonzero(self._stale).tolist()
+        packed, start = self._packed, self._pack_start
+        if len(stale) == len(self.systems):
+            packed[:-1] = np.frombuffer(b"".join([pack() for pack in self._pack_calls]), "f4")
+        else:
+            for i in stale:
+                packed[start[i] : start[i + 1]] = np.frombuffer(self._pack_calls[i](), "f4")
+        self._body_state[: self._n_rigid] = packed[self._rigid_at]
+        self._body_state[self._root_row] = packed[self._root_at]
+        for name, at in self._joint_at.items():
+            self._joint_state[name][:] = packed[at]
+        rows = [row for i in stale for row in self._live_links[i]]
+        if rows:
+            bodies = self._bodies
+            self._body_state[rows, _POSE] = [bodies[r].entity.pose.__getstate__() for r in rows]
+            self._body_state[rows, 7:10] = [bodies[r].linear_velocity for r in rows]
+            self._body_state[rows, 10:13] = [bodies[r].angular_velocity for r in rows]
+        self._stale[:] = False
+
+    def fetch_all(self) -> None:
+        """Bring every buffer up to date; those read on demand when they are asked for."""
+        self._refresh()
+        self._body_buffer[:] = self._body_state
+        for name, state in self._joint_state.items():
+            if name != "qf":
+                self._joint_buffer[name][:] = state
 
     def gpu_fetch_rigid_dynamic_data(self) -> None:
-        self._fetch_bodies(range(self._n_rigid), _POSE)
-        self._fetch_bodies(range(self._n_rigid), _VELOCITY)
+        """Fetch poses and velocities of rigid bodies."""
+        self._refresh()
+        self._body_buffer[: self._n_rigid] = self._body_state[: self._n_rigid]
 
     def gpu_fetch_articulation_link_pose(self) -> None:
-        self._fetch_bodies(range(self._n_rigid, len(self._bodies)), _POSE)
+        """Fetch poses of articulation links."""
+        self._refresh()
+        self._body_buffer[self._n_rigid :, _POSE] = self._body_state[self._n_rigid :, _POSE]
 
     def gpu_fetch_articulation_link_velocity(self) -> None:
-        self._fetch_bodies(range(self._n_rigid, len(self._bodies)), _VELOCITY)
+        """Fetch velocities of articulation links."""
+        self._refresh()
+        self._body_buffer[self._n_rigid :, _VELOCITY] = self._body_state[self._n_rigid :, _VELOCITY]
 
     def _fetch_joints(self, name: str) -> None:
-        data = getattr(self, f"cuda_articulation_{name}").array
-        for row, articulation in enumerate(self._articulations):
-            data[row, : self._dof[row]] = getattr(articulation, name)
-        if name in self._known:
-            self._known[name][:] = data
+        self._refresh()
+        self._joint_buffer[name][:] = self._joint_state[name]
 
     def gpu_fetch_articulation_qpos(self) -> None:
+        """Fetch joint positions."""
         self._fetch_joints("qpos")
 
     def gpu_fetch_articulation_qvel(self) -> None:
+        """Fetch joint velocities."""
         self._fetch_joints("qvel")
 
-    def gpu_fetch_articulation_qacc(self) -> None:
-        self._fetch_joints("qacc")
-
-    def _fetch_targets(self, name: str, attribute: str) -> None:
-        data = getattr(self, f"cuda_articulation_{name}").array
-        for row, joints in enumerate(self._joints):
-            for column, joint in enumerate(joints):
-                data[row, column] = getattr(joint, attribute)[0]
-        self._known[name][:] = data
-
     def gpu_fetch_articulation_target_qpos(self) -> None:
-        self._fetch_targets("target_qpos", "drive_target")
+        """Fetch drive targets."""
+        self._fetch_joints("target_qpos")
 
     def gpu_fetch_articulation_target_qvel(self) -> None:
-        self._fetch_targets("target_qvel", "drive_velocity_target")
+        """Fetch drive velocity targets."""
+        self._fetch_joints("target_qvel")
+
+    def gpu_fetch_articulation_qacc(self) -> None:
+        """Joint accelerations are read when the buffer is asked for: see `_read_qacc`."""
+
+    def _read_qacc(self) -> None:
+        self._refresh()
+        if self._qacc_stale:
+            for row, articulation in enumerate(self._articulations):
+                self.cuda_articulation_qacc.array[row, : self._dof[row]] = articulation.qacc
+            self._qacc_stale = False
+
+    def _read_link_data(self) -> None:
+        self._refresh()
+        data = self.cuda_articulation_link_data.array
+        for row, articulation in enumerate(self._articulations):
+            for i, link in enumerate(articulation.links):
+                data[row, i] = self._read_link(self._body_row[link])
+
+    def gpu_fetch_articulation_link_incoming_joint_forces(self) -> None:
+        """Fetch the spatial force that each link receives through its joint."""
+        self.finish_substeps()
+        data = self.cuda_articulation_link_incoming_joint_forces.array
+        for row, articulation in enumerate(self._articulations):
+            forces = articulation.get_link_incoming_joint_forces()
+            data[row, : len(forces)] = forces
 
     # ------------------------------------------------------------------ apply
-    def _changed_rows(self, data: np.ndarray, known: np.ndarray) -> np.ndarray:
-        return np.flatnonzero((data != known).any(axis=1))
+    def apply_all(self) -> None:
+        """Write all that a task has changed in the buffers to the simulation."""
+        self.gpu_apply_rigid_dynamic_data()
+        self.gpu_apply_articulation_qpos()
+        self.gpu_apply_articulation_qvel()
+        self.gpu_apply_articulation_qf()
+        self.gpu_apply_articulation_root_pose()
+        self.gpu_apply_articulation_root_velocity()
+        self._apply_targets("target_qpos", self._set_target_calls, refresh_driven=False)
+        self._apply_targets("target_qvel", self._set_target_velocity_calls, refresh_driven=False)
+
+    @staticmethod
+    def _changed(buffer: np.ndarray, state: np.ndarray) -> list[int]:
+        """Rows in which a task has written another value than the simulation holds."""
+        return np.flatnonzero((buffer != state).any(axis=1)).tolist()
+
+    def _touch(self, scene: int, moved: bool = False) -> None:
+        self._stale[scene] = True
+        if moved:
+            self._contacts.forget(scene)
 
     def gpu_apply_rigid_dynamic_data(self) -> None:
+        """Apply poses and velocities of rigid bodies."""
+        self.finish_substeps()
         n = self._n_rigid
-        data, known = self.cuda_rigid_body_data.array[:n], self._known_body[:n]
-        for row in self._changed_rows(data[:, _POSE], known[:, _POSE]):
-            self._bodies[row].entity.pose = sapien.Pose(data[row, :3], data[row, 3:7])
-        for row in self._changed_rows(data[:, _VELOCITY], known[:, _VELOCITY]):
-            body = self._bodies[row]
-            if not body.kinematic:
-                body.linear_velocity = data[row, 7:10]
-                body.angular_velocity = data[row, 10:13]
-        known[:] = data
+        buffer, state = self._body_buffer[:n], self._body_state[:n]
+        for row in self._changed(buffer[:, _POSE], state[:, _POSE]):
+            self._bodies[row].entity.pose = sapien.Pose(buffer[row, :3], buffer[row, 3:7])
+            self._touch(self._body_scene[row], moved=not self._kinematic[row])
+        for row in self._changed(buffer[:, _VELOCITY], state[:, _VELOCITY]):
+            if not self._kinematic[row]:
+                self._bodies[row].linear_velocity = buffer[row, 7:10]
+                self._bodies[row].angular_velocity = buffer[row, 10:13]
+            self._touch(self._body_scene[row])
+        state[:] = buffer
 
     def gpu_apply_articulation_root_pose(self) -> None:
-        rows = self._root_row
-        data, known = self.cuda_rigid_body_data.array, self._known_body
-        for i in self._changed_rows(data[rows, _POSE], known[rows, _POSE]):
-            row = rows[i]
-            self._articulations[i].root_pose = sapien.Pose(data[row, :3], data[row, 3:7])
-        known[rows, _POSE] = data[rows, _POSE]
+        """Apply root poses."""
+        self.finish_substeps()
+        roots, buffer = self._root_row, self._body_buffer
+        for i in self._changed(buffer[roots, _POSE], self._body_state[roots, _POSE]):
+            pose = buffer[roots[i]]
+            self._articulations[i].root_pose = sapien.Pose(pose[:3], pose[3:7])
+            self._touch(self._articulation_scene[i], moved=True)
+        self._body_state[roots, _POSE] = buffer[roots, _POSE]
 
     def gpu_apply_articulation_root_velocity(self) -> None:
-        rows = self._root_row
-        data, known = self.cuda_rigid_body_data.array, self._known_body
-        for i in self._changed_rows(data[rows, _VELOCITY], known[rows, _VELOCITY]):
+        """Apply root velocities; roots that are fixed have none."""
+        self.finish_substeps()
+        roots, buffer = self._root_row, self._body_buffer
+        for i in self._changed(buffer[roots, _VELOCITY], self._body_state[roots, _VELOCITY]):
             if not self._fixed_root[i]:
-                row = rows[i]
-                self._articulations[i].set_root_linear_velocity(data[row, 7:10])
-                self._articulations[i].set_root_angular_velocity(data[row, 10:13])
-        known[rows, _VELOCITY] = data[rows, _VELOCITY]
+                velocity = buffer[roots[i]]
+                self._articulations[i].set_root_linear_velocity(velocity[7:10])
+                self._articulations[i].set_root_angular_velocity(velocity[10:13])
+            self._touch(self._articulation_scene[i])
+        self._body_state[roots, _VELOCITY] = buffer[roots, _VELOCITY]
 
-    def _apply_joints(self, name: str) -> None:
-        data = getattr(self, f"cuda_articulation_{name}").array
-        known = self._known[name]
-        for row in self._changed_rows(data, known):
-            setattr(self._articulations[row], name, data[row, : self._dof[row]])
-        known[:] = data
+    def _apply_joints(self, name: str, moved: bool) -> None:
+        self.finish_substeps()
+        buffer, state = self._joint_buffer[name], self._joint_state[name]
+        for row in self._changed(buffer, state):
+            setattr(self._articulations[row], name, buffer[row, : self._dof[row]])
+            self._touch(self._articulation_scene[row], moved)
+        state[:] = buffer
 
     def gpu_apply_articulation_qpos(self) -> None:
-        self._apply_joints("qpos")
+        """Apply joint positions."""
+        self._apply_joints("qpos", moved=True)
 
     def gpu_apply_articulation_qvel(self) -> None:
-        self._apply_joints("qvel")
+        """Apply joint velocities."""
+        self._apply_joints("qvel", moved=False)
 
     def gpu_apply_articulation_qf(self) -> None:
-        self._apply_joints("qf")
+        """Apply joint forces, which act until others are applied."""
+        self._apply_joints("qf", moved=False)
+
+    def _apply_targets(
+        self, name: str, calls: list[list[Callable[[float], None]]], refresh_driven: bool
+    ) -> None:
+        self.finish_substeps()
+        buffer, state = self._joint_buffer[name], self._joint_state[name]
+        write = (buffer != state).any(axis=1)
+        self._driven |= write
+        if refresh_driven:
+            write = self._driven
+        values = buffer.tolist()
+        for row in np.flatnonzero(write).tolist():
+            for set_target, value in zip(calls[row], values[row]):
+                set_target(value)
+        state[:] = buffer
+        # A refresh that reads scenes again must find what was written here.
+        self._packed[self._joint_at[name]] = buffer
+        self._packed[-1] = 0
 
     def gpu_apply_articulation_target_position(self) -> None:
-        data, known = self.cuda_articulation_target_qpos.array, self._known["target_qpos"]
-        for row in self._changed_rows(data, known):
-            for joint, target in zip(self._joints[row], data[row].tolist()):
-                joint.set_drive_target(target)
-        known[:] = data
+        """Apply drive targets, of articulations under control even where they are unchanged."""
+        self._apply_targets("target_qpos", self._set_target_calls, refresh_driven=True)
 
     def gpu_apply_articulation_target_velocity(self) -> None:
-        data, known = self.cuda_articulation_target_qvel.array, self._known["target_qvel"]
-        for row in self._changed_rows(data, known):
-            for joint, target in zip(self._joints[row], data[row].tolist()):
-                joint.set_drive_velocity_target(target)
-        known[:] = data
+        """Apply drive velocity targets, likewise."""
+        self._apply_targets("target_qvel", self._set_target_velocity_calls, refresh_driven=True)
+
+    def _apply_forces(self, buffer: Buffer, is_force: bool) -> None:
+        """Each request acts in the next substep and once: the buffer is cleared."""
+        self.finish_substeps()
+        zero = np.zeros(3, dtype=np.float32)
+        for row in np.flatnonzero(buffer.array[: self._n_rigid].any(axis=1)).tolist():
+            vector = buffer.array[row, :3].copy()
+            force, torque = (vector, zero) if is_force else (zero, vector)
+            if not self._kinematic[row]:
+                self._bodies[row].add_force_torque(force, torque)
+        buffer.array[:] = 0
+
+    def gpu_apply_rigid_dynamic_force(self) -> None:
+        """Apply forces (newtons, world frame) at the centres of mass for the next substep."""
+        self._apply_forces(self.cuda_rigid_body_force, is_force=True)
+
+    def gpu_apply_rigid_dynamic_torque(self) -> None:
+        """Apply torques (newton metres, world frame) for the next substep."""
+        self._apply_forces(self.cuda_rigid_body_torque, is_force=False)
 
     def gpu_update_articulation_kinematics(self) -> None:
         """Nothing to do: the CPU system updates link poses when joints are set."""
 
     def sync_poses_gpu_to_cpu(self) -> None:
-        """Nothing to do: entities live on the CPU."""
+        """Take outstanding substeps: entities live on the CPU and need nothing else."""
+        self.finish_substeps()
 
     # ------------------------------------------------------------------ contacts
-    def gpu_create_contact_pair_impulse_query(self, body_pairs: Sequence) -> PairImpulseQuery:
-        return PairImpulseQuery(body_pairs)
+    def gpu_create_contact_pair_impulse_query(
+        self, body_pairs: Sequence[tuple[Any, Any]]
+    ) -> PairImpulseQuery:
+        """A query for the impulse on the first body of each pair by the second."""
+        return self._contacts.register(PairImpulseQuery(body_pairs))
 
     def gpu_query_contact_pair_impulses(self, query: PairImpulseQuery) -> None:
-        self._contacts.read_pairs(query)
+        """Answer a pair query with the impulses of the last substep."""
+        self.finish_substeps()
+        self._contacts.answer(query)
 
-    def gpu_create_contact_body_impulse_query(self, bodies: Sequence) -> BodyImpulseQuery:
-        return BodyImpulseQuery(bodies)
+    def gpu_create_contact_body_impulse_query(self, bodies: Sequence[Any]) -> BodyImpulseQuery:
+        """A query for the net contact impulse on each body."""
+        return self._contacts.register(BodyImpulseQuery(bodies))
 
     def gpu_query_contact_body_impulses(self, query: BodyImpulseQuery) -> None:
-        self._contacts.read_bodies(query)
+        """Answer a body query with the impulses of the last substep."""
+        self.finish_substeps()
+        self._contacts.answer(query)
