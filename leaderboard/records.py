@@ -6,11 +6,12 @@ diagnostics measured at that evaluation. It is validated on write and on read, w
 and a finished record is never overwritten. docs/metrics.md defines every scalar.
 
 JSON knows no NaN and no infinity. A measured number that is not finite is stored as null and named
-in the `nonfinite` table of the block that holds it; null without such an entry means "not measured".
+in the `nonfinite` table of the block that holds it; null without an entry means "not measured".
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -42,25 +43,29 @@ SCHEMA_VERSION = 1
 MAX_BYTES = 64 * 2**20
 """A record of this project has some ten to a few hundred kilobytes; larger files are not ours."""
 
+MAX_TEXT = 2000
+
 DIVERGED_SHARE = 0.05
 DIVERGED_EVALUATIONS = 3
 
 PACKAGES = ("torch", "mani-skill", "sapien", "escnn", "gymnasium", "numpy")
 
+_PLAIN = frozenset({bool, int, float, str, type(None)})
+
 
 def _plain(value: Any) -> Any:
     """Turn arrays, tensors and their scalars into Python numbers and lists (no torch import)."""
-    if isinstance(value, Mapping):
+    if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
+        if all(type(item) in _PLAIN for item in value):
+            return list(value)
         return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return value
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _moment(value: Any) -> Any:
-    """Read an ISO 8601 time; times without a zone are refused, others become UTC, in whole seconds."""
+    """Read an ISO 8601 time as UTC in whole seconds; times without a zone are refused."""
     if isinstance(value, str):
         value = datetime.fromisoformat(value)
     if not isinstance(value, datetime) or value.tzinfo is None:
@@ -68,11 +73,14 @@ def _moment(value: Any) -> Any:
     return value.astimezone(UTC).replace(microsecond=0)
 
 
-def _flag(value: Any) -> Any:
-    """Read a flag stored as 0/1 (half the size of false/true in a file of many episodes)."""
-    if value in (0, 1) and isinstance(value, bool | int | float):
-        return bool(value)
-    raise ValueError("expected 0 or 1")
+def _flags(value: Any) -> Any:
+    """Read flags stored as 0/1 (half the size of false/true in a file of many episodes)."""
+    value = _plain(value)
+    if not isinstance(value, list):
+        return value
+    if any(type(flag) not in (bool, int) or flag not in (0, 1) for flag in value):
+        raise ValueError("expected a list of 0 and 1")
+    return [bool(flag) for flag in value]
 
 
 def _nonfinite(value: Any) -> str | None:
@@ -86,13 +94,17 @@ Moment = Annotated[
     BeforeValidator(_moment),
     PlainSerializer(lambda moment: moment.isoformat(), return_type=str),
 ]
-Bit = Annotated[bool, BeforeValidator(_flag), PlainSerializer(int, return_type=int)]
+Flags = Annotated[
+    list[bool],
+    BeforeValidator(_flags),
+    PlainSerializer(lambda flags: [int(flag) for flag in flags], return_type=list[int]),
+]
 Count = Annotated[int, Field(ge=0)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=120)]
-Text = Annotated[str, Field(max_length=2000)]
+Text = Annotated[str, Field(max_length=MAX_TEXT)]
 MetricName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,63}(/[a-z0-9_]{1,63})*$")]
 
 
@@ -107,10 +119,22 @@ class _Block(BaseModel):
         ser_json_inf_nan="null",
     )
 
+    @classmethod
+    def _own(cls, data: Mapping[str, Any]) -> list[str]:
+        """The keys of `data` that are not blocks themselves: those look after their own values."""
+        blocks = {
+            name
+            for name, field in cls.model_fields.items()
+            if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+        }
+        return [key for key in data if key not in blocks and key != "evaluations"]
+
     @model_validator(mode="before")
     @classmethod
     def _to_plain(cls, data: Any) -> Any:
-        return _plain(data) if isinstance(data, Mapping) else data
+        if not isinstance(data, Mapping):
+            return data
+        return {**data, **{key: _plain(data[key]) for key in cls._own(data)}}
 
 
 class _Measured(_Block):
@@ -121,17 +145,17 @@ class _Measured(_Block):
     @model_validator(mode="before")
     @classmethod
     def _flag_nonfinite(cls, data: Any) -> Any:
-        if not isinstance(data, Mapping):
+        flags = data.get("nonfinite", {}) if isinstance(data, Mapping) else None
+        if not isinstance(flags, Mapping):
             return data
-        data = _plain(data)
-        flags = data.get("nonfinite", {})
-        if not isinstance(flags, dict):
-            return data
+        flags = dict(flags)
 
         def clean(value: Any, path: str) -> Any:
             if isinstance(value, dict):
                 return {key: clean(item, f"{path}/{key}") for key, item in value.items()}
             if isinstance(value, list):
+                if all(_nonfinite(item) is None for item in value):
+                    return value
                 return [clean(item, f"{path}/{index}") for index, item in enumerate(value)]
             kind = _nonfinite(value)
             if kind is None:
@@ -139,10 +163,8 @@ class _Measured(_Block):
             flags[path] = kind
             return None
 
-        data = {key: v if key == "nonfinite" else clean(v, key) for key, v in data.items()}
-        if flags:
-            data["nonfinite"] = flags
-        return data
+        own = {key: clean(_plain(data[key]), key) for key in cls._own(data) if key != "nonfinite"}
+        return {**data, **own, "nonfinite": flags}
 
     @model_validator(mode="after")
     def _flags_point_at_null(self) -> Self:
@@ -261,8 +283,8 @@ class BasePolicy(_Measured):
     """The frozen base policy and its steerability report.
 
     `base_success`: success_once with Gaussian noise; `action_std`: standard deviation of normalised
-    actions over noise draws, mean over states; `solvable`: share of initial states that at least one
-    of `draws` noise draws solves; `warning`: why steering cannot work, if it cannot.
+    actions over noise draws, mean over states; `solvable`: share of initial states that at least
+    one of `draws` noise draws solves; `warning`: why steering cannot work, if it cannot.
     """
 
     name: Name
@@ -299,8 +321,8 @@ class Episodes(_Measured):
     """Evaluation episodes as columns of equal length; ManiSkill's metric names."""
 
     seed: list[Annotated[int, Field(ge=0)]]
-    success_once: list[Bit]
-    success_at_end: list[Bit]
+    success_once: Flags
+    success_at_end: Flags
     return_: list[Finite | None] = Field(alias="return")
     episode_len: list[Annotated[int, Field(ge=1)]]
 
@@ -358,7 +380,7 @@ class Training(_Measured):
 class RunRecord(_Block):
     """Everything the leaderboard may know about one run."""
 
-    schema_version: Literal[1] = SCHEMA_VERSION
+    schema_version: Literal[1] = 1
     run_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+=:,@-]{0,199}$")]
     config: dict[str, JsonValue]
     config_hash: str = ""
@@ -389,10 +411,11 @@ class RunRecord(_Block):
             raise ValueError(_first_problem(error)) from error
         return config
 
-    @field_validator("failure")
+    @field_validator("failure", mode="before")
     @classmethod
-    def _without_paths(cls, failure: str | None) -> str | None:
-        return None if failure is None else portable(failure)
+    def _short_without_paths(cls, failure: Any) -> Any:
+        # Cut rather than refuse: a long message must not keep a failed run from being recorded.
+        return portable(failure[: 4 * MAX_TEXT])[:MAX_TEXT] if isinstance(failure, str) else failure
 
     @model_validator(mode="before")
     @classmethod
@@ -449,6 +472,15 @@ class RunRecord(_Block):
         )
 
     @property
+    def nonfinite_q(self) -> bool:
+        """Whether any Q diagnostic (`q_...`) of any evaluation was not finite."""
+        return any(
+            path.startswith("diagnostics/q_")
+            for evaluation in self.evaluations
+            for path in evaluation.nonfinite
+        )
+
+    @property
     def diverged(self) -> bool | None:
         """Whether the Q-values diverged; None for runs without a critic.
 
@@ -457,10 +489,10 @@ class RunRecord(_Block):
         """
         if not self.has_critic:
             return None
+        if self.nonfinite_q:
+            return True
         streak = 0
         for evaluation in self.evaluations:
-            if any(path.startswith("diagnostics/q_") for path in evaluation.nonfinite):
-                return True
             violation = evaluation.diagnostics.get("q_violation")
             streak = streak + 1 if violation is not None and violation > DIVERGED_SHARE else 0
             if streak == DIVERGED_EVALUATIONS:
@@ -547,7 +579,8 @@ def read_record(path: Path | str) -> RunRecord:
     version = data["schema_version"]
     if type(version) is not int or version != SCHEMA_VERSION:
         raise RecordError(
-            f"{path} has schema_version {str(version)[:20]!r}, this program reads {SCHEMA_VERSION}: "
+            f"{path} has schema_version {str(version)[:20]!r}, "
+            f"this program reads {SCHEMA_VERSION}: "
             "use the version of symsteer that wrote it or run the cell again."
         )
     if "config_hash" not in data:
@@ -580,7 +613,8 @@ def write_atomically(path: Path, data: bytes) -> None:
         finally:
             os.close(folder)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         raise RecordError(
             f"{path} cannot be written: {error.strerror}; free space or choose another folder."
         ) from error

@@ -1,0 +1,295 @@
+"""The figures: learning curves and Q-values, one panel per variant, as deterministic SVG.
+
+Colours are Okabe and Ito's, told apart with colour blindness; agents differ by marker as well. Text
+is drawn as outlines of matplotlib's own font, so that a figure looks the same everywhere and has
+the same bytes for the same records.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from leaderboard.statistics import iqm, success_interval
+from leaderboard.summary import Row, Run, Summary, Table
+
+Style = tuple[str, str, Any]
+"""Color, marker and line style of an agent."""
+
+STYLES: dict[str, Style] = {
+    "base": ("#555555", "", (0, (5, 2))),
+    "zero": ("#555555", "", (0, (1, 1.5))),
+    "standard": ("#D55E00", "s", "-"),
+    "standard-matched": ("#E69F00", "D", "-"),
+    "equivariant": ("#0072B2", "o", "-"),
+    "approximate": ("#009E73", "^", "-"),
+}
+OTHERS: tuple[Style, ...] = (("#CC79A7", "v", "-"), ("#56B4E9", "P", "-"), ("#000000", "X", "-"))
+FEASIBLE = "#DDE7D0"
+COLUMNS = 3
+MAX_MARKERS = 15
+BAND_RESAMPLES = 1000
+
+RC: Any = {
+    "svg.hashsalt": "symsteer",
+    "svg.fonttype": "path",
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.titlesize": 9.5,
+    "figure.facecolor": "white",
+    "axes.facecolor": "white",
+    "path.simplify": False,
+}
+
+
+def render_figures(summary: Summary) -> dict[tuple[str, str], list[tuple[str, str, Figure]]]:
+    """Figures of each (task, embodiment): description, kind (`success` or `q`), figure."""
+    places: dict[tuple[str, str], list[Table]] = {}
+    for table in summary.tables:
+        if table.runs:
+            places.setdefault((table.key.task, table.key.embodiment), []).append(table)
+    figures: dict[tuple[str, str], list[tuple[str, str, Figure]]] = {}
+    with mpl.rc_context(RC):
+        for place, tables in places.items():
+            figures[place] = [("Learning curves", "success", learning_curves(tables))]
+            if any(run.record.has_critic for table in tables for run in table.runs):
+                figures[place].append(("Q-values and their feasible band", "q", q_values(tables)))
+    return figures
+
+
+def to_svg(figure: Figure) -> bytes:
+    """SVG without dates or versions; the same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    with mpl.rc_context(RC):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return buffer.getvalue()
+
+
+def learning_curves(tables: Sequence[Table]) -> Figure:
+    """Success over environment steps: one panel a table, the IQM over seeds with its 95 % band.
+
+    Thin lines are single seeds; those of unfinished runs are dotted and end in a cross. References
+    that were evaluated once are horizontal lines.
+    """
+    figure, axes = _panels(tables, "success_once on held-out episodes")
+    handles: dict[str, Line2D] = {}
+    for ax, table in zip(axes, tables, strict=True):
+        ax.set_ylim(-0.02, 1.02)
+        for row in table.rows:
+            if not row.runs:
+                continue
+            style = _style(row)
+            color, marker, line = style
+            _draw_success(ax, row, style, table.key.env_steps)
+            handles.setdefault(
+                _ascii(row.label),
+                Line2D([], [], color=color, marker=marker, linestyle=line, markersize=5),
+            )
+    _legend(figure, handles)
+    return figure
+
+
+def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
+    color, marker, line = style
+    steps, curves = _common(row.finished)
+    for run in row.runs:
+        values = [evaluation.success_once for evaluation in run.curve.values()]
+        if run.finished and (len(row.finished) == 1 or row.is_reference):
+            continue
+        dotted: dict[str, Any] = {} if run.finished else {"linestyle": ":"}
+        ax.plot(list(run.curve), values, color=color, linewidth=0.7, alpha=0.35, **dotted)
+        if not run.finished and values:
+            ax.plot(list(run.curve)[-1], values[-1], "x", color=color, markersize=5, clip_on=False)
+    if not steps:
+        return
+    bands = [
+        success_interval(
+            [run.curve[step].episodes.success_once for run in row.finished], BAND_RESAMPLES
+        )
+        for step in steps
+    ]
+    low, high = [band.low for band in bands], [band.high for band in bands]
+    if len(steps) == 1 and row.is_reference:
+        ax.axhline(bands[0].value, color=color, linestyle=line, linewidth=1.4, zorder=1.5)
+        if row.agent == "base":
+            ax.axhspan(low[0], high[0], color=color, alpha=0.10, linewidth=0)
+        return
+    ax.fill_between(steps, low, high, color=color, alpha=0.14, linewidth=0)
+    ax.plot(
+        steps,
+        iqm(curves, axis=0),
+        color=color,
+        linestyle=line,
+        marker=marker,
+        markersize=4,
+        markevery=max(1, len(steps) // MAX_MARKERS),
+        linewidth=1.7,
+        clip_on=False,
+    )
+
+
+def q_values(tables: Sequence[Table]) -> Figure:
+    """Mean Q at the actor's own noise against the feasible band of the task's reward.
+
+    Thin lines are single seeds, the thick line is their mean; hollow markers are the fresh
+    discounted returns that Q should predict. Seeds whose Q is not finite end in a cross. The axis
+    turns logarithmic far outside the band.
+    """
+    figure, axes = _panels(tables, "Q-value (discounted return)")
+    handles: dict[str, Line2D | Patch] = {}
+    explained: dict[str, Line2D | Patch] = {}
+    for ax, table in zip(axes, tables, strict=True):
+        extremes: list[float] = []
+        for row in table.rows:
+            runs = [run for run in row.runs if run.record.has_critic]
+            if not runs:
+                continue
+            color, marker, line = _style(row)
+            for run in runs:
+                steps, values = _series(run, "q_mean")
+                ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
+                extremes += values
+                if any(
+                    p.startswith("diagnostics/q_") for e in run.curve.values() for p in e.nonfinite
+                ):
+                    ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7, clip_on=False)
+            steps, values = _mean_series(runs, "q_mean")
+            every = max(1, len(steps) // MAX_MARKERS)
+            style: dict[str, Any] = {
+                "color": color,
+                "marker": marker,
+                "markersize": 4,
+                "markevery": every,
+            }
+            ax.plot(steps, values, linestyle=line, linewidth=1.7, **style)
+            returns = _mean_series(runs, "return_mean")
+            ax.plot(*returns, linestyle="none", markerfacecolor="white", **style)
+            extremes += returns[1]
+            handles.setdefault(
+                _ascii(row.label),
+                Line2D([], [], color=color, marker=marker, linestyle=line, markersize=5),
+            )
+            if returns[1]:
+                hollow: dict[str, Any] = {
+                    "marker": "o",
+                    "markerfacecolor": "white",
+                    "linestyle": "none",
+                }
+                explained["fresh return"] = Line2D([], [], color="#555555", markersize=5, **hollow)
+        if feasible := table.feasible:
+            low, high = feasible
+            ax.axhspan(low, high, color=FEASIBLE, alpha=0.6, linewidth=0, zorder=0)
+            ax.axhline(low, color="#7A9A50", linewidth=0.9, zorder=1)
+            ax.axhline(high, color="#7A9A50", linewidth=0.9, zorder=1)
+            explained["feasible"] = Patch(facecolor=FEASIBLE, edgecolor="#7A9A50")
+            span = max(high - low, 1e-6)
+            low_end, high_end = min([low, *extremes]), max([high, *extremes])
+            if high_end > high + 4 * span or low_end < low - 4 * span:
+                ax.set_yscale("symlog", linthresh=span)
+            else:
+                margin = 0.06 * (high_end - low_end or 1)
+                ax.set_ylim(low_end - margin, high_end + margin)
+        if not extremes:
+            ax.text(0.5, 0.5, "no Q-values", transform=ax.transAxes, ha="center", color="#777777")
+    _legend(figure, handles | explained)
+    return figure
+
+
+def _panels(tables: Sequence[Table], ylabel: str) -> tuple[Figure, list[Axes]]:
+    columns = min(COLUMNS, len(tables))
+    rows = -(-len(tables) // columns)
+    width = 9.0 if columns > 1 else 5.6
+    figure = Figure(figsize=(width, 0.75 + 2.75 * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=ylabel.startswith("success"))
+    flat = list(grid.flat)
+    for ax in flat[len(tables) :]:
+        ax.set_visible(False)
+    for index, (ax, table) in enumerate(zip(flat, tables, strict=False)):
+        key = table.key
+        ax.set_title(_title(table, tables))
+        ax.set_xlim(-0.02 * key.env_steps, 1.02 * key.env_steps)
+        ax.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+        ax.xaxis.set_major_formatter(FuncFormatter(_thousands))
+        ax.set_xlabel("environment steps")
+        if index % columns == 0:
+            ax.set_ylabel(ylabel)
+    key = tables[0].key
+    figure.suptitle(_ascii(f"{key.task}, {key.embodiment}"), fontsize=11, fontweight="bold")
+    return figure, flat[: len(tables)]
+
+
+def _title(table: Table, tables: Sequence[Table]) -> str:
+    key, keys = table.key, [other.key for other in tables]
+    parts = ["unbroken" if key.variant == "none" else key.variant]
+    if len({other.base + other.group for other in keys}) > 1:
+        parts.append(f"{key.base} {key.group}".strip())
+    if len({(other.mode, other.demonstrations) for other in keys}) > 1:
+        parts.append(f"{key.demonstrations} {key.mode} demonstrations")
+    return _ascii(", ".join(parts), 60)
+
+
+def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch]) -> None:
+    if handles:
+        figure.legend(
+            list(handles.values()),
+            list(handles),
+            loc="outside lower center",
+            ncols=min(len(handles), 6),
+            frameon=False,
+        )
+
+
+def _style(row: Row) -> Style:
+    if row.agent in STYLES:
+        return STYLES[row.agent]
+    return OTHERS[sum(map(ord, row.agent)) % len(OTHERS)]
+
+
+def _common(runs: Sequence[Run]) -> tuple[list[int], np.ndarray]:
+    """The steps at which all runs were evaluated, and success there: [runs, steps]."""
+    if not runs:
+        return [], np.empty((0, 0))
+    steps = sorted(set.intersection(*(set(run.curve) for run in runs)))
+    return steps, np.array([[run.curve[step].success_once for step in steps] for run in runs])
+
+
+def _series(run: Run, name: str) -> tuple[list[int], list[float]]:
+    pairs = [
+        (step, value)
+        for step, evaluation in run.curve.items()
+        if (value := evaluation.diagnostics.get(name)) is not None
+    ]
+    return [step for step, _ in pairs], [value for _, value in pairs]
+
+
+def _mean_series(runs: Sequence[Run], name: str) -> tuple[list[int], list[float]]:
+    series = [dict(zip(*_series(run, name), strict=True)) for run in runs]
+    steps = sorted(set.intersection(*(set(one) for one in series)))
+    return steps, [float(np.mean([one[step] for one in series])) for step in steps]
+
+
+def _thousands(value: float, _position: int | None = None) -> str:
+    if abs(value) >= 1e6:
+        return f"{value / 1e6:g}M"
+    return f"{value / 1e3:g}k" if abs(value) >= 1e3 else f"{value:g}"
+
+
+def _ascii(text: str, limit: int = 40) -> str:
+    """Text for a figure: printable ASCII, no `$` (matplotlib would read it as mathematics)."""
+    clean = "".join(c if c.isascii() and c.isprintable() and c != "$" else "?" for c in text)
+    return clean if len(clean) <= limit else clean[: limit - 3] + "..."

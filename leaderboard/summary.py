@@ -1,0 +1,375 @@
+"""From records to the rows of the tables: grouping, pairing, and every number of a row."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from leaderboard.errors import RecordError
+from leaderboard.records import Evaluation, RunRecord, config_hash, read_record
+from leaderboard.statistics import (
+    Interval,
+    area_under_curve,
+    censored_median,
+    deepest_dip,
+    final_window_mean,
+    paired_differences,
+    steps_to_threshold,
+    success_interval,
+    two_stage_bootstrap,
+)
+
+AGENTS = ("base", "zero", "standard", "standard-matched", "equivariant", "approximate")
+"""The order of the rows; agents that are not listed follow in alphabetical order."""
+
+REFERENCES = ("base", "zero")
+"""Agents that do not learn: they are compared with, never ranked."""
+
+MIN_SEEDS = 5
+THRESHOLD = 0.8
+"""Steps are counted to this share of the best agent's final success."""
+
+NOT_RECIPE = frozenset(
+    {"seed", "device", "threads", "torch_threads", "workers", "progress", "out", "run_id"}
+)
+"""Configuration keys, at any depth, that may differ between runs of one row."""
+
+
+def agent_rank(agent: str) -> tuple[int, str]:
+    """Sorting key of agents: the fixed order first, then by name."""
+    return (AGENTS.index(agent) if agent in AGENTS else len(AGENTS)), agent
+
+
+@dataclass(frozen=True)
+class Run:
+    """One record and where it was read."""
+
+    path: Path
+    record: RunRecord
+
+    @property
+    def seed(self) -> int:
+        return self.record.cell.seed
+
+    @property
+    def agent(self) -> str:
+        return self.record.cell.agent
+
+    @property
+    def finished(self) -> bool:
+        return self.record.status == "finished"
+
+    @cached_property
+    def curve(self) -> dict[int, Evaluation]:
+        """Evaluations by env_steps; of two at the same step the later one counts."""
+        return {evaluation.env_steps: evaluation for evaluation in self.record.evaluations}
+
+    @cached_property
+    def final_success(self) -> dict[int, float]:
+        """success_once of the final evaluation by episode seed (empty before the end)."""
+        final = self.record.final
+        if final is None:
+            return {}
+        columns = final.episodes
+        return dict(zip(columns.seed, map(float, columns.success_once), strict=True))
+
+    def diagnostics(self, name: str) -> list[float]:
+        """All finite values of a diagnostic, in the order of the evaluations."""
+        values = (e.diagnostics.get(name) for e in self.record.evaluations)
+        return [value for value in values if value is not None]
+
+    def last(self, *names: str) -> float | None:
+        """The final evaluation's value of the first of `names` that was measured."""
+        final = self.record.final
+        values = [final.diagnostics.get(name) for name in names] if final else []
+        return next((value for value in values if value is not None), None)
+
+
+@dataclass(frozen=True, order=True)
+class Key:
+    """What all runs of one table have in common."""
+
+    task: str
+    embodiment: str
+    breaking: tuple[bool, str]
+    """(is broken, variant): the unbroken control sorts first."""
+    base: str
+    group: str
+    mode: str
+    demonstrations: int
+    env_steps: int
+
+    @property
+    def variant(self) -> str:
+        return self.breaking[1]
+
+    @classmethod
+    def of(cls, record: RunRecord) -> Key:
+        cell, policy = record.cell, record.base_policy
+        return cls(
+            cell.task,
+            cell.embodiment,
+            (cell.variant != "none", cell.variant),
+            policy.name,
+            policy.group or "",
+            cell.demonstrations.mode,
+            cell.demonstrations.count,
+            cell.env_steps,
+        )
+
+
+@dataclass
+class Row:
+    """An agent (one recipe of it) in one table."""
+
+    agent: str
+    recipe: str
+    runs: list[Run]
+    missing: int = 0
+    label: str = ""
+    success: Interval | None = None
+    difference: Interval | None = None
+    window: float | None = None
+    area: float | None = None
+    threshold_steps: list[int | None] = field(default_factory=list)
+    dip: float | None = None
+    rank: int | None = None
+
+    @property
+    def finished(self) -> list[Run]:
+        return [run for run in self.runs if run.finished]
+
+    @property
+    def is_reference(self) -> bool:
+        return self.agent in REFERENCES
+
+    @property
+    def episodes(self) -> list[int]:
+        """Final evaluation episodes of each finished run."""
+        return [len(run.final_success) for run in self.finished]
+
+    @property
+    def median_threshold_steps(self) -> float | None:
+        return censored_median(self.threshold_steps) if self.threshold_steps else None
+
+    @property
+    def diverged(self) -> list[bool]:
+        """Whether Q diverged, for every run with a critic, finished or not."""
+        return [run.record.diverged for run in self.runs if run.record.diverged is not None]
+
+    def over_runs(self, *names: str) -> float | None:
+        """Mean over finished runs of a diagnostic's final value."""
+        values = [value for run in self.finished if (value := run.last(*names)) is not None]
+        return float(np.mean(values)) if values else None
+
+    def largest(self, name: str) -> float | None:
+        """Largest finite value of a diagnostic over all evaluations and runs."""
+        values = [value for run in self.runs for value in run.diagnostics(name)]
+        return max(values) if values else None
+
+
+@dataclass
+class Table:
+    """All rows of one task, embodiment, variant and base policy."""
+
+    key: Key
+    rows: list[Row]
+    threshold: float | None
+
+    @property
+    def runs(self) -> list[Run]:
+        return [run for row in self.rows for run in row.runs]
+
+    @property
+    def feasible(self) -> tuple[float, float] | None:
+        """The widest feasible Q bounds of the runs, entropy allowance included."""
+        bounds = [run.record.feasible_q for run in self.runs if run.record.feasible_q]
+        if not bounds:
+            return None
+        low = min(bound.low - bound.entropy_allowance for bound in bounds)
+        return low, max(bound.high + bound.entropy_allowance for bound in bounds)
+
+    @property
+    def is_ranked(self) -> bool:
+        return any(row.rank is not None for row in self.rows)
+
+
+@dataclass
+class Summary:
+    """Everything that the page shows."""
+
+    tables: list[Table]
+    set_aside: list[Run]
+    """Older or unfinished records of a cell that a better record covers."""
+
+    @property
+    def runs(self) -> list[Run]:
+        return [run for table in self.tables for run in table.runs]
+
+    @property
+    def agents(self) -> list[str]:
+        return sorted({row.agent for table in self.tables for row in table.rows}, key=agent_rank)
+
+
+def load_runs(paths: Iterable[Path]) -> list[Run]:
+    """Read the records that `paths` name: files, run folders, folders of either.
+
+    In a folder every `record.json` at any depth counts; a folder without any must hold nothing but
+    records as `*.json`. Raises RecordError for a path that does not exist, a file that is not a
+    valid record, or when there is no record at all.
+    """
+    files: dict[Path, Path] = {}
+    paths = list(paths)
+    for path in paths:
+        if path.is_dir():
+            found = sorted(path.rglob("record.json")) or sorted(path.rglob("*.json"))
+        elif path.exists():
+            found = [path]
+        else:
+            raise RecordError(f"{path} does not exist: name a record or a folder with records.")
+        files.update({file.resolve(): file for file in found})
+    if not files:
+        names = ", ".join(str(path) for path in paths)
+        raise RecordError(f"{names} holds no record: run `symsteer run` first or name its folder.")
+    return [Run(file, read_record(file)) for file in files.values()]
+
+
+def recipe_of(config: Mapping[str, Any]) -> str:
+    """Hash of a configuration without its seeds and machine settings: what defines a row."""
+
+    def strip(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: strip(item) for key, item in value.items() if key not in NOT_RECIPE}
+        return [strip(item) for item in value] if isinstance(value, list) else value
+
+    return config_hash(strip(config))
+
+
+def summarize(runs: Sequence[Run]) -> Summary:
+    """Group runs into tables and compute every row; independent of the order of `runs`."""
+    chosen, set_aside = _one_per_cell(runs)
+    tables: dict[Key, dict[tuple[str, str], list[Run]]] = defaultdict(lambda: defaultdict(list))
+    for run in chosen:
+        tables[Key.of(run.record)][run.agent, recipe_of(run.record.config)].append(run)
+    agents = {run.agent for run in chosen}
+    built = [_table(key, rows, agents) for key, rows in sorted(tables.items())]
+    return Summary(built, set_aside)
+
+
+def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
+    """Keep, for each cell, the finished record, the newest of several; set the others aside."""
+    cells: dict[tuple[Key, str, str, int], list[Run]] = defaultdict(list)
+    for run in runs:
+        record = run.record
+        cells[Key.of(record), run.agent, recipe_of(record.config), run.seed].append(run)
+    chosen, set_aside = [], []
+    for cell in sorted(cells):
+        candidates = sorted(
+            cells[cell],
+            key=lambda run: (run.finished, run.record.started, run.record.run_id, str(run.path)),
+        )
+        best = candidates[-1]
+        chosen.append(best)
+        # The same record found twice (a run folder and its committed copy) is no second attempt.
+        set_aside += [run for run in candidates[:-1] if run.record != best.record]
+    return chosen, set_aside
+
+
+def _table(key: Key, groups: Mapping[tuple[str, str], list[Run]], agents: set[str]) -> Table:
+    seeds = {run.seed for runs in groups.values() for run in runs}
+    rows = []
+    for (agent, recipe), runs in groups.items():
+        have = {run.seed for run in runs}
+        rows.append(Row(agent, recipe, sorted(runs, key=lambda r: r.seed), len(seeds - have)))
+    for agent in agents - {agent for agent, _ in groups}:
+        rows.append(Row(agent, "", [], len(seeds)))
+    rows.sort(key=lambda row: (agent_rank(row.agent), row.recipe))
+    for row in rows:
+        twins = sum(other.agent == row.agent for other in rows)
+        row.label = row.agent if twins == 1 else f"{row.agent} {row.recipe[:6]}"
+
+    base_runs = [run for row in rows if row.agent == "base" for run in row.finished]
+    for row in rows:
+        _fill(row, base_runs, key.env_steps)
+    finals = [row.success.value for row in rows if row.success and not row.is_reference]
+    threshold = THRESHOLD * max(finals) if finals else None
+    if threshold is not None:
+        for row in rows:
+            if not row.is_reference:
+                row.threshold_steps = [
+                    steps_to_threshold(*_points(run), threshold) for run in row.finished
+                ]
+    _rank(rows)
+    return Table(key, rows, threshold)
+
+
+def _points(run: Run) -> tuple[list[int], list[float]]:
+    return list(run.curve), [evaluation.success_once for evaluation in run.curve.values()]
+
+
+def _fill(row: Row, base_runs: Sequence[Run], budget: int) -> None:
+    """Compute the numbers of a row from its finished runs."""
+    runs = row.finished
+    if not runs:
+        return
+    row.success = success_interval([list(run.final_success.values()) for run in runs])
+    row.window = float(np.mean([final_window_mean(*_points(run), budget) for run in runs]))
+    row.area = float(np.mean([area_under_curve(*_points(run), budget) for run in runs]))
+    if row.agent == "base":
+        return
+    differences, dips = [], []
+    for run in runs:
+        base = base_success(run, base_runs)
+        difference = paired_differences(run.final_success, base)
+        if difference.size:
+            differences.append(difference)
+            dips.append(deepest_dip(_points(run)[1], float(np.mean(list(base.values())))))
+    if differences:
+        row.difference = two_stage_bootstrap(differences)
+        row.dip = None if row.is_reference else min(dips)
+
+
+def base_success(run: Run, base_runs: Sequence[Run]) -> dict[int, float]:
+    """Success of the frozen base policy that `run` steers, by episode seed; empty if unknown.
+
+    Taken from the base run with the same policy (content hash) and the same run seed, else from the
+    mean of all base runs with that policy.
+    """
+    same = [
+        base
+        for base in base_runs
+        if base.record.base_policy.content_hash == run.record.base_policy.content_hash
+    ]
+    same = [base for base in same if base.seed == run.seed] or same
+    values: dict[int, list[float]] = defaultdict(list)
+    for base in same:
+        for seed, success in base.final_success.items():
+            values[seed].append(success)
+    return {seed: float(np.mean(successes)) for seed, successes in values.items()}
+
+
+def compare(first: Row, second: Row) -> Interval | None:
+    """Difference of two rows, paired by run seed and episode seed; None without common ones."""
+    others = {run.seed: run.final_success for run in second.finished}
+    differences = [
+        difference
+        for run in first.finished
+        if (difference := paired_differences(run.final_success, others.get(run.seed, {}))).size
+    ]
+    return two_stage_bootstrap(differences) if differences else None
+
+
+def _rank(rows: Sequence[Row]) -> None:
+    """Rank learning agents with enough seeds: 1 + the number of rows that are clearly better."""
+    candidates = [row for row in rows if not row.is_reference and len(row.finished) >= MIN_SEEDS]
+    if len(candidates) < 2:
+        return
+    for row in candidates:
+        comparisons = [compare(other, row) for other in candidates if other is not row]
+        row.rank = 1 + sum(c is not None and c.sign > 0 for c in comparisons)

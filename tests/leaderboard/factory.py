@@ -1,0 +1,155 @@
+"""Builds run records for the tests of the leaderboard, from numbers that the tests choose."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from leaderboard.records import (
+    BasePolicy,
+    Budget,
+    Episodes,
+    Evaluation,
+    FeasibleQ,
+    Parameters,
+    Provenance,
+    RunRecord,
+    WallClock,
+)
+
+START = datetime(2026, 1, 31, 12, 0, tzinfo=UTC)
+LEARNING = ("standard", "standard-matched", "equivariant", "approximate")
+
+
+def make_config(**changes: Any) -> dict[str, Any]:
+    config: dict[str, Any] = {
+        "task": "PickCube-v1",
+        "embodiment": "floating",
+        "variant": "none",
+        "agent": "standard",
+        "seed": 0,
+        "env_steps": 50_000,
+        "demonstrations": {"mode": "diverse", "count": 50, "seed": 0},
+        "learning_rate": 3e-4,
+    }
+    return config | changes
+
+
+def make_evaluation(
+    successes: Sequence[int],
+    env_steps: int = 50_000,
+    final: bool = True,
+    first_seed: int = 10_000,
+    **diagnostics: float | None,
+) -> Evaluation:
+    """An evaluation whose episode `first_seed + i` has success_once `successes[i]`."""
+    number = len(successes)
+    return Evaluation(
+        env_steps=env_steps,
+        decisions=env_steps // 8,
+        updates=env_steps // 8,
+        wall_clock=env_steps / 200,
+        final=final,
+        episodes=Episodes(
+            **{
+                "seed": np.arange(first_seed, first_seed + number),
+                "success_once": np.asarray(successes, dtype=bool),
+                "success_at_end": np.asarray(successes, dtype=bool),
+                "return": -50.0 + 30.0 * np.asarray(successes, dtype=np.float32),
+                "episode_len": np.full(number, 100),
+            }
+        ),
+        diagnostics=diagnostics,
+    )
+
+
+def make_record(
+    evaluations: Sequence[Evaluation] | None = None, status: str = "finished", **config: Any
+) -> RunRecord:
+    """A valid record; `config` overrides the configuration's keys."""
+    config = make_config(**config)
+    agent, seed = config["agent"], config["seed"]
+    learns = agent in LEARNING
+    if evaluations is None:
+        evaluations = [make_evaluation([1, 0, 1, 0, 1])]
+    if status != "finished":
+        evaluations = [e.model_copy(update={"final": False}) for e in evaluations]
+    return RunRecord(
+        run_id="-".join([config["task"], config["variant"].replace("/", "_"), agent, str(seed)])
+        .replace(" ", "_")
+        .encode("ascii", "ignore")
+        .decode(),
+        config=config,
+        provenance=Provenance(
+            commit="0123456789abcdef0123456789abcdef01234567",
+            dirty=False,
+            packages={"torch": "2.13.0", "mani-skill": "3.0.1"},
+            python="3.11.7",
+            platform="Linux x86_64",
+            device="cpu",
+            torch_threads=1,
+        ),
+        seeds={"run": seed, "evaluation": 10_000},
+        started=START,
+        ended=None if status == "running" else START + timedelta(seconds=250),
+        status=status,
+        failure="the simulator stopped" if status == "failed" else None,
+        parameters=Parameters(
+            actor=60_000 * learns, critic=90_000 * learns, total=150_000 * learns, width=128
+        ),
+        wall_clock=WallClock(simulate=100, decode=5, update=90, evaluate=45, total=250),
+        budget=Budget(env_steps=config["env_steps"], decisions=6_250, updates=6_250 * learns),
+        base_policy=BasePolicy(
+            name="edp",
+            group="C8",
+            content_hash=hashlib.sha256(b"base").hexdigest(),
+            base_success=0.36,
+            episodes=200,
+            action_std=0.42,
+            solvable=0.97,
+            training_seconds=61.0,
+        ),
+        feasible_q=FeasibleQ(low=-20.0, high=0.0),
+        evaluations=list(evaluations),
+    )
+
+
+def make_curve(
+    generator: np.random.Generator,
+    rates: Sequence[float],
+    budget: int = 50_000,
+    episodes: int = 100,
+    critic: bool = True,
+    q_shift: float = 0.0,
+) -> list[Evaluation]:
+    """Evaluations at equal distances from 0 to `budget` with the given success rates."""
+    points = np.linspace(0, budget, len(rates)).astype(int)
+    curve = []
+    for index, (step, rate) in enumerate(zip(points, rates, strict=True)):
+        q = -16 + 10 * rate + q_shift * index
+        diagnostics = {
+            "q_mean": q,
+            "q_min": q - 3,
+            "q_max": q + 2,
+            "q_abs_max": abs(q) + 4,
+            "q_violation": 0.2 if q > 0 else 0.01,
+            "q_bias": 0.6 + q_shift,
+            "return_mean": -16 + 10 * rate,
+            "alpha": 0.01,
+            "orbit_variance": 0.04,
+            "equivariance_actor": 0.31,
+            "equivariance_critic": 0.12,
+        }
+        curve.append(
+            make_evaluation(
+                generator.random(episodes) < rate,
+                int(step),
+                index == len(rates) - 1,
+                **(diagnostics if critic else {}),
+            )
+        )
+    return curve
