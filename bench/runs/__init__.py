@@ -1,0 +1,1 @@
+"""Run configuration, run folder, checkpoints, records and TensorBoard."""

@@ -1,0 +1,171 @@
+"""Demonstrations and base policy of a run: built once, found again by the hash of what made them."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from bench.demos import Demonstrations, collect, load
+from bench.runs.config import RunConfig, content_key
+from bench.steering.evaluation import Steerability, steerability
+from bench.steering.latent_env import LatentNoiseEnv
+from bench.tasks import make, task_class
+from leaderboard.records import BasePolicy
+from policies.base import ChunkPolicy, load_policy, policy_path, save_policy
+from policies.errors import UserError
+from policies.training import train_policy
+
+STEERABILITY_ENVS = 128
+
+
+def prepare_base(
+    config: RunConfig,
+    out: Path,
+    demonstrations: Path | None = None,
+    policy: Path | None = None,
+    progress: bool = True,
+) -> ChunkPolicy:
+    """The frozen base policy of a run, with its steerability report.
+
+    It is trained on demonstrations of the unbroken task in the run's embodiment, whatever the
+    run's variant: steering, not imitation, has to cope with the break.
+
+    Args:
+        config: the run.
+        out: folder of the runs; ``out/base`` keeps demonstrations and policies.
+        demonstrations: a trajectory file to train on instead of the scripted expert's.
+        policy: a saved policy to use instead of training one.
+        progress: whether to show progress bars.
+
+    Raises:
+        UserError: if a file does not fit the task, or nothing can be written to ``out``.
+    """
+    task = task_class(config.task)
+    layouts = (task.observation_layout, task.action_layout)
+    if policy is not None:
+        base = load_policy(policy, *layouts)
+        if "steerability" not in base.report:
+            base.report["steerability"] = dataclasses.asdict(_measure(config, base))
+        return base.to(config.device)
+    if demonstrations is None:
+        demonstrations = demonstration_file(config, out, progress)
+    demos = load(demonstrations, config.task, config.embodiment, config.demonstrations.count)
+    key = content_key(demos.content_hash, config.policy.to_json(), config.policy_seed)
+    folder = out / "base" / f"{config.task}-{config.embodiment}-{config.policy.name}-{key}"
+    if policy_path(folder).is_file():
+        return load_policy(folder, *layouts).to(config.device)
+    base = _train(config, demos, progress)
+    report = _measure(config, base)
+    if report.warning and progress:
+        tqdm.write(f"warning: {report.warning}")
+    base.report["steerability"] = dataclasses.asdict(report)
+    try:
+        save_policy(base, folder)
+    except OSError as error:
+        raise UserError(f"cannot write the base policy to {folder}: {error.strerror}") from error
+    return base.to(config.device)
+
+
+def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> Path:
+    """The scripted expert's demonstrations of the unbroken task, collected if need be."""
+    wanted = config.demonstrations
+    path = (
+        out
+        / "base"
+        / f"{config.task}-{config.embodiment}-{wanted.mode}-{wanted.count}-s{wanted.seed}.h5"
+    )
+    if path.is_file():
+        return path
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tqdm(total=wanted.count, desc="demonstrations", disable=not progress) as bar:
+
+            def advance(done: int, total: int) -> None:
+                bar.update(done - bar.n)
+
+            return collect(
+                config.task,
+                config.embodiment,
+                wanted.count,
+                wanted.mode,
+                wanted.seed,
+                path,
+                progress=advance,
+            )
+    except OSError as error:
+        raise UserError(
+            f"cannot write demonstrations to {path.parent}: {error.strerror}"
+        ) from error
+
+
+def describe_base(policy: ChunkPolicy) -> BasePolicy:
+    """The record's block on a base policy."""
+    report = policy.report["steerability"]
+    return BasePolicy(
+        name=policy.config.name,
+        group=str(policy.group),
+        content_hash=policy.content_hash(),
+        base_success=report["success"],
+        episodes=report["episodes"],
+        action_std=report["action_std"],
+        solvable=report["solvable"],
+        draws=report["draws"],
+        training_seconds=policy.training_record.get("seconds"),
+        parameters=policy.parameter_count(),
+        warning=report["warning"],
+    )
+
+
+def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPolicy:
+    with tqdm(total=config.policy.steps, desc="base policy", disable=not progress) as bar:
+
+        def advance(step: int, steps: int, loss: float) -> None:
+            bar.update(step - bar.n)
+            bar.set_postfix(loss=f"{loss:.4f}")
+
+        return train_policy(
+            config.policy,
+            demos.episodes,
+            demos.observation_layout,
+            demos.action_layout,
+            config.policy_seed,
+            advance,
+            config.device,
+        )
+
+
+def _measure(config: RunConfig, policy: ChunkPolicy) -> Steerability:
+    env = make(
+        config.task,
+        num_envs=STEERABILITY_ENVS,
+        embodiment=config.embodiment,
+        sim=config.sim,
+    )
+    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
+    try:
+        with torch.no_grad():
+            return steerability(latent, policy, config.policy_seed)
+    finally:
+        latent.close()
+
+
+def origin(demonstrations: Path | None, policy: Path | None) -> dict[str, Any]:
+    """Content hashes of the files that a run starts from, for its name and record.
+
+    Raises:
+        UserError: if a file is missing.
+    """
+    named = {"demonstrations": demonstrations, "policy": policy and policy_path(policy)}
+    hashes = {}
+    for kind, path in named.items():
+        if path is not None:
+            try:
+                hashes[kind] = hashlib.sha256(path.read_bytes()).hexdigest()
+            except OSError as error:
+                raise UserError(f"cannot read the {kind} file {path}: {error.strerror}") from error
+    return hashes

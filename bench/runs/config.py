@@ -1,0 +1,92 @@
+"""Everything that determines a run; the same configuration gives the same record on the CPU."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from agents.sac import SacConfig
+from policies.base import PolicyConfig
+from policies.errors import UserError
+
+
+@dataclass(frozen=True)
+class DemonstrationConfig:
+    """Demonstrations of the unbroken task by the scripted expert."""
+
+    mode: Literal["clean", "diverse"] = "diverse"
+    """`diverse` perturbs the expert and keeps successes; a policy trained on `clean` ones leaves
+    little to steer."""
+    count: int = 50
+    """Number of demonstrations."""
+    seed: int = 0
+    """Seed of the collection."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Held-out episodes, the same initial states for every agent, variant and seed."""
+
+    every: int = 5_000
+    """Control steps of training between two evaluations."""
+    episodes: int = 50
+    """Episodes of an evaluation during training."""
+    final_episodes: int = 100
+    """Episodes of the last evaluation, the one that tables report."""
+    diagnostic_episodes: int = 32
+    """Stochastic on-policy episodes against whose returns Q is held at every evaluation."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One steering run."""
+
+    task: str = "PickCube-v1"
+    """Task; `symsteer list` names them."""
+    embodiment: str = "floating"
+    """`floating` (gripper without an arm: near-exact symmetry) or `panda` (arm)."""
+    variant: str = "none"
+    """How the symmetry is broken: `none`, `action_gain:0.5`, or several joined with `+`."""
+    agent: str = "equivariant"
+    """standard, standard-matched, equivariant, approximate, base or zero."""
+    seed: int = 0
+    """Seed of the run: networks, exploration, training episodes."""
+    env_steps: int = 50_000
+    """Budget in control steps, summed over the parallel environments."""
+    num_envs: int = 8
+    """Parallel training environments."""
+    sim: Literal["cpu", "cuda"] = "cpu"
+    """Where physics runs."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where networks run."""
+    demonstrations: DemonstrationConfig = field(default_factory=DemonstrationConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    policy_seed: int = 0
+    """Seed of the base policy's training; runs that share it share the base policy."""
+    sac: SacConfig = field(default_factory=SacConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("env_steps", "num_envs"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if self.seed < 0:
+            raise UserError(f"seed is {self.seed}; it must not be negative")
+        if self.demonstrations.count < 1:
+            raise UserError("demonstrations.count must be at least 1")
+        evaluation = self.evaluation
+        if min(evaluation.every, evaluation.episodes, evaluation.final_episodes) < 1:
+            raise UserError("evaluation.every and the numbers of episodes must be at least 1")
+
+    def to_json(self) -> dict[str, Any]:
+        """Nested plain data."""
+        return dataclasses.asdict(self)
+
+
+def content_key(*parts: Any) -> str:
+    """Twelve hexadecimal digits that change with any of the JSON-able parts."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,0 +1,57 @@
+"""TensorBoard as a view of the record: the same numbers, nothing that the record lacks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch.utils.tensorboard import SummaryWriter
+
+LAYOUT = {
+    "SymSteer": {
+        "Success on held-out episodes": ["Multiline", ["eval/success_once", "eval/success_at_end"]],
+        "Q against its feasible band": ["Margin", ["diag/q_mean", "diag/q_low", "diag/q_high"]],
+        "Q bias against fresh returns": ["Multiline", ["diag/q_bias", "diag/q_bias_hard"]],
+        "Equivariance errors": [
+            "Multiline",
+            ["diag/equivariance_decode", "diag/equivariance_actor", "diag/equivariance_critic"],
+        ],
+        "Temperature": ["Multiline", ["diag/alpha"]],
+    }
+}
+
+
+class RunLog:
+    """Scalars of one run, against control steps.
+
+    Namespaces: ``eval/`` held-out episodes, ``train/`` training episodes, ``losses/``, ``time/``
+    seconds and rates, ``diag/`` Q and equivariance diagnostics. docs/metrics.md has the formulas.
+    """
+
+    def __init__(self, folder: Path, config: Mapping[str, Any]):
+        self.writer = SummaryWriter(str(folder))
+        self.writer.add_custom_scalars(LAYOUT)
+        text = json.dumps(config, indent=2).replace("\n", "  \n")
+        self.writer.add_text("config", f"```\n{text}\n```")
+        self._config = config
+
+    def scalars(self, namespace: str, values: Mapping[str, float | None], step: int) -> None:
+        """Write every value that was measured."""
+        for name, value in values.items():
+            if value is not None:
+                self.writer.add_scalar(f"{namespace}/{name}", value, step)
+
+    def finish(self, metrics: Mapping[str, float]) -> None:
+        """Write the table of hyperparameters with the final metrics, and close."""
+        hparams = {k: v for k, v in self._config.items() if isinstance(v, bool | int | float | str)}
+        # run_name="." keeps the table in this run's own folder.
+        self.writer.add_hparams(
+            hparams, {f"final/{k}": v for k, v in metrics.items()}, run_name="."
+        )
+        self.close()
+
+    def close(self) -> None:
+        """Flush to disk."""
+        self.writer.close()

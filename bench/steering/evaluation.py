@@ -1,0 +1,172 @@
+"""Whole episodes from a fixed list of seeds, and the steerability of a base policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from bench.steering.latent_env import LatentNoiseEnv
+from policies.base import ChunkPolicy
+from policies.errors import UserError
+
+HELD_OUT_SEED = 1_000_000
+"""Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
+and run; training, demonstrations and steerability draw their seeds below it."""
+
+
+def held_out_seeds(count: int) -> list[int]:
+    """The seeds of the first ``count`` evaluation episodes."""
+    return [HELD_OUT_SEED + i for i in range(count)]
+
+
+DECISION_FIELDS = ("obs", "noise", "reward", "next_obs", "running", "terminal")
+
+
+@dataclass
+class Rollout:
+    """Full-length episodes, one row an episode.
+
+    Attributes:
+        episodes: columns ``seed, success_once, success_at_end, return, episode_len`` of
+            ManiSkill's metrics, each ``[N]``.
+        obs: observation of every decision, ``[T, N, obs_dim]``.
+        noise: what the agent chose, ``[T, N, Tp, Da]``.
+        reward: summed over the executed steps, ``[T, N]``.
+        next_obs: ``[T, N, obs_dim]``.
+        running: whether the episode had not yet succeeded before the decision, ``[T, N]`` bool.
+        terminal: whether the decision led to the first success, ``[T, N]`` bool.
+    """
+
+    episodes: dict[str, torch.Tensor]
+    obs: torch.Tensor
+    noise: torch.Tensor
+    reward: torch.Tensor
+    next_obs: torch.Tensor
+    running: torch.Tensor
+    terminal: torch.Tensor
+
+    def episodes_of(self, rows: slice) -> Rollout:
+        """The same for some of the episodes."""
+        return Rollout(
+            episodes={name: value[rows] for name, value in self.episodes.items()},
+            **{name: getattr(self, name)[:, rows] for name in DECISION_FIELDS},
+        )
+
+
+Act = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+"""``(obs [N, obs_dim], rows [N]) -> noise [N, Tp, Da]``; ``rows`` index the list of seeds."""
+
+
+def rollout(env: LatentNoiseEnv, act: Act, seeds: Sequence[int]) -> Rollout:
+    """Run one full-length episode from each seed.
+
+    Args:
+        env: with ``ignore_terminations``, so that success at the end is measured.
+        act: called once a decision for the N parallel environments.
+        seeds: any number; they are worked off in batches of N.
+
+    Raises:
+        UserError: if the environment ends episodes at success.
+    """
+    if not env.ignore_terminations:
+        raise UserError("evaluation needs an environment with ignore_terminations=True")
+    parts = []
+    for start in range(0, len(seeds), env.num_envs):
+        # The last batch may be short: its spare environments repeat a seed and are dropped.
+        rows = torch.arange(start, start + env.num_envs).clamp(max=len(seeds) - 1)
+        keep = min(env.num_envs, len(seeds) - start)
+        parts.append(_rollout_batch(env, act, [seeds[int(row)] for row in rows], rows, keep))
+    return Rollout(
+        episodes={k: torch.cat([p.episodes[k] for p in parts]) for k in parts[0].episodes},
+        **{name: torch.cat([getattr(p, name) for p in parts], dim=1) for name in DECISION_FIELDS},
+    )
+
+
+def _rollout_batch(
+    env: LatentNoiseEnv, act: Act, seeds: list[int], rows: torch.Tensor, keep: int
+) -> Rollout:
+    obs = env.reset(seeds)
+    decisions = math.ceil(env.max_episode_steps / env.execute)
+    steps: dict[str, list[torch.Tensor]] = {name: [] for name in DECISION_FIELDS}
+    running = torch.ones(env.num_envs, dtype=torch.bool, device=obs.device)
+    for _ in range(decisions):
+        noise = act(obs, rows)
+        result = env.step(noise)
+        succeeded = running & result.success_once
+        row = (obs, noise, result.reward, result.next_obs, running, succeeded)
+        for name, value in zip(DECISION_FIELDS, row, strict=True):
+            steps[name].append(value[:keep])
+        running = running & ~succeeded
+        obs = result.obs
+    # All episodes end with the last decision, so the rows are the environments in order.
+    episodes = {name: value[:keep] for name, value in result.episodes.items()}
+    episodes["seed"] = torch.tensor(seeds[:keep])
+    return Rollout(episodes=episodes, **{k: torch.stack(v) for k, v in steps.items()})
+
+
+@dataclass
+class Steerability:
+    """Whether there is anything to steer in a base policy.
+
+    Attributes:
+        success: share of successful episodes over all states and draws (noise from N(0, I)).
+        episodes: how many episodes that is.
+        solvable: share of initial states that at least one of the draws solves.
+        states: how many initial states.
+        draws: noise draws a state.
+        action_std: standard deviation of the normalised actions over the noise, mean over states,
+            steps and dimensions.
+        warning: why steering cannot work, or None.
+    """
+
+    success: float
+    episodes: int
+    solvable: float
+    states: int
+    draws: int
+    action_std: float
+    warning: str | None
+
+
+MIN_SOLVABLE, MIN_ACTION_STD = 0.9, 0.3
+
+
+def steerability(
+    env: LatentNoiseEnv, policy: ChunkPolicy, seed: int, states: int = 32, draws: int = 16
+) -> Steerability:
+    """Draw noise ``draws`` times for each of ``states`` initial states (below the held-out seeds).
+
+    The thresholds of the warning come from pilot runs: bases under them gained nothing from SAC.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    first = HELD_OUT_SEED // 2 + states * seed
+    seeds = [first + i for i in range(states) for _ in range(draws)]
+
+    def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        shape = (len(obs), policy.horizon, policy.act_layout.dim)
+        return torch.randn(shape, generator=generator).to(obs.device)
+
+    result = rollout(env, act, seeds)
+    success = result.episodes["success_once"].float().view(states, draws)
+    first_obs = result.obs[0].view(states, draws, -1)
+    first_noise = result.noise[0].view(states, draws, *result.noise.shape[2:])
+    actions = policy.decode(first_obs.flatten(0, 1), first_noise.flatten(0, 1))
+    action_std = actions.view(first_noise.shape).std(dim=1).mean().item()
+    solvable = (success.amax(dim=1) > 0).float().mean().item()
+    reasons = []
+    if solvable < MIN_SOLVABLE:
+        reasons.append(f"only {solvable:.0%} of the initial states are ever solved")
+    if action_std < MIN_ACTION_STD:
+        reasons.append(f"the noise moves the actions by only {action_std:.2f}")
+    return Steerability(
+        success=success.mean().item(),
+        episodes=states * draws,
+        solvable=solvable,
+        states=states,
+        draws=draws,
+        action_std=action_std,
+        warning=f"little to steer: {' and '.join(reasons)}" if reasons else None,
+    )

@@ -1,0 +1,139 @@
+"""The MDP that a steering agent sees: its action is the noise that the base policy decodes.
+
+State s, action w in R^(Tp x Da); the frozen policy decodes a = pi_dp(s, w), the first Ta actions
+are executed, rewards are summed over them (DSRL, arXiv 2506.15799; Equi-DSRL, arXiv 2512.11345).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from policies.base import ChunkPolicy
+
+
+@dataclass
+class Transition:
+    """What one decision led to; every tensor has N rows.
+
+    Attributes:
+        obs: observation to act on next, ``[N, obs_dim]``: the first one of a new episode where
+            the last one ended.
+        reward: -1 for every executed step before success, summed, ``[N]``.
+        next_obs: observation that the decision led to, also where the episode ended,
+            ``[N, obs_dim]``.
+        terminal: success; nothing is bootstrapped behind it, ``[N]`` bool.
+        truncated: the time limit was reached without success, ``[N]`` bool.
+        success_once: the episode of this decision has had a success so far, ``[N]`` bool.
+        episodes: ManiSkill's metrics of the episodes that ended, each ``[number ended]``.
+    """
+
+    obs: torch.Tensor
+    reward: torch.Tensor
+    next_obs: torch.Tensor
+    terminal: torch.Tensor
+    truncated: torch.Tensor
+    success_once: torch.Tensor
+    episodes: dict[str, torch.Tensor]
+
+
+@dataclass
+class Clock:
+    """Seconds spent decoding noise and simulating."""
+
+    decode: float = 0.0
+    simulate: float = 0.0
+
+
+@dataclass
+class LatentNoiseEnv:
+    """N parallel environments whose action is the noise of an action chunk.
+
+    Args:
+        env: parallel ManiSkill environments from :func:`bench.tasks.make`.
+        policy: frozen decoder with the same layouts; its device is the device of everything that
+            goes in and comes out, wherever physics runs.
+        ignore_terminations: let episodes run to the time limit after a success, as ManiSkill's
+            evaluation does; without it a success ends the episode.
+    """
+
+    env: Any
+    policy: ChunkPolicy
+    ignore_terminations: bool = False
+    clock: Clock = field(default_factory=Clock)
+
+    def __post_init__(self) -> None:
+        self.num_envs: int = self.env.num_envs
+        self.execute = self.policy.execute
+        self.max_episode_steps: int = self.env.max_episode_steps
+        self.device = next(self.policy.parameters()).device
+        self.control_steps = 0
+
+    def reset(self, seeds: list[int]) -> torch.Tensor:
+        """Start an episode everywhere, environment i from ``seeds[i]``; ``[N, obs_dim]``."""
+        start = time.perf_counter()
+        obs, _ = self.env.reset(seed=seeds)
+        self._obs = obs.to(self.device)
+        self._elapsed = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        self._return = torch.zeros(self.num_envs, device=self.device)
+        self._success_once = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self.clock.simulate += time.perf_counter() - start
+        return self._obs
+
+    @torch.no_grad()
+    def step(self, noise: torch.Tensor) -> Transition:
+        """Decode ``noise [N, Tp, Da]``, execute the first Ta actions, reset what ended.
+
+        What a chunk still does after its episode has ended counts for nothing.
+        """
+        start = time.perf_counter()
+        actions = self.policy.decode(self._obs, noise).to(self.env.device)
+        decoded = time.perf_counter()
+        next_obs = self._obs
+        alive = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        reward = torch.zeros(self.num_envs, device=self.device)
+        terminal, truncated = torch.zeros_like(alive), torch.zeros_like(alive)
+        success_at_end = torch.zeros_like(alive)
+        for t in range(self.execute):
+            obs, _, _, _, info = self.env.step(actions[:, t])
+            self.control_steps += self.num_envs
+            success = info["success"].to(self.device)
+            next_obs = torch.where(alive[:, None], obs.to(self.device), next_obs)
+            self._elapsed += alive
+            self._success_once |= alive & success
+            reward -= (alive & ~self._success_once).float()
+            if not self.ignore_terminations:
+                terminal |= alive & success
+            timed_out = alive & ~terminal & (self._elapsed >= self.max_episode_steps)
+            truncated |= timed_out
+            success_at_end |= success & (terminal | timed_out) & alive
+            alive &= ~(terminal | truncated)
+            if not alive.any():
+                break
+        self._return += reward
+        success_once = self._success_once.clone()
+        ended = (terminal | truncated).nonzero().flatten()
+        episodes = {
+            "success_once": success_once[ended],
+            "success_at_end": success_at_end[ended].clone(),
+            "return": self._return[ended].clone(),
+            "episode_len": self._elapsed[ended].clone(),
+        }
+        self._obs = next_obs
+        if len(ended):
+            fresh, _ = self.env.reset(options={"env_idx": ended.to(self.env.device)})
+            self._obs = next_obs.clone()
+            self._obs[ended] = fresh.to(self.device)[ended]
+            self._elapsed[ended] = 0
+            self._return[ended] = 0
+            self._success_once[ended] = False
+        self.clock.decode += decoded - start
+        self.clock.simulate += time.perf_counter() - decoded
+        return Transition(self._obs, reward, next_obs, terminal, truncated, success_once, episodes)
+
+    def close(self) -> None:
+        """Free the simulation."""
+        self.env.close()

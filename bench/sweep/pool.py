@@ -1,0 +1,100 @@
+"""Work off a suite in a pool of processes: one run a process, one thread a run."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+from bench.runs.base_policy import prepare_base
+from bench.runs.config import RunConfig
+from bench.runs.folder import is_finished, run_id
+from bench.runs.run import execute
+from bench.sweep.suite import Suite
+from leaderboard.records import read_record
+from policies.errors import UserError
+
+
+@dataclass
+class Outcome:
+    """What became of a cell: ``finished``, ``skipped`` (finished before) or ``failed``."""
+
+    config: RunConfig
+    status: str
+    detail: str = ""
+
+
+def run_suite(suite: Suite, out: Path, workers: int) -> list[Outcome]:
+    """Run every cell that is not finished; a failed one does not stop the others.
+
+    Base policies that several cells share are built first, once.
+
+    Raises:
+        UserError: if ``workers`` is not positive, or demonstrations or policies cannot be built.
+    """
+    if workers < 1:
+        raise UserError(f"--workers is {workers}; it must be at least 1")
+    outcomes, todo = [], []
+    for config in suite.runs:
+        folder = out / run_id(config, {})
+        if is_finished(folder):
+            outcomes.append(Outcome(config, "skipped", _describe(folder)))
+            print(f"  skipped   {_label(config)}  {outcomes[-1].detail}", flush=True)
+        else:
+            todo.append(config)
+    bases = {(c.task, c.embodiment, c.demonstrations, c.policy, c.policy_seed): c for c in todo}
+    for config in bases.values():
+        prepare_base(config, out)
+    started = time.monotonic()
+    # Spawned, because forking a process that has used torch's threads can deadlock.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_limit_threads, initargs=(workers,)
+    ) as pool:
+        futures: dict[Future[Path], RunConfig] = {
+            pool.submit(execute, config, out, progress=False): config for config in todo
+        }
+        try:
+            for done, future in enumerate(as_completed(futures), 1):
+                config = futures[future]
+                try:
+                    outcome = Outcome(config, "finished", _describe(future.result()))
+                except Exception as error:
+                    outcome = Outcome(config, "failed", f"{type(error).__name__}: {error}")
+                outcomes.append(outcome)
+                left = (time.monotonic() - started) / done * (len(futures) - done)
+                print(
+                    f"  {outcome.status:9s} {_label(config)}  {outcome.detail}  "
+                    f"[{done}/{len(futures)}, about {left / 60:.1f} min left]",
+                    flush=True,
+                )
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return outcomes
+
+
+def _limit_threads(workers: int) -> None:
+    import torch
+
+    torch.set_num_threads(max(1, (os.cpu_count() or 1) // workers))
+
+
+def _label(config: RunConfig) -> str:
+    return (
+        f"{config.task} {config.embodiment} {config.variant:16s} {config.agent:16s} "
+        f"seed {config.seed}"
+    )
+
+
+def _describe(folder: Path) -> str:
+    record = read_record(folder / "record.json")
+    final = record.evaluations[-1]
+    success = sum(final.episodes.success_once)
+    return (
+        f"success {success / len(final.episodes.seed):4.0%} of {len(final.episodes.seed)}, "
+        f"{record.wall_clock.total:.0f} s"
+    )
