@@ -101,11 +101,11 @@ class ContactReader:
             for contact in system.get_contacts():
                 first, second = contact.bodies
                 impulse = None
-                for query, total in zip(self._queries, totals):
+                for query, total in zip(self._queries, totals, strict=True):
                     for row, sign in query.entries(first, second):
                         if impulse is None:
                             impulse = np.sum([p.impulse for p in contact.points], axis=0)
                         total[row] += sign * impulse
-        for query, total in zip(self._queries, totals):
+        for query, total in zip(self._queries, totals, strict=True):
             query.cuda_impulses.array[:] = total
         self._answered = True

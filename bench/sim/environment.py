@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import lru_cache
+from functools import cache
 from typing import Any, Literal
 
 import sapien
 import sapien.physx as physx
+import torch
 from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.system.backend import BackendInfo
 
-from bench.sim import patches
+from bench.sim import patches, rendering
 from bench.sim.headless import prepare_headless
 from bench.sim.scene import BatchedScene
 from policies.errors import UserError
@@ -35,26 +37,60 @@ class BatchedCpuMixin:
     """Runs a ManiSkill task for N environments in one process on CPU physics.
 
     Mix in before a `BaseEnv` subclass: ``class MyEnv(BatchedCpuMixin, PickCubeEnv)``. Takes the
-    arguments of that class; ``sim_backend`` and ``render_backend`` are set here.
+    arguments of that class. Cameras work where there is a Vulkan driver and ``render_mode`` or a
+    visual ``obs_mode`` asks for them; without either nothing is prepared for rendering.
+
+    Raises:
+        UserError: another simulator or release is asked for, or cameras without a driver.
     """
 
-    def __init__(self, *args: Any, num_envs: int = 1, **kwargs: Any) -> None:
-        kwargs["sim_backend"] = "physx_cpu"
-        kwargs["render_backend"] = "none"
-        if kwargs.get("parallel_in_single_scene"):
+    def __init__(
+        self,
+        *args: Any,
+        num_envs: int = 1,
+        obs_mode: str | None = None,
+        render_mode: str | None = None,
+        sim_backend: str = "auto",
+        render_backend: str | None = None,
+        parallel_in_single_scene: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        if sim_backend not in ("auto", "cpu", "physx_cpu"):
+            raise UserError(
+                f'sim_backend "{sim_backend}" contradicts batched CPU physics: '
+                "leave it out, or create the environment with sim='cuda'."
+            )
+        if parallel_in_single_scene:
             raise UserError("parallel_in_single_scene needs the GPU simulation: use sim='cuda'.")
         patches.install()
         prepare_headless()
-        super().__init__(*args, num_envs=num_envs, **kwargs)
+        cameras = render_mode is not None or obs_mode not in (None, "state", "state_dict", "none")
+        self._camera_device = rendering.find_device(render_backend) if cameras else None
+        super().__init__(
+            *args,
+            num_envs=num_envs,
+            obs_mode=obs_mode,
+            render_mode=render_mode,
+            sim_backend="physx_cpu",
+            render_backend="none",
+            **kwargs,
+        )
 
     @property
     def backend(self) -> BackendInfo:
+        """Devices and names of simulation and rendering."""
         return self._backend
 
     @backend.setter
     def backend(self, info: BackendInfo) -> None:
-        # Another name than ManiSkill's CPU backends, which refuse several environments.
-        self._backend = dataclasses.replace(info, sim_backend="physx_cpu_batched")
+        # Another name than ManiSkill's CPU backends, which refuse several environments, and the
+        # render device that ManiSkill's parser may not be able to name.
+        self._backend = dataclasses.replace(
+            info,
+            sim_backend="physx_cpu_batched",
+            render_device=self._camera_device,
+            render_backend="none" if self._camera_device is None else self._camera_device.name,
+        )
 
     @property
     def _sim_device(self) -> _BatchedDevice:
@@ -66,13 +102,36 @@ class BatchedCpuMixin:
 
     def _setup_scene(self) -> None:
         self._set_scene_config()
+        sub_scenes = []
+        for _ in range(self.num_envs):
+            systems: list[sapien.System] = [physx.PhysxCpuSystem()]
+            if self._camera_device is not None:
+                systems.append(sapien.render.RenderSystem(self._camera_device))
+            sub_scenes.append(sapien.Scene(systems))
         self.scene = BatchedScene(
-            [sapien.Scene([physx.PhysxCpuSystem()]) for _ in range(self.num_envs)],
-            sim_config=self.sim_config,
-            device=self.device,
-            backend=self.backend,
+            sub_scenes, sim_config=self.sim_config, device=self.device, backend=self.backend
         )
         self.scene.timestep = 1.0 / self._sim_freq
+
+    def _load_agent(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_agent(*args, **kwargs)
+        self._check_controllers()
+
+    def _check_controllers(self) -> None:
+        """Refuse what ManiSkill refuses on the GPU: its batched solver knows the root frame only."""
+        agents = self.agent.agents if isinstance(self.agent, MultiAgent) else [self.agent]
+        for agent in agents:
+            controller = getattr(agent, "controller", None)
+            for part in getattr(controller, "controllers", {"": controller}).values():
+                if isinstance(part, PDEEPosController):
+                    try:
+                        part._check_gpu_sim_works()
+                    except AssertionError as error:
+                        raise UserError(
+                            f'Control mode "{agent.control_mode}" moves the end effector in the '
+                            f'frame "{part.config.frame}", which batched simulation does not '
+                            'support: use "pd_ee_delta_pose" or a joint-space mode.'
+                        ) from error
 
     def _step_action(self, action: Any) -> Any:
         if self._code_runs_between_substeps():
@@ -90,32 +149,87 @@ class BatchedCpuMixin:
         return not (
             type(self)._before_simulation_step is BaseEnv._before_simulation_step
             and type(self)._after_simulation_step is BaseEnv._after_simulation_step
-            and agent.before_simulation_step
-            in (BaseAgent.before_simulation_step, MultiAgent.before_simulation_step)
+            and (
+                self.agent is None
+                or agent.before_simulation_step
+                in (BaseAgent.before_simulation_step, MultiAgent.before_simulation_step)
+            )
         )
 
 
 class CudaMixin:
-    """Runs a ManiSkill task on ManiSkill's own GPU simulation, also for one environment."""
+    """Runs a ManiSkill task on ManiSkill's own GPU simulation, also for one environment.
 
-    def __init__(self, *args: Any, num_envs: int = 1, **kwargs: Any) -> None:
-        kwargs["sim_backend"] = "physx_cuda"
-        kwargs.setdefault("render_backend", "none")
+    Raises:
+        UserError: CUDA or PhysX's GPU library is missing.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        num_envs: int = 1,
+        sim_backend: str = "auto",
+        render_backend: str | None = None,
+        render_mode: str | None = None,
+        obs_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if sim_backend == "auto":
+            sim_backend = "physx_cuda"
+        check_cuda()
+        patches.check_versions()
         prepare_headless()
-        super().__init__(*args, num_envs=num_envs, **kwargs)
+        if render_backend is None:
+            cameras = render_mode is not None or obs_mode not in (
+                None,
+                "state",
+                "state_dict",
+                "none",
+            )
+            render_backend = "gpu" if cameras else "none"
+        super().__init__(
+            *args,
+            num_envs=num_envs,
+            sim_backend=sim_backend,
+            render_backend=render_backend,
+            render_mode=render_mode,
+            obs_mode=obs_mode,
+            **kwargs,
+        )
 
 
-@lru_cache(maxsize=None)
+def check_cuda() -> None:
+    """Raise `UserError` unless ManiSkill's GPU simulation can run here."""
+    if not torch.cuda.is_available():
+        raise UserError(
+            "sim='cuda' needs an NVIDIA GPU and the CUDA build of torch: use sim='cpu' here."
+        )
+    try:
+        physx.enable_gpu()
+    except Exception as error:  # a missing library shows as a network or a loader error
+        raise UserError(
+            "sim='cuda' needs PhysX's GPU library, which SAPIEN downloads at first use and could "
+            f"not get or load ({type(error).__name__}): use sim='cpu', which may feed a learner "
+            "on the GPU."
+        ) from error
+
+
+@cache
 def make_env_class(env_cls: type[BaseEnv], sim: Simulator = "cpu") -> type[BaseEnv]:
     """A subclass of a ManiSkill task class that runs on the given simulator.
 
     Args:
         env_cls: any `BaseEnv` subclass, ManiSkill's or ours.
         sim: ``"cpu"`` for batched CPU physics, ``"cuda"`` for ManiSkill's GPU simulation.
+
+    Raises:
+        UserError: there is no such simulator.
     """
     if sim not in ("cpu", "cuda"):
         raise UserError(f'Unknown simulator "{sim}": choose "cpu" or "cuda".')
     mixin = BatchedCpuMixin if sim == "cpu" else CudaMixin
+    if issubclass(env_cls, mixin):
+        return env_cls
     return type(
         f"{env_cls.__name__}_{sim}",
         (mixin, env_cls),
@@ -136,12 +250,15 @@ def create(
         env_cls: any `BaseEnv` subclass, ManiSkill's or ours.
         num_envs: how many environments.
         sim: ``"cpu"`` or ``"cuda"``.
-        render: whether ``env.render()`` must work; needs a Vulkan driver.
+        render: whether ``env.render()`` must give pictures; needs a Vulkan driver.
         kwargs: passed on to the class.
 
     Raises:
-        UserError: the simulator is unknown or not available here, or the wrong release.
+        UserError: the simulator or the renderer is unknown or not available here, or ManiSkill
+            or SAPIEN is of another release than this package was written for.
     """
     if num_envs < 1:
         raise UserError(f"num_envs is {num_envs}, but at least one environment is needed.")
+    if render:
+        kwargs.setdefault("render_mode", "rgb_array")
     return make_env_class(env_cls, sim)(num_envs=num_envs, **kwargs)

@@ -234,7 +234,7 @@ class BatchedPhysx:
             name: np.full((len(self._articulations), d), total, dtype=np.int64)
             for name in ("qpos", "qvel", "target_qpos", "target_qvel")
         }
-        for row, (at, dof) in enumerate(zip(articulation_at, self._dof)):
+        for row, (at, dof) in enumerate(zip(articulation_at, self._dof, strict=True)):
             joints = np.arange(dof)
             self._joint_at["qpos"][row, :dof] = at + 13 + joints
             self._joint_at["qvel"][row, :dof] = at + 13 + dof + joints
@@ -500,7 +500,7 @@ class BatchedPhysx:
             write = self._driven
         values = buffer.tolist()
         for row in np.flatnonzero(write).tolist():
-            for set_target, value in zip(calls[row], values[row]):
+            for set_target, value in zip(calls[row], values[row], strict=False):
                 set_target(value)
         state[:] = buffer
         # A refresh that reads scenes again must find what was written here.

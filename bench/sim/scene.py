@@ -7,8 +7,10 @@ from typing import Any
 import torch
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building.actor_builder import ActorBuilder
+from mani_skill.utils.structs.render_camera import RenderCamera
 
 from bench.sim.physx import BatchedPhysx
+from bench.sim.rendering import RenderGroup
 
 
 class BatchedScene(ManiSkillScene):
@@ -59,3 +61,15 @@ class BatchedScene(ManiSkillScene):
 
     def _gpu_fetch_all(self) -> None:
         self.px.fetch_all()
+
+    def add_camera(self, *args: Any, **kwargs: Any) -> RenderCamera:
+        """Add a camera to every scene; takes the arguments of `ManiSkillScene.add_camera`."""
+        # Mounted cameras follow their entity, as on the CPU, and not a row of a CUDA buffer.
+        self.gpu_sim_enabled = False
+        try:
+            return super().add_camera(*args, **kwargs)
+        finally:
+            self.gpu_sim_enabled = True
+
+    def _setup_gpu_rendering(self) -> None:
+        self.render_system_group = RenderGroup(self.sub_scenes, self.px)

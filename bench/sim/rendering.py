@@ -1,0 +1,93 @@
+"""Cameras of batched CPU scenes, for ManiSkill's batched rendering code.
+
+ManiSkill's GPU branch renders all scenes at once through SAPIEN's ``RenderSystemGroup`` and
+``RenderCameraGroup``, which read poses from CUDA. The stand-ins here have the same calls and
+render scene by scene from the entities' own poses, on whatever Vulkan device there is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import sapien
+import sapien.render
+import torch
+from mani_skill.utils import common
+
+from bench.sim.headless import rendering_works
+from bench.sim.physx import BatchedPhysx
+from policies.errors import UserError
+
+
+def find_device(name: str | None = None) -> sapien.Device:
+    """The device to render on.
+
+    Args:
+        name: a name that SAPIEN understands ("cuda:1", "pci:0000:01:00.0"), or None for the
+            first device that can render.
+
+    Raises:
+        UserError: there is no Vulkan device, or not this one.
+    """
+    if not rendering_works():
+        raise UserError(
+            "Rendering needs a Vulkan driver, and none was found: install your GPU's driver, or "
+            "Debian's chromium for a software renderer and set VK_ICD_FILENAMES to its "
+            "vk_swiftshader_icd.json; state-only runs need none."
+        )
+    if name in (None, "gpu", "cpu", "none"):
+        return sapien.render.RenderSystem().device
+    try:
+        return sapien.Device(name)
+    except RuntimeError as error:
+        raise UserError(
+            f'There is no render device "{name}": leave render_backend out to take the first one.'
+        ) from error
+
+
+class Pictures:
+    """Pictures of all scenes [N, height, width, channels], with CudaArray's ``.torch()``."""
+
+    def __init__(self, pictures: torch.Tensor) -> None:
+        self._pictures = pictures
+
+    def torch(self) -> torch.Tensor:
+        """The pictures, on the CPU."""
+        return self._pictures
+
+
+class CameraGroup:
+    """The same camera in every scene."""
+
+    def __init__(self, cameras: Sequence[sapien.render.RenderCameraComponent]) -> None:
+        self._cameras = cameras
+
+    def take_picture(self) -> None:
+        """Render every scene."""
+        for camera in self._cameras:
+            camera.take_picture()
+
+    def get_picture_cuda(self, name: str) -> Pictures:
+        """One texture of the pictures taken last, for instance "Color"."""
+        pictures = [common.to_tensor(camera.get_picture(name)) for camera in self._cameras]
+        return Pictures(torch.stack(pictures))
+
+
+class RenderGroup:
+    """The renderers of all scenes."""
+
+    def __init__(self, scenes: Sequence[sapien.Scene], px: BatchedPhysx) -> None:
+        self._scenes = scenes
+        self._px = px
+
+    def update_render(self) -> None:
+        """Move what is drawn to where the simulation has it."""
+        self._px.finish_substeps()
+        for scene in self._scenes:
+            scene.update_render()
+
+    def create_camera_group(
+        self, cameras: Sequence[sapien.render.RenderCameraComponent], names: Sequence[str]
+    ) -> CameraGroup:
+        """Group one camera of each scene; textures need not be named in advance here."""
+        return CameraGroup(cameras)
