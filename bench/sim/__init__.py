@@ -4,13 +4,19 @@
 - `make_env_class(env_cls, sim)`: the class behind it, to subclass or register.
 - `BatchedCpuMixin`: what makes a task class run on batched CPU physics.
 - `prepare_headless()`: lets state-only environments run without a Vulkan driver.
+
+Names are imported when they are first used: `bench.sim.capabilities` must work where ManiSkill
+cannot be imported, to say why.
 """
 
-from bench.sim.headless import prepare_headless, rendering_works, silence_import_noise
+from __future__ import annotations
 
-silence_import_noise()
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from bench.sim.environment import BatchedCpuMixin, create, make_env_class  # noqa: E402
+if TYPE_CHECKING:
+    from bench.sim.environment import BatchedCpuMixin, create, make_env_class
+    from bench.sim.headless import prepare_headless, rendering_works
 
 __all__ = [
     "BatchedCpuMixin",
@@ -19,3 +25,19 @@ __all__ = [
     "prepare_headless",
     "rendering_works",
 ]
+
+_HOME = {
+    "BatchedCpuMixin": "environment",
+    "create": "environment",
+    "make_env_class": "environment",
+    "prepare_headless": "headless",
+    "rendering_works": "headless",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in ("BatchedCpuMixin", "create", "make_env_class"):
+        importlib.import_module("bench.sim.headless").silence_import_noise()
+    return getattr(importlib.import_module(f"bench.sim.{_HOME[name]}"), name)

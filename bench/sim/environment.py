@@ -118,7 +118,7 @@ class BatchedCpuMixin:
         self._check_controllers()
 
     def _check_controllers(self) -> None:
-        """Refuse what ManiSkill refuses on the GPU: its batched solver knows the root frame only."""
+        """Refuse what ManiSkill refuses on the GPU: the batched solver works in the root frame."""
         agents = self.agent.agents if isinstance(self.agent, MultiAgent) else [self.agent]
         for agent in agents:
             controller = getattr(agent, "controller", None)

@@ -13,9 +13,8 @@ from typing import Any
 
 import torch
 
+from bench.sim.pins import PINNED
 from policies.errors import UserError
-
-PINNED = {"mani-skill": "3.0.1", "sapien": "3.0.3"}
 
 
 def check_versions() -> None:
