@@ -20,7 +20,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from leaderboard.statistics import iqm, success_interval
-from leaderboard.summary import Row, Run, Summary, Table
+from leaderboard.summary import MIN_SEEDS, Row, Run, Summary, Table
 
 Style = tuple[str, str, Any]
 """Color, marker and line style of an agent."""
@@ -83,8 +83,8 @@ def to_svg(figure: Figure) -> bytes:
 def learning_curves(tables: Sequence[Table]) -> Figure:
     """Success over environment steps: one panel a table, the IQM over seeds with its 95 % band.
 
-    Thin lines are single seeds; those of unfinished runs are dotted and end in a cross. References
-    that were evaluated once are horizontal lines.
+    Thin lines are single seeds, drawn while these are few; those of unfinished runs are dotted and
+    end in a cross. References that were evaluated once are horizontal lines.
     """
     figure, axes = _panels(tables, "success_once on held-out episodes")
     handles: dict[str, Line2D] = {}
@@ -109,7 +109,7 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
     steps, curves = _common(row.finished)
     for run in row.runs:
         values = [evaluation.success_once for evaluation in run.curve.values()]
-        if run.finished and (len(row.finished) == 1 or row.is_reference):
+        if run.finished and (row.is_reference or not 1 < len(row.finished) < MIN_SEEDS):
             continue
         dotted: dict[str, Any] = {} if run.finished else {"linestyle": ":"}
         ax.plot(list(run.curve), values, color=color, linewidth=0.7, alpha=0.35, **dotted)
@@ -223,7 +223,7 @@ def _panels(tables: Sequence[Table], ylabel: str) -> tuple[Figure, list[Axes]]:
         key = table.key
         ax.set_title(_title(table, tables))
         ax.set_xlim(-0.02 * key.env_steps, 1.02 * key.env_steps)
-        ax.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+        ax.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
         ax.xaxis.set_major_formatter(FuncFormatter(_thousands))
         ax.set_xlabel("environment steps")
         if index % columns == 0:

@@ -48,6 +48,9 @@ MAX_TEXT = 2000
 DIVERGED_SHARE = 0.05
 DIVERGED_EVALUATIONS = 3
 
+Q_VALUES = ("q_mean", "q_min", "q_max", "q_abs_max")
+"""Diagnostics that are Q-values themselves: their presence shows a critic."""
+
 PACKAGES = ("torch", "mani-skill", "sapien", "escnn", "gymnasium", "numpy")
 
 _PLAIN = frozenset({bool, int, float, str, type(None)})
@@ -78,7 +81,7 @@ def _flags(value: Any) -> Any:
     value = _plain(value)
     if not isinstance(value, list):
         return value
-    if any(type(flag) not in (bool, int) or flag not in (0, 1) for flag in value):
+    if any(type(flag) not in (bool, int, float) or flag not in (0, 1) for flag in value):
         raise ValueError("expected a list of 0 and 1")
     return [bool(flag) for flag in value]
 
@@ -466,26 +469,24 @@ class RunRecord(_Block):
     def has_critic(self) -> bool:
         """Whether any evaluation measured a Q-value."""
         return any(
-            name.startswith("q_")
-            for evaluation in self.evaluations
-            for name in evaluation.diagnostics
+            name in evaluation.diagnostics for evaluation in self.evaluations for name in Q_VALUES
         )
 
     @property
     def nonfinite_q(self) -> bool:
-        """Whether any Q diagnostic (`q_...`) of any evaluation was not finite."""
+        """Whether a Q-value of any evaluation was not finite (`Q_VALUES`; a bias may be)."""
         return any(
-            path.startswith("diagnostics/q_")
+            f"diagnostics/{name}" in evaluation.nonfinite
             for evaluation in self.evaluations
-            for path in evaluation.nonfinite
+            for name in Q_VALUES
         )
 
     @property
     def diverged(self) -> bool | None:
         """Whether the Q-values diverged; None for runs without a critic.
 
-        The rule: `q_violation` above 5 % at 3 consecutive evaluations, or any Q diagnostic
-        (`q_...`) that is not finite.
+        The rule: `q_violation` above 5 % at 3 consecutive evaluations, or Q-values that are not
+        finite.
         """
         if not self.has_critic:
             return None

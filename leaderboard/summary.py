@@ -35,10 +35,8 @@ MIN_SEEDS = 5
 THRESHOLD = 0.8
 """Steps are counted to this share of the best agent's final success."""
 
-NOT_RECIPE = frozenset(
-    {"seed", "device", "threads", "torch_threads", "workers", "progress", "out", "run_id"}
-)
-"""Configuration keys, at any depth, that may differ between runs of one row."""
+MACHINE = frozenset({"device", "threads", "torch_threads", "workers", "progress", "out"})
+"""Configuration keys, at any depth, that may differ between runs of one row, as seeds may."""
 
 
 def agent_rank(agent: str) -> tuple[int, str]:
@@ -245,7 +243,11 @@ def recipe_of(config: Mapping[str, Any]) -> str:
 
     def strip(value: Any) -> Any:
         if isinstance(value, Mapping):
-            return {key: strip(item) for key, item in value.items() if key not in NOT_RECIPE}
+            return {
+                key: strip(item)
+                for key, item in value.items()
+                if key not in MACHINE and key != "seed" and not key.endswith("_seed")
+            }
         return [strip(item) for item in value] if isinstance(value, list) else value
 
     return config_hash(strip(config))

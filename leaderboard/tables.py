@@ -44,6 +44,12 @@ that score them; the number is always the last checkpoint's, never the best one'
   **Runs** and never dropped in silence.
 """
 
+CAPTION = (
+    "Thick lines are the IQM (success) or the mean (Q) over seeds, bands the 95 % interval of the "
+    "IQM, thin lines single seeds, dotted ones with a cross unfinished runs. The green area holds "
+    "the returns that the reward allows."
+)
+
 
 def code(text: str, limit: int = 300) -> str:
     """Show text from a record as a code span that it cannot leave, on one line, in a table cell."""
@@ -125,7 +131,9 @@ def render_page(
         if (key.task, key.embodiment) != place:
             place = key.task, key.embodiment
             parts.append(f"## {code(key.task)}, {code(key.embodiment)}")
-            parts += [f"![{text}]({quote(path)})" for text, path in figures.get(place, ())]
+            if place in figures:
+                parts += [f"![{text}]({quote(path)})" for text, path in figures[place]]
+                parts.append(CAPTION)
         parts += _section(table)
     parts += ["## Provenance", *_provenance(summary, links)]
     return "\n\n".join(parts) + "\n"
@@ -157,15 +165,19 @@ def _overview(summary: Summary) -> str:
 
 
 def _glance(row: Row) -> str:
+    if row.success is None:
+        return _status(row)
     mark = MARKS[row.difference.sign] if row.difference else ""
     dagger = " \u2020" if any(row.diverged) else ""
-    return interval(row.success) + (mark + dagger).replace(" ", "\u00a0")
+    value, bounds = interval(row.success).split("\u00a0", 1)
+    return f"{value}{mark}{dagger}".replace(" ", "\u00a0") + f"<br>{bounds}"
 
 
 def _cell_name(table: Table, summary: Summary) -> str:
     """Task, embodiment and variant, and of the rest of the key what tells the tables apart."""
     key = table.key
-    name = f"{code(key.task)} {code(key.embodiment)} {code(key.variant)}"
+    variant = "unbroken" if key.variant == "none" else code(key.variant)
+    name = f"{code(key.task)} {code(key.embodiment)} {variant}"
     keys = [other.key for other in summary.tables]
     if len({other.base + other.group for other in keys}) > 1:
         name += f" {code((key.base + ' ' + key.group).strip())}"
@@ -263,11 +275,11 @@ def _diagnostics(table: Table) -> list[str]:
     if not rows:
         return []
     feasible = table.feasible
-    bounds = f" (feasible {compact(feasible[0])} to {compact(feasible[1])})" if feasible else ""
+    bounds = f" (feasible Q: {compact(feasible[0])} to {compact(feasible[1])})" if feasible else ""
     header = [
         "Agent",
         "Diverged",
-        f"Largest \\|Q\\|{bounds}",
+        "Largest \\|Q\\|",
         "Q bias",
         "Orbit variance",
         "Equivariance error: actor, critic",
@@ -291,7 +303,7 @@ def _diagnostics(table: Table) -> list[str]:
                 number(sum(minutes) / len(minutes), 1) if minutes else NOTHING,
             ]
         )
-    return [_grid(header, body, left=1)]
+    return [f"Q-values, symmetry and cost{bounds}:", _grid(header, body, left=1)]
 
 
 def _parameters(row: Row) -> str:

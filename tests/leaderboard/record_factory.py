@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -79,10 +80,7 @@ def make_record(
     if status != "finished":
         evaluations = [e.model_copy(update={"final": False}) for e in evaluations]
     return RunRecord(
-        run_id="-".join([config["task"], config["variant"].replace("/", "_"), agent, str(seed)])
-        .replace(" ", "_")
-        .encode("ascii", "ignore")
-        .decode(),
+        run_id=re.sub(r"[^\w.=-]", "=", f"run-{config['variant']}-{agent}-{seed}", flags=re.ASCII),
         config=config,
         provenance=Provenance(
             commit="0123456789abcdef0123456789abcdef01234567",

@@ -1,0 +1,371 @@
+"""The run record: round trip, strictness, damage, and the rule for divergence."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import subprocess
+import sys
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from record_factory import START, make_config, make_evaluation, make_record
+
+from leaderboard.errors import RecordError
+from leaderboard.records import (
+    Evaluation,
+    FeasibleQ,
+    Provenance,
+    RunRecord,
+    config_hash,
+    dump_record,
+    portable,
+    read_record,
+    write_record,
+)
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def refuse_constant(name: str) -> Any:
+    raise AssertionError(f"{name} in a record")
+
+
+def test_round_trip_keeps_everything(tmp_path: Path) -> None:
+    record = make_record([make_evaluation([1, 0, 1, 1], q_mean=-3.25, q_violation=0.0)])
+    path = tmp_path / "run" / "record.json"
+    write_record(record, path)
+    assert read_record(path) == record
+    assert dump_record(read_record(path)) == path.read_text()
+    assert sorted(p.name for p in path.parent.iterdir()) == ["record.json"]
+
+
+def test_arrays_and_tensors_are_stored_as_numbers(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    evaluation = make_evaluation([1, 0], q_mean=np.float32(0.5), alpha=torch.tensor(0.25))
+    evaluation = evaluation.model_copy()
+    assert evaluation.diagnostics == {"q_mean": 0.5, "alpha": 0.25}
+    columns = {
+        "seed": torch.arange(3),
+        "success_once": torch.tensor([True, False, True]),
+        "success_at_end": [torch.tensor(True), False, np.bool_(False)],
+        "return": torch.tensor([0.0, -1.0, -2.0]),
+        "episode_len": np.array([5, 6, 7]),
+    }
+    data = evaluation.model_dump(by_alias=True) | {"episodes": columns}
+    episodes = Evaluation.model_validate(data).episodes
+    assert episodes.success_once == [True, False, True]
+    assert episodes.success_at_end == [True, False, False]
+    assert episodes.return_ == [0.0, -1.0, -2.0]
+
+
+def test_numbers_that_are_not_finite_become_flagged_nulls(tmp_path: Path) -> None:
+    evaluation = make_evaluation([1, 0], q_mean=math.nan, q_abs_max=math.inf, alpha=None)
+    data = evaluation.model_dump(by_alias=True)
+    data["episodes"]["return"] = [-math.inf, 1.0]
+    record = make_record([Evaluation.model_validate(data)])
+    path = tmp_path / "record.json"
+    write_record(record, path)
+    text = json.loads(path.read_text(), parse_constant=refuse_constant)
+    stored = text["evaluations"][0]
+    assert stored["diagnostics"] == {"q_mean": None, "q_abs_max": None, "alpha": None}
+    assert stored["nonfinite"] == {"diagnostics/q_mean": "nan", "diagnostics/q_abs_max": "inf"}
+    assert stored["episodes"]["return"] == [None, 1.0]
+    assert stored["episodes"]["nonfinite"] == {"return/0": "-inf"}
+    assert read_record(path) == record
+
+
+def test_a_flag_without_its_null_is_refused() -> None:
+    data = make_evaluation([1], q_mean=1.0).model_dump(by_alias=True)
+    for path in ("diagnostics/q_mean", "diagnostics/nothing", "episodes/return/9"):
+        with pytest.raises(ValidationError, match="nonfinite"):
+            Evaluation.model_validate(data | {"nonfinite": {path: "nan"}})
+
+
+def test_values_set_late_are_checked_on_write(tmp_path: Path) -> None:
+    record = make_record(status="running")
+    record.evaluations[0].diagnostics["q_mean"] = math.inf
+    write_record(record, tmp_path / "record.json")
+    assert read_record(tmp_path / "record.json").diverged
+    with pytest.raises(ValidationError):
+        record.status = "done"  # type: ignore[assignment]
+    record.status = "failed"
+    with pytest.raises(RecordError, match="ended"):
+        write_record(record, tmp_path / "record.json")
+    record.ended = START
+    with pytest.raises(RecordError, match="failure"):
+        write_record(record, tmp_path / "record.json")
+    assert read_record(tmp_path / "record.json").status == "running"
+
+
+def test_only_an_unfinished_record_of_the_same_run_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    write_record(make_record(status="running"), path)
+    with pytest.raises(RecordError, match="another run"):
+        write_record(make_record(seed=1), path)
+    write_record(make_record(status="interrupted"), path)
+    write_record(make_record(), path)
+    with pytest.raises(RecordError, match="finished"):
+        write_record(make_record(), path)
+    path.write_text("{")
+    with pytest.raises(RecordError, match="strict JSON"):
+        write_record(make_record(), path)
+
+
+def test_a_failed_write_leaves_the_old_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "record.json"
+    write_record(make_record(status="running"), path)
+    before = path.read_bytes()
+
+    def full(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(RecordError, match="No space left on device"):
+        write_record(make_record(), path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["record.json"]
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordError, match="cannot be written"):
+        write_record(make_record(), tmp_path / "file" / "record.json")
+
+
+def test_configurations_are_checked() -> None:
+    for key in ("task", "embodiment", "variant", "agent", "seed", "env_steps", "demonstrations"):
+        config = make_config()
+        del config[key]
+        data = make_record().model_dump(by_alias=True) | {"config": config}
+        del data["config_hash"]
+        with pytest.raises(ValidationError, match=key):
+            RunRecord.model_validate(data)
+    for change in ({"seed": "0"}, {"seed": -1}, {"env_steps": 0}, {"lr": math.nan}, {"lr": {1}}):
+        with pytest.raises(ValidationError):
+            make_record(**change)
+
+
+def test_hash_ignores_the_order_of_keys_and_nothing_else() -> None:
+    config = make_config()
+    backwards = dict(reversed(list(config.items())))
+    assert config_hash(config) == config_hash(backwards)
+    assert config_hash(config) != config_hash(config | {"learning_rate": 3.1e-4})
+
+
+def test_times_become_utc() -> None:
+    local = datetime(2026, 1, 31, 14, 0, 0, 5, tzinfo=timezone(timedelta(hours=2)))
+    record = make_record()
+    record.ended = local
+    assert record.ended == START
+    assert record.ended.utcoffset() == timedelta(0)
+    with pytest.raises(ValidationError, match="zone"):
+        record.ended = datetime(2026, 1, 31, 14, 0, 0)
+
+
+def test_failures_name_no_folder_of_the_machine() -> None:
+    text = 'File "/home/me/x/run.py", line 3: C:\\Users\\me\\a.h5 and/or see https://a.org/b/c'
+    assert portable(text) == 'File "run.py", line 3: a.h5 and/or see https://a.org/b/c'
+    record = make_record(status="failed")
+    record.failure = "cannot read /data/private/demo.h5 " + "x" * 5000
+    assert record.failure.startswith("cannot read demo.h5 x")
+    assert len(record.failure) == 2000
+
+
+def test_feasible_bounds_are_ordered() -> None:
+    with pytest.raises(ValidationError, match="low"):
+        FeasibleQ(low=1.0, high=0.0)
+
+
+def violations(*values: float | None) -> list[Evaluation]:
+    return [
+        make_evaluation([1], 1000 * i, i == len(values) - 1, q_mean=-1.0, q_violation=value)
+        for i, value in enumerate(values)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("shares", "expected"),
+    [
+        ((0.06, 0.06, 0.06), True),
+        ((0.0, 1.0, 0.051, 0.2, 0.0), True),
+        ((0.06, 0.06, 0.05, 0.06, 0.06), False),
+        ((0.06, 0.06, None, 0.06), False),
+        ((0.9, 0.9), False),
+        ((0.0, 0.0, 0.0, 0.0), False),
+    ],
+)
+def test_diverged_needs_three_violations_in_a_row(
+    shares: tuple[float | None, ...], expected: bool
+) -> None:
+    assert make_record(violations(*shares)).diverged is expected
+
+
+def test_q_values_that_are_not_finite_are_divergence_and_a_missing_bias_is_not() -> None:
+    assert make_record([make_evaluation([1], q_mean=math.nan)]).diverged is True
+    assert make_record([make_evaluation([1], q_mean=-1.0, q_abs_max=math.inf)]).diverged is True
+    assert make_record([make_evaluation([1], q_mean=-1.0, q_bias=math.nan)]).diverged is False
+    assert make_record([make_evaluation([1])], agent="base").diverged is None
+
+
+def test_provenance_of_this_checkout_and_of_a_bare_folder(tmp_path: Path) -> None:
+    here = Provenance.collect("cpu", 1, REPOSITORY, ["numpy", "no-such-package"])
+    assert here.packages == {"numpy": np.__version__}
+    outside = Provenance.collect("cpu", 1, tmp_path)
+    assert outside.commit is None
+    assert outside.dirty is None
+
+
+def test_importing_the_leaderboard_does_not_import_torch() -> None:
+    code = (
+        "import sys, leaderboard.records, leaderboard.report, leaderboard.__main__\n"
+        "heavy = {'torch', 'mani_skill', 'sapien', 'policies', 'agents', 'bench'}\n"
+        "sys.exit(' '.join(heavy & set(sys.modules)) or 0)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True)
+    assert result.returncode == 0, result.stderr
+
+
+# Damage
+
+
+def stored(tmp_path: Path) -> tuple[Path, dict[str, Any]]:
+    path = tmp_path / "record.json"
+    write_record(make_record([make_evaluation([1, 0, 1], q_mean=-2.0)]), path)
+    return path, json.loads(path.read_text())
+
+
+def change(data: dict[str, Any], where: str, value: Any) -> None:
+    *parents, last = where.split("/")
+    target: Any = data
+    for key in parents:
+        target = target[int(key)] if isinstance(target, list) else target[key]
+    target[last] = value
+
+
+EDITS: list[tuple[str, Any, str]] = [
+    ("schema_version", 2, "schema_version"),
+    ("schema_version", "1", "schema_version"),
+    ("schema_version", True, "schema_version"),
+    ("run_id", "../../etc/passwd", "run_id"),
+    ("run_id", "", "run_id"),
+    ("extra", 1, "extra"),
+    ("config/env_steps", 60_000, "config_hash"),
+    ("config_hash", "0" * 64, "config_hash"),
+    ("status", "done", "status"),
+    ("status", "running", "ended"),
+    ("started", "yesterday", "started"),
+    ("started", "2026-01-31T12:00:00", "zone"),
+    ("ended", "2020-01-01T00:00:00+00:00", "before"),
+    ("provenance/commit", "<script>", "commit"),
+    ("provenance/secret", 1, "secret"),
+    ("parameters/actor", "many", "actor"),
+    ("parameters/actor", -1, "actor"),
+    ("wall_clock/total", -1.0, "total"),
+    ("base_policy/base_success", 1.5, "base_success"),
+    ("base_policy/content_hash", "abc", "content_hash"),
+    ("feasible_q/low", None, "low"),
+    ("evaluations", [], "final evaluation"),
+    ("evaluations/0/final", False, "final evaluation"),
+    ("evaluations/0/env_steps", -5, "env_steps"),
+    ("evaluations/0/episodes/success_once", [1, 0, 2], "0 and 1"),
+    ("evaluations/0/episodes/success_once", [1, 0, "1"], "0 and 1"),
+    ("evaluations/0/episodes/success_once", [1, 0], "equally long"),
+    ("evaluations/0/episodes/success_once", [0, 0, 1], "without having had success"),
+    ("evaluations/0/episodes/seed", [1, 1, 2], "twice"),
+    ("evaluations/0/diagnostics", {"<b>": 1.0}, "diagnostics"),
+    ("evaluations/0/diagnostics/q_mean", "-2", "q_mean"),
+    ("evaluations/0/nonfinite", {"diagnostics/q_mean": "nan"}, "nonfinite"),
+]
+
+
+@pytest.mark.parametrize(("where", "value", "word"), EDITS)
+def test_edited_records_are_refused(tmp_path: Path, where: str, value: Any, word: str) -> None:
+    path, data = stored(tmp_path)
+    change(data, where, value)
+    path.write_text(json.dumps(data))
+    with pytest.raises(RecordError) as caught:
+        read_record(path)
+    message = str(caught.value)
+    assert word in message
+    assert str(path) in message
+    assert "\n" not in message
+
+
+TEXTS: list[tuple[bytes, str]] = [
+    (b"", "strict JSON"),
+    (b"null", "not a run record"),
+    (b"[1, 2]", "not a run record"),
+    (b"{}", "not a run record"),
+    (b'{"schema_version": NaN}', "NaN"),
+    (b'{"schema_version": 1e999}', "too large"),
+    (b'{"schema_version": 1, "schema_version": 1}', "twice"),
+    (b'{"schema_version": 1}', "config_hash"),
+    (b'{"schema_version": 1, "config_hash": "0"}', "not a valid record"),
+    (b"\xff\xfe\x00", "UTF-8"),
+    (b"[" * 200_000, "strict JSON"),
+    (b'{"schema_version": ' + b"9" * 10_000 + b"}", "strict JSON"),
+]
+
+
+@pytest.mark.parametrize(("text", "word"), TEXTS)
+def test_foreign_files_are_refused(tmp_path: Path, text: bytes, word: str) -> None:
+    path = tmp_path / "record.json"
+    path.write_bytes(text)
+    with pytest.raises(RecordError, match=word):
+        read_record(path)
+
+
+def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(RecordError, match="cannot be read"):
+            read_record(path)
+
+
+def test_every_truncation_is_refused(tmp_path: Path) -> None:
+    path, _ = stored(tmp_path)
+    data = path.read_bytes()
+    for length in range(0, len(data) - 2, 37):
+        path.write_bytes(data[:length])
+        with pytest.raises(RecordError):
+            read_record(path)
+
+
+def test_random_damage_gives_a_record_error_or_a_valid_record(tmp_path: Path) -> None:
+    path, data = stored(tmp_path)
+    generator = random.Random(0)
+    junk: list[Any] = [None, True, -1, 10**30, 0.5, "x", "\u0000", [], {}, [None], {"a": []}]
+
+    def places(value: Any, trail: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        items: list[tuple[Any, Any]] = []
+        if isinstance(value, dict):
+            items = list(value.items())
+        elif isinstance(value, list):
+            items = list(enumerate(value))
+        return [trail, *(p for key, item in items for p in places(item, (*trail, key)))]
+
+    trails = places(data)[1:]
+    refused = 0
+    for _ in range(400):
+        copy = json.loads(json.dumps(data))
+        *parents, last = generator.choice(trails)
+        target = copy
+        for key in parents:
+            target = target[key]
+        if generator.random() < 0.2:
+            del target[last]
+        else:
+            target[last] = generator.choice(junk)
+        path.write_text(json.dumps(copy))
+        try:
+            read_record(path)
+        except RecordError:
+            refused += 1
+    assert refused > 300

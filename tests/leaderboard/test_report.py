@@ -1,0 +1,357 @@
+"""The generated page: determinism, escaping, what it shows, and the command line."""
+
+from __future__ import annotations
+
+import csv
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from record_factory import LEARNING, make_curve, make_evaluation, make_record
+
+from leaderboard.__main__ import main
+from leaderboard.errors import RecordError
+from leaderboard.records import read_record, write_record
+from leaderboard.report import DEFAULT_RECORDS, generate, slug
+from leaderboard.tables import code, compact, count, number, relative_link
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def write_runs(folder: Path, seeds: int = 2) -> None:
+    """A grid like the demo's: two variants, references and three agents, with one failure."""
+    generator = np.random.default_rng(0)
+    for variant in ("none", "action_gain:0.5"):
+        for seed in range(seeds):
+            for agent in ("base", "zero", "standard", "equivariant", "approximate"):
+                status = "finished"
+                if agent in LEARNING:
+                    shift = 6.0 if (agent, variant) == ("standard", "none") else 0.0
+                    curve = make_curve(generator, np.linspace(0.35, 0.7, 6), q_shift=shift)
+                    if (agent, variant, seed) == ("approximate", "none", 1):
+                        status, curve = "failed", curve[:3]
+                else:
+                    curve = [make_evaluation(generator.random(100) < 0.35)]
+                record = make_record(curve, status, agent=agent, seed=seed, variant=variant)
+                name = f"{agent}-{variant.replace(':', '=')}-{seed}"
+                write_record(record, folder / name / "record.json")
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("page")
+    write_runs(folder / "runs")
+    generate([folder / "runs"], folder / "board")
+    return folder
+
+
+def test_the_page_shows_every_run(page: Path) -> None:
+    text = (page / "board" / "LEADERBOARD.md").read_text()
+    assert "5 finished seeds that a ranking needs" in text
+    assert "Rank |" not in text
+    assert "1\u00a0finished, 1\u00a0failed" in text
+    assert "the simulator stopped" in text
+    for agent in ("base", "zero", "standard", "equivariant", "approximate"):
+        assert text.count(f"| `{agent}` |") >= 3
+    for path in (page / "runs").iterdir():
+        target = f"../runs/{path.name.replace('=', '%3D')}/record.json"
+        assert f"({target})" in text
+    diverged = re.search(r"^\| `standard` \| (\S+) \|", text, re.M)
+    assert diverged
+    assert diverged[1] == "2/2"
+    assert "\u2020" in text
+    assert str(page) not in text
+
+
+def test_tables_are_well_formed(page: Path) -> None:
+    lines = (page / "board" / "LEADERBOARD.md").read_text().splitlines()
+    widths: list[int] = []
+    for line in lines:
+        if line.startswith("|"):
+            widths.append(len(re.split(r"(?<!\\)\|", line)) - 2)
+        elif widths:
+            assert len(set(widths)) == 1
+            assert 2 < widths[0] <= 9
+            assert len(widths) > 2
+            widths = []
+
+
+def test_figures_are_shown_and_are_svg_without_dates(page: Path) -> None:
+    text = (page / "board" / "LEADERBOARD.md").read_text()
+    shown = re.findall(r"!\[[^]]+\]\((figures/[^)]+\.svg)\)", text)
+    files = sorted(f"figures/{p.name}" for p in (page / "board" / "figures").iterdir())
+    assert sorted(shown) == files
+    assert len(files) == 2
+    for name in files:
+        data = (page / "board" / name).read_bytes()
+        assert ElementTree.fromstring(data).tag.endswith("svg")
+        assert b"dc:date" not in data
+        assert b"Matplotlib v" not in data
+
+
+def test_csv_holds_the_numbers_of_the_page(page: Path) -> None:
+    with open(page / "board" / "leaderboard.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 10
+    failed = [r for r in rows if r["failed"] == "1"]
+    assert [(r["agent"], r["variant"], r["finished"]) for r in failed] == [
+        ("approximate", "none", "1")
+    ]
+    standard = next(r for r in rows if r["agent"] == "standard" and r["variant"] == "none")
+    records = [
+        read_record(page / "runs" / f"standard-none-{seed}" / "record.json") for seed in (0, 1)
+    ]
+    finals = [record.final.success_once for record in records if record.final]
+    assert float(standard["success_iqm"]) == pytest.approx(np.mean(finals), abs=1e-5)
+    assert standard["diverged"] == "2"
+    assert float(standard["feasible_low"]) == -20
+
+
+def test_the_same_records_give_the_same_bytes(page: Path, tmp_path: Path) -> None:
+    """In another process, in another order, and over an older output."""
+    folders = sorted((page / "runs").iterdir(), reverse=True)
+    again = page / "again"
+    command = [sys.executable, "-m", "leaderboard", *map(str, folders), "--out", str(again)]
+    for _ in range(2):
+        result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+        assert snapshot(again) == snapshot(page / "board")
+
+
+def test_changed_records_give_other_bytes(page: Path, tmp_path: Path) -> None:
+    write_runs(tmp_path / "runs", seeds=1)
+    generate([tmp_path / "runs"], tmp_path / "board")
+    new, old = snapshot(tmp_path / "board"), snapshot(page / "board")
+    assert new.keys() == old.keys()
+    assert all(new[name] != old[name] for name in new)
+
+
+def test_stale_figures_go_and_foreign_files_stay(page: Path, tmp_path: Path) -> None:
+    out = tmp_path / "board"
+    (out / "figures").mkdir(parents=True)
+    stale = out / "figures" / f"q-{slug('OldTask-v1', 'floating')}.svg"
+    foreign = out / "figures" / "mine.svg"
+    stale.write_text("")
+    foreign.write_text("")
+    generate([page / "runs"], out)
+    assert not stale.exists()
+    assert foreign.exists()
+
+
+@pytest.mark.parametrize("seeds", [1, 5])
+def test_any_number_of_seeds_is_shown(tmp_path: Path, seeds: int) -> None:
+    write_runs(tmp_path / "runs", seeds)
+    generate([tmp_path / "runs"], tmp_path / "board")
+    text = (tmp_path / "board" / "LEADERBOARD.md").read_text()
+    assert ("Rank |" in text) == (seeds == 5)
+
+
+def test_a_lone_unfinished_run_is_shown(tmp_path: Path) -> None:
+    record = make_record([], status="running")
+    write_record(record, tmp_path / "run" / "record.json")
+    generate([tmp_path / "run"], tmp_path / "board")
+    text = (tmp_path / "board" / "LEADERBOARD.md").read_text()
+    assert "1\u00a0running" in text
+
+
+# Hostile records
+
+HOSTILE = [
+    "<script>alert(1)</script>",
+    "`</td><img src=x onerror=alert(1)>`",
+    "a|b|c\\|d",
+    "[click](javascript:alert(1))",
+    "![x](https://evil.example/x.png)",
+    "https://evil.example www.evil.example me@evil.example",
+    "line\nbreak\r\n# Heading\n| a | b |",
+    "../../../etc/passwd",
+    "``` ` `` ",
+    "$x^2$ \\frac{1}{0} <!-- --> ]]>",
+    "\u202eright to left\u0000\u0007",
+    "=HYPERLINK(1)",
+    "*bold* _it_ ~~no~~ &lt; &#x3c;",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_hostile_text_stays_text(tmp_path: Path, text: str) -> None:
+    markdown = pytest.importorskip("markdown_it")
+    record = make_record(
+        [make_evaluation([1, 0], q_mean=-1.0)],
+        task=text,
+        embodiment=text,
+        variant=text,
+        agent=text,
+        demonstrations={"mode": text, "count": 3, "seed": 0},
+    )
+    data = record.model_dump(by_alias=True) | {"run_id": "run"}
+    data["base_policy"] |= {"name": text, "group": text, "warning": text}
+    data["provenance"] |= {"device": text, "platform": text, "packages": {text: text}}
+    data |= {"status": "failed", "failure": text}
+    data["evaluations"][0]["final"] = False
+    hostile = type(record).model_validate(data)
+    write_record(hostile, tmp_path / "hostile" / "record.json")
+    write_record(make_record(agent="base"), tmp_path / "good" / "record.json")
+    files = generate([tmp_path / "hostile", tmp_path / "good"], tmp_path / "board")
+
+    names = {str(path.relative_to(tmp_path / "board")) for path in files}
+    allowed = re.compile(r"LEADERBOARD\.md|leaderboard\.csv|figures/(q|success)-[a-z0-9-]+\.svg")
+    assert all(allowed.fullmatch(name) for name in names)
+    for path in files:
+        if path.suffix == ".svg":
+            ElementTree.fromstring(path.read_bytes())
+        if path.suffix == ".csv":
+            assert not any(
+                cell.startswith(("=", "@"))
+                for line in csv.reader(path.read_text().splitlines())
+                for cell in line
+            )
+    parser = markdown.MarkdownIt("commonmark").enable(["table", "strikethrough"])
+    tokens = [
+        token
+        for block in parser.parse((tmp_path / "board" / "LEADERBOARD.md").read_text())
+        for token in [block, *(block.children or [])]
+    ]
+    raw = {t.content.strip() for t in tokens if t.type in ("html_block", "html_inline")}
+    assert raw <= {"<br>", "<details>\n<summary>All records</summary>", "</details>"}
+    links = {str(t.attrs.get("href") or t.attrs.get("src")) for t in tokens if t.attrs}
+    links -= {"None"}
+    assert all(re.fullmatch(r"(figures|\.\./(hostile|good))/[\w.%-]+", link) for link in links)
+    headings = [tokens[i + 1].content for i, t in enumerate(tokens) if t.type == "heading_open"]
+    assert all(
+        h in ("Leaderboard", "How to read it", "At a glance", "Unbroken symmetry", "Provenance")
+        or h.startswith(("Broken by `", "`"))
+        for h in headings
+    )
+    plain = " ".join(t.content for t in tokens if t.type == "text")
+    assert "evil" not in plain
+    assert "alert" not in plain
+    assert "passwd" not in plain
+
+
+def test_code_spans_cannot_be_left() -> None:
+    assert code("a`b|c\\d\ne") == "`a'b\u00a6c/d e`"
+    assert code("  ") == code("") == "\u2013"
+    assert len(code("x" * 1000)) == 302
+
+
+def test_links_do_not_spell_out_this_machine() -> None:
+    assert relative_link(Path("/a/b/runs/x y/record.json"), Path("/a/b/board")) == (
+        "../runs/x%20y/record.json"
+    )
+    assert relative_link(Path("/home/me/record.json"), Path("/var/tmp/board/now")) is None
+
+
+def test_numbers_are_readable() -> None:
+    assert number(-0.004) == "0.00"
+    assert number(-0.126) == "\u22120.13"
+    assert number(None) == "\u2013"
+    assert number(0.1, sign=True) == "+0.10"
+    assert number(0.0, sign=True) == "0.00"
+    texts = {0.0: "0", 3.14159: "3.14", -17.25: "\u221217.2", 22_998: "22998", 9e6: "9.0e6"}
+    assert {value: compact(value) for value in texts} == texts
+    assert compact(2.3e-7) == "2.3e\u22127"
+    assert [count(v) for v in (0, 950, 1_200, 50_000, 2_500_000)] == [
+        "0",
+        "950",
+        "1.2\u00a0k",
+        "50\u00a0k",
+        "2.5\u00a0M",
+    ]
+
+
+# Command line
+
+
+def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "leaderboard", *map(str, arguments)],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_command_line_says_what_it_wrote(page: Path, tmp_path: Path) -> None:
+    result = call(page / "runs", "--out", tmp_path / "board")
+    assert result.returncode == 0
+    assert "LEADERBOARD.md" in result.stdout
+    assert not result.stderr
+
+
+def test_bad_records_leave_the_output_as_it_was(page: Path, tmp_path: Path) -> None:
+    runs, out = tmp_path / "runs", tmp_path / "board"
+    write_runs(runs, seeds=1)
+    generate([runs], out)
+    before = snapshot(out)
+    victim = next(iter(sorted(runs.rglob("record.json"))))
+    victim.write_bytes(victim.read_bytes()[:-200])
+    result = call(runs, "--out", out)
+    assert result.returncode == 2
+    assert not result.stdout
+    assert result.stderr.count("\n") == 1
+    assert str(victim) in result.stderr
+    assert "Traceback" not in result.stderr
+    assert "run the cell again" in result.stderr
+    assert snapshot(out) == before
+    fresh = tmp_path / "fresh"
+    assert call(runs, "--out", fresh).returncode == 2
+    assert not fresh.exists()
+
+
+def test_bad_arguments_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("x")
+    write_record(make_record(), tmp_path / "good" / "record.json")
+    for arguments in (
+        [tmp_path / "nowhere"],
+        [tmp_path / "empty"],
+        [tmp_path / "file"],
+        [tmp_path / "good", "--out", tmp_path / "file"],
+        [tmp_path / "good", "--out", tmp_path / "file" / "below"],
+    ):
+        assert main([str(argument) for argument in arguments]) == 2
+        message = capsys.readouterr().err
+        assert message.startswith("error: ")
+        assert message.count("\n") == 1
+
+
+# What is committed
+
+
+def test_committed_records_are_valid_and_name_no_machine() -> None:
+    paths = sorted((REPOSITORY / DEFAULT_RECORDS).rglob("*.json"))
+    for path in paths:
+        read_record(path)
+        found = re.search(r"/(home|root|tmp|work|Users|mnt)/", path.read_text())
+        assert found is None, f"{path.name} names a folder of a machine"
+
+
+def test_the_committed_page_belongs_to_the_committed_records(tmp_path: Path) -> None:
+    records = REPOSITORY / DEFAULT_RECORDS
+    committed = records.parent / "LEADERBOARD.md"
+    if not committed.exists():
+        pytest.skip("no leaderboard has been committed yet")
+    # Links are relative, so the copy must lie where the original lies.
+    copy = tmp_path / "leaderboard"
+    for path in records.rglob("*.json"):
+        target = copy / path.relative_to(records.parent)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+    try:
+        generate([copy / "results"], copy)
+    except RecordError as error:
+        pytest.fail(str(error))
+    assert (copy / "LEADERBOARD.md").read_text() == committed.read_text()

@@ -1,0 +1,218 @@
+"""Grouping, pairing, ranking: from records to rows."""
+
+from __future__ import annotations
+
+import random
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from record_factory import START, make_curve, make_evaluation, make_record
+
+from leaderboard.errors import RecordError
+from leaderboard.records import RunRecord, config_hash, write_record
+from leaderboard.summary import Row, Run, Summary, base_success, load_runs, recipe_of, summarize
+
+
+def run(record: RunRecord, name: str = "") -> Run:
+    return Run(Path(name or f"{record.run_id}.json"), record)
+
+
+def outcomes(rate: float, seed: int, number: int = 100) -> list[int]:
+    return (np.random.default_rng(seed).random(number) < rate).astype(int).tolist()
+
+
+def of(rate: float, **config: Any) -> Run:
+    """A finished run with one evaluation at the given success rate."""
+    seed = 1000 * config.get("seed", 0) + int(1000 * rate)
+    return run(make_record([make_evaluation(outcomes(rate, seed))], **config))
+
+
+def row(summary: Summary, agent: str, table: int = 0) -> Row:
+    return next(r for r in summary.tables[table].rows if r.agent == agent)
+
+
+def test_rows_come_in_the_fixed_order() -> None:
+    agents = ["mine", "approximate", "zero", "equivariant", "standard", "base", "standard-matched"]
+    summary = summarize([of(0.5, agent=agent) for agent in agents])
+    assert summary.agents == [
+        "base",
+        "zero",
+        "standard",
+        "standard-matched",
+        "equivariant",
+        "approximate",
+        "mine",
+    ]
+    assert [r.agent for r in summary.tables[0].rows] == summary.agents
+
+
+def test_what_cannot_be_compared_is_in_different_tables() -> None:
+    demonstrations = {"mode": "diverse", "count": 20, "seed": 0}
+    runs = [
+        of(0.5),
+        of(0.5, variant="action_gain:0.5"),
+        of(0.5, embodiment="panda"),
+        of(0.5, task="PushCube-v1"),
+        of(0.5, env_steps=10_000),
+        of(0.5, demonstrations=demonstrations),
+    ]
+    assert len(summarize(runs).tables) == 6
+    keys = [table.key for table in summarize(runs[:3]).tables]
+    assert [(key.embodiment, key.variant) for key in keys] == [
+        ("floating", "none"),
+        ("floating", "action_gain:0.5"),
+        ("panda", "none"),
+    ]
+
+
+def test_seeds_and_machine_settings_do_not_split_a_row_but_hyperparameters_do() -> None:
+    config = make_record().config
+    assert recipe_of(config) == recipe_of(config | {"seed": 5, "device": "cuda", "policy_seed": 2})
+    nested = config | {"demonstrations": {"mode": "diverse", "count": 50, "seed": 9}}
+    assert recipe_of(config) == recipe_of(nested)
+    assert recipe_of(config) != config_hash(config)
+    runs = [of(0.5, seed=0), of(0.5, seed=1), of(0.6, seed=0, learning_rate=1e-3)]
+    rows = summarize(runs).tables[0].rows
+    assert [len(r.runs) for r in rows] in ([1, 2], [2, 1])
+    assert len({r.label for r in rows}) == 2
+    assert all(r.label.startswith("standard ") for r in rows)
+
+
+def test_the_difference_to_base_is_paired_by_policy_seed_and_episode() -> None:
+    base0, base1 = outcomes(0.4, 1), outcomes(0.2, 2)
+    runs = [
+        run(make_record([make_evaluation(base0)], agent="base", seed=0)),
+        run(make_record([make_evaluation(base1)], agent="base", seed=1)),
+        run(make_record([make_evaluation(base0)], agent="zero", seed=0)),
+        run(make_record([make_evaluation(base1)], agent="zero", seed=1)),
+        # Its base run has another seed, so it is compared with the mean of both base runs.
+        run(make_record([make_evaluation([1] * 100)], agent="equivariant", seed=7)),
+    ]
+    summary = summarize(runs)
+    zero = row(summary, "zero").difference
+    assert zero is not None
+    assert (zero.value, zero.low, zero.high) == (0.0, 0.0, 0.0)
+    assert zero.sign == 0
+    difference = row(summary, "equivariant").difference
+    expected = 1 - (np.mean(base0) + np.mean(base1)) / 2
+    assert difference is not None
+    assert difference.value == pytest.approx(expected)
+    assert row(summary, "base").difference is None
+
+
+def test_runs_on_another_base_policy_are_not_compared_with_it() -> None:
+    other = make_record(agent="base")
+    other.base_policy.content_hash = "f" * 64
+    assert base_success(of(0.5), [run(other)]) == {}
+    summary = summarize([run(other), of(0.5)])
+    assert row(summary, "standard").difference is None
+
+
+def test_episodes_on_other_seeds_are_not_compared() -> None:
+    base = make_record([make_evaluation([1, 0], first_seed=1)], agent="base")
+    summary = summarize([run(base), of(0.5)])
+    assert row(summary, "standard").difference is None
+
+
+def test_unfinished_and_missing_runs_are_kept_and_not_counted() -> None:
+    runs = [
+        of(0.4, agent="base", seed=0),
+        of(0.4, agent="base", seed=1),
+        of(0.6, seed=0),
+        run(make_record(status="failed", seed=1)),
+        run(make_record(status="interrupted", seed=2)),
+        of(0.7, agent="equivariant", variant="action_gain:0.5"),
+    ]
+    summary = summarize(runs)
+    standard = row(summary, "standard")
+    assert (len(standard.runs), len(standard.finished), standard.missing) == (3, 1, 0)
+    assert row(summary, "base").missing == 1
+    absent = row(summary, "equivariant")
+    assert absent.runs == []
+    assert absent.missing == 3
+    assert absent.success is None
+    assert row(summary, "standard", 1).missing == 1
+
+
+def test_curves_give_area_threshold_dip_and_window() -> None:
+    generator = np.random.default_rng(0)
+    base = [run(make_record([make_evaluation(outcomes(0.5, 3))], agent="base"))]
+    rates = [0.5, 0.05, 0.95, 0.95, 0.95, 0.95]
+    curve = make_curve(generator, rates)
+    summary = summarize([*base, run(make_record(curve))])
+    standard, table = row(summary, "standard"), summary.tables[0]
+    final = curve[-1].success_once
+    assert table.threshold == pytest.approx(0.8 * final)
+    assert standard.threshold_steps == [20_000]
+    expected = curve[1].success_once - np.mean(outcomes(0.5, 3))
+    assert standard.dip == pytest.approx(expected)
+    assert expected < -0.3
+    heights = [evaluation.success_once for evaluation in curve]
+    assert standard.area == pytest.approx((sum(heights) - (heights[0] + heights[-1]) / 2) / 5)
+    assert standard.window == pytest.approx(np.mean(heights[-2:]))
+    assert row(summary, "base").threshold_steps == []
+    assert row(summary, "base").dip is None
+
+
+def five(agent: str, rate: float, seeds: int = 5) -> list[Run]:
+    return [of(rate, agent=agent, seed=seed) for seed in range(seeds)]
+
+
+def test_ranks_have_ties_and_need_five_seeds() -> None:
+    runs = five("standard", 0.5) + five("equivariant", 0.52) + five("approximate", 0.9)
+    summary = summarize(runs + five("standard-matched", 0.95, seeds=4) + five("base", 0.99))
+    ranks = {r.agent: r.rank for r in summary.tables[0].rows}
+    assert ranks == {
+        "approximate": 1,
+        "standard": 2,
+        "equivariant": 2,
+        "standard-matched": None,
+        "base": None,
+    }
+    few = summarize(five("standard", 0.5, 4) + five("approximate", 0.9, 4))
+    assert not few.tables[0].is_ranked
+
+
+def test_a_second_attempt_replaces_the_first_in_plain_sight() -> None:
+    failed = run(make_record(status="failed"), "a.json")
+    old = of(0.5)
+    new = make_record([make_evaluation([1] * 10)])
+    new.started = START + timedelta(hours=1)
+    new.ended = START + timedelta(hours=2)
+    new.run_id = "again"
+    newest_failed = make_record(status="failed")
+    newest_failed.started = START + timedelta(hours=5)
+    newest_failed.ended = START + timedelta(hours=6)
+    copies = [failed, old, run(new, "n.json"), run(newest_failed, "f.json"), run(new, "copy.json")]
+    for seed in range(3):
+        random.Random(seed).shuffle(copies)
+        summary = summarize(copies)
+        chosen = row(summary, "standard").runs
+        assert [r.record.run_id for r in chosen] == ["again"]
+        assert len(summary.set_aside) == 3
+
+
+def test_folders_are_searched_for_records(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    write_record(make_record(), runs / "a" / "record.json")
+    write_record(make_record(seed=1), runs / "deep" / "b" / "record.json")
+    (runs / "a" / "config.json").write_text("{}")
+    assert len(load_runs([runs])) == 2
+    assert len(load_runs([runs, runs / "a", runs / "a" / "record.json"])) == 2
+    results = tmp_path / "results"
+    write_record(make_record(seed=2), results / "first.json")
+    write_record(make_record(seed=3), results / "suite" / "second.json")
+    assert len(load_runs([results])) == 2
+    (results / "notes.json").write_text("{}")
+    with pytest.raises(RecordError, match=r"notes\.json"):
+        load_runs([results])
+
+
+def test_nothing_to_read_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match="does not exist"):
+        load_runs([tmp_path / "nowhere"])
+    with pytest.raises(RecordError, match="holds no record"):
+        load_runs([tmp_path])
