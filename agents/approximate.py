@@ -1,0 +1,73 @@
+"""The approximately equivariant agent: a residual pathway prior (RPP, arXiv 2112.01388).
+
+Every layer is an equivariant map plus a plain map. The plain (free) path starts near zero and is
+penalised: loss + w_b |W_free|^2 + w_e |W_eq|^2 with w_b > w_e. At zero the agent is exactly the
+equivariant one; where the world breaks the symmetry, the data can pay for leaving it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import nn
+
+from agents.equivariant import EquivariantAgent
+from agents.networks import Dense, dense, shrink_
+from agents.replay import Batch
+
+
+class ResidualPathway(nn.Module):
+    """Sum of an equivariant layer and a plain one of the same shape."""
+
+    def __init__(self, equivariant: nn.Module, free_init: float):
+        super().__init__()
+        self.equivariant = equivariant
+        outputs, inputs = dense(equivariant)[0].shape
+        self.free = Dense(inputs, outputs)
+        shrink_(self.free, free_init)
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Weight ``[out, in]`` and bias ``[out]``."""
+        weight, bias = dense(self.equivariant)
+        return weight + self.free.weight, bias + self.free.bias
+
+
+class ApproximateAgent(EquivariantAgent):
+    """The equivariant agent with a penalised free path beside every layer."""
+
+    name = "approximate"
+
+    def actor_layers(self) -> list[nn.Module]:
+        return [ResidualPathway(layer, self.config.free_init) for layer in super().actor_layers()]
+
+    def critic_layers(self) -> list[nn.Module]:
+        return [ResidualPathway(layer, self.config.free_init) for layer in super().critic_layers()]
+
+    def parameter_groups(self, network: nn.Module) -> list[dict[str, Any]]:
+        # Adam adds weight_decay * W to the gradient: that of w |W|^2 for weight_decay = 2 w.
+        free, equivariant = paths(network)
+        return [
+            {"params": free, "weight_decay": 2 * self.config.free_penalty},
+            {"params": equivariant, "weight_decay": 2 * self.config.equivariant_penalty},
+        ]
+
+    def update(self, batch: Batch) -> dict[str, torch.Tensor]:
+        scalars = super().update(batch)
+        for name, network in (("actor", self.actor), ("critic", self.critic)):
+            free, equivariant = (
+                torch.stack(torch._foreach_norm([p.detach() for p in path])).norm()
+                for path in paths(network)
+            )
+            scalars[f"train/free_path_{name}"] = free / equivariant
+        return scalars
+
+
+def paths(network: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """Parameters of the free and of the equivariant path."""
+    free, equivariant = [], []
+    for module in network.modules():
+        if isinstance(module, ResidualPathway):
+            free += list(module.free.parameters())
+            equivariant += list(module.equivariant.parameters())
+    return free, equivariant

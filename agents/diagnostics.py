@@ -1,0 +1,232 @@
+"""Is the critic right, and does the agent keep its symmetry? Every scalar with its formula.
+
+All values are in the environment's reward units, per decision. ``q`` arrays hold all critics,
+``[critics, B]``, as :meth:`agents.sac.SacAgent.q_values` returns them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from agents.sac import SacAgent
+from policies.errors import UserError
+from policies.geometry import Group
+
+Scalars = dict[str, float]
+
+
+def bound_violation(q: torch.Tensor, low: float, high: float) -> Scalars:
+    """How many values no return can explain.
+
+    - ``violation_share`` = mean over critics and states of [Q < low or Q > high or Q not finite],
+      with the interval of :func:`agents.sac.feasible_q`;
+    - ``max_abs_q`` = max |Q|; ``q_min``, ``q_mean``, ``q_max``;
+    - ``finite`` = 1 if every value is finite, else 0.
+
+    Args:
+        q: any shape.
+    """
+    finite = torch.isfinite(q)
+    outside = ~finite | (q < low) | (q > high)
+    return {
+        "violation_share": outside.double().mean().item(),
+        "max_abs_q": q.abs().max().item(),
+        "q_min": q.min().item(),
+        "q_mean": q.mean().item(),
+        "q_max": q.max().item(),
+        "finite": float(finite.all()),
+    }
+
+
+def diverged(
+    violation_shares: Sequence[float],
+    finite: Sequence[float] | None = None,
+    threshold: float = 0.05,
+    consecutive: int = 3,
+) -> bool:
+    """The project's rule: violation above 5 % at 3 consecutive evaluations, or anything non-finite.
+
+    Args:
+        violation_shares: one number per evaluation, in order.
+        finite: the ``finite`` flags of the same evaluations.
+    """
+    if not all(math.isfinite(share) for share in violation_shares):
+        return True
+    if finite is not None and not all(finite):
+        return True
+    run = 0
+    for share in violation_shares:
+        run = run + 1 if share > threshold else 0
+        if run >= consecutive:
+            return True
+    return False
+
+
+def q_bias(
+    q: torch.Tensor,
+    reward: torch.Tensor,
+    terminal: torch.Tensor,
+    truncated: torch.Tensor,
+    gamma: float,
+    tail: tuple[float, float],
+    log_prob: torch.Tensor | None = None,
+    alpha: float = 0.0,
+    tail_tolerance: float = 0.05,
+) -> Scalars:
+    """Bias of Q against fresh on-policy returns (REDQ's measure, arXiv 2101.05982).
+
+    With d = terminal, the returns are
+
+        hard:  G(t) = r(t) + gamma (1 - d(t)) G(t+1)
+        soft:  G(t) = r(t) + gamma (1 - d(t)) (G(t+1) - alpha log pi(t+1)).
+
+    The critics bootstrap through time-outs, so the return of an episode that was cut k decisions
+    after state t lacks ``gamma^k`` times an unknown tail. Nothing is guessed in its place:
+
+    - states with ``gamma^k <= tail_tolerance`` (terminated episodes: 0) are *covered*; their tail
+      is taken at the middle of ``tail``. ``bias_mean``, ``bias_std`` = mean and standard deviation
+      of Q - G over covered states, ``bias_normalized``, ``bias_std_normalized`` = both divided by
+      |mean G|; ``covered_share`` = their share. Covered states lean towards successful episodes:
+      read the share beside the bias.
+    - over *all* states ``bias_low`` = mean(Q - G with the highest tail) and ``bias_high`` = mean(Q
+      - G with the lowest tail) enclose the mean hard bias, whatever the tail is.
+
+    ``soft_bias_mean`` and ``soft_bias_std`` repeat the first two with the soft return, if
+    ``log_prob`` is given. Missing figures (nothing covered) are NaN.
+
+    Args:
+        q: mean or any one critic's value of the played noise, ``[T, N]``.
+        reward, terminal, truncated, log_prob: per decision, ``[T, N]``; ``terminal`` by success,
+            ``truncated`` by time-out. What follows an episode's end in a column is the next
+            episode; the last row cuts whatever still runs there.
+        gamma, alpha: discount and entropy weight.
+        tail: smallest and largest value that a state can have, e.g. ``feasible_q(gamma, None)``.
+        tail_tolerance: largest weight of the unknown tail in a covered state.
+
+    Raises:
+        UserError: if the shapes differ.
+    """
+    shapes = {tuple(x.shape) for x in (q, reward, terminal, truncated)}
+    if len(shapes) != 1 or q.ndim != 2:
+        raise UserError(f"Q bias needs arrays of one shape [decisions, environments], not {shapes}")
+    q, reward = q.double(), reward.double()
+    ends = terminal.bool()
+    cut = truncated.bool() & ~ends
+    cut[-1] |= ~ends[-1]
+    bonus = torch.zeros_like(q) if log_prob is None else -alpha * log_prob.double()
+
+    hard, soft, weight = (torch.empty_like(q) for _ in range(3))
+    next_hard, next_soft, next_weight = (torch.zeros_like(q[0]) for _ in range(3))
+    next_bonus = torch.zeros_like(q[0])
+    for t in reversed(range(len(q))):
+        goes_on = (~ends[t] & ~cut[t]).double()
+        hard[t] = reward[t] + gamma * goes_on * next_hard
+        soft[t] = reward[t] + gamma * goes_on * (next_soft + next_bonus)
+        # Discount with which the unknown value after the cut enters G(t).
+        weight[t] = gamma * torch.where(cut[t], 1.0, goes_on * next_weight)
+        next_hard, next_soft, next_weight, next_bonus = hard[t], soft[t], weight[t], bonus[t]
+
+    low, high = tail
+    covered = weight <= tail_tolerance
+    middle = weight * (low + high) / 2
+
+    def spread(gap: torch.Tensor) -> tuple[float, float]:
+        if not covered.any():
+            return math.nan, math.nan
+        return gap[covered].mean().item(), gap[covered].std(unbiased=False).item()
+
+    mean, std = spread(q - hard - middle)
+    scale = abs((hard + middle)[covered].mean().item()) if covered.any() else math.nan
+    scale = scale if scale > 0 else math.nan
+    scalars = {
+        "bias_mean": mean,
+        "bias_std": std,
+        "bias_normalized": mean / scale,
+        "bias_std_normalized": std / scale,
+        "covered_share": covered.double().mean().item(),
+        "bias_low": (q - hard - weight * high).mean().item(),
+        "bias_high": (q - hard - weight * low).mean().item(),
+        "return_mean": hard.mean().item(),
+    }
+    if log_prob is not None:
+        scalars["soft_bias_mean"], scalars["soft_bias_std"] = spread(q - soft - middle)
+    return scalars
+
+
+def critic_preference(agent: SacAgent, obs: torch.Tensor, generator: torch.Generator) -> Scalars:
+    """How much better than the base the critic believes the actor to be.
+
+    ``critic_preference`` = mean over states and critics of Q(s, deterministic actor) - Q(s, w),
+    w ~ N(0, I). Set it beside the true gap in return; a belief without a gap is exploitation.
+
+    Args:
+        obs: ``[B, obs_dim]``.
+        generator: draws the random noise, on the agent's device.
+    """
+    own = agent.act(obs, deterministic=True)
+    random = torch.randn(own.shape, generator=generator, device=own.device, dtype=own.dtype)
+    gap = agent.q_values(obs, own) - agent.q_values(obs, random)
+    return {"critic_preference": gap.mean().item()}
+
+
+def policy_statistics(agent: SacAgent, obs: torch.Tensor) -> Scalars:
+    """Where the stochastic policy stands.
+
+    - ``alpha`` = exp(log alpha); ``entropy`` = mean of -log pi(w|s) over one draw per state;
+    - ``noise_norm`` = mean ||w||; ``mode_norm`` = mean ||deterministic w||;
+    - ``saturated_share`` = share of irrep blocks of drawn w with norm > 0.95 bound.
+    """
+    noise, log_prob = agent.sample(obs)
+    mode = agent.act(obs, deterministic=True)
+    return {
+        "alpha": agent.log_alpha.detach().exp().item(),
+        "entropy": -log_prob.mean().item(),
+        "noise_norm": noise.flatten(1).norm(dim=1).mean().item(),
+        "mode_norm": mode.flatten(1).norm(dim=1).mean().item(),
+        "saturated_share": agent.distribution.saturated(noise.flatten(1)).double().mean().item(),
+    }
+
+
+@torch.no_grad()
+def orbit_variance(
+    agent: SacAgent, obs: torch.Tensor, noise: torch.Tensor, group: Group
+) -> Scalars:
+    """Zero for invariant critics, a dial for approximate ones.
+
+    - ``orbit_variance`` = mean over states and critics of Var_g Q(gs, gw), g over the group;
+    - ``orbit_share`` = that divided by the variance of Q over the whole orbit-extended batch.
+
+    Args:
+        obs, noise: ``[B, obs_dim]``, ``[B, Tp, Da]``.
+    """
+    q = torch.stack(
+        [
+            agent.q_values(
+                agent.obs_layout.transform(obs, angle, reflect),
+                agent.act_layout.transform(noise, angle, reflect),
+            )
+            for angle, reflect in group.elements
+        ]
+    ).double()
+    within = q.var(dim=0, unbiased=False).mean().item()
+    total = q.transpose(0, 1).flatten(1).var(dim=1, unbiased=False).mean().item()
+    return {"orbit_variance": within, "orbit_share": within / total if total > 0 else 0.0}
+
+
+@torch.no_grad()
+def equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -> Scalars:
+    """Relative error of the deterministic actor under the group.
+
+    ``actor_equivariance_error`` = max over g of rms_s ||mu(gs) - g mu(s)|| / rms_s ||mu(s)||.
+    """
+    own = agent.act(obs, deterministic=True)
+    size = own.double().square().mean().sqrt()
+    worst = 0.0
+    for angle, reflect in group.elements:
+        moved = agent.act(agent.obs_layout.transform(obs, angle, reflect), deterministic=True)
+        gap = moved.double() - agent.act_layout.transform(own.double(), angle, reflect)
+        worst = max(worst, (gap.square().mean().sqrt() / size.clamp(min=1e-30)).item())
+    return {"actor_equivariance_error": worst}

@@ -1,0 +1,128 @@
+"""A Gaussian squashed into balls, one per irrep block, that commutes with the group.
+
+Noise ``w`` splits into irrep blocks (scalars and planar vectors). Each block is
+
+    u = mean + scale * eps,   eps ~ N(0, I),   one scale per block,
+    w = bound * tanh(|u|) * u / |u|,
+
+so a rotation of ``mean`` and ``eps`` rotates ``w``, and the density is invariant. A tanh for each
+number by itself would pin the axes: it commutes with quarter turns only. On scalars the two
+agree. The change of volume of one block is
+
+    log |dw/du| = size * log(bound) + log sech^2(|u|) + (size - 1) * log(tanh(|u|) / |u|).
+
+Squashed Gaussians: Haarnoja et al., arXiv 1812.05905, appendix C; the radial form is ours.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from policies.errors import UserError
+from policies.geometry import Layout
+
+# Below this |u|^2 the functions of |u| are evaluated by their power series, whose first dropped
+# terms are below float64's resolution there; it also keeps sqrt's gradient away from zero.
+SMALL = 1e-4
+
+
+class SquashedGaussian(nn.Module):
+    """The distribution family of one noise layout; parameters come with every call.
+
+    Args:
+        layout: geometry of the flattened noise, ``dim`` numbers in ``blocks`` irrep blocks.
+        bound: largest norm of a block, > 0.
+
+    Raises:
+        UserError: if the bound is not positive.
+    """
+
+    index: torch.Tensor
+    sizes: torch.Tensor
+    membership: torch.Tensor
+
+    def __init__(self, layout: Layout, bound: float):
+        super().__init__()
+        if not bound > 0:
+            raise UserError(f"the noise bound must be positive, not {bound}")
+        self.layout, self.bound = layout, bound
+        self.dim, self.blocks = layout.dim, len(layout.blocks)
+        membership = F.one_hot(layout.block_index, self.blocks).to(torch.get_default_dtype())
+        self.register_buffer("index", layout.block_index.clone(), persistent=False)
+        self.register_buffer("membership", membership, persistent=False)  # [dim, blocks]
+        self.register_buffer("sizes", membership.sum(0), persistent=False)
+
+    def sample(
+        self, mean: torch.Tensor, log_scale: torch.Tensor, eps: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Reparametrised sample and its log-density.
+
+        Args:
+            mean: ``[..., dim]``.
+            log_scale: ``[..., blocks]``.
+            eps: standard normal numbers, ``[..., dim]``.
+
+        Returns:
+            Noise ``[..., dim]`` and log-probability ``[...]``, both differentiable.
+        """
+        u = mean + self._spread(log_scale.exp()) * eps
+        noise, log_volume = self._squash(u)
+        return noise, self._gaussian(eps, log_scale) - log_volume
+
+    def mode(self, mean: torch.Tensor) -> torch.Tensor:
+        """The squashed mean, ``[..., dim]``: what a deterministic policy plays."""
+        return self._squash(mean)[0]
+
+    def log_prob(
+        self, mean: torch.Tensor, log_scale: torch.Tensor, noise: torch.Tensor
+    ) -> torch.Tensor:
+        """Log-density ``[...]`` of given noise; blocks on or beyond the bound count as on it."""
+        q2 = noise.square() @ self.membership / self.bound**2
+        small = q2 < SMALL
+        limit = 1 - 4 * torch.finfo(noise.dtype).eps
+        q = torch.where(small, 0.5, q2).sqrt().clamp(max=limit)
+        series = 1 + q2 * (1 / 3 + q2 * (1 / 5 + q2 / 7))
+        stretch = torch.where(small, series, torch.atanh(q) / q)
+        # A block beyond the bound is first brought back to it.
+        inside = torch.where(small, 1.0, q / q2.clamp(min=SMALL).sqrt())
+        u = noise / self.bound * self._spread(stretch * inside)
+        eps = (u - mean) / self._spread(log_scale.exp())
+        return self._gaussian(eps, log_scale) - self._squash(u)[1]
+
+    def saturated(self, noise: torch.Tensor, share: float = 0.95) -> torch.Tensor:
+        """Which blocks' norms exceed ``share`` of the bound, ``[..., blocks]`` bool."""
+        return noise.square() @ self.membership > (share * self.bound) ** 2
+
+    @property
+    def log_volume(self) -> float:
+        """Log-volume of the support: the largest entropy that any policy can have."""
+        size_one = math.log(2 * self.bound)
+        size_two = math.log(math.pi * self.bound**2)
+        return sum(size_one if size == 1 else size_two for size in self.sizes.tolist())
+
+    def _spread(self, per_block: torch.Tensor) -> torch.Tensor:
+        """``[..., blocks]`` to ``[..., dim]``: each number gets its block's value."""
+        return per_block.index_select(-1, self.index)
+
+    def _gaussian(self, eps: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
+        """Log-density of ``u`` under the unsquashed Gaussian, ``[...]``."""
+        constant = 0.5 * self.dim * math.log(2 * math.pi)
+        return -0.5 * eps.square().sum(-1) - log_scale @ self.sizes - constant
+
+    def _squash(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """``w = bound tanh(|u|) u/|u|`` per block and the summed log-determinant."""
+        r2 = u.square() @ self.membership
+        small = r2 < SMALL
+        r = torch.where(small, 1.0, r2).sqrt()
+        ratio_series = 1 - r2 * (1 / 3 - r2 * (2 / 15 - r2 * 17 / 315))
+        ratio = torch.where(small, ratio_series, r.tanh() / r)
+        # sech^2 = 4 / (e^r + e^-r)^2, written so that large radii neither overflow nor give log 0.
+        far = 2 * (math.log(2) - r - F.softplus(-2 * r))
+        log_sech2 = torch.where(small, -r2 * (1 - r2 * (1 / 6 - r2 * 2 / 45)), far)
+        log_volume = (log_sech2 + (self.sizes - 1) * ratio.log()).sum(-1)
+        noise = self.bound * u * self._spread(ratio)
+        return noise, log_volume + self.dim * math.log(self.bound)

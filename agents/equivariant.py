@@ -1,0 +1,76 @@
+"""The equivariant agent: every linear map commutes with the group, so the policy turns with the
+scene and the critics do not notice that it turned.
+
+Actor: lift, group convolutions, projection to the chunk's irreps (means) and to one scalar per
+irrep block (scales). Critics: the same trunk over observation and noise, pooled over the group
+axis. Both ends are one :class:`Pool`: onto a scalar it is exactly that pooling.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+from agents.networks import shrink_
+from agents.sac import SacAgent, SacConfig
+from policies.equivariant import Lift, Project, RegularLinear
+from policies.geometry import Field, Group, Layout
+
+VALUE = Layout([Field("value", 0)])
+
+
+class Pool(Project):
+    """``Project`` as a sum over the group instead of a mean: y = sum_g rho(g) W f(g) + b.
+
+    Adam moves every parameter by about ``lr``, whatever its gradient's size. The mean divides
+    that by |G| in the dense matrix, and the output would learn |G| times slower than a plain
+    layer's. With the sum, and the plain layer's bound for |G| * channels inputs at the start,
+    equivariant and plain layers move alike.
+    """
+
+    def __init__(self, group: Group, channels: int, layout: Layout):
+        super().__init__(group, channels, layout)
+        with torch.no_grad():
+            self.weight.div_(math.sqrt(group.order))
+            self.bias.div_(math.sqrt(group.order))
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = super().dense()
+        return weight * self.group.order, bias
+
+
+class EquivariantAgent(SacAgent):
+    """Equivariant actor, invariant critics, exact for every element of ``config.group``."""
+
+    name = "equivariant"
+
+    def actor_layers(self) -> list[nn.Module]:
+        return equivariant_actor_layers(self)
+
+    def critic_layers(self) -> list[nn.Module]:
+        return equivariant_critic_layers(self)
+
+
+def equivariant_actor_layers(agent: SacAgent) -> list[nn.Module]:
+    """From observation to means and scales; the output layer starts small."""
+    layers = equivariant_layers(agent.obs_layout, agent.actor_layout, agent.config)
+    shrink_(layers[-1], agent.config.initial_output)
+    return layers
+
+
+def equivariant_critic_layers(agent: SacAgent) -> list[nn.Module]:
+    """From observation and noise to an invariant value."""
+    return equivariant_layers(agent.critic_layout, VALUE, agent.config)
+
+
+def equivariant_layers(inputs: Layout, outputs: Layout, config: SacConfig) -> list[nn.Module]:
+    """``depth`` hidden layers of width/|G| regular fields and an output layer."""
+    group = Group.parse(config.group)
+    fields = max(1, round(config.width / group.order))
+    return [
+        Lift(inputs, group, fields),
+        *[RegularLinear(group, fields, fields) for _ in range(config.depth - 1)],
+        Pool(group, fields, outputs),
+    ]

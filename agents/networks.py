@@ -1,0 +1,99 @@
+"""The one network shape of every agent: a stack of multilayer perceptrons.
+
+What distinguishes the agents is where the matrices come from. A layer is any module with
+``dense() -> (weight [out, in], bias [out])``: an ordinary linear layer, an equivariant layer
+expanded to its dense matrix, or the sum of both. The product is then the same for all, and the
+members of an ensemble share it (one batched product instead of one per critic).
+
+The nonlinearity is LayerNorm (optional, without parameters of its own) followed by ReLU. Both
+commute with permutations of the features, so regular fields stay regular fields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, cast
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+# Per layer the matrices [members, out, in] and biases [members, 1, out].
+Weights = list[tuple[torch.Tensor, torch.Tensor]]
+
+
+class DenseLayer(Protocol):
+    """A linear layer that can give itself as one matrix."""
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Weight ``[out, in]`` and bias ``[out]``."""
+        ...
+
+
+class Dense(nn.Linear):
+    """An ordinary linear layer."""
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.weight, self.bias
+
+
+class Ensemble(nn.Module):
+    """``members`` perceptrons of equal shape, evaluated together.
+
+    Args:
+        members: for each member its layers, first to last.
+        layer_norm: whether hidden features are normalised.
+
+    ``width`` is the number of features of the first hidden layer.
+    """
+
+    def __init__(self, members: Sequence[Sequence[nn.Module]], layer_norm: bool):
+        super().__init__()
+        self.width = len(dense(members[0][0])[1])
+        self.members = nn.ModuleList([nn.ModuleList(layers) for layers in members])
+        self.layer_norm = layer_norm
+
+    def weights(self) -> Weights:
+        """The dense matrices of every layer; differentiable with respect to the parameters."""
+        stacked = []
+        for layers in zip(*self.members, strict=True):
+            matrices, biases = zip(*(dense(layer) for layer in layers), strict=True)
+            stacked.append((torch.stack(matrices), torch.stack(biases).unsqueeze(1)))
+        return stacked
+
+    def apply_weights(self, weights: Weights, x: torch.Tensor) -> torch.Tensor:
+        """Evaluate given matrices: ``[B, in] -> [members, B, out]``."""
+        out = x.expand(len(weights[0][0]), *x.shape)
+        for index, (matrix, bias) in enumerate(weights):
+            if index > 0:
+                if self.layer_norm:
+                    out = F.layer_norm(out, out.shape[-1:])
+                out = F.relu(out, inplace=True)
+            out = torch.baddbmm(bias, out, matrix.mT)
+        return out
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """``[B, in] -> [members, B, out]``."""
+        return self.apply_weights(self.weights(), x)
+
+
+def dense(layer: nn.Module) -> tuple[torch.Tensor, torch.Tensor]:
+    """A layer's matrix ``[out, in]`` and bias ``[out]``."""
+    return cast(DenseLayer, layer).dense()
+
+
+def detached(weights: Weights) -> Weights:
+    """The same matrices without gradient."""
+    return [(matrix.detach(), bias.detach()) for matrix, bias in weights]
+
+
+def shrink_(layer: nn.Module, factor: float) -> None:
+    """Scale all parameters of a layer, in place: a small output at initialisation."""
+    with torch.no_grad():
+        for parameter in layer.parameters():
+            parameter.mul_(factor)
+
+
+def count(module: nn.Module) -> int:
+    """Number of trainable numbers."""
+    return sum(parameter.numel() for parameter in module.parameters())

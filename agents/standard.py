@@ -1,0 +1,74 @@
+"""The plain agent: ordinary perceptrons, which know nothing of the symmetry (DSRL's choice)."""
+
+from __future__ import annotations
+
+import itertools
+
+from torch import nn
+
+from agents.equivariant import equivariant_actor_layers, equivariant_critic_layers
+from agents.networks import Dense, count, shrink_
+from agents.sac import SacAgent
+
+
+class StandardAgent(SacAgent):
+    """Plain actor, plain critics."""
+
+    name = "standard"
+
+    def actor_layers(self) -> list[nn.Module]:
+        layers = plain_layers(
+            self.obs_layout.dim, self.actor_width(), self.config.depth, self.actor_layout.dim
+        )
+        shrink_(layers[-1], self.config.initial_output)
+        return layers
+
+    def critic_layers(self) -> list[nn.Module]:
+        return plain_layers(self.critic_layout.dim, self.critic_width(), self.config.depth, 1)
+
+    def actor_width(self) -> int:
+        """Hidden features of the actor."""
+        return self.config.width
+
+    def critic_width(self) -> int:
+        """Hidden features of each critic."""
+        return self.config.width
+
+
+class MatchedStandardAgent(StandardAgent):
+    """The plain agent with as many parameters as the equivariant one of the same configuration.
+
+    At equal width plain hidden layers have |G| times the parameters of equivariant ones, so this
+    rival separates symmetry from size. Actor and critics are matched each by itself.
+    """
+
+    name = "standard-matched"
+
+    def actor_width(self) -> int:
+        rival = nn.ModuleList(equivariant_actor_layers(self))
+        return matched_width(
+            count(rival), self.obs_layout.dim, self.config.depth, self.actor_layout.dim
+        )
+
+    def critic_width(self) -> int:
+        rival = nn.ModuleList(equivariant_critic_layers(self))
+        return matched_width(count(rival), self.critic_layout.dim, self.config.depth, 1)
+
+
+def plain_layers(inputs: int, width: int, depth: int, outputs: int) -> list[nn.Module]:
+    """``depth`` hidden layers of ``width`` and an output layer."""
+    sizes = [inputs, *[width] * depth, outputs]
+    return [Dense(a, b) for a, b in itertools.pairwise(sizes)]
+
+
+def matched_width(parameters: int, inputs: int, depth: int, outputs: int) -> int:
+    """The width at which ``plain_layers`` comes closest to a number of parameters."""
+
+    def size(width: int) -> int:
+        hidden = (depth - 1) * (width + 1) * width
+        return (inputs + 1) * width + hidden + (width + 1) * outputs
+
+    width = 1
+    while size(width + 1) <= parameters:
+        width += 1
+    return min(width, width + 1, key=lambda w: abs(size(w) - parameters))

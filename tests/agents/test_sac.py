@@ -1,0 +1,375 @@
+"""The learner: targets by hand, temperature, determinism, saving, and real learning."""
+
+import copy
+import dataclasses
+import io
+
+import pytest
+import torch
+
+from agents import AGENTS, ReplayBuffer, SacConfig
+from agents.approximate import paths
+from agents.diagnostics import equivariance_error
+from agents.networks import count
+from agents.sac import entropy_allowance, feasible_q
+from policies.errors import UserError
+from policies.geometry import Field, Group, Layout
+
+LEARNERS = ["standard", "standard-matched", "equivariant", "approximate"]
+SAC = ["standard", "equivariant", "approximate"]
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_update_moves_every_parameter_and_stays_finite(problem, name):
+    agent = problem.agent(name)
+    before = {
+        key: [p.detach().clone() for p in getattr(agent, key).parameters()]
+        for key in ("actor", "critic", "target")
+    }
+    for seed in range(3):
+        scalars = agent.update(problem.batch(seed=seed))
+        assert all(torch.isfinite(value) for value in scalars.values()), scalars
+    for key, old in before.items():
+        moved = [
+            not torch.equal(a, b)
+            for a, b in zip(old, getattr(agent, key).parameters(), strict=True)
+        ]
+        assert all(moved), (key, moved)
+    assert agent.updates == 3
+
+
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("terminal", [0.0, 1.0])
+def test_critic_target_is_the_hand_computed_one(problem, terminal, soft):
+    agent = problem.agent("standard", dtype=torch.float64, soft_backup=soft, initial_alpha=0.3)
+    batch = problem.batch(dtype=torch.float64, terminal=terminal)
+    for seed in range(3):  # so that target and online critics differ
+        agent.update(problem.batch(seed=10 + seed, dtype=torch.float64))
+    with torch.no_grad():
+        mean, log_scale = agent.moments(batch.next_obs)
+        generator = copy.deepcopy(agent.generator)
+        eps = torch.randn(mean.shape, generator=generator, dtype=torch.float64)
+        noise, log_prob = agent.distribution.sample(mean, log_scale, eps)
+        target_q = agent.target(torch.cat([batch.next_obs, noise], 1))[..., 0]
+        value = torch.minimum(target_q[0], target_q[1])
+        if soft:
+            value = value - agent.log_alpha.exp() * log_prob
+        wanted = batch.reward if terminal else batch.reward + 0.95 * value
+        q = agent.q_values(batch.obs, batch.noise)
+        expected = (q[0] - wanted).square().mean() + (q[1] - wanted).square().mean()
+    scalars = agent.update(batch)
+    assert scalars["losses/critic"].item() == pytest.approx(expected.item(), rel=1e-12)
+    assert scalars["train/target_mean"].item() == pytest.approx(wanted.mean().item(), rel=1e-12)
+
+
+def test_time_outs_bootstrap_and_success_does_not(problem):
+    def target(terminal):
+        agent = problem.agent("standard")
+        return agent.update(problem.batch(terminal=terminal))["train/target_mean"].item()
+
+    assert target(1.0) == pytest.approx(problem.batch().reward.mean().item(), abs=1e-6)
+    assert abs(target(0.0) - target(1.0)) > 1e-3
+
+
+def test_target_critics_follow_by_tau(problem):
+    agent = problem.agent("equivariant", tau=0.25)
+    old = [p.clone() for p in agent.target.parameters()]
+    agent.update(problem.batch())
+    for before, target, online in zip(
+        old, agent.target.parameters(), agent.critic.parameters(), strict=True
+    ):
+        assert torch.allclose(target, 0.75 * before + 0.25 * online, atol=1e-6)
+        assert not target.requires_grad
+
+
+def test_actor_step_leaves_the_critics_alone_and_climbs_q(problem):
+    agent = problem.agent("standard", initial_alpha=1e-6)
+    obs = problem.batch(256).obs
+
+    def value():
+        return agent.q_values(obs, agent.act(obs, deterministic=True)).amin(0).mean().item()
+
+    agent.critic_optimizer.param_groups[0]["lr"] = 0.0
+    frozen = [p.clone() for p in agent.critic.parameters()]
+    before = value()
+    for seed in range(30):
+        agent.update(problem.batch(seed=seed))
+    assert all(torch.equal(a, b) for a, b in zip(frozen, agent.critic.parameters(), strict=True))
+    assert value() > before + 1e-3
+
+
+@pytest.mark.parametrize(("wanted", "sign"), [(100.0, 1), (-100.0, -1)])
+def test_alpha_moves_towards_the_target_entropy(problem, wanted, sign):
+    agent = problem.agent("equivariant", target_entropy=wanted)
+    before = agent.log_alpha.item()
+    entropy = agent.update(problem.batch())["train/entropy"].item()
+    assert (wanted - entropy) * sign > 0
+    assert (agent.log_alpha.item() - before) * sign > 0
+
+
+def test_default_target_entropy_is_minus_half_the_noise(problem):
+    dim = problem.horizon * problem.act_layout.dim
+    assert problem.agent("standard").target_entropy == -dim / 2
+    assert problem.agent("standard", target_entropy=3.0).target_entropy == 3.0
+
+
+def test_reward_scale_leaves_reported_values_in_reward_units(problem):
+    batch = problem.batch(terminal=1.0)
+    plain = problem.agent("standard").update(batch)
+    scaled = problem.agent("standard", reward_scale=10.0).update(batch)
+    assert scaled["train/target_mean"].item() == pytest.approx(
+        plain["train/target_mean"].item(), rel=1e-5
+    )
+
+
+def parameters(agent):
+    parts = (agent.actor, agent.critic, agent.target)
+    return [p.detach() for part in parts for p in part.parameters()] + [agent.log_alpha.detach()]
+
+
+def same(a, b):
+    return all(torch.equal(x, y) for x, y in zip(parameters(a), parameters(b), strict=True))
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_same_seed_same_agent(problem, name):
+    def run(seed):
+        torch.randn(seed + 3)  # the global generator must not matter
+        agent, replay = problem.agent(name, seed=seed), problem.replay()
+        for _ in range(5):
+            agent.update(replay.sample(32))
+        return agent, agent.act(problem.batch().obs)
+
+    (first, noise), (second, again), (other, _) = run(0), run(0), run(1)
+    assert same(first, second)
+    assert torch.equal(noise, again)
+    assert not same(first, other)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_saved_agent_continues_bit_equal(problem, name):
+    agent, replay = problem.agent(name), problem.replay()
+    for _ in range(4):
+        agent.update(replay.sample(32))
+    file = io.BytesIO()
+    torch.save({"agent": agent.state_dict(), "replay": replay.state_dict()}, file)
+
+    def go_on(agent, replay):
+        scalars = [agent.update(replay.sample(32)) for _ in range(4)]
+        return scalars[-1], agent.act(problem.batch().obs)
+
+    scalars, noise = go_on(agent, replay)
+    file.seek(0)
+    saved = torch.load(file, weights_only=True)
+    agent_again, replay_again = problem.agent(name, seed=77), problem.replay(seed=78)
+    agent_again.act(problem.batch().obs)  # expanded weights must not survive the loading
+    agent_again.load_state_dict(saved["agent"])
+    replay_again.load_state_dict(saved["replay"])
+    scalars_again, noise_again = go_on(agent_again, replay_again)
+    assert same(agent, agent_again)
+    assert torch.equal(noise, noise_again)
+    assert scalars == scalars_again
+    assert agent_again.updates == 8
+
+
+def test_acting_uses_the_newest_weights(problem):
+    agent, obs = problem.agent("equivariant"), problem.batch().obs
+    before = agent.act(obs, deterministic=True)
+    assert torch.equal(before, agent.act(obs, deterministic=True))
+    agent.update(problem.batch())
+    assert not torch.equal(before, agent.act(obs, deterministic=True))
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"name": "standard"}, "agent"),
+        ({"width": 64}, "width"),
+        ({"group": "C4"}, "group"),
+        ({"problem": {"horizon": 4}}, "horizon"),
+        ({"problem": {"obs_layout": Layout([Field("xy", 1)])}}, "obs_layout"),
+    ],
+)
+def test_a_checkpoint_of_another_agent_is_refused(problem, change, word):
+    state = problem.agent("equivariant").state_dict()
+    change = dict(change)
+    other = dataclasses.replace(problem, **change.pop("problem", {}))
+    agent = other.agent(change.pop("name", "equivariant"), **change)
+    with pytest.raises(UserError, match=word):
+        agent.load_state_dict(state)
+
+
+def test_ensemble_is_its_members_one_by_one(problem):
+    agent = problem.agent("equivariant", dtype=torch.float64)
+    x = torch.randn(5, agent.critic_layout.dim, dtype=torch.float64)
+    for member, value in zip(agent.critic.members, agent.critic(x), strict=True):
+        lift, hidden, pool = member
+        out = lift(x)
+        out = torch.nn.functional.layer_norm(out, out.shape[-2:]).relu()
+        out = hidden(out)
+        out = torch.nn.functional.layer_norm(out, out.shape[-2:]).relu()
+        assert torch.allclose(pool(out), value, atol=1e-12)
+
+
+def test_free_penalty_is_the_gradient_of_the_squared_norm(problem):
+    penalised = problem.agent("approximate", free_penalty=0.5, equivariant_penalty=0.1)
+    by_hand = problem.agent("approximate", free_penalty=0.0)
+    for network in (by_hand.actor, by_hand.critic):
+        free, equivariant = paths(network)
+        for weight, path in ((0.5, free), (0.1, equivariant)):
+            for p in path:
+                p.register_hook(lambda grad, p=p, weight=weight: grad + 2 * weight * p.detach())
+    for seed in range(3):
+        penalised.update(problem.batch(seed=seed))
+        by_hand.update(problem.batch(seed=seed))
+    for a, b in zip(parameters(penalised), parameters(by_hand), strict=True):
+        assert torch.allclose(a, b, atol=1e-6)
+
+
+@pytest.mark.parametrize("group", ["C8", "C4", "D4"])
+@pytest.mark.parametrize("width", [128, 256])
+def test_matched_agent_has_the_equivariant_ones_size(problem, group, width):
+    equivariant = problem.agent("equivariant", group=group, width=width).parameter_counts()
+    matched = problem.agent("standard-matched", group=group, width=width).parameter_counts()
+    plain = problem.agent("standard", group=group, width=width).parameter_counts()
+    for key in ("actor", "critic", "total"):
+        assert matched[key] == pytest.approx(equivariant[key], rel=0.02)
+    assert plain["total"] > 2 * equivariant["total"]
+    assert matched["actor_width"] < plain["actor_width"] == width
+
+
+def test_parameter_counts_are_those_of_the_modules(problem):
+    agent = problem.agent("approximate")
+    counts = agent.parameter_counts()
+    assert counts["actor"] == count(agent.actor)
+    assert counts["critic"] == count(agent.critic) == sum(map(count, agent.critic.members))
+    assert counts["total"] == counts["actor"] + counts["critic"]
+
+
+def test_escnn_counts_the_same_parameters(problem):
+    """The equivariant critic has as many free numbers as escnn's basis for the same types."""
+    import escnn.nn
+    from escnn import gspaces
+
+    agent = problem.agent("equivariant", width=64)
+    space = gspaces.no_base_space(agent_group := Group.parse("C8").escnn_group(2))
+    hidden = escnn.nn.FieldType(space, [agent_group.regular_representation] * 8)
+    value = escnn.nn.FieldType(space, [agent_group.trivial_representation])
+    inputs = agent.critic_layout.field_type(Group.parse("C8"))
+    theirs = [
+        escnn.nn.Linear(inputs, hidden),
+        escnn.nn.Linear(hidden, hidden),
+        escnn.nn.Linear(hidden, value),
+    ]
+    assert [count(layer) for layer in agent.critic.members[0]] == [count(t) for t in theirs]
+
+
+def test_untrained_policies_start_near_zero_with_the_given_scale(problem):
+    for name in LEARNERS:
+        mean, log_scale = problem.agent(name).moments(problem.batch().obs)
+        assert mean.abs().max() < 0.1
+        assert torch.allclose(log_scale.exp(), torch.tensor(0.5), atol=0.05)
+
+
+def test_unknown_agent_names_the_known_ones(problem):
+    with pytest.raises(UserError, match=r"equivariant.*zero"):
+        problem.agent("equivarient")
+    assert set(AGENTS) == {*LEARNERS, "base", "zero"}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gamma": 1.0},
+        {"tau": 0.0},
+        {"lr": -1.0},
+        {"width": 0},
+        {"noise_bound": 0.0},
+        {"initial_scale": 10.0},
+        {"free_penalty": 0.1, "equivariant_penalty": 1.0},
+    ],
+)
+def test_impossible_options_are_refused(options):
+    with pytest.raises(UserError, match=r"agent options?"):
+        SacConfig(**options)
+
+
+def test_bad_groups_are_refused(problem):
+    for name in ("X8", "SO2"):
+        with pytest.raises(UserError):
+            problem.agent("equivariant", group=name)
+
+
+def test_feasible_q():
+    assert feasible_q(0.5, 3) == pytest.approx((-1.75, 0.0))
+    assert feasible_q(0.95, None) == pytest.approx((-20.0, 0.0))
+    assert feasible_q(0.95, 25, (-4.0, 0.0)) == pytest.approx((-4 * (1 - 0.95**25) / 0.05, 0.0))
+    assert feasible_q(0.5, 2, (0.0, 1.0), 0.25) == pytest.approx((-0.25, 1.75))
+    assert feasible_q(0.5, 2, (-2.0, -1.0)) == pytest.approx((-3.0, -1.0))
+    assert entropy_allowance(0.9, 0.1, -20.0) == pytest.approx(18.0)
+    with pytest.raises(UserError):
+        feasible_q(1.0, None)
+
+
+# A bandit: the best noise is a known function of what is seen, the reward is minus the squared
+# distance to it. Unbroken, it turns with the scene; broken, a part of it is fixed in the room.
+
+BANDIT_OBS = Layout([Field("xy", 1), Field("height", 0), Field("rod", 2)])
+BANDIT_ACT = Layout([Field("xy", 1), Field("z", 0)])
+
+
+def best_noise(obs, broken):
+    direction = obs[:, BANDIT_OBS.slice("xy")]
+    direction = direction / direction.norm(dim=1, keepdim=True)
+    left = 0.9 * torch.stack([-direction[:, 1], direction[:, 0]], dim=1)
+    if broken:
+        left = 0.5 * left + torch.tensor([0.7, 0.0])
+    z = 0.8 * obs[:, BANDIT_OBS.slice("height")].tanh()
+    return torch.cat([left, z], dim=1).unsqueeze(1).expand(-1, 2, -1)
+
+
+def bandit_reward(obs, noise, broken):
+    return -(noise - best_noise(obs, broken)).square().sum((1, 2))
+
+
+def solve(problem, name, broken, rounds=400):
+    """Final reward of the deterministic actor and its equivariance error."""
+    bandit = dataclasses.replace(
+        problem,
+        obs_layout=BANDIT_OBS,
+        act_layout=BANDIT_ACT,
+        horizon=2,
+        config=SacConfig(width=128, batch_size=128, lr=1e-3, alpha_lr=1e-3),
+    )
+    agent, base = bandit.agent(name), bandit.agent("base", seed=1)
+    replay = ReplayBuffer(30_000, BANDIT_OBS.dim, 2, BANDIT_ACT.dim, seed=3)
+    g = torch.Generator().manual_seed(2)
+    for i in range(rounds):
+        obs = torch.randn(64 if i else 512, BANDIT_OBS.dim, generator=g)
+        noise = (agent if i else base).act(obs)
+        replay.add(obs, noise, bandit_reward(obs, noise, broken), obs, torch.ones(len(obs)))
+        agent.update(replay.sample(128))
+    obs = torch.randn(512, BANDIT_OBS.dim, generator=g)
+    reward = bandit_reward(obs, agent.act(obs, deterministic=True), broken).mean().item()
+    error = equivariance_error(agent, obs, Group.parse("C8"))["actor_equivariance_error"]
+    return reward, error
+
+
+@pytest.mark.parametrize("name", SAC)
+def test_learns_a_symmetric_problem(problem, name):
+    """Best is 0, standing still about -2.1, the base policy about -8."""
+    reward, error = solve(problem, name, broken=False)
+    assert reward > -0.6
+    if name == "equivariant":
+        assert error < 1e-5
+    if name == "approximate":
+        assert error < 0.2
+
+
+def test_a_broken_problem_needs_a_free_path(problem):
+    strict, strict_error = solve(problem, "equivariant", broken=True)
+    approximate, error = solve(problem, "approximate", broken=True)
+    assert strict_error < 1e-5
+    assert strict < -0.8
+    assert error > 0.5
+    assert approximate > -0.5
