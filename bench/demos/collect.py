@@ -77,9 +77,10 @@ def collect(
 ) -> Path:
     """Write ``count`` successful expert episodes to ``out_path`` (``.h5``) and its ``.json``.
 
-    Episodes end at their first success. The same arguments give the same demonstrations for
-    every ``num_envs``: an attempt depends on its own seed only, and attempts are kept in the
-    order of their seeds.
+    Episodes end at their first success. On the CPU the same arguments give the same
+    demonstrations. Initial states and disturbances depend on each attempt's own seed only, and
+    attempts are kept in the order of their seeds; with another ``num_envs`` contacts may still
+    turn out differently in the last digits, because PhysX remembers earlier contacts.
 
     Args:
         task: name of a task.
@@ -156,7 +157,7 @@ def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[_Att
             obs=np.stack([o[i] for o in observations[: end + 1]]),
             actions=np.stack([a[i] for a in actions[:end]]),
             rewards=np.stack([r[i] for r in rewards[:end]]),
-            states=_stack_row([s for s in states[: end + 1]], i),
+            states=_stack_row(states[: end + 1], i),
         )
         for i, end in enumerate(length)
         if end > 0
@@ -187,8 +188,7 @@ def _disturbances(
     for name in ("gripper", "tilt"):
         noise[:, :, env.action_layout.slice(name)] = 0.0
     return tuple(
-        torch.as_tensor(array, dtype=torch.float32, device=env.device)
-        for array in (noise, offsets)
+        torch.as_tensor(array, dtype=torch.float32, device=env.device) for array in (noise, offsets)
     )
 
 

@@ -244,8 +244,7 @@ def _matched(
     matched: dict[str, dict[str, np.ndarray]] = {}
     for kind in ("actors", "articulations"):
         stored = {
-            _SAME_ROBOT.get(key, key): value
-            for key, value in group["states"].get(kind, {}).items()
+            _SAME_ROBOT.get(key, key): value for key, value in group["states"].get(kind, {}).items()
         }
         matched[kind] = {}
         for key, value in template[kind].items():

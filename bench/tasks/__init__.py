@@ -14,8 +14,9 @@ from typing import Any
 
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
+from mani_skill import logger
 
-from bench.sim import create
+from bench.sim import create, rendering_works
 from bench.tasks.base import SymmetricTask
 from bench.tasks.embodiments import EMBODIMENTS
 from bench.tasks.pick_cube import PickCube
@@ -101,9 +102,15 @@ def make(
 
 
 def _make_for_gym(task: str, num_envs: int = 1, **kwargs: Any) -> SymmetricTask:
-    """Entry point of ``gym.make``: ManiSkill's way of naming a simulator is understood too."""
+    """Entry point of ``gym.make``: understands ManiSkill's way of naming a simulator.
+
+    As in ManiSkill, whose tools always name one, a render mode on a machine that cannot render
+    is no error until something is rendered.
+    """
     backend = str(kwargs.pop("sim_backend", "auto"))
-    kwargs.pop("render_backend", None)
+    if kwargs.get("render_mode") is not None and not rendering_works():
+        logger.warning("render_mode=%r is left out: nothing renders here", kwargs["render_mode"])
+        kwargs["render_mode"] = None
     if "cuda" in backend or "gpu" in backend:
         kwargs.setdefault("sim", "cuda")
     return make(task, num_envs=num_envs, **kwargs)

@@ -8,6 +8,7 @@ stored states. Positions are relative to the workspace centre, the origin of the
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, ClassVar
 
@@ -53,7 +54,7 @@ class SymmetricTask(BaseEnv):
         kwargs: as for ManiSkill's class.
     """
 
-    SUPPORTED_ROBOTS = [e.robot_uid for e in EMBODIMENTS.values()]
+    SUPPORTED_ROBOTS: ClassVar[list[str]] = [e.robot_uid for e in EMBODIMENTS.values()]
 
     task_id: ClassVar[str]
     max_episode_steps: ClassVar[int]
@@ -135,11 +136,22 @@ class SymmetricTask(BaseEnv):
 
     def _step_action(self, action: Any) -> Any:
         if self.variants and isinstance(action, np.ndarray | torch.Tensor):
-            action = common.to_tensor(action, device=self.device)
-            action = self.body.bound(action.reshape(self.num_envs, -1))
+            commanded = common.to_tensor(action, device=self.device).reshape(self.num_envs, -1)
+            executed = self.body.bound(commanded)
             for variant in self.variants:
-                action = variant.action(action)
+                executed = variant.action(executed)
+            # Where no variant acts, not even the rounding of the bound may.
+            action = torch.where(self._broken[:, None], executed, commanded)
         return super()._step_action(action)
+
+    @functools.cached_property
+    def _broken(self) -> torch.Tensor:
+        """Environments in which some variant has a strength above zero, ``[N]`` bool."""
+        broken = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        for variant in self.variants:
+            strength = torch.as_tensor(variant.strength, device=self.device)
+            broken = broken | (strength != 0)
+        return broken
 
     # ------------------------------------------------------------------ resets
 
@@ -157,10 +169,9 @@ class SymmetricTask(BaseEnv):
         options = dict(options or {})
         partial = options.get("env_idx")
         if partial is not None:
-            partial = torch.as_tensor(partial, dtype=torch.long, device=self.device)
+            # ManiSkill writes the rows of a partial reset in the order of the environments.
+            partial, order = torch.as_tensor(partial, dtype=torch.long, device=self.device).sort()
             options["env_idx"] = partial
-            if len(partial) == self.num_envs:
-                partial = None
         if seed is not None:
             seed = [int(s) for s in np.atleast_1d(common.to_numpy(seed))]
             count = self.num_envs if partial is None else len(partial)
@@ -168,15 +179,12 @@ class SymmetricTask(BaseEnv):
                 raise UserError(
                     f"{len(seed)} seeds were given for {count} environments; give one each"
                 )
-            if partial is None and "env_idx" in options:
-                # A full reset in another order: ManiSkill reads seeds by environment.
-                if len(seed) > 1:
-                    seed = [seed[int(i)] for i in torch.argsort(options["env_idx"])]
-                options.pop("env_idx")
+            if partial is not None and len(seed) == len(partial):
+                seed = [seed[i] for i in order.tolist()]
         kept = None
         if partial is not None and self.agent is not None:
             # ManiSkill resets the controllers of all environments after a partial reset.
-            kept = _clone(self.agent.get_controller_state())
+            kept = self.agent.get_controller_state()
         self._reset_rows = partial
         try:
             obs, info = super().reset(seed=seed, options=options)
@@ -218,15 +226,25 @@ class SymmetricTask(BaseEnv):
         controller targets makes the present pose the target.
         """
         state = _as_batched(state, self.device)
+        if env_idx is not None:
+            # ManiSkill writes rows in the order of the environments.
+            env_idx, order = torch.as_tensor(env_idx, dtype=torch.long, device=self.device).sort()
+            state = _rows(state, order)
         super().set_state_dict(
             {key: state[key] for key in ("actors", "articulations") if key in state}, env_idx
         )
         if env_idx is None:
             self.agent.set_controller_state(state.get("controller", {}))
         else:
-            targets = _clone(self.agent.get_controller_state())
-            if targets:
+            targets = self.agent.get_controller_state()
+            if targets and "controller" in state:
                 _copy_rows_from_subset(targets, state["controller"], env_idx)
+            elif targets:
+                self.agent.set_controller_state({})
+                _copy_rows_from_subset(
+                    targets, _rows(self.agent.get_controller_state(), env_idx), env_idx
+                )
+            if targets:
                 self.agent.set_controller_state(targets)
 
     def transform_state(self, state: dict, angle: float, reflect: bool = False) -> dict:
@@ -360,8 +378,8 @@ def _expand(seed: list[int], count: int) -> list[int]:
     return seed + np.random.RandomState(seed[0]).randint(2**31, size=count - 1).tolist()
 
 
-def _clone(tree: Any) -> Any:
-    return {k: _clone(v) for k, v in tree.items()} if isinstance(tree, dict) else tree.clone()
+def _rows(tree: Any, index: torch.Tensor) -> Any:
+    return {k: _rows(v, index) for k, v in tree.items()} if isinstance(tree, dict) else tree[index]
 
 
 def _copy_rows(source: Any, target: Any, rows: torch.Tensor) -> None:

@@ -142,9 +142,7 @@ class Floating(Embodiment):
         near = q[:, 3:].clone()
         # Seen from above the tool points away, so yaw and the last joint run in opposite senses.
         near[:, 2] = (-near[:, 2] if reflect else near[:, 2]) - angle
-        return torch.cat(
-            [q[:, :3] @ world.T, matrix_to_euler_facing_down(rotation, near)], dim=1
-        )
+        return torch.cat([q[:, :3] @ world.T, matrix_to_euler_facing_down(rotation, near)], dim=1)
 
 
 @dataclass(frozen=True)

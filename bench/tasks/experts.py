@@ -50,7 +50,9 @@ class Expert:
 
     def __init__(self, env: SymmetricTask):
         if env.task_id not in _INTENTS:
-            raise UserError(f"{env.task_id!r} has no expert; there is one for {', '.join(_INTENTS)}")
+            raise UserError(
+                f"{env.task_id!r} has no expert; there is one for {', '.join(_INTENTS)}"
+            )
         self.env = env
         self.offset = torch.zeros(env.num_envs, 3, device=env.device)
         self._intent = _INTENTS[env.task_id]
@@ -97,9 +99,7 @@ def _grasp(
     held = around & (width < 0.045) & (width > 0.03)
     closing = width < 0.075
     reach = torch.where(closing, 0.02, 0.008)
-    ready = (aside < reach) & (move[:, 2].abs() < reach) & (yaw.abs() < 0.15) | (
-        around & closing
-    )
+    ready = (aside < reach) & (move[:, 2].abs() < reach) & (yaw.abs() < 0.15) | (around & closing)
     lift = _funnel(aside, 0.012, 3.0, HOVER).maximum(_funnel(yaw.abs(), 0.12, 0.2, HOVER))
     approach = torch.cat([move[:, :2], move[:, 2:] + lift[:, None]], dim=1)
     still = ready[:, None]

@@ -12,11 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import sapien
 import torch
 from gymnasium import spaces
-from mani_skill.agents.base_agent import Keyframe
-from mani_skill.agents.controllers import PDJointPosControllerConfig, PDJointPosMimicControllerConfig
+from mani_skill.agents.controllers import (
+    PDJointPosControllerConfig,
+    PDJointPosMimicControllerConfig,
+)
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots import FloatingPandaGripper, Panda
@@ -113,6 +114,10 @@ class PlanarPoseController(PDJointPosController):
         )
         self.set_drive_targets(self._target_qpos)
 
+    def get_state(self) -> dict:
+        """The target as joint positions, ``[N, 6]``; a copy."""
+        return {"target_qpos": self._target_qpos.clone()}
+
     def set_state(self, state: dict) -> None:
         """Restore the target; an absent state leaves it at the present pose."""
         if state:
@@ -167,12 +172,6 @@ class FloatingGripper(FloatingPandaGripper):
 
     uid = "symsteer_floating_gripper"
     root_height = 0.3
-    keyframes = dict(
-        rest=Keyframe(
-            qpos=np.array([0, 0, 0.18 + TCP_OFFSET - root_height, 0, np.pi, 0, 0.04, 0.04]),
-            pose=sapien.Pose([0, 0, root_height]),
-        )
-    )
     # About critically damped for the hand's 0.76 kg: a target is reached to 90 % within one
     # control step of 50 ms.
     root_stiffness = 4e3
@@ -201,7 +200,7 @@ class FloatingGripper(FloatingPandaGripper):
             mimic={"panda_finger_joint2": {"joint": "panda_finger_joint1"}},
         )
         joints = {k: inherited[k] for k in ("pd_joint_delta_pos", "pd_joint_pos")}
-        return dict(pd_ee_delta_pose=dict(root=root, gripper=gripper), **joints)
+        return {"pd_ee_delta_pose": {"root": root, "gripper": gripper}, **joints}
 
     is_grasping = Panda.is_grasping
 

@@ -10,7 +10,7 @@ from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.structs import Pose
 
 from bench.tasks.base import SymmetricTask, disc, flat_pose, fourfold_yaw
-from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix, yaw_quaternion
+from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
 from policies.geometry import Field
 
 

@@ -1,0 +1,247 @@
+"""How symmetric is a task, measured in simulation.
+
+The measure is a whole episode: put a copy of its initial state, turned by each element of a
+planar group, into an environment of its own; let every copy execute the same actions, turned
+alike; turn the paths back and compare them. In a world with the symmetry they coincide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from bench.tasks import make
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import Expert
+from bench.tasks.rotations import planar_matrix
+from policies.errors import UserError
+from policies.geometry import Group
+
+Actions = Literal["random", "expert"]
+
+MOVED = 1e-4
+"""An object that is further than this from where it began (metres) has been touched."""
+
+
+@dataclass(frozen=True)
+class RolloutError:
+    """Rotated episodes against the original, one entry per episode.
+
+    Attributes:
+        path: length of the original's path of the tool centre point until it succeeds or its
+            time is over, metres, ``[E]``.
+        tcp: largest distance over time and group elements between the turned-back tool centre
+            point and the original's over the same steps, metres, ``[E]``.
+        objects: the same for the task's objects, ``[E]``.
+        contact_free_path, contact_free_tcp: the same up to the first step in which any copy has
+            moved an object.
+        steps: steps before that contact, ``[E]``.
+        contact: whether an object was moved, ``[E]``.
+        success: whether the original succeeded, ``[E]``.
+        same_outcome: whether all copies agree on that, ``[E]``.
+    """
+
+    path: np.ndarray
+    tcp: np.ndarray
+    objects: np.ndarray
+    contact_free_path: np.ndarray
+    contact_free_tcp: np.ndarray
+    steps: np.ndarray
+    contact: np.ndarray
+    success: np.ndarray
+    same_outcome: np.ndarray
+
+    @property
+    def contact_free_ratio(self) -> np.ndarray:
+        """Error over path length before any contact, ``[E]``."""
+        return self.contact_free_tcp / np.maximum(self.contact_free_path, 1e-9)
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """Error over path length of the whole episode, contacts included, ``[E]``."""
+        return self.tcp / np.maximum(self.path, 1e-9)
+
+    def share_within(self, limit: float = 0.01, contacts: bool = False) -> float:
+        """Share of episodes whose error is at most ``limit`` of the path."""
+        return float(np.mean((self.ratio if contacts else self.contact_free_ratio) <= limit))
+
+    def summary(self) -> str:
+        """A few readable lines."""
+        free, full = 1e3 * self.contact_free_tcp, 1e3 * self.tcp
+        moved = 1e3 * self.objects
+        return (
+            f"{len(self.path)} episodes, {np.mean(self.contact):.0%} with contact\n"
+            f"before contact: within 1 % of the path {self.share_within():.1%}; error mm "
+            f"median {np.median(free):.4f}, 95th percentile {np.quantile(free, 0.95):.4f}, "
+            f"max {free.max():.4f}; path mean {np.mean(self.contact_free_path):.3f} m over "
+            f"{np.mean(self.steps):.1f} steps\n"
+            f"whole episode:  within 1 % of the path {self.share_within(contacts=True):.1%}; "
+            f"error mm median {np.median(full):.4f}, 95th percentile "
+            f"{np.quantile(full, 0.95):.4f}, max {full.max():.4f}; objects mm median "
+            f"{np.median(moved):.4f}, 95th percentile {np.quantile(moved, 0.95):.4f}; "
+            f"success {np.mean(self.success):.1%}, "
+            f"all copies agree {np.mean(self.same_outcome):.1%}"
+        )
+
+
+def rotated_rollout_error(
+    task: str,
+    *,
+    episodes: int,
+    actions: Actions = "random",
+    group: str = "C8",
+    steps: int | None = None,
+    seed: int = 0,
+    variant: str = "none",
+    batch: int = 25,
+    env_options: dict[str, Any] | None = None,
+) -> RolloutError:
+    """Compare episodes of the floating gripper with their rotated copies.
+
+    Args:
+        task: name of a task.
+        episodes: how many, with seeds ``seed``, ``seed + 1``, ...
+        actions: ``random`` (correlated noise in all seven dimensions, heights kept clear of the
+            objects) or ``expert`` (the scripted expert of the original; its actions are turned
+            for the copies, no copy sees its own state).
+        group: a finite planar group, e.g. ``C8`` or ``D4``.
+        steps: per episode; by default the task's limit.
+        seed: of the first episode.
+        variant: symmetry-breaking variant that acts on all copies.
+        batch: episodes that run side by side, each with one environment per group element.
+        env_options: further arguments of :func:`bench.tasks.make`.
+
+    Raises:
+        UserError: for an unknown kind of actions, task, group or variant.
+    """
+    if actions not in ("random", "expert"):
+        raise UserError(f"actions must be 'random' or 'expert', not {actions!r}")
+    elements = Group.parse(group).elements
+    env = make(task, num_envs=batch * len(elements), variant=variant, **(env_options or {}))
+    steps = env.max_episode_steps if steps is None else steps
+    parts = []
+    for start in range(seed, seed + episodes, batch):
+        parts.append(_rollout(env, start, batch, elements, steps, actions))
+    env.close()
+    merged = {
+        name: np.concatenate([getattr(part, name) for part in parts])[:episodes]
+        for name in RolloutError.__dataclass_fields__
+    }
+    return RolloutError(**merged)
+
+
+def _rollout(
+    env: SymmetricTask,
+    start: int,
+    count: int,
+    elements: tuple[tuple[float, bool], ...],
+    steps: int,
+    kind: Actions,
+) -> RolloutError:
+    """``count`` episodes; environment g * count + i is copy g of episode i."""
+    order = len(elements)
+    env.reset(seed=[start + i for i in range(count)] * order)
+    state = env.get_state_dict()
+    copies = [env.transform_state(state, angle, reflect) for angle, reflect in elements]
+    env.set_state_dict(_interleave(copies, count))
+    choose = _expert_actions(env, count) if kind == "expert" else _noise(env, start, count, steps)
+    tcp, objects, success = [_tcp(env)], [_objects(env)], []
+    for step in range(steps):
+        original = choose(step)
+        turned = [env.action_layout.transform(original, *element) for element in elements]
+        _, _, _, _, info = env.step(torch.cat(turned))
+        tcp.append(_tcp(env))
+        objects.append(_objects(env))
+        success.append(info["success"].clone())
+
+    back = [planar_matrix(angle, reflect, tcp[0]).T for angle, reflect in elements]
+    paths = _turn_back(torch.stack(tcp), back, count)
+    bodies = _turn_back(torch.stack(objects), back, count)
+    error = (paths - paths[:, :1]).norm(dim=-1).amax(dim=1)
+    body_error = (bodies - bodies[:, :1]).norm(dim=-1).amax(dim=(1, 3))
+    travelled = torch.cat(
+        [torch.zeros(1, count), (paths[1:, 0] - paths[:-1, 0]).norm(dim=-1).cumsum(dim=0)]
+    )
+    touched = ((bodies - bodies[:1]).norm(dim=-1) > MOVED).any(dim=1).any(dim=-1)
+    free = (touched.cumsum(dim=0) == 0).sum(dim=0) - 1
+    won = torch.stack(success).unflatten(1, (order, count))
+    # An episode ends with its first success; later steps are nobody's.
+    end = 1 + (won[:, 0].cumsum(dim=0) == 0).sum(dim=0).clamp(max=steps - 1)
+    free = free.minimum(end)
+    every = torch.arange(count)
+    time = torch.arange(steps + 1)[:, None]
+    before, during = time <= free, time <= end
+    won = won.any(dim=0)
+    return RolloutError(
+        path=travelled[end, every].numpy(),
+        tcp=(error * during).amax(dim=0).numpy(),
+        objects=(body_error * during).amax(dim=0).numpy(),
+        contact_free_path=travelled[free, every].numpy(),
+        contact_free_tcp=(error * before).amax(dim=0).numpy(),
+        steps=free.numpy(),
+        contact=(touched & during).any(dim=0).numpy(),
+        success=won[0].numpy(),
+        same_outcome=(won == won[:1]).all(dim=0).numpy(),
+    )
+
+
+def _turn_back(points: torch.Tensor, back: list[torch.Tensor], count: int) -> torch.Tensor:
+    """``[steps, order * count, ..., 3]`` to ``[steps, order, count, ..., 3]``, turned back."""
+    split = points.unflatten(1, (len(back), count))
+    return torch.stack([split[:, g] @ matrix.T for g, matrix in enumerate(back)], dim=1)
+
+
+def _expert_actions(env: SymmetricTask, count: int) -> Callable[[int], torch.Tensor]:
+    expert = Expert(env)
+    return lambda step: expert.act()[:count]
+
+
+def _noise(env: SymmetricTask, start: int, count: int, steps: int) -> Callable[[int], torch.Tensor]:
+    """Correlated random actions, one stream per episode.
+
+    The vertical action steers towards a random height above the objects, so that the arm-less
+    hand roams without touching anything.
+    """
+    layout = env.action_layout
+    draws = np.stack(
+        [
+            np.random.default_rng([start + i, 2]).standard_normal((steps, layout.dim))
+            for i in range(count)
+        ],
+        axis=1,
+    )
+    level = np.zeros_like(draws)
+    level[0] = draws[0]
+    for step in range(1, steps):
+        level[step] = 0.8 * level[step - 1] + 0.6 * draws[step]
+    noise = torch.as_tensor(level, dtype=torch.float32)
+
+    def choose(step: int) -> torch.Tensor:
+        action = noise[step].clone()
+        height = env.agent.tcp_pose.p[:count, 2]
+        clear = 0.18 + 0.04 * noise[step][:, layout.slice("z")]
+        action[:, layout.slice("z")] = (clear - height[:, None]) / 0.03
+        return env.body.bound(action)
+
+    return choose
+
+
+def _interleave(copies: list[Any], count: int) -> Any:
+    """Rows ``g * count ...`` of copy g, for every tensor of the state."""
+    if isinstance(copies[0], dict):
+        return {key: _interleave([copy[key] for copy in copies], count) for key in copies[0]}
+    return torch.cat([c[g * count : (g + 1) * count] for g, c in enumerate(copies)])
+
+
+def _tcp(env: SymmetricTask) -> torch.Tensor:
+    return env.agent.tcp_pose.p.clone()
+
+
+def _objects(env: SymmetricTask) -> torch.Tensor:
+    """Positions of the movable bodies, ``[N, bodies, 3]``."""
+    bodies = [a for a in env.scene.actors.values() if a.px_body_type == "dynamic"]
+    return torch.stack([body.pose.p.clone() for body in bodies], dim=1)

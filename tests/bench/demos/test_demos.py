@@ -1,0 +1,296 @@
+"""Demonstrations: collected, read back, read by ManiSkill's tools, refused when they are wrong."""
+
+import json
+import shutil
+
+import gymnasium as gym
+import h5py
+import numpy as np
+import pytest
+import torch
+from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
+from mani_skill.trajectory.utils import dict_to_list_of_dicts
+
+from bench.demos import Diversity, collect, load
+from bench.sim import make_env_class
+from bench.tasks import make, task_class
+from policies.errors import UserError
+
+TASK = "PickCube-v1"
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory):
+    path = tmp_path_factory.mktemp("demos") / "clean.h5"
+    seen = []
+    collect(TASK, "floating", 6, "clean", 0, path, progress=lambda *now: seen.append(now))
+    assert seen[-1] == (6, 6)
+    return path
+
+
+@pytest.fixture
+def copy(clean, tmp_path):
+    """A private copy of the clean file, to be damaged."""
+    for path in (clean, clean.with_suffix(".json")):
+        shutil.copy(path, tmp_path / path.name)
+    return tmp_path / clean.name
+
+
+def edit_json(path, change):
+    side = path.with_suffix(".json")
+    data = json.loads(side.read_text())
+    change(data)
+    side.write_text(json.dumps(data))
+
+
+def test_round_trip(clean):
+    demos = load(clean, TASK, "floating")
+    task = task_class(TASK)
+    assert len(demos) == 6
+    assert demos.observation_layout == task.observation_layout
+    assert demos.action_layout == task.action_layout
+    for obs, actions in demos.episodes:
+        assert obs.shape == (len(actions) + 1, task.observation_layout.dim)
+        assert actions.shape[1] == 7
+        assert obs.dtype == actions.dtype == torch.float32
+        assert actions.abs().max() <= 1 + 1e-6
+    assert demos.meta["mode"] == "clean"
+    assert load(clean, TASK, "floating").content_hash == demos.content_hash
+    few = load(clean, TASK, "floating", count=2)
+    assert len(few) == 2
+    assert few.content_hash != demos.content_hash
+    assert not list(clean.parent.glob("*.partial"))
+
+
+def test_replaying_the_actions_succeeds(clean):
+    """Seed and actions alone reproduce the stored observations and the success at the end."""
+    records = json.loads(clean.with_suffix(".json").read_text())["episodes"]
+    demos = load(clean, TASK, "floating")
+    for record, (obs, actions) in zip(records, demos.episodes, strict=True):
+        env = make(TASK, num_envs=1)
+        first, _ = env.reset(seed=[record["episode_seed"]])
+        assert torch.equal(first[0], obs[0])
+        for action, expected in zip(actions, obs[1:], strict=True):
+            now, _, terminated, _, info = env.step(action[None])
+            assert torch.allclose(now[0], expected, atol=1e-5)
+        assert info["success"].item()
+        assert terminated.item()
+
+
+def test_the_same_arguments_give_the_same_demonstrations(tmp_path):
+    hashes = []
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        path = collect(TASK, "floating", 3, "diverse", seed, tmp_path / f"{name}.h5", num_envs=2)
+        hashes.append(load(path, TASK, "floating").content_hash)
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_diverse_demonstrations_carry_noise(tmp_path, clean):
+    path = collect(TASK, "floating", 6, "diverse", 0, tmp_path / "diverse.h5")
+    demos, tidy = load(path, TASK, "floating"), load(clean, TASK, "floating")
+    assert demos.meta["mode"] == "diverse"
+    layout = demos.action_layout
+    compared = 0
+    for obs, actions in demos.episodes:
+        for tidy_obs, tidy_actions in tidy.episodes:
+            if torch.equal(obs[0], tidy_obs[0]):
+                compared += 1
+                difference = (actions[0] - tidy_actions[0]).abs()
+                assert difference[layout.slice("xy")].max() > 1e-3
+                assert difference[layout.slice("gripper")] == 0
+    assert compared >= 3
+    assert demos.meta["steps"] > tidy.meta["steps"]
+
+
+def test_maniskills_tools_read_our_files(clean):
+    dataset = ManiSkillTrajectoryDataset(str(clean))
+    demos = load(clean, TASK, "floating")
+    assert len(dataset) == sum(len(a) for _, a in demos.episodes)
+    assert np.array_equal(dataset.actions, torch.cat([a for _, a in demos.episodes]))
+    assert dataset.success.sum() == 6
+    assert dataset.env_id == "SymSteer/PickCube-v1"
+    # ManiSkill's way of replaying by states: one unbatched numpy state after the other.
+    env = gym.make(dataset.env_id, **dataset.env_kwargs)
+    env.reset(seed=0)
+    with h5py.File(clean) as file:
+        states = dict_to_list_of_dicts(file["traj_2"]["env_states"])
+    obs, _ = demos.episodes[2]
+    for state, expected in zip(states, obs, strict=True):
+        env.unwrapped.set_state_dict(state)
+        assert torch.allclose(env.unwrapped.get_obs()[0], expected, atol=1e-5)
+
+
+def test_maniskills_replay_script_replays_our_files(clean, tmp_path, capsys):
+    from mani_skill.trajectory import replay_trajectory
+
+    path = tmp_path / "clean.h5"
+    for source in (clean, clean.with_suffix(".json")):
+        shutil.copy(source, tmp_path / source.name)
+    # It asks for a render mode without rendering anything.
+    arguments = replay_trajectory.Args(
+        traj_path=str(path), sim_backend="physx_cpu", use_env_states=True, save_traj=True, count=2
+    )
+    replay_trajectory.main(arguments)
+    assert "2/2" in capsys.readouterr().out
+
+
+def record_like_maniskill(path, task, control_mode="pd_ee_delta_pose", robot="panda", steps=70):
+    """What ManiSkill publishes: stock environment, stock observations, states, no own section."""
+    stock = next(base for base in task_class(task).__mro__ if base.__module__.startswith("mani_"))
+    env = make_env_class(stock, "cpu")(
+        num_envs=1, obs_mode="state", control_mode=control_mode, robot_uids=robot
+    )
+    obs, _ = env.reset(seed=3)
+    generator = torch.Generator().manual_seed(0)
+    size = env.single_action_space.shape[0]
+    log = {"obs": [obs[0].numpy().copy()], "actions": [], "states": [env.get_state_dict()]}
+    tcp = [env.agent.tcp_pose.p[0].numpy().copy()]
+    for _ in range(steps):
+        action = torch.rand(1, size, generator=generator) * 2 - 1
+        obs = env.step(action)[0]
+        log["obs"].append(obs[0].numpy().copy())
+        log["actions"].append(action[0].numpy())
+        log["states"].append(env.get_state_dict())
+        tcp.append(env.agent.tcp_pose.p[0].numpy().copy())
+    with h5py.File(path, "w") as file:
+        group = file.create_group("traj_0")
+        group["obs"] = np.stack(log["obs"])
+        group["actions"] = np.stack(log["actions"])
+        for kind in ("actors", "articulations"):
+            for name in log["states"][0][kind]:
+                group[f"env_states/{kind}/{name}"] = np.stack(
+                    [state[kind][name][0].numpy() for state in log["states"]]
+                )
+    kwargs = {"obs_mode": "state", "control_mode": control_mode, "sim_backend": "physx_cpu"}
+    if robot != "panda":
+        kwargs["robot_uids"] = robot
+    side = {
+        "env_info": {"env_id": task, "env_kwargs": kwargs, "max_episode_steps": 50},
+        "episodes": [{"episode_id": 0, "episode_seed": 3, "control_mode": control_mode}],
+        "source_type": "rl",
+    }
+    path.with_suffix(".json").write_text(json.dumps(side))
+    return np.stack(tcp)
+
+
+@pytest.mark.parametrize(
+    ("task", "robot"),
+    [
+        ("PickCube-v1", "panda"),
+        ("PushCube-v1", "panda"),
+        ("StackCube-v1", "panda_wristcam"),
+    ],
+)
+def test_files_in_maniskills_own_form(tmp_path, task, robot):
+    path = tmp_path / "trajectory.h5"
+    tcp = record_like_maniskill(path, task, robot=robot)
+    demos = load(path, task, "panda")
+    ((obs, actions),) = demos.episodes
+    layout = demos.observation_layout
+    assert actions.shape == (70, 7)
+    assert np.allclose(obs[:, layout.slice("tcp_xy")], tcp[:, :2], atol=1e-5)
+    assert np.allclose(obs[:, layout.slice("tcp_z")], tcp[:, 2:], atol=1e-5)
+    assert demos.meta["mode"] == "external"
+    assert demos.meta["source"] == "rl"
+    with pytest.raises(UserError, match="recorded with 'panda', but 'floating'"):
+        load(path, task, "floating")
+
+
+def test_other_control_modes_are_refused(tmp_path):
+    path = tmp_path / "trajectory.h5"
+    record_like_maniskill(path, TASK, control_mode="pd_joint_delta_pos", steps=3)
+    with pytest.raises(UserError, match=r"pd_joint_delta_pos.*pd_ee_delta_pose is wanted"):
+        load(path, TASK, "panda")
+
+
+def refusal(path, *, task=TASK, embodiment="floating", count=None):
+    with pytest.raises(UserError) as error:
+        load(path, task, embodiment, count)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_wrong_task_is_refused(clean):
+    assert "PickCube-v1, but PushCube-v1 is wanted" in refusal(clean, task="PushCube-v1")
+    assert "no task 'Nothing'" in refusal(clean, task="Nothing")
+
+
+def test_wrong_embodiment_is_refused(clean):
+    assert "'floating', but 'panda' is wanted" in refusal(clean, embodiment="panda")
+    assert "no embodiment 'hand'" in refusal(clean, embodiment="hand")
+
+
+def test_missing_files_are_refused(copy, tmp_path):
+    copy.with_suffix(".json").unlink()
+    assert "clean.json is missing" in refusal(copy)
+    assert "no demonstration file" in refusal(tmp_path / "nothing.h5")
+
+
+def test_truncated_file_is_refused(copy):
+    whole = copy.read_bytes()
+    copy.write_bytes(whole[: len(whole) // 2])
+    assert "truncated or not an HDF5 file" in refusal(copy)
+    copy.write_bytes(b"nothing of the kind")
+    assert "truncated or not an HDF5 file" in refusal(copy)
+
+
+def test_damaged_json_is_refused(copy):
+    copy.with_suffix(".json").write_text("{")
+    assert "does not describe ManiSkill trajectories" in refusal(copy)
+    copy.with_suffix(".json").write_text('{"episodes": []}')
+    assert "env_info" in refusal(copy)
+
+
+@pytest.mark.parametrize(("key", "word"), [("actions", "actions"), ("obs", "observations")])
+def test_nan_is_refused(copy, key, word):
+    with h5py.File(copy, "r+") as file:
+        file[f"traj_1/{key}"][2, 0] = np.nan
+    assert f"NaN or infinite {word} in traj_1" in refusal(copy)
+
+
+def test_wrong_action_dimension_is_refused(copy):
+    with h5py.File(copy, "r+") as file:
+        actions = file["traj_0/actions"][:, :4]
+        del file["traj_0/actions"]
+        file["traj_0/actions"] = actions
+    assert "7] is wanted" in refusal(copy)
+
+
+def test_cut_observations_are_refused(copy):
+    with h5py.File(copy, "r+") as file:
+        obs = file["traj_0/obs"][:-1]
+        del file["traj_0/obs"]
+        file["traj_0/obs"] = obs
+    assert "observations of shape" in refusal(copy)
+
+
+def test_too_few_episodes_are_refused(clean, copy):
+    assert "holds 6 successful episodes, but 7 are wanted" in refusal(clean, count=7)
+
+    def fail(data):
+        for record in data["episodes"]:
+            record["success"] = False
+
+    edit_json(copy, fail)
+    assert "holds 0 successful episodes" in refusal(copy)
+
+
+def test_missing_trajectory_is_refused(copy):
+    with h5py.File(copy, "r+") as file:
+        del file["traj_3"]
+    assert "traj_3" in refusal(copy)
+
+
+def test_bad_arguments_of_collect_are_explained(tmp_path):
+    path = tmp_path / "a.h5"
+    with pytest.raises(UserError, match="valid: clean, diverse"):
+        collect(TASK, "floating", 1, "messy", 0, path)
+    with pytest.raises(UserError, match="at least 1"):
+        collect(TASK, "floating", 0, "clean", 0, path)
+    with pytest.raises(UserError, match=r"\.h5"):
+        collect(TASK, "floating", 1, "clean", 0, tmp_path / "a.hdf")
+    wild = Diversity(noise=30.0)
+    with pytest.raises(UserError, match="succeeded only 0 times"):
+        collect(TASK, "floating", 1, "diverse", 0, path, diversity=wild)
+    assert not path.exists()

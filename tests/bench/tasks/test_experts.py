@@ -1,0 +1,56 @@
+"""The scripted experts solve their tasks and commute with the symmetries."""
+
+import pytest
+import torch
+
+from bench.tasks import make
+from bench.tasks.experts import Expert
+from policies.geometry import Group
+
+TASKS = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
+
+
+def success_rate(task, embodiment, episodes, first_seed=0):
+    env = make(task, num_envs=episodes, embodiment=embodiment)
+    env.reset(seed=list(range(first_seed, first_seed + episodes)))
+    expert = Expert(env)
+    solved = torch.zeros(episodes, dtype=torch.bool)
+    steps = torch.full((episodes,), env.max_episode_steps)
+    for step in range(env.max_episode_steps):
+        info = env.step(expert.act())[-1]
+        steps[info["success"] & ~solved] = step + 1
+        solved |= info["success"]
+    env.close()
+    rate = solved.float().mean().item()
+    print(f"{task} {embodiment}: {rate:.3f} of {episodes}, {steps.float().mean():.1f} steps")
+    return rate
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_expert_solves_the_floating_task(task):
+    assert success_rate(task, "floating", 32) >= 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(("embodiment", "least"), [("floating", 0.95), ("panda", 0.9)])
+def test_expert_success_over_200_seeds(task, embodiment, least):
+    assert success_rate(task, embodiment, 200, first_seed=10_000) >= least
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_expert_is_equivariant(task):
+    env = make(task, num_envs=8)
+    env.reset(seed=list(range(8)))
+    expert = Expert(env)
+    for step in range(12):
+        state = env.get_state_dict()
+        action = expert.act()
+        for angle, reflect in Group.parse("D8").elements[:: 3 if step % 4 else 1]:
+            env.set_state_dict(env.transform_state(state, angle, reflect))
+            expected = env.action_layout.transform(action, angle, reflect)
+            # A float error may tip a threshold for one state in many, no more.
+            close = torch.isclose(expert.act(), expected, atol=2e-3).all(dim=1)
+            assert close.float().mean() >= 7 / 8, (step, angle, reflect)
+        env.set_state_dict(state)
+        env.step(action)

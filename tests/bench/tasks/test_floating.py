@@ -1,0 +1,177 @@
+"""The floating gripper's controller: follows, is bounded by norms, commutes with symmetries."""
+
+import math
+
+import pytest
+import torch
+
+from bench.tasks import make
+from bench.tasks.floating import ACTION_LAYOUT, PlanarPoseControllerConfig, bound_blocks
+from bench.tasks.rotations import (
+    euler_rates_matrix,
+    euler_to_matrix,
+    matrix_to_euler_facing_down,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+    transform_quaternion,
+)
+from policies.geometry import Group
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = make("PickCube-v1", num_envs=16)
+    yield env
+    env.close()
+
+
+def test_bound_blocks_shortens_norms_and_is_idempotent():
+    action = 3 * torch.randn(1000, 7, generator=torch.Generator().manual_seed(0))
+    bounded = bound_blocks(action, ACTION_LAYOUT)
+    for block in ACTION_LAYOUT.blocks:
+        norm = action[:, block].norm(dim=1)
+        assert torch.allclose(bounded[:, block].norm(dim=1), norm.clamp(max=1), atol=1e-6)
+    assert torch.equal(bound_blocks(bounded, ACTION_LAYOUT), bounded)
+    for angle, reflect in Group.parse("D8").elements:
+        turned = bound_blocks(ACTION_LAYOUT.transform(action, angle, reflect), ACTION_LAYOUT)
+        expected = ACTION_LAYOUT.transform(bounded, angle, reflect)
+        assert torch.allclose(turned, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["xy", "z", "tilt", "yaw"])
+def test_the_controller_follows(env, name):
+    """Three steps at norm 1 cover at least 90 % of three step lengths, and never more."""
+    config = PlanarPoseControllerConfig
+    step = {
+        "xy": config.horizontal_step,
+        "z": config.vertical_step,
+        "tilt": config.tilt_step,
+        "yaw": config.yaw_step,
+    }[name]
+    env.reset(seed=list(range(16)))
+    before = env.agent.tcp_pose.raw_pose.clone()
+    action = torch.zeros(16, 7)
+    bearing = torch.arange(16) * (2 * math.pi / 16)
+    block = ACTION_LAYOUT.slice(name)
+    if block.stop - block.start == 2:
+        action[:, block] = 5 * torch.stack([bearing.cos(), bearing.sin()], dim=1)
+    else:
+        action[:, block] = 5.0
+    for _ in range(3):
+        env.step(action)
+    after = env.agent.tcp_pose.raw_pose
+    if name in ("xy", "z"):
+        moved = after[:, :3] - before[:, :3]
+        distance = moved.norm(dim=1)
+    else:
+        turn = quaternion_to_matrix(after[:, 3:]) @ quaternion_to_matrix(before[:, 3:]).mT
+        distance = torch.acos(((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1))
+        assert (after[:, :3] - before[:, :3]).norm(dim=1).max() < 3e-3
+    assert (distance / (3 * step)).min() > 0.9
+    assert (distance / (3 * step)).max() < 1.02
+    assert (distance.max() - distance.min()) / step < 0.01
+
+
+def test_positive_rotations_are_right_handed(env):
+    env.reset(seed=list(range(16)))
+    before = quaternion_to_matrix(env.agent.tcp_pose.q)
+    action = torch.zeros(16, 7)
+    action[:, ACTION_LAYOUT.slice("yaw")] = 1.0
+    env.step(action)
+    turn = quaternion_to_matrix(env.agent.tcp_pose.q) @ before.mT
+    assert (turn[:, 1, 0] > 0.1).all()
+
+
+def test_a_blocked_gripper_does_not_wind_up(env):
+    env.reset(seed=list(range(16)))
+    down = torch.zeros(16, 7)
+    down[:, ACTION_LAYOUT.slice("z")] = -1.0
+    for _ in range(15):
+        env.step(down)
+    up = -down
+    height = env.agent.tcp_pose.p[:, 2].clone()
+    env.step(up)
+    assert (env.agent.tcp_pose.p[:, 2] - height).min() > 0.005
+
+
+def test_tilt_and_reach_are_limited(env):
+    env.reset(seed=list(range(16)))
+    action = torch.zeros(16, 7)
+    action[:, ACTION_LAYOUT.slice("tilt")] = torch.tensor([0.6, 0.8])
+    action[:, ACTION_LAYOUT.slice("xy")] = torch.tensor([0.6, -0.8])
+    action[:, ACTION_LAYOUT.slice("z")] = 0.3
+    for _ in range(25):
+        env.step(action)
+    tool = quaternion_to_matrix(env.agent.tcp_pose.q)[:, :, 2]
+    lean = torch.acos(-tool[:, 2])
+    config = PlanarPoseControllerConfig
+    assert torch.allclose(lean, torch.tensor(config.max_tilt), atol=0.02)
+    radius = env.agent.tcp_pose.p[:, :2].norm(dim=1)
+    assert torch.allclose(radius, torch.tensor(config.reach), atol=0.01)
+
+
+def test_is_static_ignores_direction(env):
+    env.reset(seed=list(range(16)))
+    state = env.get_state_dict()
+    bearing = torch.arange(16) * (2 * math.pi / 16)
+    for speed, expected in ((0.19, True), (0.21, False)):
+        robot = state["articulations"][env.agent.robot.name]
+        robot[:, 21] = speed * bearing.cos()
+        robot[:, 22] = speed * bearing.sin()
+        env.set_state_dict(state)
+        assert env.agent.is_static(0.2).tolist() == [expected] * 16
+
+
+def test_euler_angles_survive_the_round_trip():
+    generator = torch.Generator().manual_seed(0)
+    angles = torch.rand(500, 3, generator=generator, dtype=torch.float64) - 0.5
+    angles[:, 1] += math.pi
+    angles[:, 2] *= 20
+    again = matrix_to_euler_facing_down(euler_to_matrix(angles), angles + 0.5)
+    assert torch.allclose(again, angles, atol=1e-9)
+
+
+def test_euler_rates_give_the_angular_velocity():
+    generator = torch.Generator().manual_seed(0)
+    angles = torch.randn(100, 3, generator=generator, dtype=torch.float64)
+    rates = torch.randn(100, 3, generator=generator, dtype=torch.float64)
+    eps = 1e-6
+    step = euler_to_matrix(angles + eps * rates) @ euler_to_matrix(angles - eps * rates).mT
+    skew = (step - step.mT) / (4 * eps)
+    omega = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)
+    assert torch.allclose(
+        (euler_rates_matrix(angles) @ rates[:, :, None]).squeeze(-1), omega, atol=1e-7
+    )
+
+
+def test_rotation_vectors_and_quaternions_agree():
+    v = torch.tensor([[0.0, 0.0, 0.7], [0.0, 0.0, 0.0], [0.3, -0.2, 0.5]], dtype=torch.float64)
+    matrices = rotation_vector_to_matrix(v)
+    assert torch.allclose(matrices, torch.linalg.matrix_exp(_cross(v)), atol=1e-12)
+
+
+@pytest.mark.parametrize("element", [(0.7, False), (0.7, True), (0.0, True)])
+def test_mirrored_orientations_are_conjugated(element):
+    angle, reflect = element
+    q = torch.nn.functional.normalize(
+        torch.randn(50, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64), dim=1
+    )
+    c, s = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    mirror = torch.diag(torch.tensor([1.0, -1.0 if reflect else 1.0, 1.0], dtype=torch.float64))
+    expected = turn @ mirror @ quaternion_to_matrix(q) @ mirror
+    assert torch.allclose(
+        quaternion_to_matrix(transform_quaternion(q, angle, reflect)), expected, atol=1e-12
+    )
+
+
+def _cross(v):
+    zero = torch.zeros_like(v[:, 0])
+    return torch.stack(
+        [
+            torch.stack([zero, -v[:, 2], v[:, 1]], dim=1),
+            torch.stack([v[:, 2], zero, -v[:, 0]], dim=1),
+            torch.stack([-v[:, 1], v[:, 0], zero], dim=1),
+        ],
+        dim=1,
+    )

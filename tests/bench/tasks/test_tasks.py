@@ -1,0 +1,305 @@
+"""Tasks: observations follow their layouts, resets are seeded and symmetric, states turn."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+from mani_skill.envs.tasks.tabletop.stack_cube import StackCubeEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from bench.tasks import embodiments, make, task_class, task_names
+from policies.errors import UserError
+from policies.geometry import Group
+
+TASKS = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
+ELEMENTS = [*Group.parse("D4").elements, (0.3, False), (-2.0, True)]
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def floating(request):
+    env = make(request.param, num_envs=6, reward_mode="dense")
+    yield env
+    env.close()
+
+
+def roam(env, steps, seed=0):
+    """Random actions, so that states are general: tilted, moving, fingers half open."""
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(steps):
+        env.step(torch.rand(env.num_envs, 7, generator=generator) * 2 - 1)
+
+
+def assert_same(a, b):
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key])
+    else:
+        assert torch.equal(a, b)
+
+
+def rows(tree, index):
+    if isinstance(tree, dict):
+        return {key: rows(value, index) for key, value in tree.items()}
+    return tree[index].clone()
+
+
+def test_names():
+    assert task_names() == list(TASKS)
+    assert embodiments() == ["floating", "panda"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ({"task": "PickCub-v1"}, ["PickCub-v1", "'PickCube-v1'", "StackCube-v1"]),
+        ({"task": "PickCube-v1", "embodiment": "pand"}, ["'panda'", "floating"]),
+        ({"task": "PickCube-v1", "variant": "action_gian:1"}, ["'action_gain'"]),
+        ({"task": "PickCube-v1", "sim": "gpu"}, ["gpu", "cpu", "cuda"]),
+        ({"task": "PickCube-v1", "num_envs": 0}, ["num_envs"]),
+    ],
+)
+def test_bad_names_are_explained(arguments, parts):
+    with pytest.raises(UserError) as error:
+        make(**{"num_envs": 1, **arguments})
+    for part in parts:
+        assert part in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("task", "stock"), list(zip(TASKS, (PushCubeEnv, PickCubeEnv, StackCubeEnv), strict=True))
+)
+def test_success_is_maniskills(task, stock):
+    assert task_class(task).evaluate is stock.evaluate
+    assert task in REGISTERED_ENVS
+    assert REGISTERED_ENVS[task].cls is stock
+
+
+@pytest.mark.parametrize("embodiment", ["floating", "panda"])
+@pytest.mark.parametrize("task", TASKS)
+def test_observation_follows_the_layout(task, embodiment):
+    env = make(task, num_envs=3, embodiment=embodiment)
+    obs, _ = env.reset(seed=[1, 2, 3])
+    layout = env.observation_layout
+    assert obs.shape == (3, layout.dim)
+    assert obs.dtype == torch.float32
+    assert env.action_layout.dim == 7
+    assert env.single_observation_space.shape == (layout.dim,)
+    assert torch.equal(obs[:, layout.slice("tcp_xy")], env.agent.tcp_pose.p[:, :2])
+    assert torch.equal(obs[:, layout.slice("tcp_z")], env.agent.tcp_pose.p[:, 2:])
+    assert torch.allclose(obs[:, layout.slice("gripper_width")], torch.tensor(0.08), atol=1e-6)
+    fields = env.get_obs(unflattened=True)
+    for part in fields.values():
+        for name, value in part.items():
+            assert torch.equal(obs[:, layout.slice(name)], value), name
+
+
+@pytest.mark.parametrize("embodiment", ["floating", "panda"])
+@pytest.mark.parametrize("task", TASKS)
+def test_a_seed_alone_determines_the_initial_state(task, embodiment):
+    many = make(task, num_envs=4, embodiment=embodiment)
+    many.reset(seed=[11, 12, 13, 14])
+    together = many.get_state_dict()
+    one = make(task, num_envs=1, embodiment=embodiment)
+    one.reset(seed=[13])
+    assert_same(one.get_state_dict(), rows(together, slice(2, 3)))
+    many.reset(seed=[0, 1, 2, 3])
+    many.reset(seed=[13, 11], options={"env_idx": torch.tensor([3, 0])})
+    again = many.get_state_dict()
+    assert_same(rows(again, slice(3, 4)), rows(together, slice(2, 3)))
+    assert_same(rows(again, slice(0, 1)), rows(together, slice(0, 1)))
+
+
+def test_partial_reset_leaves_the_others_alone():
+    def play(interfere):
+        env = make("PickCube-v1", num_envs=3)
+        env.reset(seed=[1, 2, 3])
+        roam(env, 5)
+        if interfere:
+            env.reset(seed=[9], options={"env_idx": torch.tensor([1])})
+        roam(env, 5, seed=1)
+        kept = rows(env.get_state_dict(), [0, 2])
+        # Unseeded resets continue each environment's own stream.
+        env.reset()
+        return kept, rows(env.get_state_dict(), [0, 2])
+
+    for quiet, disturbed in zip(play(False), play(True), strict=True):
+        assert_same(quiet, disturbed)
+
+
+def test_wrong_number_of_seeds_is_explained():
+    env = make("PickCube-v1", num_envs=3)
+    with pytest.raises(UserError, match="2 seeds were given for 3 environments"):
+        env.reset(seed=[1, 2])
+    with pytest.raises(UserError, match="3 seeds were given for 2 environments"):
+        env.reset(seed=[1, 2, 3], options={"env_idx": [0, 1]})
+
+
+def test_resets_have_no_preferred_direction():
+    env = make("PushCube-v1", num_envs=400)
+    obs, _ = env.reset(seed=list(range(400)))
+    layout = env.observation_layout
+    # Components of isotropic vectors average to zero: five standard errors of unit vectors.
+    for name in ("tcp_x_axis", "tcp_y_axis", "cube_yaw"):
+        assert (obs[:, layout.slice(name)].mean(dim=0).abs() < 5 * 0.71 / 20).all(), name
+    direction = env.push_direction()
+    assert (direction.mean(dim=0).abs() < 5 * 0.71 / 20).all()
+    cube = obs[:, layout.slice("cube_xy")]
+    assert cube.norm(dim=1).max() <= env.spawn_radius + 1e-6
+    # Uniform in the disc: half of the points lie within radius / sqrt(2).
+    inside = (cube.norm(dim=1) < env.spawn_radius / math.sqrt(2)).float().mean()
+    assert 0.4 < inside < 0.6
+    ahead = obs[:, layout.slice("cube_to_goal_xy")]
+    assert torch.allclose(ahead, 0.2 * direction, atol=1e-5)
+
+
+def test_restoring_a_state(floating):
+    """The state comes back to the bit, controller targets included, and goes on as before."""
+    floating.reset(seed=list(range(6)))
+    roam(floating, 4)
+    state = rows(floating.get_state_dict(), slice(None))
+    roam(floating, 6, seed=2)
+    expected = rows(floating.get_state_dict(), slice(None))
+    floating.set_state_dict(state)
+    assert_same(rows(floating.get_state_dict(), slice(None)), state)
+    roam(floating, 6, seed=2)
+    now = floating.get_state_dict()
+    assert torch.equal(
+        now["controller"]["root"]["target_qpos"][:, 3:],
+        expected["controller"]["root"]["target_qpos"][:, 3:],
+    )
+    # PhysX keeps contact caches of its own, which no state holds.
+    for kind in ("actors", "articulations"):
+        for name, value in now[kind].items():
+            positions = slice(0, 3) if kind == "actors" else slice(13, 21)
+            close = torch.isclose(
+                value[:, positions], expected[kind][name][:, positions], atol=2e-5
+            )
+            assert close.all(), name
+
+
+def test_restoring_some_environments_keeps_the_others(floating):
+    floating.reset(seed=list(range(6)))
+    roam(floating, 3)
+    before = rows(floating.get_state_dict(), slice(None))
+    roam(floating, 3)
+    after = rows(floating.get_state_dict(), slice(None))
+    floating.set_state_dict(rows(before, [2, 3]), env_idx=torch.tensor([4, 1]))
+    now = floating.get_state_dict()
+    assert_same(rows(now, [0, 2, 3, 5]), rows(after, [0, 2, 3, 5]))
+    assert_same(rows(now, [4, 1]), rows(before, [2, 3]))
+
+
+def test_turning_a_state_turns_observation_and_keeps_the_reward(floating):
+    """The layout says how each observed number turns; the simulation state must agree."""
+    floating.reset(seed=list(range(6)))
+    roam(floating, 8)
+    state = rows(floating.get_state_dict(), slice(None))
+    floating.set_state_dict(state)
+    obs = floating.get_obs().clone()
+    zero = torch.zeros(6, 7)
+    reward = floating.get_reward(obs, zero, floating.get_info()).clone()
+    for angle, reflect in ELEMENTS:
+        floating.set_state_dict(floating.transform_state(state, angle, reflect))
+        expected = floating.observation_layout.transform(obs.double(), angle, reflect)
+        assert torch.allclose(floating.get_obs().double(), expected, atol=2e-5), (angle, reflect)
+        turned = floating.get_reward(obs, zero, floating.get_info())
+        assert torch.allclose(turned, reward, atol=1e-5)
+
+
+def test_transformations_compose(floating):
+    floating.reset(seed=list(range(6)))
+    roam(floating, 8)
+    state = floating.get_state_dict()
+    there = floating.transform_state(state, 1.1, True)
+    # A reflection followed by a rotation is its own inverse.
+    back = floating.transform_state(there, 1.1, True)
+
+    def compare(a, b):
+        for key, value in a.items():
+            if isinstance(value, dict):
+                compare(value, b[key])
+            else:
+                assert torch.allclose(value, b[key], atol=5e-6), key
+
+    compare(state, back)
+    moved = there["articulations"][floating.agent.robot.name][:, 13:21]
+    assert (moved - state["articulations"][floating.agent.robot.name][:, 13:21]).abs().max() > 0.1
+
+
+def test_panda_states_cannot_be_turned():
+    env = make("PickCube-v1", num_envs=1, embodiment="panda")
+    with pytest.raises(UserError, match="floating"):
+        env.transform_state(env.get_state_dict(), 0.5)
+
+
+def test_push_reward_in_the_stock_direction_is_maniskills():
+    env = make("PushCube-v1", num_envs=6, reward_mode="dense")
+    env.reset(seed=list(range(6)))
+    roam(env, 6)
+    direction = env.push_direction()
+    angles = -torch.atan2(direction[:, 1], direction[:, 0])
+    # Turn every environment so that it pushes along +x, where the stock formula holds.
+    states = [env.transform_state(env.get_state_dict(), float(a)) for a in angles]
+    row = [rows(state, slice(i, i + 1)) for i, state in enumerate(states)]
+
+    def stack(trees):
+        if isinstance(trees[0], dict):
+            return {key: stack([tree[key] for tree in trees]) for key in trees[0]}
+        return torch.cat(trees)
+
+    env.set_state_dict(stack(row))
+    info = env.get_info()
+    ours = env.compute_dense_reward(None, None, info)
+    stock = PushCubeEnv.compute_dense_reward(env, None, None, info)
+    assert torch.allclose(ours, stock, atol=1e-5)
+    assert ours.std() > 0.01
+
+
+def test_truncation_at_the_limit():
+    env = make("PickCube-v1", num_envs=2)
+    env.reset(seed=[0, 1])
+    for step in range(env.max_episode_steps):
+        _, _, terminated, truncated, _ = env.step(torch.zeros(2, 7))
+        assert truncated.tolist() == [step + 1 == env.max_episode_steps] * 2
+        assert not terminated.any()
+
+
+def test_gymnasium_makes_the_same_environment():
+    env = gym.make(
+        "SymSteer/PickCube-v1", num_envs=2, embodiment="floating", variant="action_gain", strength=1
+    )
+    base = env.unwrapped
+    assert isinstance(base, PickCubeEnv)
+    assert base.variants[0].name == "action_gain"
+    obs, _ = env.reset(seed=[3, 4])
+    ours = make("PickCube-v1", num_envs=2)
+    assert torch.equal(obs, ours.reset(seed=[3, 4])[0])
+
+
+def test_feasible_return():
+    task = task_class("PickCube-v1")
+    assert task.feasible_return(0.9, steps_per_decision=4) == pytest.approx((-40.0, 0.0))
+    low, high = task.feasible_return(0.5, steps_per_decision=25, bootstrap_truncation=False)
+    assert (low, high) == pytest.approx((-25 * (1 + 0.5), 0.0))
+    assert task.feasible_return(1.0, bootstrap_truncation=False)[0] == -50
+    with pytest.raises(UserError, match="gamma"):
+        task.feasible_return(1.0)
+    with pytest.raises(UserError, match="gamma"):
+        task.feasible_return(-0.1)
+
+
+def test_observation_is_a_function_of_the_state():
+    """Nothing in the observation depends on how the state came about (contacts, velocities)."""
+    env = make("StackCube-v1", num_envs=4)
+    env.reset(seed=[0, 1, 2, 3])
+    roam(env, 10)
+    obs, state = env.get_obs().clone(), rows(env.get_state_dict(), slice(None))
+    other = make("StackCube-v1", num_envs=4)
+    other.set_state_dict(state)
+    assert np.allclose(other.get_obs(), obs, atol=1e-6)
