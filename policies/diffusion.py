@@ -1,0 +1,119 @@
+"""The diffusion process of the base policies: schedule, training loss, deterministic sampler.
+
+Forward process q(x_t | x_0) = N(sqrt(a_t) x_0, (1 - a_t) I) with the squared-cosine schedule
+(Nichol & Dhariwal, arXiv 2102.09672); sampling by DDIM with eta = 0 (Song et al., arXiv
+2010.02502), so that the initial noise alone decides which action chunk comes out. Schedule,
+time steps ("trailing") and step agree with diffusers' ``DDIMScheduler``
+(``tests/policies/test_diffusion.py``); diffusers itself is not needed at run time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+
+from policies.errors import UserError
+
+Prediction = Literal["sample", "epsilon"]
+Bound = Callable[[torch.Tensor], torch.Tensor]
+
+
+class Diffusion:
+    """Noise schedule, loss and sampler.
+
+    Args:
+        steps: K, the number of noise levels in training.
+        prediction: what the network outputs: ``sample`` (the clean chunk x_0) or ``epsilon``
+            (the noise). ``epsilon`` recovers x_0 by dividing by sqrt(a_t), which is about 5e-4
+            at the first sampling step: rounding errors grow by 1/sqrt(a_t).
+
+    Raises:
+        UserError: if ``steps`` or ``prediction`` is invalid.
+    """
+
+    def __init__(self, steps: int = 100, prediction: Prediction = "sample"):
+        if steps < 2:
+            raise UserError(f"diffusion needs at least 2 noise levels, not {steps}")
+        if prediction not in ("sample", "epsilon"):
+            raise UserError(f"unknown prediction {prediction!r}; choose sample or epsilon")
+        self.steps = steps
+        self.prediction = prediction
+        product = 1.0
+        self.signal: list[float] = []
+        for t in range(steps):
+            beta = min(1 - _squared_cosine((t + 1) / steps) / _squared_cosine(t / steps), 0.999)
+            product *= 1 - beta
+            self.signal.append(product)
+
+    def timesteps(self, sampling_steps: int) -> list[int]:
+        """Noise levels of the sampler, from K - 1 down, evenly spaced from the noisy end.
+
+        Raises:
+            UserError: unless 1 <= sampling_steps <= K.
+        """
+        if not 1 <= sampling_steps <= self.steps:
+            raise UserError(
+                f"the sampler can take 1 to {self.steps} steps (the noise levels in training), "
+                f"not {sampling_steps}"
+            )
+        return [round(self.steps * (1 - i / sampling_steps)) - 1 for i in range(sampling_steps)]
+
+    def add_noise(self, x0: torch.Tensor, noise: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        """Draw x_t given x_0; shapes ``x0, noise [B, ...]``, ``t [B]`` int64."""
+        signal = torch.tensor(self.signal, dtype=torch.float64)
+        shape = (-1,) + (1,) * (x0.dim() - 1)
+        keep = signal.sqrt().to(x0)[t].view(shape)
+        spread = (1 - signal).sqrt().to(x0)[t].view(shape)
+        return keep * x0 + spread * noise
+
+    def loss(self, output: torch.Tensor, x0: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Mean squared error of the network's output, a scalar."""
+        target = x0 if self.prediction == "sample" else noise
+        return torch.nn.functional.mse_loss(output, target)
+
+    def ddim_step(
+        self,
+        output: torch.Tensor,
+        t: int,
+        t_next: int,
+        x: torch.Tensor,
+        bound: Bound | None = None,
+    ) -> torch.Tensor:
+        """One deterministic step from noise level ``t`` to ``t_next`` (-1 is the clean chunk).
+
+        Args:
+            output: the network's prediction at ``x``.
+            x: the noisy chunk, any shape.
+            bound: applied to the predicted clean chunk; must commute with the symmetry. The
+                noise direction is the one that belongs to the bounded prediction.
+        """
+        keep, spread = math.sqrt(self.signal[t]), math.sqrt(1 - self.signal[t])
+        clean = output if self.prediction == "sample" else (x - spread * output) / keep
+        if bound is not None:
+            clean = bound(clean)
+        if t_next < 0:
+            return clean
+        noise = (x - keep * clean) / spread
+        signal = self.signal[t_next]
+        return math.sqrt(signal) * clean + math.sqrt(1 - signal) * noise
+
+    def sample(
+        self,
+        network: Callable[[torch.Tensor, int], torch.Tensor],
+        noise: torch.Tensor,
+        sampling_steps: int,
+        bound: Bound | None = None,
+    ) -> torch.Tensor:
+        """Follow the deterministic sampler from ``noise``; ``network(x, t)`` predicts."""
+        levels = self.timesteps(sampling_steps)
+        x = noise
+        for t, t_next in zip(levels, [*levels[1:], -1], strict=True):
+            x = self.ddim_step(network(x, t), t, t_next, x, bound)
+        return x
+
+
+def _squared_cosine(time: float) -> float:
+    return math.cos((time + 0.008) / 1.008 * math.pi / 2) ** 2

@@ -1,0 +1,101 @@
+"""Statistics that bring data to unit size, and bounds, both commuting with planar symmetries.
+
+Per-dimension min-max statistics break rotation equivariance: the two components of a horizontal
+vector get different scales and offsets. Here scalars are brought to [-1, 1] one by one, while
+every irrep block of frequency >= 1 has one scale and no offset, and bounds act on the norm of
+each block.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+from torch import nn
+
+from policies.errors import UserError
+from policies.geometry import Layout
+
+MINIMUM_RANGE = 1e-2
+"""Half-ranges below this count as constant (1 cm, or 0.6 degrees in a rotation column): dividing
+by them would blow simulation noise up to unit size."""
+
+
+@functools.lru_cache(maxsize=64)
+def _same_block(layout: Layout, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    index = layout.block_index
+    return (index[:, None] == index[None, :]).to(dtype=dtype, device=device)
+
+
+def clip_blocks(x: torch.Tensor, layout: Layout, radius: float) -> torch.Tensor:
+    """Shorten every irrep block of ``x [..., dim]`` to at most ``radius``.
+
+    Scalars are clamped to [-radius, radius], vectors keep their direction. Blocks within the
+    bound come back bit-equal.
+    """
+    norm = ((x * x) @ _same_block(layout, x.dtype, x.device)).sqrt()
+    shortened = x * (radius / norm.clamp_min(radius))
+    # Rounding may leave a component a few ulps outside; nothing else is touched here.
+    return shortened.clamp(-radius, radius)
+
+
+class Normalizer(nn.Module):
+    """An affine map per irrep block: normalize(x) = (x - offset) / scale.
+
+    Args:
+        layout: geometry of the vectors.
+        scale: ``[dim]``, positive, equal within each block of frequency >= 1.
+        offset: ``[dim]``, zero except for scalars that reflections leave alone.
+
+    The state dict holds ``scale`` and ``offset``.
+    """
+
+    scale: torch.Tensor
+    offset: torch.Tensor
+
+    def __init__(
+        self,
+        layout: Layout,
+        scale: torch.Tensor | None = None,
+        offset: torch.Tensor | None = None,
+    ):
+        super().__init__()
+        self.layout = layout
+        self.register_buffer("scale", torch.ones(layout.dim) if scale is None else scale)
+        self.register_buffer("offset", torch.zeros(layout.dim) if offset is None else offset)
+
+    @classmethod
+    def fit(cls, layout: Layout, data: torch.Tensor) -> Normalizer:
+        """Statistics of ``data [..., dim]``.
+
+        Scalars: the middle and half the range between minimum and maximum. Odd scalars (they
+        change sign under reflections): the largest magnitude, no offset. Vectors: the largest
+        norm, no offset. What varies by less than ``MINIMUM_RANGE`` keeps scale 1.
+
+        Raises:
+            UserError: if the data are empty, not finite or of another width.
+        """
+        if data.shape[-1] != layout.dim or data.numel() == 0:
+            raise UserError(
+                f"the data to normalise have shape {tuple(data.shape)}; needed are one or more "
+                f"rows of {layout.dim} numbers, the width of the layout"
+            )
+        data = data.reshape(-1, layout.dim).double()
+        if not data.isfinite().all():
+            raise UserError("the data to normalise hold NaN or infinite numbers; remove them")
+        low, high = data.min(dim=0).values, data.max(dim=0).values
+        radius = ((data * data) @ _same_block(layout, data.dtype, data.device)).max(dim=0).values
+        # What reflections leave alone may have an offset; everything else is fixed at zero.
+        shiftable = layout.invariant_mask(reflections=True).to(data.device)
+        offset = torch.where(shiftable, (low + high) / 2, 0.0)
+        scale = torch.where(shiftable, (high - low) / 2, radius.sqrt())
+        scale = torch.where(scale < MINIMUM_RANGE, 1.0, scale)
+        return cls(layout, scale.float(), offset.float())
+
+    def normalize(self, x: torch.Tensor) -> torch.Tensor:
+        """Data units to unit size; shapes ``[..., dim] -> [..., dim]``."""
+        return (x - self.offset) / self.scale
+
+    def unnormalize(self, x: torch.Tensor) -> torch.Tensor:
+        """The inverse of :meth:`normalize`."""
+        return x * self.scale + self.offset

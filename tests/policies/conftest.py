@@ -1,0 +1,112 @@
+"""A small symmetric world for the policies' tests: a point mass with an equivariant controller."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from policies.base import PolicyConfig
+from policies.geometry import Field, Layout
+from policies.training import train_policy
+
+OBS = Layout(
+    [
+        Field("tcp", 1),
+        Field("height", 0),
+        Field("goal", 1),
+        Field("rod", 2),
+        Field("twist", 0, odd=True),
+        Field("width", 0),
+    ]
+)
+ACT = Layout(
+    [
+        Field("xy", 1),
+        Field("z", 0),
+        Field("tilt", 1, odd=True),
+        Field("yaw", 0, odd=True),
+        Field("gripper", 0),
+    ]
+)
+SMALL = {"channels": 16, "width": 32, "depth": 2, "warmup_steps": 10, "learning_rate": 4e-3}
+
+
+def controller(obs: torch.Tensor) -> torch.Tensor:
+    """Actions [..., 7] that commute with every rotation and reflection of the plane."""
+    tcp, goal = (
+        torch.view_as_complex(obs[..., OBS.slice(n)].clone()) for n in ("tcp", "goal")
+    )
+    rod = torch.view_as_complex(obs[..., OBS.slice("rod")].clone())
+    reach = goal - tcp
+    xy = reach / reach.abs().clamp_min(0.25)
+    tilt = 0.5j * rod * xy.conj()
+    yaw = (xy.conj() * tcp).imag - obs[..., OBS.slice("twist")].squeeze(-1)
+    z = -obs[..., OBS.slice("height")]
+    gripper = torch.where(reach.abs() < 0.3, -1.0, 1.0).to(obs)
+    return torch.cat(
+        [
+            torch.view_as_real(xy),
+            z,
+            torch.view_as_real(tilt),
+            yaw.clamp(-1, 1)[..., None],
+            gripper[..., None],
+        ],
+        dim=-1,
+    )
+
+
+def sample_observations(count: int, generator: torch.Generator) -> torch.Tensor:
+    obs = torch.rand(count, OBS.dim, generator=generator) * 2 - 1
+    rod = obs[:, OBS.slice("rod")]
+    obs[:, OBS.slice("rod")] = rod / rod.norm(dim=-1, keepdim=True)
+    return obs
+
+
+def make_episodes(count: int, seed: int = 0, length: int = 8, noise: float = 0.0):
+    generator = torch.Generator().manual_seed(seed)
+    obs = sample_observations(count, generator)
+    states, actions = [obs], []
+    for _ in range(length):
+        action = controller(obs)
+        action = action + noise * torch.randn(action.shape, generator=generator)
+        obs = obs.clone()
+        obs[:, OBS.slice("tcp")] += 0.2 * action[:, ACT.slice("xy")]
+        obs[:, OBS.slice("height")] += 0.2 * action[:, ACT.slice("z")]
+        states.append(obs)
+        actions.append(action)
+    states, actions = torch.stack(states, dim=1), torch.stack(actions, dim=1)
+    return [(states[i], actions[i]) for i in range(count)]
+
+
+@pytest.fixture(scope="session")
+def world() -> SimpleNamespace:
+    """Layouts, controller, episodes and a configuration small enough for tests."""
+    return SimpleNamespace(
+        obs_layout=OBS,
+        act_layout=ACT,
+        controller=controller,
+        observations=lambda count, seed=0: sample_observations(
+            count, torch.Generator().manual_seed(seed)
+        ),
+        episodes=make_episodes,
+        small=SMALL,
+    )
+
+
+@pytest.fixture(scope="session")
+def trained(world):
+    """Policies trained briefly, one per configuration; ``trained(**config fields)``."""
+    cache = {}
+
+    def get(**fields):
+        key = tuple(sorted(fields.items()))
+        if key not in cache:
+            config = PolicyConfig(
+                **{**world.small, "steps": 120, "batch_size": 64, "ema_decay": 0.9, **fields}
+            )
+            cache[key] = train_policy(
+                config, world.episodes(24, noise=0.2), world.obs_layout, world.act_layout
+            )
+        return cache[key]
+
+    return get

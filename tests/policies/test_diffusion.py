@@ -1,0 +1,92 @@
+"""Our schedule and sampler against diffusers' DDIM scheduler."""
+
+import pytest
+import torch
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+
+from policies.diffusion import Diffusion
+from policies.errors import UserError
+
+
+def reference(prediction, clip=False):
+    return DDIMScheduler(
+        num_train_timesteps=100,
+        beta_schedule="squaredcos_cap_v2",
+        prediction_type=prediction,
+        clip_sample=clip,
+        clip_sample_range=1.0,
+        timestep_spacing="trailing",
+    )
+
+
+def test_schedule_and_forward_process():
+    ours, theirs = Diffusion(100), reference("sample")
+    assert torch.allclose(torch.tensor(ours.signal).float(), theirs.alphas_cumprod, rtol=2e-4)
+    assert torch.allclose(torch.tensor(ours.signal).float(), theirs.alphas_cumprod, atol=1e-6)
+    x0, noise = torch.randn(2, 100, 8, 7, generator=torch.Generator().manual_seed(0))
+    t = torch.arange(100)
+    assert torch.allclose(ours.add_noise(x0, noise, t), theirs.add_noise(x0, noise, t), atol=1e-5)
+
+
+@pytest.mark.parametrize("steps", [1, 4, 5, 10, 20])
+def test_timesteps(steps):
+    theirs = reference("sample")
+    theirs.set_timesteps(steps)
+    assert Diffusion(100).timesteps(steps) == theirs.timesteps.tolist()
+
+
+@pytest.mark.parametrize("prediction", ["sample", "epsilon"])
+@pytest.mark.parametrize("clip", [False, True])
+@pytest.mark.parametrize("steps", [4, 5, 10])
+def test_every_step_is_diffusers_step(prediction, clip, steps):
+    """Per-axis clipping is what diffusers has, so the bound here is a clamp."""
+    ours, theirs = Diffusion(100, prediction), reference(prediction, clip)
+    theirs.set_timesteps(steps)
+    generator = torch.Generator().manual_seed(0)
+    levels = ours.timesteps(steps)
+    bound = (lambda x: x.clamp(-1, 1)) if clip else None
+    for t, t_next in zip(levels, [*levels[1:], -1], strict=True):
+        x, output = torch.randn(2, 64, 8, 7, generator=generator).double()
+        step = theirs.step(output, t, x, eta=0.0, use_clipped_model_output=clip).prev_sample
+        mine = ours.ddim_step(output, t, t_next, x, bound)
+        # diffusers keeps its schedule in float32: sqrt(a_t) at t = 99 has 4 good digits there.
+        tolerance = 2e-3 if prediction == "epsilon" and t == 99 and not clip else 5e-5
+        assert torch.allclose(mine, step, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("steps", [4, 8, 10])
+def test_sampler_follows_the_steps(steps):
+    """A predictor that knows the answer gets it; a linear one matches diffusers' whole loop."""
+    ours = Diffusion(100)
+    noise = torch.randn(5, 8, 7, generator=torch.Generator().manual_seed(0))
+    answer = torch.linspace(-1, 1, 7).expand_as(noise)
+    assert torch.equal(ours.sample(lambda x, t: answer, noise, steps), answer)
+    if 100 % steps:
+        return
+    theirs = reference("sample")
+    theirs.set_timesteps(steps)
+    x = noise
+    for t in theirs.timesteps:
+        x = theirs.step(0.5 * x + answer, int(t), x).prev_sample
+    assert torch.allclose(ours.sample(lambda x, t: 0.5 * x + answer, noise, steps), x, atol=1e-5)
+
+
+def test_loss_targets():
+    x0, noise = torch.randn(2, 4, 8, 7, generator=torch.Generator().manual_seed(0))
+    assert Diffusion(prediction="sample").loss(x0, x0, noise) == 0
+    assert Diffusion(prediction="epsilon").loss(noise, x0, noise) == 0
+    assert Diffusion(prediction="sample").loss(noise, x0, noise) > 0
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        lambda: Diffusion(1),
+        lambda: Diffusion(100, "velocity"),
+        lambda: Diffusion(100).timesteps(0),
+        lambda: Diffusion(100).timesteps(101),
+    ],
+)
+def test_mistakes_raise_user_errors(mistake):
+    with pytest.raises(UserError):
+        mistake()

@@ -1,0 +1,109 @@
+"""Normaliser and block-wise bounds: values, exact commutation, guards."""
+
+import math
+
+import pytest
+import torch
+
+from policies.errors import UserError
+from policies.geometry import Field, Layout
+from policies.normalizer import MINIMUM_RANGE, Normalizer, clip_blocks
+
+LAYOUT = Layout(
+    [Field("xy", 1, 2), Field("z", 0), Field("yaw", 0, odd=True), Field("rod", 2, odd=True)]
+)
+ELEMENTS = [(2 * math.pi * i / 8, flip) for i in range(8) for flip in (False, True)]
+
+
+def data(count=200):
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(count, LAYOUT.dim, generator=generator, dtype=torch.float64)
+    return x * torch.tensor([1.0, 3, 0.5, 0.5, 2, 1, 1, 4]) + torch.tensor(
+        [2.0, 0, 0, -1, 5, 0.3, 1, 0]
+    )
+
+
+def test_statistics():
+    x = data()
+    fitted = Normalizer.fit(LAYOUT, x)
+    z, yaw = x[:, LAYOUT.slice("z")], x[:, LAYOUT.slice("yaw")]
+    y = fitted.normalize(x)
+    assert torch.allclose(y[:, LAYOUT.slice("z")].aminmax()[0], torch.tensor(-1.0).double())
+    assert torch.allclose(y[:, LAYOUT.slice("z")].aminmax()[1], torch.tensor(1.0).double())
+    assert fitted.offset[LAYOUT.slice("z")].item() == pytest.approx(
+        float(z.max() + z.min()) / 2, rel=1e-6
+    )
+    assert fitted.scale[LAYOUT.slice("yaw")].item() == pytest.approx(float(yaw.abs().max()))
+    vectors = [b for b in LAYOUT.blocks if b.stop - b.start == 2]
+    for block in vectors:
+        assert fitted.scale[block][0] == fitted.scale[block][1]
+        assert y[:, block].norm(dim=-1).max().item() == pytest.approx(1.0, abs=1e-6)
+    moved = ~LAYOUT.invariant_mask(reflections=True)
+    assert (fitted.offset[moved] == 0).all()
+    # Blocks of one field keep scales of their own.
+    assert fitted.scale[0] != fitted.scale[2]
+
+
+def test_round_trip():
+    x = data()
+    fitted = Normalizer.fit(LAYOUT, x)
+    assert torch.allclose(fitted.unnormalize(fitted.normalize(x)), x, atol=1e-12)
+    other = Normalizer(LAYOUT)
+    other.load_state_dict(fitted.state_dict())
+    assert torch.equal(other.normalize(x), fitted.normalize(x))
+
+
+@pytest.mark.parametrize("element", [*ELEMENTS, (0.3, False), (1.7, True)])
+def test_commutes_with_rotations_and_reflections(element):
+    x = data()
+    fitted = Normalizer.fit(LAYOUT, x).double()
+    turned = fitted.normalize(LAYOUT.transform(x, *element))
+    assert torch.allclose(turned, LAYOUT.transform(fitted.normalize(x), *element), atol=1e-13)
+    clipped = clip_blocks(LAYOUT.transform(x, *element), LAYOUT, 1.0)
+    assert torch.allclose(
+        clipped, LAYOUT.transform(clip_blocks(x, LAYOUT, 1.0), *element), atol=1e-13
+    )
+
+
+def test_per_dimension_statistics_and_clamps_do_not_commute():
+    x = data()
+    angle = math.pi / 4
+    low, high = x.amin(0), x.amax(0)
+    naive = Normalizer(LAYOUT, (high - low) / 2, (high + low) / 2)
+    turned = naive.normalize(LAYOUT.transform(x, angle))
+    assert (turned - LAYOUT.transform(naive.normalize(x), angle)).abs().max() > 0.1
+    clamped = LAYOUT.transform(x, angle).clamp(-1, 1)
+    assert (clamped - LAYOUT.transform(x.clamp(-1, 1), angle)).abs().max() > 0.1
+
+
+def test_constant_fields_keep_their_unit():
+    x = data()
+    x[:, LAYOUT.slice("z")] = 7.0
+    x[:, LAYOUT.slice("rod")] = 1e-4 * torch.randn(len(x), 2, dtype=torch.float64)
+    fitted = Normalizer.fit(LAYOUT, x)
+    assert fitted.scale[LAYOUT.slice("z")].item() == 1.0
+    assert fitted.offset[LAYOUT.slice("z")].item() == 7.0
+    assert fitted.scale[LAYOUT.slice("rod")].tolist() == [1.0, 1.0]
+    assert fitted.normalize(x)[:, LAYOUT.slice("rod")].abs().max() < MINIMUM_RANGE
+
+
+def test_clip_blocks_bounds_norms_and_leaves_the_rest_alone():
+    x = data().float()
+    y = clip_blocks(x, LAYOUT, 1.5)
+    for block in LAYOUT.blocks:
+        before, after = x[:, block].norm(dim=-1), y[:, block].norm(dim=-1)
+        assert after.max() <= 1.5 * (1 + 1e-6)
+        inside = before <= 1.49
+        assert torch.equal(x[inside, block], y[inside, block])
+        cosine = (x[:, block] * y[:, block]).sum(-1) / (before * after)
+        assert torch.allclose(cosine, torch.ones(()), atol=1e-5)
+    assert y.abs().max() <= 1.5
+    assert torch.equal(clip_blocks(torch.zeros(1, LAYOUT.dim), LAYOUT, 1.0), torch.zeros(1, 8))
+
+
+@pytest.mark.parametrize(
+    "bad", [torch.zeros(0, 8), torch.zeros(5, 7), torch.full((5, 8), float("nan"))]
+)
+def test_bad_data_raise_user_errors(bad):
+    with pytest.raises(UserError):
+        Normalizer.fit(LAYOUT, bad)

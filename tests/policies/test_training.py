@@ -1,0 +1,184 @@
+"""Training: chunks, augmentation, determinism, learning, matched sizes, mistakes."""
+
+import math
+
+import pytest
+import torch
+
+from policies.base import ChunkPolicy, PolicyConfig
+from policies.edp import parameter_count
+from policies.errors import UserError
+from policies.geometry import Group
+from policies.training import Augmentation, make_chunks, train_policy
+
+
+def train(world, seed=0, progress=None, episodes=None, **fields):
+    config = PolicyConfig(**{**world.small, "steps": 30, "batch_size": 32, **fields})
+    episodes = world.episodes(6, noise=0.2) if episodes is None else episodes
+    return train_policy(config, episodes, world.obs_layout, world.act_layout, seed, progress)
+
+
+def test_chunks_end_with_a_held_gripper_and_no_motion(world):
+    (obs, actions), *_ = world.episodes(1, length=5)
+    seen, chunks = make_chunks([(obs, actions)], world.act_layout, 4, hold=("gripper", "absent"))
+    assert torch.equal(seen, obs[:5])
+    assert chunks.shape == (5, 4, world.act_layout.dim)
+    assert torch.equal(chunks[1], actions[1:5])
+    last = chunks[4]
+    assert torch.equal(last[0], actions[4])
+    gripper = world.act_layout.slice("gripper")
+    assert torch.equal(last[:, gripper], actions[4, gripper].expand(4, 1))
+    moving = torch.ones(world.act_layout.dim, dtype=torch.bool)
+    moving[gripper] = False
+    assert (last[1:, moving] == 0).all()
+    _, free = make_chunks([(obs, actions)], world.act_layout, 4)
+    assert (free[4, 1:] == 0).all()
+
+
+def test_chunks_never_mix_episodes(world):
+    episodes = world.episodes(3, length=6)
+    together = make_chunks(episodes, world.act_layout, 8, ("gripper",))
+    alone = [make_chunks([e], world.act_layout, 8, ("gripper",)) for e in episodes]
+    for i in range(2):
+        assert torch.equal(together[i], torch.cat([a[i] for a in alone]))
+
+
+@pytest.mark.parametrize("name", ["SO2", "C8", "D4"])
+def test_augmentation_turns_rows_as_the_layout_does(world, name):
+    group = Group.parse(name)
+    augmentation = Augmentation(group)
+    drawn = augmentation.draw(40, torch.Generator().manual_seed(0))
+    assert len(drawn.unique()) >= min(8, 40 if name == "SO2" else group.order)
+    x = torch.randn(40, 3, world.act_layout.dim, dtype=torch.float64)
+    y = augmentation.apply(drawn, x, world.act_layout)
+    for i in range(40):
+        element = (float(drawn[i]), False) if name == "SO2" else group.elements[drawn[i]]
+        assert torch.allclose(y[i], world.act_layout.transform(x[i], *element), atol=1e-6)
+
+
+def test_augmented_training_sees_turned_pairs(world):
+    """All demonstrations reach east; only the augmented policy learns what west means."""
+    generator = torch.Generator().manual_seed(0)
+    obs = world.observations(400)
+    obs[:, world.obs_layout.slice("tcp")] *= 0.1
+    angle = (torch.rand(400, generator=generator) - 0.5) * math.pi / 4
+    east = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    obs[:, world.obs_layout.slice("goal")] = 0.8 * east
+    actions = world.controller(obs)
+    episodes = [(o[None].repeat(2, 1), a[None]) for o, a in zip(obs, actions, strict=True)]
+    west = world.obs_layout.transform(obs[:64], math.pi)
+    expected = world.controller(west)[:, world.act_layout.slice("xy")]
+    noise = torch.randn(64, 8, world.act_layout.dim, generator=generator)
+    errors = {}
+    for name in ("plain", "plain-augmented", "edp"):
+        policy = train(world, episodes=episodes, name=name, steps=250, batch_size=64)
+        got = policy.decode(west, noise)[:, 0, world.act_layout.slice("xy")]
+        errors[name] = float((got - expected).norm(dim=-1).mean())
+    assert errors["plain-augmented"] < 0.5 < 1.0 < errors["plain"]
+    assert errors["edp"] < 0.5
+
+
+@pytest.mark.parametrize("name", ["edp", "plain", "plain-augmented"])
+def test_the_same_seed_gives_the_same_policy(world, name):
+    first, second, other = (train(world, seed, name=name) for seed in (3, 3, 4))
+    assert first.content_hash() == second.content_hash()
+    assert first.training_record["losses"] == second.training_record["losses"]
+    assert first.content_hash() != other.content_hash()
+
+
+def test_training_leaves_the_global_generator_alone(world):
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    train(world, steps=2)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize("network", ["mlp", "unet"])
+def test_it_learns_the_controller(trained, world, network):
+    policy = trained(group="C8", network=network)
+    losses = [loss for _, loss in policy.training_record["losses"]]
+    assert losses[-1] < 0.5 * losses[0]
+    obs = world.observations(64, seed=3)
+    noise = torch.randn(64, 8, 7, generator=torch.Generator().manual_seed(0))
+    wanted = world.controller(obs).clamp(-1, 1)
+    error = (policy.decode(obs, noise)[:, 0] - wanted).square().mean()
+    shuffled = (policy.decode(obs.flip(0), noise)[:, 0] - wanted).square().mean()
+    assert error < 0.8 * wanted.square().mean()
+    assert error < 0.7 * shuffled
+
+
+def test_record_progress_and_frozen_weights(world):
+    calls = []
+    policy = train(world, progress=lambda *call: calls.append(call))
+    assert isinstance(policy, ChunkPolicy)
+    assert calls[-1][:2] == (30, 30)
+    record = policy.training_record
+    assert record["losses"] == [(step, loss) for step, _, loss in calls]
+    assert record["parameters"] == parameter_count(policy.denoiser) == policy.parameter_count()
+    assert record["episodes"] == 6
+    assert record["chunks"] == sum(len(a) for _, a in world.episodes(6))
+    assert not policy.training
+    assert not any(p.requires_grad for p in policy.parameters())
+
+
+def test_actions_beyond_the_environments_bound_are_bounded_first(world):
+    """The environment executes bounded actions; imitating the excess would be wrong."""
+    episodes = [(o, 3 * a) for o, a in world.episodes(4)]
+    policy = train(world, episodes=episodes, steps=2)
+    assert policy.act_normalizer.scale.max() <= 1 + 1e-6
+
+
+@pytest.mark.parametrize("network", ["mlp", "unet"])
+@pytest.mark.parametrize("name", ["plain", "plain-augmented"])
+def test_plain_policies_have_matched_parameters_and_no_group(world, name, network):
+    sizes = {}
+    for kind in ("edp", name):
+        config = PolicyConfig(name=kind, network=network, width=64)
+        policy = ChunkPolicy(config, world.obs_layout, world.act_layout)
+        sizes[kind] = policy.parameter_count()
+        assert str(policy.group) == ("C8" if kind == "edp" else "C1")
+        assert policy.config == policy.config.resolved(world.obs_layout, world.act_layout)
+    assert abs(sizes[name] / sizes["edp"] - 1) < 0.05
+    free = PolicyConfig(name=name, network=network, width=64, match_parameters=False)
+    assert free.resolved(world.obs_layout, world.act_layout).width == 64
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        {"name": "quantum"},
+        {"network": "transformer"},
+        {"prediction": "velocity"},
+        {"group": "E8"},
+        {"group": "SO2"},
+        {"augmentation": "everything"},
+        {"horizon": 0},
+        {"execute": 9},
+        {"network": "unet", "horizon": 7, "execute": 4},
+        {"sampling_steps": 101},
+        {"diffusion_steps": 1, "sampling_steps": 1},
+        {"learning_rate": 0.0},
+        {"ema_decay": 1.0},
+        {"steps": 0},
+    ],
+)
+def test_bad_configurations_raise_user_errors(mistake, world):
+    with pytest.raises(UserError) as error:
+        ChunkPolicy(PolicyConfig(**mistake), world.obs_layout, world.act_layout)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "episodes",
+    [
+        [],
+        [(torch.zeros(5, 3), torch.zeros(4, 7))],
+        [(torch.zeros(5, 9), torch.zeros(4, 6))],
+        [(torch.zeros(3, 9), torch.zeros(4, 7))],
+        [(torch.zeros(1, 9), torch.zeros(0, 7))],
+        [(torch.full((5, 9), math.nan), torch.zeros(4, 7))],
+    ],
+)
+def test_bad_demonstrations_raise_user_errors(world, episodes):
+    with pytest.raises(UserError):
+        train(world, episodes=episodes)
