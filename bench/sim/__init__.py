@@ -38,6 +38,4 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name in ("BatchedCpuMixin", "create", "make_env_class"):
-        importlib.import_module("bench.sim.headless").silence_import_noise()
     return getattr(importlib.import_module(f"bench.sim.{_HOME[name]}"), name)

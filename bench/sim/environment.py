@@ -62,6 +62,7 @@ class BatchedCpuMixin:
             )
         if parallel_in_single_scene:
             raise UserError("parallel_in_single_scene needs the GPU simulation: use sim='cuda'.")
+        patches.check_versions()
         patches.install()
         prepare_headless()
         cameras = render_mode is not None or obs_mode not in (None, "state", "state_dict", "none")

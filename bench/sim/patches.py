@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from bench.sim.kinematics import SerialChain
 from bench.sim.pins import PINNED
 from policies.errors import UserError
 
@@ -46,8 +47,7 @@ def _dispatch_property(cls: type, name: str, ours: Any) -> None:
 
 @lru_cache(maxsize=1)
 def install() -> None:
-    """Install the patches, once per process."""
-    check_versions()
+    """Install the patches, once per process. Call `check_versions` first."""
     from mani_skill.agents.controllers.utils.kinematics import Kinematics
     from mani_skill.envs.tasks.tabletop.push_t import WhiteTableSceneBuilder
     from mani_skill.utils.structs.articulation import Articulation
@@ -78,6 +78,7 @@ def install() -> None:
         # The batched solver, which ManiSkill chooses by device type, works on CPU tensors too.
         if is_batched(self.articulation.scene):
             self._setup_gpu()
+            self.pk_chain = SerialChain.replace(self.pk_chain)
         else:
             stock_setup_cpu(self)
 

@@ -1,0 +1,95 @@
+"""Jacobians of serial chains, batched.
+
+ManiSkill's batched inverse kinematics spends most of its time in pytorch_kinematics, which
+builds hundreds of small tensors for one Jacobian. This computes the same matrix in some thirty
+tensor operations.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+_TOLERANCE = 1e-4
+
+
+class SerialChain:
+    """A chain of revolute and prismatic joints, taken from a pytorch_kinematics chain.
+
+    Has the two methods of that chain that ManiSkill's solver calls.
+
+    Args:
+        chain: a ``pytorch_kinematics.SerialChain``.
+    """
+
+    def __init__(self, chain: Any) -> None:
+        self.chain = chain
+        offset = torch.eye(4, dtype=torch.float64)
+        offsets, axes, revolute = [], [], []
+        for frame in chain._serial_frames:
+            if frame.joint.offset is not None:
+                offset = offset @ frame.joint.offset.get_matrix()[0].double()
+            if frame.joint.joint_type == "fixed":
+                continue
+            offsets.append(offset)
+            axes.append(frame.joint.axis.double())
+            revolute.append(frame.joint.joint_type == "revolute")
+            offset = torch.eye(4, dtype=torch.float64)
+        stacked = torch.stack(offsets)
+        self._rotation = stacked[:, :3, :3].float()
+        self._translation = stacked[:, :3, 3:].float()
+        self._tool = offset[:3, 3:].float()
+        self._axis = torch.stack(axes).float()[..., None]
+        self._revolute = torch.tensor(revolute)
+        cross = torch.zeros(len(axes), 3, 3)
+        for matrix, (x, y, z) in zip(cross, self._axis[..., 0].tolist(), strict=True):
+            matrix[:] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        # Rodrigues: R(q) = 1 + sin(q) K + (1 - cos(q)) K^2; a prismatic joint does not turn.
+        self._cross = cross * self._revolute[:, None, None]
+        self._cross_squared = self._cross @ self._cross
+
+    @classmethod
+    def replace(cls, chain: Any) -> Any:
+        """Ours for a pytorch_kinematics chain, or that chain itself where ours does not fit."""
+        ours = cls(chain)
+        q = torch.linspace(-1.1, 0.7, len(ours._revolute))[None]
+        same = torch.allclose(ours.jacobian(q), chain.jacobian(q), atol=_TOLERANCE)
+        return ours if same else chain
+
+    def forward_kinematics(self, q: torch.Tensor) -> Any:
+        """Pose of the end link; the original chain's own method."""
+        return self.chain.forward_kinematics(q)
+
+    def jacobian(self, q: torch.Tensor) -> torch.Tensor:
+        """Geometric Jacobian of the end link in the base frame.
+
+        Args:
+            q: joint positions [B, J], radians or metres.
+
+        Returns:
+            [B, 6, J]: linear velocity above angular velocity, per joint velocity.
+        """
+        angle = q[:, :, None, None]
+        turn = torch.sin(angle) * self._cross + (1 - torch.cos(angle)) * self._cross_squared
+        steps = self._rotation + self._rotation @ turn
+        shifts = self._translation
+        if not self._revolute.all():
+            slide = self._rotation @ self._axis * angle
+            shifts = shifts + torch.where(self._revolute[:, None, None], 0.0, slide)
+        rotation = steps[:, 0]
+        position = shifts[..., 0, :, :].expand(len(q), 3, 1)
+        rotations, positions = [rotation], [position]
+        for j in range(1, q.shape[1]):
+            position = position + rotation @ shifts[..., j, :, :]
+            rotation = rotation @ steps[:, j]
+            rotations.append(rotation)
+            positions.append(position)
+        end = position + rotation @ self._tool
+        axis = (torch.stack(rotations, 1) @ self._axis)[..., 0]
+        arm = (end[:, None] - torch.stack(positions, 1))[..., 0]
+        linear = torch.cross(axis, arm, dim=-1)
+        if not self._revolute.all():
+            linear = torch.where(self._revolute[:, None], linear, axis)
+            axis = axis * self._revolute[:, None]
+        return torch.cat([linear, axis], dim=-1).transpose(1, 2)

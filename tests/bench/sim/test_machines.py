@@ -1,0 +1,158 @@
+"""Machines without Vulkan, without CUDA, without libraries, or with other releases."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+
+from bench.sim import create, make_env_class, patches, rendering_works
+from bench.sim.capabilities import probe
+from policies.errors import UserError
+
+NO_VULKAN = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a fresh interpreter."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1", **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_headless_without_vulkan():
+    """With no driver: states work, stock ManiSkill too, nothing warns, cameras are refused."""
+    code = """
+from bench.sim import create, prepare_headless, rendering_works
+from policies.errors import UserError
+from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+assert prepare_headless() is False and prepare_headless() is False
+assert not rendering_works()
+for cls in (PickCubeEnv, PushTEnv):
+    env = create(cls, 2, obs_mode="state")
+    env.reset(seed=[1, 2])
+    env.step(env.action_space.sample())
+stock = PickCubeEnv(sim_backend="physx_cpu", render_backend="none", obs_mode="state")
+stock.step(stock.action_space.sample())
+for settings in (dict(render=True), dict(obs_mode="rgb")):
+    try:
+        create(PickCubeEnv, 1, **settings)
+    except UserError as error:
+        assert "Vulkan driver" in str(error)
+    else:
+        raise SystemExit("no error")
+print("done")
+"""
+    result = run_python(code, **NO_VULKAN)
+    assert result.stdout.strip().endswith("done"), result.stderr
+    assert "Warning" not in result.stderr
+
+
+def test_cameras_with_vulkan():
+    """Human cameras and mounted sensors show each scene's own state."""
+    if not rendering_works():
+        pytest.skip("no Vulkan device")
+    env = create(
+        PickCubeEnv, 2, render=True, obs_mode="rgb+segmentation", robot_uids="panda_wristcam"
+    )
+    obs, _ = env.reset(seed=[1, 2])
+    assert obs["sensor_data"]["hand_camera"]["rgb"].shape == (2, 128, 128, 3)
+    first, second = env.render()
+    assert (first != second).any()
+    env.cube.set_pose(torch.tensor([[0, 0, 5.0, 1, 0, 0, 0]]).repeat(2, 1))
+    env.scene._gpu_apply_all()
+    env.scene._gpu_fetch_all()
+    assert (env.render()[0] != first).any()
+
+
+@pytest.mark.parametrize("package", ["mani-skill", "sapien"])
+def test_other_release_is_refused(monkeypatch, package):
+    """Another ManiSkill or SAPIEN than the one patched gives one sentence with the cure."""
+    monkeypatch.setitem(patches.PINNED, package, "9.9.9")
+    with pytest.raises(UserError, match=rf"{package} 9\.9\.9.*pip install {package}==9\.9\.9"):
+        create(PickCubeEnv, 1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"sim": "gpu"}, 'Unknown simulator "gpu": choose "cpu" or "cuda"'),
+        ({"num_envs": 0}, "at least one environment"),
+        ({"sim_backend": "physx_cuda"}, "contradicts batched CPU physics"),
+        ({"parallel_in_single_scene": True}, "needs the GPU simulation"),
+        ({"control_mode": "pd_ee_body_frame"}, "body_translation"),
+    ],
+)
+def test_bad_settings(monkeypatch, settings, message):
+    """Each wrong setting is answered by one sentence."""
+    from mani_skill.agents.robots.panda.panda import Panda
+
+    modes = Panda._controller_configs
+
+    def with_body_frame(self):
+        configs = modes.fget(self)
+        arm = configs["pd_ee_delta_pose"]["arm"]
+        arm.frame = "body_translation:root_aligned_body_rotation"
+        return {**configs, "pd_ee_body_frame": {**configs["pd_ee_delta_pose"], "arm": arm}}
+
+    if settings.get("control_mode") == "pd_ee_body_frame":
+        monkeypatch.setattr(Panda, "_controller_configs", property(with_body_frame))
+    with pytest.raises(UserError, match=message):
+        create(PickCubeEnv, **{"num_envs": 2, **settings})
+
+
+def test_cuda_absent():
+    """sim="cuda" without a GPU says so in one sentence."""
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    with pytest.raises(UserError, match="needs an NVIDIA GPU"):
+        make_env_class(PickCubeEnv, "cuda")(num_envs=2)
+
+
+@pytest.mark.gpu
+def test_cuda():
+    """ManiSkill's own GPU simulation, where its library is."""
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA")
+    library = next(check for check in probe() if check.name == "PhysX on GPU")
+    if not library.ok:
+        pytest.skip(library.detail)
+    env = create(PickCubeEnv, 4, sim="cuda", obs_mode="state")
+    assert env.reset(seed=[1, 2, 3, 4])[0].is_cuda
+
+
+def test_probe_of_this_machine():
+    """Every finding is one line, and what is required is there."""
+    checks = probe()
+    assert len({check.name for check in checks}) == len(checks) == 10
+    for check in checks:
+        assert "\n" not in check.detail + check.cure
+        assert check.ok or not check.required, check
+
+
+def test_probe_without_libraries():
+    """With ManiSkill, SAPIEN and torch not importable, the probe names the package to install."""
+    code = """
+import sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name in ("sapien", "mani_skill", "torch"):
+            raise ImportError("libX11.so.6: cannot open shared object file: No such file")
+sys.meta_path.insert(0, Missing())
+from bench.sim.capabilities import probe
+for check in probe():
+    print(check.name, check.ok, check.cure, sep="|")
+"""
+    result = run_python(code)
+    assert "ManiSkill|False|apt install libx11-6" in result.stdout, result.stderr
+    assert "CUDA|False|" in result.stdout
+    assert "TensorBoard|True|" in result.stdout
