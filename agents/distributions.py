@@ -17,6 +17,7 @@ Squashed Gaussians: Haarnoja et al., arXiv 1812.05905, appendix C; the radial fo
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -25,8 +26,8 @@ from torch import nn
 from policies.errors import UserError
 from policies.geometry import Layout
 
-# Below this |u|^2 the functions of |u| are evaluated by their power series, whose first dropped
-# terms are below float64's resolution there; it also keeps sqrt's gradient away from zero.
+# Below this |u|^2, functions of |u| are evaluated by their power series in |u|^2, whose first
+# dropped terms are below 1e-14 there.
 SMALL = 1e-4
 
 
@@ -115,14 +116,54 @@ class SquashedGaussian(nn.Module):
 
     def _squash(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """``w = bound tanh(|u|) u/|u|`` per block and the summed log-determinant."""
-        r2 = u.square() @ self.membership
-        small = r2 < SMALL
-        r = torch.where(small, 1.0, r2).sqrt()
-        ratio_series = 1 - r2 * (1 / 3 - r2 * (2 / 15 - r2 * 17 / 315))
-        ratio = torch.where(small, ratio_series, r.tanh() / r)
+        direction, log_volume = RadialTanh.apply(u, self.membership, self.index, self.sizes)
+        return self.bound * direction, log_volume + self.dim * math.log(self.bound)
+
+
+class RadialTanh(torch.autograd.Function):
+    """``tanh(|u|) u/|u|`` per block and its log-determinant, with the derivative in closed form.
+
+    With s = |u|^2 of a block of n numbers and the ratio ``p(s) = tanh(|u|) / |u|``:
+
+        w = p u,   log det = log sech^2 |u| + (n - 1) log p,
+        dp/ds = (sech^2 |u| - p) / (2 s),   d log det / ds = -p + (n - 1) (dp/ds) / p.
+
+    A function of s, not of |u|, is smooth at zero. Written out because automatic differentiation
+    of the same formulas took a sixth of an update's time.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        u: torch.Tensor,
+        membership: torch.Tensor,
+        index: torch.Tensor,
+        sizes: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """``u [..., dim]`` to ``w [..., dim]`` and log-determinant ``[...]``."""
+        s = u.square() @ membership
+        small = s < SMALL
+        r = s.sqrt()
+        tanh = r.tanh()
+        ratio = torch.where(small, 1 - s * (1 / 3 - s * (2 / 15 - s * 17 / 315)), tanh / r)
         # sech^2 = 4 / (e^r + e^-r)^2, written so that large radii neither overflow nor give log 0.
-        far = 2 * (math.log(2) - r - F.softplus(-2 * r))
-        log_sech2 = torch.where(small, -r2 * (1 - r2 * (1 / 6 - r2 * 2 / 45)), far)
-        log_volume = (log_sech2 + (self.sizes - 1) * ratio.log()).sum(-1)
-        noise = self.bound * u * self._spread(ratio)
-        return noise, log_volume + self.dim * math.log(self.bound)
+        far = 2 * (math.log(2) - r - torch.log1p((-2 * r).exp()))
+        log_sech2 = torch.where(small, -s * (1 - s * (1 / 6 - s * 2 / 45)), far)
+        log_volume = (log_sech2 + (sizes - 1) * ratio.log()).sum(-1)
+        if any(ctx.needs_input_grad):
+            series = -1 / 3 + s * (4 / 15 - s * (17 / 105 - s * 248 / 2835))
+            slope = torch.where(small, series, (1 - tanh * tanh - ratio) / (2 * s))
+            ctx.save_for_backward(u, membership, index, ratio, slope, sizes)
+        return u * ratio.index_select(-1, index), log_volume
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
+        """Chain rule through s: du gathers ``p dw`` and ``2 u`` times what reaches s."""
+        grad_w, grad_volume = gradients
+        u, membership, index, ratio, slope, sizes = ctx.saved_tensors
+        to_s = slope * ((grad_w * u) @ membership)
+        to_s = to_s + grad_volume.unsqueeze(-1) * ((sizes - 1) * slope / ratio - ratio)
+        spread = torch.cat([ratio, 2 * to_s], dim=-1)
+        spread = spread.unflatten(-1, (2, -1)).index_select(-1, index)
+        ratio, to_s = spread.unbind(-2)
+        return grad_w * ratio + u * to_s, None, None, None

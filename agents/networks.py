@@ -52,9 +52,24 @@ class Ensemble(nn.Module):
         self.width = len(dense(members[0][0])[1])
         self.members = nn.ModuleList([nn.ModuleList(layers) for layers in members])
         self.layer_norm = layer_norm
+        self._expanded: Weights | None = None
 
     def weights(self) -> Weights:
-        """The dense matrices of every layer; differentiable with respect to the parameters."""
+        """The dense matrices of every layer; differentiable with respect to the parameters.
+
+        Kept until :meth:`changed`: acting, judging and the next update share one expansion. One
+        backward pass per expansion, as that frees its graph.
+        """
+        if self._expanded is None:
+            with torch.enable_grad():
+                self._expanded = self._expand()
+        return self._expanded
+
+    def changed(self) -> None:
+        """To be called whenever parameters changed (optimiser step, loading)."""
+        self._expanded = None
+
+    def _expand(self) -> Weights:
         stacked = []
         for layers in zip(*self.members, strict=True):
             matrices, biases = zip(*(dense(layer) for layer in layers), strict=True)

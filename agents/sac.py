@@ -156,7 +156,9 @@ class SacAgent:
             critic = Ensemble(critics, config.layer_norm)
         self.distribution.to(self.device, dtype)
         self.actor, self.critic = actor.to(self.device, dtype), critic.to(self.device, dtype)
-        self.target = copy.deepcopy(self.critic).requires_grad_(False)
+        # The targets are kept as dense matrices: expansion is linear, so following the matrices is
+        # following the parameters, without an expansion of their own.
+        self.target = [(w.clone(), b.clone()) for w, b in detached(self.critic.weights())]
         self.log_alpha = torch.tensor(
             math.log(config.initial_alpha), dtype=dtype, device=self.device, requires_grad=True
         )
@@ -165,7 +167,6 @@ class SacAgent:
         self.alpha_optimizer = self._adam([{"params": [self.log_alpha]}], config.alpha_lr)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
         self.updates = 0
-        self._acting: Weights | None = None
 
     # What subclasses decide.
 
@@ -204,15 +205,13 @@ class SacAgent:
     @torch.no_grad()
     def moments(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean ``[B, Tp * Da]`` and log-scale ``[B, blocks]`` before the squash."""
-        if self._acting is None:
-            self._acting = self.actor.weights()
-        return self._heads(self._acting, self._features(obs))
+        return self._heads(self.actor.weights(), self._features(obs))
 
     @torch.no_grad()
     def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Every critic's value in the environment's reward units, ``[critics, B]``."""
-        inputs = torch.cat([self._features(obs), noise.to(self.dtype).flatten(1)], dim=-1)
-        return self.critic(inputs).squeeze(-1) / self.config.reward_scale
+        q = self._q(self.critic.weights(), self._features(obs), noise.to(self.dtype).flatten(1))
+        return q / self.config.reward_scale
 
     # Learning.
 
@@ -225,45 +224,35 @@ class SacAgent:
         config = self.config
         obs, next_obs = self._features(batch.obs), self._features(batch.next_obs)
         alpha = self.log_alpha.detach().exp()
-        policy = self.actor.weights()  # expanded once for both uses
+        policy = self.actor.weights()
 
         with torch.no_grad():
-            noise, log_prob = self._sample(*self._heads(detached(policy), next_obs))
-            next_q = self.target(torch.cat([next_obs, noise], -1)).squeeze(-1).amin(0)
+            noise, log_prob = self._sample(*self._heads(policy, next_obs))
+            next_q = self._q(self.target, next_obs, noise).amin(0)
             if config.soft_backup:
                 next_q = next_q - alpha * log_prob
             # Only success ends the future; a time-out has terminal 0 and bootstraps.
             wanted = (
                 config.reward_scale * batch.reward + config.gamma * (1 - batch.terminal) * next_q
             )
-        inputs = torch.cat([obs, batch.noise.flatten(1)], dim=-1)
-        q = self.critic(inputs).squeeze(-1)
+        q = self._q(self.critic.weights(), obs, batch.noise.flatten(1))
         critic_loss = (q - wanted).square().mean(1).sum()
-        self.critic_optimizer.zero_grad()
-        critic_loss.backward()
-        self.critic_optimizer.step()
+        _descend(critic_loss, self.critic_optimizer)
+        self.critic.changed()
 
         noise, log_prob = self._sample(*self._heads(policy, obs))
-        with torch.no_grad():
-            judge = self.critic.weights()  # no gradient to the critics' parameters
-        actor_q = self.critic.apply_weights(judge, torch.cat([obs, noise], -1)).squeeze(-1).amin(0)
-        actor_loss = (alpha * log_prob - actor_q).mean()
-        self.actor_optimizer.zero_grad()
-        actor_loss.backward()
-        self.actor_optimizer.step()
+        judge = detached(self.critic.weights())  # the actor's loss must not reach the critics
+        actor_loss = (alpha * log_prob - self._q(judge, obs, noise).amin(0)).mean()
+        _descend(actor_loss, self.actor_optimizer)
+        self.actor.changed()
 
         entropy = -log_prob.detach().mean()
         alpha_loss = self.log_alpha * (entropy - self.target_entropy)
-        self.alpha_optimizer.zero_grad()
-        alpha_loss.backward()
-        self.alpha_optimizer.step()
+        _descend(alpha_loss, self.alpha_optimizer)
 
         with torch.no_grad():
-            torch._foreach_lerp_(
-                list(self.target.parameters()), list(self.critic.parameters()), config.tau
-            )
+            torch._foreach_lerp_(_flat(self.target), _flat(judge), config.tau)
         self.updates += 1
-        self._acting = None
         q = q.detach() / config.reward_scale
         return {
             "losses/critic": critic_loss.detach(),
@@ -296,6 +285,7 @@ class SacAgent:
             {
                 "description": self.description(),
                 **state,
+                "target": _flat(self.target),
                 "log_alpha": self.log_alpha.detach(),
                 "generator": self.generator.get_state(),
                 "updates": self.updates,
@@ -311,11 +301,15 @@ class SacAgent:
         check_description(self.description(), state.get("description", {}))
         for name in self._parts():
             getattr(self, name).load_state_dict(state[name])
+        self.actor.changed()
+        self.critic.changed()
         with torch.no_grad():
             self.log_alpha.copy_(state["log_alpha"])
+            torch._foreach_copy_(
+                _flat(self.target), [t.to(self.log_alpha) for t in state["target"]]
+            )
         self.generator.set_state(state["generator"].cpu())
         self.updates = int(state["updates"])
-        self._acting = None
 
     def parameter_counts(self) -> dict[str, int]:
         """Trainable numbers (all critics together, without targets) and hidden widths."""
@@ -332,8 +326,7 @@ class SacAgent:
 
     @staticmethod
     def _parts() -> tuple[str, ...]:
-        networks = ("actor", "critic", "target")
-        return (*networks, "actor_optimizer", "critic_optimizer", "alpha_optimizer")
+        return ("actor", "critic", "actor_optimizer", "critic_optimizer", "alpha_optimizer")
 
     @staticmethod
     def _adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
@@ -351,6 +344,10 @@ class SacAgent:
         )
         start = math.log(share / (1 - share))
         return mean, LOG_SCALE_MIN + (LOG_SCALE_MAX - LOG_SCALE_MIN) * (raw + start).sigmoid()
+
+    def _q(self, critics: Weights, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Values ``[critics, B]`` of normalised observations and flat noise."""
+        return self.critic.apply_weights(critics, torch.cat([obs, noise], -1)).squeeze(-1)
 
     def _sample(
         self, mean: torch.Tensor, log_scale: torch.Tensor
@@ -428,6 +425,16 @@ def check_description(mine: dict[str, Any], saved: dict[str, Any]) -> None:
                 f"this checkpoint has {key} {saved.get(key)!r}, the agent has {value!r}; "
                 "load it with the run's own configuration"
             )
+
+
+def _descend(loss: torch.Tensor, optimizer: torch.optim.Optimizer) -> None:
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+
+
+def _flat(weights: Weights) -> list[torch.Tensor]:
+    return [tensor for layer in weights for tensor in layer]
 
 
 def _side_by_side(**layouts: Layout) -> Layout:

@@ -177,6 +177,7 @@ def test_approximate_agent_contains_the_equivariant_one(problem):
         for mine, other in zip(ours.members, theirs.members, strict=True):
             for layer, strict in zip(mine, other, strict=True):
                 strict.load_state_dict(layer.equivariant.state_dict())
+        theirs.changed()
     batch = problem.batch(dtype=torch.float64)
     for a, b in zip(approximate.moments(batch.obs), equivariant.moments(batch.obs), strict=True):
         assert torch.equal(a, b)
