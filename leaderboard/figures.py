@@ -34,7 +34,7 @@ STYLES: dict[str, Style] = {
     "approximate": ("#009E73", "^", "-"),
 }
 OTHERS: tuple[Style, ...] = (("#CC79A7", "v", "-"), ("#56B4E9", "P", "-"), ("#000000", "X", "-"))
-FEASIBLE = "#DDE7D0"
+FEASIBLE, FEASIBLE_EDGE, FEASIBLE_TEXT = "#DDE7D0", "#7A9A50", "#4F6B2A"
 COLUMNS = 3
 MAX_MARKERS = 15
 BAND_RESAMPLES = 1000
@@ -191,23 +191,42 @@ def q_values(tables: Sequence[Table]) -> Figure:
                     "linestyle": "none",
                 }
                 explained["fresh return"] = Line2D([], [], color="#555555", markersize=5, **hollow)
-        if feasible := table.feasible:
-            low, high = feasible
-            ax.axhspan(low, high, color=FEASIBLE, alpha=0.6, linewidth=0, zorder=0)
-            ax.axhline(low, color="#7A9A50", linewidth=0.9, zorder=1)
-            ax.axhline(high, color="#7A9A50", linewidth=0.9, zorder=1)
-            explained["feasible"] = Patch(facecolor=FEASIBLE, edgecolor="#7A9A50")
-            span = max(high - low, 1e-6)
-            low_end, high_end = min([low, *extremes]), max([high, *extremes])
-            if high_end > high + 4 * span or low_end < low - 4 * span:
-                ax.set_yscale("symlog", linthresh=span)
-            else:
-                margin = 0.06 * (high_end - low_end or 1)
-                ax.set_ylim(low_end - margin, high_end + margin)
+        if table.feasible:
+            _feasible_band(ax, *table.feasible, extremes)
+            explained["feasible"] = Patch(facecolor=FEASIBLE, edgecolor=FEASIBLE_EDGE)
         if not extremes:
             ax.text(0.5, 0.5, "no Q-values", transform=ax.transAxes, ha="center", color="#777777")
     _legend(figure, handles | explained)
     return figure
+
+
+def _feasible_band(ax: Axes, low: float, high: float, values: Sequence[float]) -> None:
+    """Shade the feasible band and choose the axis so that both values and bounds can be read."""
+    ax.axhspan(low, high, color=FEASIBLE, alpha=0.6, linewidth=0, zorder=0)
+    for bound in (low, high):
+        ax.axhline(bound, color=FEASIBLE_EDGE, linewidth=0.9, zorder=1)
+    span = max(high - low, 1e-6)
+    bottom, top = min([high, *values]), max([high, *values])
+    if top > high + 4 * span or bottom < low - 4 * span:
+        ax.set_yscale("symlog", linthresh=span)
+        return
+    if values and bottom - low > 2 * (top - bottom):
+        # The lower bound is so far away that showing it would flatten the curves.
+        ax.text(
+            0.98,
+            0.02,
+            f"feasible down to {low:.4g}",
+            transform=ax.transAxes,
+            ha="right",
+            va="bottom",
+            color=FEASIBLE_TEXT,
+            fontsize=8,
+        )
+        margin = 0.18 * (top - bottom)
+    else:
+        bottom = min(bottom, low)
+        margin = 0.06 * (top - bottom)
+    ax.set_ylim(bottom - margin, top + margin)
 
 
 def _panels(tables: Sequence[Table], ylabel: str) -> tuple[Figure, list[Axes]]:

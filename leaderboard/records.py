@@ -486,7 +486,8 @@ class RunRecord(_Block):
         """Whether the Q-values diverged; None for runs without a critic.
 
         The rule: `q_violation` above 5 % at 3 consecutive evaluations, or Q-values that are not
-        finite.
+        finite. Evaluations before the first update do not count: what an untrained critic says
+        has not diverged from anything.
         """
         if not self.has_critic:
             return None
@@ -494,6 +495,8 @@ class RunRecord(_Block):
             return True
         streak = 0
         for evaluation in self.evaluations:
+            if evaluation.updates == 0:
+                continue
             violation = evaluation.diagnostics.get("q_violation")
             streak = streak + 1 if violation is not None and violation > DIVERGED_SHARE else 0
             if streak == DIVERGED_EVALUATIONS:

@@ -39,7 +39,7 @@ that score them; the number is always the last checkpoint's, never the best one'
   there. **Dip** is the deepest fall below the base policy at any evaluation of any seed.
 - **Diverged** († at a glance) counts the seeds whose Q-values left the range of returns that the
   reward allows (more than {100 * DIVERGED_SHARE:.0f} % of the states at {DIVERGED_EVALUATIONS}
-  evaluations in a row) or were not finite.
+  evaluations in a row, once learning has begun) or were not finite.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
   **Runs** and never dropped in silence.
 """

@@ -186,7 +186,7 @@ def test_feasible_bounds_are_ordered() -> None:
 
 def violations(*values: float | None) -> list[Evaluation]:
     return [
-        make_evaluation([1], 1000 * i, i == len(values) - 1, q_mean=-1.0, q_violation=value)
+        make_evaluation([1], 1000 * (i + 1), i == len(values) - 1, q_mean=-1.0, q_violation=value)
         for i, value in enumerate(values)
     ]
 
@@ -206,6 +206,15 @@ def test_diverged_needs_three_violations_in_a_row(
     shares: tuple[float | None, ...], expected: bool
 ) -> None:
     assert make_record(violations(*shares)).diverged is expected
+
+
+def test_untrained_critics_have_not_diverged() -> None:
+    evaluations = violations(0.9, 0.9, 0.9, 0.9, 0.0)
+    for evaluation in evaluations[:2]:
+        evaluation.updates = 0
+    assert make_record(evaluations).diverged is False
+    evaluations[1].updates = 1
+    assert make_record(evaluations).diverged is True
 
 
 def test_q_values_that_are_not_finite_are_divergence_and_a_missing_bias_is_not() -> None:
