@@ -50,6 +50,23 @@ def test_success_equals_stock(kit):
     assert info["success"].tolist() == [False, True]
 
 
+def test_held_robot_stays_awake(kit):
+    """Holding one target for seconds keeps the robot awake, as stock ManiSkill does."""
+    env = kit.batched("PickCube", 2, control_mode="pd_joint_pos")
+    stock = kit.stock("PickCube", control_mode="pd_joint_pos")
+    env.reset(seed=[1, 2])
+    stock.reset(seed=3)
+    stock.set_state_dict(kit.rows(env.get_state_dict(), 1))
+    hold = torch.cat([env.agent.robot.get_qpos()[:, :7], torch.ones(2, 1)], dim=1)
+    for _ in range(60):
+        env.step(hold)
+        stock.step(hold[1:])
+    for e in (env, stock):
+        assert not any(robot.links[0].sleeping for robot in e.agent.robot._objs)
+    state, stock_state = kit.flat(env.get_state_dict()), kit.flat(stock.get_state_dict())
+    torch.testing.assert_close(state[1], stock_state[0], atol=1e-6, rtol=0)
+
+
 def test_contact_impulses_equal_stock(kit):
     """Pair and body queries during a grasp report what stock ManiSkill computes."""
     env = kit.batched("PickCube", 3, control_mode="pd_ee_delta_pose")
