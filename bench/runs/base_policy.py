@@ -1,4 +1,4 @@
-"""Demonstrations and base policy of a run: built once, found again by the hash of what made them."""
+"""Demonstrations and base policy of a run: built once, found again by content hash."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from bench.demos import Demonstrations, collect, load
 from bench.runs.config import RunConfig, content_key
-from bench.steering.evaluation import Steerability, steerability
+from bench.steering.evaluation import DRAWS, Steerability, steerability
 from bench.steering.latent_env import LatentNoiseEnv
 from bench.tasks import make, task_class
 from leaderboard.records import BasePolicy
@@ -21,6 +21,7 @@ from policies.errors import UserError
 from policies.training import train_policy
 
 STEERABILITY_ENVS = 128
+"""Parallel environments of the steerability report; fewer if it has fewer episodes."""
 
 
 def prepare_base(
@@ -142,14 +143,16 @@ def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPol
 def _measure(config: RunConfig, policy: ChunkPolicy) -> Steerability:
     env = make(
         config.task,
-        num_envs=STEERABILITY_ENVS,
+        num_envs=min(STEERABILITY_ENVS, DRAWS * config.evaluation.steerability_states),
         embodiment=config.embodiment,
         sim=config.sim,
     )
     latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
     try:
         with torch.no_grad():
-            return steerability(latent, policy, config.policy_seed)
+            return steerability(
+                latent, policy, config.policy_seed, config.evaluation.steerability_states
+            )
     finally:
         latent.close()
 

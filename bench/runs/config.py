@@ -38,6 +38,8 @@ class EvaluationConfig:
     """Episodes of the last evaluation, the one that tables report."""
     diagnostic_episodes: int = 32
     """Stochastic on-policy episodes against whose returns Q is held at every evaluation."""
+    steerability_states: int = 24
+    """Initial states of the base policy's steerability report, each with 16 noise draws."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,8 @@ class RunConfig:
         if self.demonstrations.count < 1:
             raise UserError("demonstrations.count must be at least 1")
         evaluation = self.evaluation
-        if min(evaluation.every, evaluation.episodes, evaluation.final_episodes) < 1:
-            raise UserError("evaluation.every and the numbers of episodes must be at least 1")
+        if min(dataclasses.astuple(evaluation)) < 1:
+            raise UserError("every number under evaluation must be at least 1")
 
     def to_json(self) -> dict[str, Any]:
         """Nested plain data."""

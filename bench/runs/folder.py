@@ -55,7 +55,8 @@ def open_run_folder(folder: Path) -> None:
         folder.mkdir(parents=True)
     except OSError as error:
         raise UserError(
-            f"cannot write to {folder.parent}: {error.strerror}; choose a writable folder with --out"
+            f"cannot write to {folder.parent}: {error.strerror}; "
+            "choose a writable folder with --out"
         ) from error
 
 

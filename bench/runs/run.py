@@ -38,7 +38,7 @@ from policies.errors import UserError
 from policies.geometry import Group
 
 TRAINING_SEEDS = 10_000
-"""Run s draws its training episodes from seeds ``TRAINING_SEEDS * s`` on, below the held-out ones."""
+"""Run s draws its training episodes from seeds ``TRAINING_SEEDS * s`` on: none is held out."""
 
 DIAGNOSTIC_SEED = HELD_OUT_SEED + 500_000
 """On-policy episodes for the bias of Q start here: held out, and apart from the reported ones."""
@@ -138,6 +138,7 @@ class _Run:
         self.config, self.folder, self.base, self.progress = config, folder, base, progress
         self.start = time.perf_counter()
         self.timer = _Timer()
+        self.means = _Means()
         self.decisions = self.updates = 0
         self.device = torch.device(config.device)
         self.agent = self._make_agent(config.agent)
@@ -232,8 +233,6 @@ class _Run:
         self.evaluate(0)
         first = TRAINING_SEEDS * config.seed
         obs = env.reset(list(range(first, first + config.num_envs)))
-        scalars = _Means()
-        episodes = _Means()
         next_evaluation = config.evaluation.every
         owed = 0.0
         rounds = 0
@@ -248,19 +247,18 @@ class _Run:
                 obs = result.obs
                 self.decisions += config.num_envs
                 rounds += 1
-                episodes.add({f"train/{k}": v for k, v in result.episodes.items()})
+                self.means.add({f"train/{k}": v for k, v in result.episodes.items()})
                 if not warming:
                     begin = time.perf_counter()
                     owed += config.num_envs * config.sac.utd
                     while owed >= 1:
-                        scalars.add(agent.update(replay.sample(config.sac.batch_size)))
+                        self.means.add(agent.update(replay.sample(config.sac.batch_size)))
                         owed -= 1
                         self.updates += 1
                     self.timer.update += time.perf_counter() - begin
                 bar.update(min(env.control_steps, config.env_steps) - bar.n)
                 if rounds % LOG_EVERY == 0:
-                    values = {**scalars.take(), **episodes.take(), **self._rates(env.control_steps)}
-                    self._write_scalars(values, env.control_steps)
+                    values = self._write_training_scalars(env.control_steps)
                     if "train/success_once" in values:
                         bar.set_postfix(
                             success=f"{values['train/success_once']:.2f}",
@@ -269,6 +267,7 @@ class _Run:
                 if next_evaluation <= env.control_steps < config.env_steps:
                     self.evaluate(env.control_steps)
                     next_evaluation += config.evaluation.every
+        self._write_training_scalars(env.control_steps)
         env.close()
         return env.control_steps
 
@@ -279,9 +278,13 @@ class _Run:
         count = config.evaluation.final_episodes if final else config.evaluation.episodes
         seeds = held_out_seeds(count)
         if agent.learns:
+            # An evaluation draws its own noise, so that it leaves training as it is.
+            state = agent.generator.get_state()
+            agent.generator.manual_seed(DIAGNOSTIC_SEED + config.seed)
             greedy, on_policy = self._learner_episodes(seeds)
             generator = torch.Generator(self.device).manual_seed(config.seed)
             diagnostics = measure(agent, self.base, greedy, on_policy, self.feasible, generator)
+            agent.generator.set_state(state)
         else:
             reference = self._make_agent(agent.name)
             greedy = rollout(self.evaluator, lambda obs, rows: reference.act(obs), seeds)
@@ -323,9 +326,6 @@ class _Run:
         """Deterministic episodes from ``seeds`` and stochastic ones, side by side."""
         agent, greedy_count = self.agent, len(seeds)
         extra = [DIAGNOSTIC_SEED + i for i in range(self.config.evaluation.diagnostic_episodes)]
-        # The evaluation draws its own noise, so that evaluating leaves training as it is.
-        state = agent.generator.get_state()
-        agent.generator.manual_seed(DIAGNOSTIC_SEED + self.config.seed)
         log_probs: list[torch.Tensor] = []
 
         def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
@@ -337,7 +337,6 @@ class _Run:
             )
 
         whole = rollout(self.evaluator, act, [*seeds, *extra])
-        agent.generator.set_state(state)
         # One entry a decision and batch: [batches * T] x [N] -> [T, batches * N].
         steps = len(whole.obs)
         log_prob = torch.cat(
@@ -386,6 +385,11 @@ class _Run:
             "time/update": self.timer.update,
             "time/evaluate": self.timer.evaluate,
         }
+
+    def _write_training_scalars(self, env_steps: int) -> dict[str, float]:
+        values = {**self.means.take(), **self._rates(env_steps)}
+        self._write_scalars(values, env_steps)
+        return values
 
     def _write_scalars(self, values: dict[str, float | None], step: int) -> None:
         for name, value in values.items():

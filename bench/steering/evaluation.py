@@ -11,6 +11,7 @@ import torch
 from bench.steering.latent_env import LatentNoiseEnv
 from policies.base import ChunkPolicy
 from policies.errors import UserError
+from policies.steerability import DESIRED_ACTION_STD, action_spread
 
 HELD_OUT_SEED = 1_000_000
 """Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
@@ -117,8 +118,8 @@ class Steerability:
         solvable: share of initial states that at least one of the draws solves.
         states: how many initial states.
         draws: noise draws a state.
-        action_std: standard deviation of the normalised actions over the noise, mean over states,
-            steps and dimensions.
+        action_std: spread of the normalised actions over the noise on visited states; see
+            :func:`policies.steerability.action_spread`.
         warning: why steering cannot work, or None.
     """
 
@@ -131,11 +132,15 @@ class Steerability:
     warning: str | None
 
 
-MIN_SOLVABLE, MIN_ACTION_STD = 0.9, 0.3
+DRAWS = 16
+"""Noise draws for each initial state of a steerability report."""
+
+MIN_SOLVABLE = 0.9
+"""Below this share of solvable initial states steering gained little in pilot runs."""
 
 
 def steerability(
-    env: LatentNoiseEnv, policy: ChunkPolicy, seed: int, states: int = 32, draws: int = 16
+    env: LatentNoiseEnv, policy: ChunkPolicy, seed: int, states: int, draws: int = DRAWS
 ) -> Steerability:
     """Draw noise ``draws`` times for each of ``states`` initial states (below the held-out seeds).
 
@@ -151,15 +156,14 @@ def steerability(
 
     result = rollout(env, act, seeds)
     success = result.episodes["success_once"].float().view(states, draws)
-    first_obs = result.obs[0].view(states, draws, -1)
-    first_noise = result.noise[0].view(states, draws, *result.noise.shape[2:])
-    actions = policy.decode(first_obs.flatten(0, 1), first_noise.flatten(0, 1))
-    action_std = actions.view(first_noise.shape).std(dim=1).mean().item()
+    # The first draw's states on the way of every initial state, as far as it was not yet solved.
+    visited = result.obs[:, ::draws][result.running[:, ::draws]]
+    action_std = action_spread(policy, visited, draws, seed)["action_std"]
     solvable = (success.amax(dim=1) > 0).float().mean().item()
     reasons = []
     if solvable < MIN_SOLVABLE:
         reasons.append(f"only {solvable:.0%} of the initial states are ever solved")
-    if action_std < MIN_ACTION_STD:
+    if action_std < DESIRED_ACTION_STD:
         reasons.append(f"the noise moves the actions by only {action_std:.2f}")
     return Steerability(
         success=success.mean().item(),

@@ -12,7 +12,7 @@ from pathlib import Path
 from bench.runs.base_policy import prepare_base
 from bench.runs.config import RunConfig
 from bench.runs.folder import is_finished, run_id
-from bench.runs.run import execute
+from bench.runs.run import check, execute
 from bench.sweep.suite import Suite
 from leaderboard.records import read_record
 from policies.errors import UserError
@@ -26,6 +26,12 @@ class Outcome:
     status: str
     detail: str = ""
 
+    @property
+    def label(self) -> str:
+        """The cell in words."""
+        c = self.config
+        return f"{c.task} {c.embodiment} {c.variant:16s} {c.agent:16s} seed {c.seed}"
+
 
 def run_suite(suite: Suite, out: Path, workers: int) -> list[Outcome]:
     """Run every cell that is not finished; a failed one does not stop the others.
@@ -33,21 +39,30 @@ def run_suite(suite: Suite, out: Path, workers: int) -> list[Outcome]:
     Base policies that several cells share are built first, once.
 
     Raises:
-        UserError: if ``workers`` is not positive, or demonstrations or policies cannot be built.
+        UserError: if ``workers`` is not positive, or a cell names what does not exist.
     """
     if workers < 1:
         raise UserError(f"--workers is {workers}; it must be at least 1")
+    for config in suite.runs:
+        check(config)
     outcomes, todo = [], []
     for config in suite.runs:
         folder = out / run_id(config, {})
         if is_finished(folder):
             outcomes.append(Outcome(config, "skipped", _describe(folder)))
-            print(f"  skipped   {_label(config)}  {outcomes[-1].detail}", flush=True)
+            print(f"  skipped   {outcomes[-1].label}  {outcomes[-1].detail}", flush=True)
         else:
             todo.append(config)
-    bases = {(c.task, c.embodiment, c.demonstrations, c.policy, c.policy_seed): c for c in todo}
-    for config in bases.values():
-        prepare_base(config, out)
+    broken: dict[tuple, str] = {}
+    for config in {_base_key(c): c for c in todo}.values():
+        try:
+            prepare_base(config, out)
+        except Exception as error:
+            broken[_base_key(config)] = f"its base policy failed: {_reason(error)}"
+    for config in todo:
+        if _base_key(config) in broken:
+            outcomes.append(Outcome(config, "failed", broken[_base_key(config)]))
+    todo = [config for config in todo if _base_key(config) not in broken]
     started = time.monotonic()
     # Spawned, because forking a process that has used torch's threads can deadlock.
     context = multiprocessing.get_context("spawn")
@@ -63,11 +78,11 @@ def run_suite(suite: Suite, out: Path, workers: int) -> list[Outcome]:
                 try:
                     outcome = Outcome(config, "finished", _describe(future.result()))
                 except Exception as error:
-                    outcome = Outcome(config, "failed", f"{type(error).__name__}: {error}")
+                    outcome = Outcome(config, "failed", _reason(error))
                 outcomes.append(outcome)
                 left = (time.monotonic() - started) / done * (len(futures) - done)
                 print(
-                    f"  {outcome.status:9s} {_label(config)}  {outcome.detail}  "
+                    f"  {outcome.status:9s} {outcome.label}  {outcome.detail}  "
                     f"[{done}/{len(futures)}, about {left / 60:.1f} min left]",
                     flush=True,
                 )
@@ -77,17 +92,18 @@ def run_suite(suite: Suite, out: Path, workers: int) -> list[Outcome]:
     return outcomes
 
 
+def _base_key(config: RunConfig) -> tuple:
+    return config.task, config.embodiment, config.demonstrations, config.policy, config.policy_seed
+
+
+def _reason(error: Exception) -> str:
+    return str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+
+
 def _limit_threads(workers: int) -> None:
     import torch
 
     torch.set_num_threads(max(1, (os.cpu_count() or 1) // workers))
-
-
-def _label(config: RunConfig) -> str:
-    return (
-        f"{config.task} {config.embodiment} {config.variant:16s} {config.agent:16s} "
-        f"seed {config.seed}"
-    )
 
 
 def _describe(folder: Path) -> str:

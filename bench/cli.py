@@ -1,0 +1,214 @@
+"""The verbs of ``symsteer``.
+
+Verbs import what they need when they are called, so that ``--help`` and ``doctor`` work on a
+machine where the simulator does not.
+"""
+
+from __future__ import annotations
+
+import os
+import runpy
+import sys
+import warnings
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bench.runs.config import RunConfig
+from leaderboard.errors import RecordError
+from policies.errors import UserError
+
+ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
+
+app = tyro.extras.SubcommandApp()
+
+
+@app.command
+def run(
+    config: Annotated[RunConfig, tyro.conf.arg(name="")],
+    out: Path = Path("runs"),
+    demos: Path | None = None,
+    base_policy: Path | None = None,
+    quiet: bool = False,
+) -> int:
+    """Steer a base policy with one agent on one task, and record what happens.
+
+    Args:
+        config: What to run.
+        out: Folder of the runs; demonstrations and base policies are kept in OUT/base.
+        demos: Trajectory file (.h5 with .json) to train the base policy on, instead of the
+            scripted expert's demonstrations.
+        base_policy: Saved base policy (policy.safetensors) to steer, instead of training one.
+        quiet: No progress bars.
+    """
+    from bench.runs.run import execute
+
+    folder = execute(config, out, demos, base_policy, progress=not quiet)
+    print(f"record:      {folder / 'record.json'}")
+    print(f"TensorBoard: tensorboard --logdir {out}")
+    print(f"leaderboard: symsteer report {out}")
+    return 0
+
+
+@app.command
+def sweep(suite: str, /, out: Path = Path("runs"), workers: int = 0) -> int:
+    """Work off a suite of runs; finished ones are skipped, failed ones are listed at the end.
+
+    Args:
+        suite: Name of a suite (see `symsteer list`) or path of a .toml file.
+        out: Folder of the runs.
+        workers: Runs side by side; 0 means one a core.
+    """
+    from bench.sweep.pool import run_suite
+    from bench.sweep.suite import load_suite
+
+    grid = load_suite(suite)
+    print(f"{grid.name}: {grid.description} ({len(grid.runs)} runs)")
+    outcomes = run_suite(grid, out, workers or os.cpu_count() or 1)
+    failed = [outcome for outcome in outcomes if outcome.status == "failed"]
+    for outcome in failed:
+        print(f"failed: {outcome.label}: {outcome.detail}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+@app.command
+def demo(out: Path = Path("runs/demo")) -> int:
+    """The whole path in minutes on a CPU: demonstrations, base policy, five agents, leaderboard.
+
+    Args:
+        out: Folder of the runs and of their leaderboard.
+    """
+    status = sweep("demo", out=out)
+    report(out, out=out / "leaderboard")
+    page = out / "leaderboard" / "LEADERBOARD.md"
+    print(
+        f"\nOpen the leaderboard:  {page}"
+        f"\nSee the runs:          {_program('tensorboard')} --logdir {out}"
+        "  then http://localhost:6006"
+    )
+    return status
+
+
+@app.command
+def report(records: Path | None = None, /, out: Path | None = None) -> int:
+    """Write the leaderboard (markdown, CSV, figures) from run records; `python -m leaderboard`.
+
+    Args:
+        records: Record file, run folder or folder of runs; default: the committed records.
+        out: Where to write; default: the leaderboard folder of this repository.
+    """
+    arguments = [str(records)] if records else []
+    arguments += ["--out", str(out)] if out else []
+    # By name, not by import: the bench writes records and draws nothing.
+    saved, sys.argv = sys.argv, ["leaderboard", *arguments]
+    try:
+        runpy.run_module("leaderboard", run_name="__main__")
+    except SystemExit as finished:
+        return int(finished.code or 0)
+    finally:
+        sys.argv = saved
+    return 0
+
+
+@app.command(name="list")
+def list_names() -> int:
+    """Name the tasks, embodiments, variants, agents and suites."""
+    from agents import AGENTS
+    from bench.sweep.suite import load_suite, suite_names
+    from bench.tasks import embodiments, task_names
+    from bench.variants import variant_names
+
+    print("tasks:       " + ", ".join(task_names()))
+    print("embodiments: " + ", ".join(embodiments()))
+    print("variants:    none, " + ", ".join(f"{name}:STRENGTH" for name in variant_names()))
+    print("agents:      " + ", ".join(AGENTS))
+    for name in suite_names():
+        suite = load_suite(name)
+        print(f"suite:       {name}: {suite.description} ({len(suite.runs)} runs)")
+    return 0
+
+
+@app.command
+def demos(
+    path: Path,
+    /,
+    task: str = "PickCube-v1",
+    embodiment: str = "floating",
+    count: int = 50,
+    mode: Literal["clean", "diverse"] = "diverse",
+    seed: int = 0,
+) -> int:
+    """Write demonstrations of the scripted expert as a ManiSkill trajectory (.h5 and .json).
+
+    Args:
+        path: The .h5 file to write.
+        task: Task; `symsteer list` names them.
+        embodiment: floating or panda.
+        count: Number of demonstrations, successes all.
+        mode: clean, or diverse (correlated noise and offsets: what steering needs).
+        seed: Seed of the collection.
+    """
+    from tqdm import tqdm
+
+    from bench.demos import collect, load
+
+    with tqdm(total=count, desc="demonstrations") as bar:
+
+        def advance(done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        collect(task, embodiment, count, mode, seed, path, progress=advance)
+    steps = load(path, task, embodiment).meta["steps"]
+    print(f"wrote {count} demonstrations, {steps} steps, to {path}")
+    return 0
+
+
+@app.command
+def doctor(quiet: bool = False) -> int:
+    """Say what this machine can do, and what to install for more.
+
+    Args:
+        quiet: Only what is missing and needed.
+    """
+    from bench.sim.capabilities import probe
+
+    checks = probe()
+    for check in checks:
+        if check.ok and quiet:
+            continue
+        if not check.ok and quiet and not check.required:
+            continue
+        mark = "ok     " if check.ok else "MISSING" if check.required else "absent "
+        print(f"{mark} {check.name:18s} {check.detail}")
+        if not check.ok and check.cure:
+            print(f"{'':26s} -> {check.cure}")
+    return 0 if all(check.ok or not check.required for check in checks) else 1
+
+
+def _program(name: str) -> str:
+    """How to call a console script of this environment from the present folder."""
+    path = Path(sys.executable).with_name(name)
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return name
+
+
+def main() -> int:
+    """Parse the command line and run a verb.
+
+    Returns:
+        The exit code: 0 done, 1 something failed, 2 the input is wrong, 130 interrupted.
+    """
+    # Notes of third-party packages about optional parts that SymSteer does not use.
+    warnings.filterwarnings("ignore", message=".*py3nj.*")
+    warnings.filterwarnings("ignore", message="Failed to find system libvulkan.*")
+    try:
+        return app.cli(prog="symsteer", description=ABOUT, sort_subcommands=False)
+    except (UserError, RecordError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130

@@ -1,0 +1,196 @@
+"""One run from demonstrations to the record: what it leaves, what it refuses, that it repeats."""
+
+import json
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from agents import make_agent
+from bench.runs import run as run_module
+from bench.runs.base_policy import prepare_base
+from bench.runs.folder import is_finished
+from bench.runs.run import execute
+from bench.steering.evaluation import held_out_seeds
+from bench.tasks import task_class
+from leaderboard.records import read_record
+from policies.errors import UserError
+from tests.bench.tiny_run import tiny_config
+
+
+def test_the_record_tells_the_whole_run(finished):
+    config, folder = finished
+    record = read_record(folder / "record.json")
+    assert record.status == "finished"
+    assert is_finished(folder)
+    steps = [e.env_steps for e in record.evaluations]
+    assert steps == [0, 160, record.budget.env_steps]
+    # A decision more than the budget at most; time limits cut chunks short.
+    assert 320 <= record.budget.env_steps < 320 + config.num_envs * config.policy.execute
+    # No update during the warm-up of 16 decisions, then one a decision.
+    assert record.budget.updates == record.budget.decisions - config.sac.warmup
+    final = record.evaluations[-1]
+    assert final.final
+    assert final.episodes.seed == held_out_seeds(5)
+    low, high = task_class(config.task).feasible_return(config.sac.gamma, config.policy.execute)
+    assert (record.feasible_q.low, record.feasible_q.high) == (low, high)
+    assert final.diagnostics["equivariance_decode"] < 1e-5
+    assert final.diagnostics["equivariance_actor"] < 1e-4
+    assert record.base_policy.episodes == 2 * 16
+    clock = record.wall_clock
+    parts = clock.simulate + clock.decode + clock.update + clock.evaluate
+    assert 0 < parts <= clock.total
+    stored = json.loads((folder / "config.json").read_text())
+    assert stored == record.config
+    assert stored["sac"]["width"] == 16
+
+
+def test_no_path_of_this_machine_is_recorded(finished):
+    _, folder = finished
+    text = (folder / "record.json").read_text() + (folder / "config.json").read_text()
+    assert str(folder.parent) not in text
+    assert "/" not in json.loads(text.split("}\n{")[0] + ("}" if "}\n{" in text else ""))["run_id"]
+
+
+def test_tensorboard_shows_the_same_numbers(finished):
+    _, folder = finished
+    record = read_record(folder / "record.json")
+    events = EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    tags = set(events.Tags()["scalars"])
+    assert {"eval/success_once", "eval/return", "diag/q_mean", "diag/q_low", "diag/alpha"} <= tags
+    assert {"losses/critic", "time/update", "train/q_mean", "train/episode_len"} <= tags
+    points = [(e.step, e.value) for e in events.Scalars("eval/success_once")]
+    assert points == [
+        (e.env_steps, pytest.approx(e.success_once, abs=1e-6)) for e in record.evaluations
+    ]
+
+
+def test_the_checkpoint_restores_the_agent(finished):
+    config, folder = finished
+    state = torch.load(folder / "checkpoint.pt", weights_only=True)
+    base = prepare_base(config, folder.parent, progress=False)
+    agent = make_agent(
+        config.agent,
+        base.obs_layout,
+        base.act_layout,
+        base.horizon,
+        config.sac,
+        seed=99,
+        normalize_obs=base.normalized_observation,
+    )
+    obs = torch.randn(4, base.obs_layout.dim)
+    before = agent.act(obs, deterministic=True)
+    agent.load_state_dict(state["agent"])
+    assert agent.updates == read_record(folder / "record.json").budget.updates
+    assert not torch.equal(before, agent.act(obs, deterministic=True))
+
+
+def without_clock(folder):
+    data = json.loads((folder / "record.json").read_text())
+    for key in ("started", "ended", "wall_clock", "provenance"):
+        del data[key]
+    del data["base_policy"]["training_seconds"]
+    for evaluation in data["evaluations"]:
+        del evaluation["wall_clock"]
+    return data
+
+
+def test_the_same_configuration_gives_the_same_record(finished, tmp_path):
+    config, folder = finished
+    again = execute(config, tmp_path, progress=False)
+    assert again.name == folder.name
+    assert without_clock(again) == without_clock(folder)
+
+
+def test_evaluating_more_often_does_not_change_training(finished, tmp_path):
+    config, folder = finished
+    evaluation = type(config.evaluation)(
+        every=80, episodes=3, final_episodes=5, diagnostic_episodes=2, steerability_states=2
+    )
+    often = execute(tiny_config(evaluation=evaluation), tmp_path, progress=False)
+    assert len(read_record(often / "record.json").evaluations) == 5
+    last = [without_clock(f)["evaluations"][-1] for f in (folder, often)]
+    assert last[0]["episodes"] == last[1]["episodes"]
+    assert last[0]["diagnostics"] == last[1]["diagnostics"]
+
+
+@pytest.mark.parametrize("agent", ["standard", "standard-matched", "approximate", "base", "zero"])
+def test_every_agent_runs_on_a_broken_world(agent, finished):
+    """The base policy is shared with the unbroken run, not trained again."""
+    _, folder = finished
+    out = folder.parent
+    policies = set((out / "base").iterdir())
+    config = tiny_config(agent=agent, variant="action_gain:0.5", env_steps=160)
+    record = read_record(execute(config, out, progress=False) / "record.json")
+    assert record.status == "finished"
+    assert set((out / "base").iterdir()) == policies
+    assert (record.feasible_q is None) == (agent in ("base", "zero"))
+
+
+def test_a_finished_run_is_not_overwritten(finished):
+    config, folder = finished
+    before = (folder / "record.json").read_bytes()
+    with pytest.raises(UserError, match="finished already"):
+        execute(config, folder.parent, progress=False)
+    assert (folder / "record.json").read_bytes() == before
+
+
+def test_a_failed_run_says_so_and_is_kept_aside(finished, monkeypatch):
+    _, folder = finished
+    broken = tiny_config(seed=1)
+
+    def fail(*args, **kwargs):
+        raise RuntimeError("the network exploded")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "measure", fail)
+        with pytest.raises(RuntimeError):
+            execute(broken, folder.parent, progress=False)
+    [failed] = folder.parent.glob("*-s1-*")
+    record = read_record(failed / "record.json")
+    assert record.status == "failed"
+    assert "the network exploded" in record.failure
+    execute(broken, folder.parent, progress=False)
+    assert is_finished(failed)
+    aside = failed.with_name(failed.name + ".unfinished-1")
+    assert read_record(aside / "record.json").status == "failed"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"task": "PickCub-v1"}, "PickCube-v1"),
+        ({"embodiment": "hand"}, "floating"),
+        ({"variant": "action_gian:0.5"}, "action_gain"),
+        ({"variant": "action_gain:1.5"}, r"\[0, 1\]"),
+        ({"agent": "ppo"}, "equivariant"),
+        ({"seed": 10**6}, "seed"),
+    ],
+)
+def test_mistakes_are_refused_before_anything_is_built(change, words, tmp_path):
+    with pytest.raises(UserError, match=words):
+        execute(tiny_config(**change), tmp_path, progress=False)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+@pytest.mark.parametrize("option", ["sim", "device"])
+def test_missing_cuda_is_refused(option, tmp_path):
+    with pytest.raises(UserError, match="no CUDA device"):
+        execute(tiny_config(**{option: "cuda"}), tmp_path, progress=False)
+
+
+def test_an_unwritable_folder_is_refused(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match="writable"):
+        execute(tiny_config(), tmp_path / "file", progress=False)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_learner_on_cuda_with_physics_on_the_cpu(tmp_path):
+    record = read_record(
+        execute(tiny_config(device="cuda"), tmp_path, progress=False) / "record.json"
+    )
+    assert record.status == "finished"

@@ -1,0 +1,173 @@
+"""The latent-noise environment against stepping the task by hand."""
+
+import pytest
+import torch
+
+from bench.steering.evaluation import HELD_OUT_SEED, held_out_seeds, rollout, steerability
+from bench.steering.latent_env import LatentNoiseEnv
+from bench.tasks import make, task_class
+from bench.tasks.experts import Expert
+from policies.base import ChunkPolicy, PolicyConfig
+from policies.errors import UserError
+
+TASK = "PickCube-v1"
+
+
+def untrained_policy(execute: int = 4) -> ChunkPolicy:
+    torch.manual_seed(0)
+    task = task_class(TASK)
+    config = PolicyConfig(channels=8, width=16, depth=1, execute=execute, sampling_steps=2)
+    return ChunkPolicy(config, task.observation_layout, task.action_layout)
+
+
+class NoiseIsAction(torch.nn.Module):
+    """A decoder that plays its noise, so that a test decides every action."""
+
+    def __init__(self, execute: int):
+        super().__init__()
+        task = task_class(TASK)
+        self.obs_layout, self.act_layout = task.observation_layout, task.action_layout
+        self.horizon = self.execute = execute
+        self.nothing = torch.nn.Parameter(torch.zeros(1))
+
+    def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        return noise
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = make(TASK, num_envs=4)
+    yield env
+    env.close()
+
+
+def test_step_is_the_decoded_chunk_played_by_hand(env):
+    policy = untrained_policy()
+    latent = LatentNoiseEnv(env, policy)
+    seeds = [3, 4, 5, 6]
+    noise = torch.randn(3, 4, policy.horizon, policy.act_layout.dim)
+    obs = latent.reset(seeds)
+    seen = [obs]
+    for w in noise:
+        result = latent.step(w)
+        assert torch.equal(result.reward, torch.full((4,), -float(policy.execute)))
+        assert not result.terminal.any()
+        seen.append(result.obs)
+    obs, _ = env.reset(seed=seeds)
+    for i, w in enumerate(noise):
+        assert torch.equal(obs, seen[i])
+        actions = policy.decode(obs, w)
+        for t in range(policy.execute):
+            obs, *_ = env.step(actions[:, t])
+    assert torch.equal(obs, seen[-1])
+    assert latent.control_steps == 3 * policy.execute * 4
+
+
+def expert_chunk(env, expert: Expert) -> torch.Tensor:
+    """One expert action as a chunk of one, with environment 0 held still."""
+    action = expert.act()
+    action[0] = 0.0
+    return action[:, None]
+
+
+def test_success_ends_an_episode_and_its_cost(env):
+    latent = LatentNoiseEnv(env, NoiseIsAction(execute=1))
+    latent.reset([0, 1, 2, 3])
+    expert = Expert(env)
+    total = torch.zeros(4)
+    for _ in range(env.max_episode_steps):
+        before = env.elapsed_steps.clone()
+        result = latent.step(expert_chunk(env, expert))
+        total += result.reward
+        won = result.terminal.nonzero().flatten()
+        assert torch.equal(result.reward == 0, result.terminal)
+        if len(won):
+            assert not result.truncated[won].any()
+            assert result.episodes["success_once"].all()
+            # A return of -(length - 1): every step costs 1 but the one that succeeds.
+            length = before[won] + 1
+            assert torch.equal(result.episodes["episode_len"].float(), length.float())
+            assert torch.equal(result.episodes["return"], -(length.float() - 1))
+            # The next observation is the end of the old episode, not the start of the new one.
+            assert (result.next_obs[won] != result.obs[won]).any(dim=1).all()
+            break
+    else:
+        pytest.fail("the expert never succeeded")
+
+
+def test_time_out_truncates_without_terminal(env):
+    latent = LatentNoiseEnv(env, NoiseIsAction(execute=8))
+    latent.reset([0, 1, 2, 3])
+    still = torch.zeros(4, 8, latent.policy.act_layout.dim)
+    decisions = -(-env.max_episode_steps // 8)
+    for _ in range(decisions - 1):
+        assert not latent.step(still).truncated.any()
+    result = latent.step(still)
+    assert result.truncated.all()
+    assert not result.terminal.any()
+    # The last chunk is cut by the time limit: only what was executed costs.
+    last = env.max_episode_steps - 8 * (decisions - 1)
+    assert result.reward.tolist() == [-float(last)] * 4
+    assert result.episodes["return"].tolist() == [-float(env.max_episode_steps)] * 4
+    assert env.elapsed_steps.tolist() == [0] * 4
+
+
+def test_rollout_does_not_depend_on_the_number_of_environments(env):
+    policy = untrained_policy()
+    seeds = held_out_seeds(6)
+    noise = torch.randn(6, policy.horizon, policy.act_layout.dim)
+    wide = make(TASK, num_envs=6)
+    runs = [
+        rollout(
+            LatentNoiseEnv(e, policy, ignore_terminations=True), lambda o, rows: noise[rows], seeds
+        )
+        for e in (env, wide)
+    ]
+    wide.close()
+    assert runs[0].episodes["seed"].tolist() == seeds
+    assert torch.equal(runs[0].obs, runs[1].obs)
+    for name, value in runs[0].episodes.items():
+        assert torch.equal(value, runs[1].episodes[name]), name
+
+
+def test_rollout_measures_success_once_and_at_the_end(env):
+    """An expert that then lets go: success once everywhere it worked, at the end rarely."""
+    latent = LatentNoiseEnv(env, NoiseIsAction(execute=1), ignore_terminations=True)
+    expert: list[Expert] = []
+
+    def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        if not expert:
+            expert.append(Expert(env))
+        if env.elapsed_steps[0] < 30:
+            return expert_chunk(env, expert[0])
+        away = torch.zeros(4, 1, 7)
+        away[..., env.action_layout.slice("z")] = 1.0
+        return away
+
+    result = rollout(latent, act, [0, 1, 2, 3])
+    episodes = result.episodes
+    assert episodes["success_once"].tolist() == [False, True, True, True]
+    assert not episodes["success_at_end"].any()
+    assert episodes["episode_len"].tolist() == [env.max_episode_steps] * 4
+    assert episodes["return"][0] == -env.max_episode_steps
+    # Exactly one decision of each solved episode is terminal, and nothing after it is "running".
+    assert result.terminal.sum(0).tolist() == [0, 1, 1, 1]
+    assert torch.equal(-result.running.sum(0) + result.terminal.sum(0), episodes["return"].long())
+
+
+def test_evaluation_refuses_an_environment_that_ends_at_success(env):
+    with pytest.raises(UserError, match="ignore_terminations"):
+        rollout(LatentNoiseEnv(env, untrained_policy()), lambda o, r: o, [0])
+
+
+def test_steerability_of_an_untrained_policy_warns(env):
+    policy = untrained_policy()
+    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
+    report = steerability(latent, policy, seed=0, states=2, draws=4)
+    assert report.episodes == 8
+    assert report.solvable < 0.9
+    assert "initial states" in report.warning
+
+
+def test_held_out_seeds_are_fixed_and_apart():
+    assert held_out_seeds(3) == [HELD_OUT_SEED, HELD_OUT_SEED + 1, HELD_OUT_SEED + 2]

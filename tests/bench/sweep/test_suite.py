@@ -1,0 +1,94 @@
+"""Suites as data: products, defaults, mistakes; and a pool that isolates a failing cell."""
+
+import pytest
+
+from agents.sac import SacConfig
+from bench.sweep import pool
+from bench.sweep.suite import Suite, build_config, load_suite, suite_names
+from leaderboard.records import read_record
+from policies.errors import UserError
+from tests.bench.tiny_run import tiny_config
+
+
+def write(tmp_path, text: str) -> str:
+    path = tmp_path / "suite.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_the_grid_is_a_product_over_shared_settings(tmp_path):
+    suite = load_suite(
+        write(
+            tmp_path,
+            """
+            description = "two by two"
+            [grid]
+            agent = ["base", "standard"]
+            seed = [3, 4]
+            [run]
+            env_steps = 77
+            [run.sac]
+            width = 32
+            """,
+        )
+    )
+    assert [(c.agent, c.seed) for c in suite.runs] == [
+        ("base", 3),
+        ("base", 4),
+        ("standard", 3),
+        ("standard", 4),
+    ]
+    assert {c.env_steps for c in suite.runs} == {77}
+    assert {c.sac.width for c in suite.runs} == {32}
+    assert suite.runs[0].sac.gamma == build_config({}, "").sac.gamma
+
+
+def test_every_suite_that_ships_can_be_read():
+    assert "demo" in suite_names()
+    for name in suite_names():
+        suite = load_suite(name)
+        assert suite.runs
+        assert suite.description
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[grid]\nagnt = ['base']", "did you mean agent"),
+        ("[run.sac]\ngama = 0.9", "did you mean sac.gamma"),
+        ("[run]\nenv_steps = 'many'", "env_steps"),
+        ("[run]\nsac = 3", "must be a table"),
+        ("[grid]\nseed = []", "at least one value"),
+        ("[run]\nenv_steps = 0", "at least 1"),
+        ("not toml", "cannot be read as TOML"),
+        ("colour = 'red'", "unknown key colour"),
+    ],
+)
+def test_mistakes_in_a_suite(text, words, tmp_path):
+    with pytest.raises(UserError, match=words):
+        load_suite(write(tmp_path, text))
+
+
+def test_an_unknown_suite_lists_the_known_ones():
+    with pytest.raises(UserError, match="demo"):
+        load_suite("dmeo")
+
+
+def test_a_failed_cell_is_isolated_and_finished_ones_are_skipped(tmp_path, capsys):
+    good = tiny_config(agent="zero")
+    # Passes every check on the configuration and fails inside the run.
+    bad = tiny_config(agent="standard", sac=SacConfig(width=16, replay_capacity=2))
+    suite = Suite("two", "", (good,))
+    [outcome] = pool.run_suite(suite, tmp_path, workers=1)
+    assert outcome.status == "finished"
+    record = next(tmp_path.glob("*/record.json"))
+    written = record.stat().st_mtime_ns
+    mixed = Suite("two", "", (good, bad))
+    outcomes = pool.run_suite(mixed, tmp_path, workers=1)
+    assert [o.status for o in outcomes] == ["skipped", "failed"]
+    assert "replay_capacity" in outcomes[1].detail
+    assert record.stat().st_mtime_ns == written
+    assert read_record(record).status == "finished"
+    with pytest.raises(UserError, match="there is no embodiment"):
+        pool.run_suite(Suite("three", "", (tiny_config(embodiment="hand"),)), tmp_path, workers=1)
+    assert "failed" in capsys.readouterr().out

@@ -1,0 +1,147 @@
+"""What a user sees: verbs, and one sentence with exit code 2 for each mistake."""
+
+import json
+import subprocess
+import sys
+
+import h5py
+import pytest
+import torch
+
+from bench.cli import main
+from bench.demos import collect
+from bench.tasks import task_class
+from policies.base import ChunkPolicy, PolicyConfig, save_policy
+
+
+def symsteer(monkeypatch, *arguments) -> int:
+    monkeypatch.setattr(sys, "argv", ["symsteer", *map(str, arguments)])
+    try:
+        return main()
+    except SystemExit as error:
+        return int(error.code or 0)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    return collect("PickCube-v1", "floating", 2, "clean", 0, tmp_path_factory.mktemp("d") / "a.h5")
+
+
+def sentence(capsys) -> str:
+    """The one line on stderr."""
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("error: ")
+    assert "Traceback" not in lines[0]
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--task", "PickCub-v1"], "PickCube-v1"),
+        (["--embodiment", "hand"], "floating, panda"),
+        (["--variant", "gravity"], "action_gain"),
+        (["--variant", "action_gain:2"], "[0, 1]"),
+        (["--variant", "action_gain:much"], "action_gain:0.5"),
+        (["--agent", "ppo"], "equivariant"),
+        (["--sac.group", "E8"], "C8"),
+        (["--env-steps", "0"], "at least 1"),
+        (["--demos", "nowhere.h5"], "nowhere.h5"),
+        (["--base-policy", "nowhere.safetensors"], "nowhere.safetensors"),
+    ],
+)
+def test_mistakes_in_a_run(arguments, words, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert symsteer(monkeypatch, "run", "--quiet", *arguments) == 2
+    assert words in sentence(capsys)
+    assert not any(tmp_path.rglob("record.json"))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+@pytest.mark.parametrize("option", ["--sim", "--device"])
+def test_cuda_where_there_is_none(option, monkeypatch, capsys, tmp_path):
+    assert symsteer(monkeypatch, "run", option, "cuda", "--out", tmp_path) == 2
+    assert "no CUDA device" in sentence(capsys)
+
+
+def test_demonstrations_of_another_task(demos, monkeypatch, capsys, tmp_path):
+    arguments = ("run", "--quiet", "--task", "PushCube-v1", "--demos", demos, "--out", tmp_path)
+    assert symsteer(monkeypatch, *arguments) == 2
+    assert "PickCube-v1" in sentence(capsys)
+    assert not any(tmp_path.iterdir())
+
+
+def test_truncated_demonstrations(demos, monkeypatch, capsys, tmp_path):
+    cut = tmp_path / "cut.h5"
+    cut.write_bytes(demos.read_bytes()[: demos.stat().st_size // 3])
+    cut.with_suffix(".json").write_bytes(demos.with_suffix(".json").read_bytes())
+    arguments = ("run", "--quiet", "--demos", cut, "--out", tmp_path / "runs")
+    assert symsteer(monkeypatch, *arguments, "--demonstrations.count", 2) == 2
+    assert "truncated" in sentence(capsys)
+
+
+def test_demonstrations_with_nan(demos, monkeypatch, capsys, tmp_path):
+    bad = tmp_path / "nan.h5"
+    bad.write_bytes(demos.read_bytes())
+    bad.with_suffix(".json").write_bytes(demos.with_suffix(".json").read_bytes())
+    with h5py.File(bad, "r+") as file:
+        file["traj_0/actions"][0, 0] = float("nan")
+    arguments = ("run", "--quiet", "--demos", bad, "--out", tmp_path / "runs")
+    assert symsteer(monkeypatch, *arguments, "--demonstrations.count", 2) == 2
+    assert str(bad) in sentence(capsys)
+
+
+def test_a_checkpoint_of_another_layout(monkeypatch, capsys, tmp_path):
+    task = task_class("PushCube-v1")
+    config = PolicyConfig(channels=8, width=16, depth=1)
+    policy = ChunkPolicy(config, task.observation_layout, task.action_layout)
+    path = save_policy(policy, tmp_path / "push.safetensors")
+    arguments = ("run", "--quiet", "--base-policy", path, "--out", tmp_path / "runs")
+    assert symsteer(monkeypatch, *arguments) == 2
+    assert "observation layout" in sentence(capsys)
+
+
+def test_records_that_are_none(monkeypatch, capsys, tmp_path):
+    (tmp_path / "record.json").write_text(json.dumps({"hello": 1}))
+    assert symsteer(monkeypatch, "report", tmp_path, "--out", tmp_path / "page") == 2
+    assert "record.json" in sentence(capsys)
+
+
+def test_an_unknown_suite(monkeypatch, capsys, tmp_path):
+    assert symsteer(monkeypatch, "sweep", "dmeo", "--out", tmp_path) == 2
+    assert "demo" in sentence(capsys)
+
+
+def test_list_names_everything(monkeypatch, capsys):
+    assert symsteer(monkeypatch, "list") == 0
+    out = capsys.readouterr().out
+    for word in ("StackCube-v1", "panda", "action_gain", "approximate", "demo"):
+        assert word in out
+
+
+def test_demos_are_written(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "push.h5"
+    arguments = ("demos", path, "--task", "PushCube-v1", "--count", 2, "--mode", "clean")
+    assert symsteer(monkeypatch, *arguments) == 0
+    assert "wrote 2 demonstrations" in capsys.readouterr().out
+    assert path.with_suffix(".json").is_file()
+
+
+def test_doctor_names_what_there_is(monkeypatch, capsys):
+    assert symsteer(monkeypatch, "doctor") == 0
+    out = capsys.readouterr().out
+    assert "CUDA" in out
+    assert "rendering" in out.lower()
+
+
+def test_the_module_is_the_same_program():
+    done = subprocess.run(
+        [sys.executable, "-m", "bench", "run", "--agent", "ppo"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: there is no agent 'ppo'")
