@@ -37,6 +37,15 @@ def test_log_density_is_that_of_the_jacobian(size):
         assert log_prob[i].item() == pytest.approx(expected.item(), rel=1e-9, abs=1e-8)
 
 
+@pytest.mark.parametrize("size", [1e-3, 0.99 * SMALL**0.5, 1.01 * SMALL**0.5, 0.3, 1.0, 5.0])
+def test_gradients_are_those_of_finite_differences(size):
+    gaussian = SquashedGaussian(LAYOUT, 1.5).double()
+    mean, log_scale, eps = parameters(4)
+    mean, log_scale = size * mean, 0.2 * log_scale + math.log(0.3 * size)
+    inputs = [x.requires_grad_() for x in (mean, log_scale, eps)]
+    assert torch.autograd.gradcheck(gaussian.sample, inputs, eps=1e-7, atol=1e-5)
+
+
 def test_density_of_one_vector_block_integrates_to_one():
     gaussian = SquashedGaussian(Layout([Field("xy", 1)]), 1.5).double()
     axis = torch.linspace(-1.5, 1.5, 1201, dtype=torch.float64)
