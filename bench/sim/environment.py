@@ -33,7 +33,7 @@ class _BatchedDevice:
         return False
 
 
-class BatchedCpuMixin:
+class BatchedCpuMixin(BaseEnv):
     """Runs a ManiSkill task for N environments in one process on CPU physics.
 
     Mix in before a `BaseEnv` subclass: ``class MyEnv(BatchedCpuMixin, PickCubeEnv)``. Takes the
@@ -158,7 +158,7 @@ class BatchedCpuMixin:
         )
 
 
-class CudaMixin:
+class CudaMixin(BaseEnv):
     """Runs a ManiSkill task on ManiSkill's own GPU simulation, also for one environment.
 
     Raises:
@@ -262,4 +262,4 @@ def create(
         raise UserError(f"num_envs is {num_envs}, but at least one environment is needed.")
     if render:
         kwargs.setdefault("render_mode", "rgb_array")
-    return make_env_class(env_cls, sim)(num_envs=num_envs, **kwargs)
+    return make_env_class(env_cls, sim)(num_envs=num_envs, **kwargs)  # type: ignore[arg-type]
