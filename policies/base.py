@@ -81,10 +81,13 @@ class PolicyConfig:
     """Ta: actions executed before the next decision."""
     diffusion_steps: int = 100
     """K: noise levels in training."""
-    sampling_steps: int = 5
+    sampling_steps: int = 8
     """DDIM steps of the sampler."""
     prediction: Prediction = "sample"
     """What the network predicts: the clean chunk (sample) or the noise (epsilon)."""
+    snr_cap: float = 5.0
+    """Largest weight of a noise level in the loss of sample prediction (Min-SNR); larger values
+    spread the actions more over the noise, values of 0.05 or less weigh all levels alike."""
     steps: int = 1500
     """Gradient steps."""
     batch_size: int = 256
@@ -212,7 +215,7 @@ class ChunkPolicy(nn.Module):
         self.obs_layout, self.act_layout = obs_layout, act_layout
         self.horizon, self.execute = config.horizon, config.execute
         self.group = Group.parse(config.group)
-        self.diffusion = Diffusion(config.diffusion_steps, config.prediction)
+        self.diffusion = Diffusion(config.diffusion_steps, config.prediction, config.snr_cap)
         self.obs_normalizer = obs_normalizer or Normalizer(obs_layout)
         self.act_normalizer = act_normalizer or Normalizer(act_layout)
         self.denoiser = Denoiser(

@@ -174,7 +174,7 @@ def train_policy(
         noisy = policy.diffusion.add_noise(batch_chunks, noise, levels)
         condition = network.encode(policy.normalized_observation(batch_obs))
         output = network(noisy, condition + network.encode_time(levels))
-        loss = policy.diffusion.loss(output, batch_chunks, noise)
+        loss = policy.diffusion.loss(output, batch_chunks, noise, levels)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(parameters, 1.0)

@@ -28,14 +28,20 @@ ACT = Layout(
         Field("gripper", 0),
     ]
 )
-SMALL = {"channels": 16, "width": 32, "depth": 2, "warmup_steps": 10, "learning_rate": 4e-3}
+SMALL = {
+    "channels": 16,
+    "width": 32,
+    "depth": 2,
+    "warmup_steps": 10,
+    "learning_rate": 4e-3,
+    # Equal weights of all noise levels: the controller is learned within a few steps.
+    "snr_cap": 0.05,
+}
 
 
 def controller(obs: torch.Tensor) -> torch.Tensor:
     """Actions [..., 7] that commute with every rotation and reflection of the plane."""
-    tcp, goal = (
-        torch.view_as_complex(obs[..., OBS.slice(n)].clone()) for n in ("tcp", "goal")
-    )
+    tcp, goal = (torch.view_as_complex(obs[..., OBS.slice(n)].clone()) for n in ("tcp", "goal"))
     rod = torch.view_as_complex(obs[..., OBS.slice("rod")].clone())
     reach = goal - tcp
     xy = reach / reach.abs().clamp_min(0.25)
@@ -101,9 +107,10 @@ def trained(world):
     def get(**fields):
         key = tuple(sorted(fields.items()))
         if key not in cache:
-            config = PolicyConfig(
-                **{**world.small, "steps": 120, "batch_size": 64, "ema_decay": 0.9, **fields}
-            )
+            short = {"steps": 120, "batch_size": 64, "ema_decay": 0.9}
+            if fields.get("network") == "unet":
+                short |= {"steps": 100, "batch_size": 32, "width": 16}
+            config = PolicyConfig(**{**world.small, **short, **fields})
             cache[key] = train_policy(
                 config, world.episodes(24, noise=0.2), world.obs_layout, world.act_layout
             )

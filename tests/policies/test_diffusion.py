@@ -73,9 +73,25 @@ def test_sampler_follows_the_steps(steps):
 
 def test_loss_targets():
     x0, noise = torch.randn(2, 4, 8, 7, generator=torch.Generator().manual_seed(0))
-    assert Diffusion(prediction="sample").loss(x0, x0, noise) == 0
-    assert Diffusion(prediction="epsilon").loss(noise, x0, noise) == 0
-    assert Diffusion(prediction="sample").loss(noise, x0, noise) > 0
+    t = torch.tensor([0, 30, 60, 99])
+    assert Diffusion(prediction="sample").loss(x0, x0, noise, t) == 0
+    assert Diffusion(prediction="epsilon").loss(noise, x0, noise, t) == 0
+    assert Diffusion(prediction="sample").loss(noise, x0, noise, t) > 0
+    expected = torch.nn.functional.mse_loss(x0, noise)
+    for plain in (Diffusion(prediction="epsilon"), Diffusion(snr_cap=0.05)):
+        assert torch.allclose(plain.loss(x0, noise, noise, t), expected)
+
+
+def test_loss_weights_follow_the_signal_to_noise_ratio():
+    process = Diffusion(100, snr_cap=5.0)
+    snr = torch.tensor([a / (1 - a) for a in process.signal])
+    weights = torch.tensor(process.weights)
+    assert weights.mean().item() == pytest.approx(1.0)
+    assert torch.allclose(weights / weights[0], snr.clamp(0.05, 5.0) / 5.0)
+    x0 = torch.zeros(2, 8, 7)
+    output = torch.ones(2, 8, 7)
+    loss = process.loss(output, x0, x0, torch.tensor([10, 80]))
+    assert loss.item() == pytest.approx(float(weights[[10, 80]].mean()), rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -83,6 +99,7 @@ def test_loss_targets():
     [
         lambda: Diffusion(1),
         lambda: Diffusion(100, "velocity"),
+        lambda: Diffusion(100, snr_cap=0.0),
         lambda: Diffusion(100).timesteps(0),
         lambda: Diffusion(100).timesteps(101),
     ],
