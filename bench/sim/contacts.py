@@ -69,43 +69,68 @@ class ContactReader:
     def __init__(self, systems: Sequence[physx.PhysxCpuSystem]) -> None:
         self._systems = systems
         self._queries: list[PairImpulseQuery | BodyImpulseQuery] = []
-        self._answered = False
+        # Per scene: query, row and signed impulse of every contact that enters a result.
+        self._found: list[list[tuple[int, int, np.ndarray]]] = [[] for _ in systems]
         self._forgotten: set[int] = set(range(len(systems)))
+        self._must_read = True
+        self._must_sum = True
+        # Query, row and sign by pair of bodies, filled as pairs come into contact.
+        self._known_pairs: dict[tuple[Any, Any], list[tuple[int, int, int]]] = {}
 
     def register(self, query: Query) -> Query:
         """Answer this query too from now on."""
         self._queries.append(query)
-        self._answered = False
+        self._known_pairs.clear()
+        self._must_read = True
         return query
 
     def invalidate(self) -> None:
         """All scenes have taken a substep."""
-        self._answered = False
+        self._must_read = True
         self._forgotten.clear()
 
     def forget(self, scene: int) -> None:
         """A scene was set to another state: it has no contacts until its next substep."""
-        self._answered = False
         self._forgotten.add(scene)
+        self._found[scene].clear()
+        self._must_sum = True
 
     def answer(self, query: PairImpulseQuery | BodyImpulseQuery) -> None:
-        """Bring a query's result up to date."""
-        if not self._answered:
+        """Bring the results of this and all other queries up to date."""
+        if self._must_read:
             self._read()
+        if self._must_sum:
+            self._sum()
 
     def _read(self) -> None:
-        totals = [np.zeros(q.cuda_impulses.array.shape) for q in self._queries]
         for scene, system in enumerate(self._systems):
+            found = self._found[scene]
+            found.clear()
             if scene in self._forgotten:
                 continue
             for contact in system.get_contacts():
-                first, second = contact.bodies
-                impulse = None
-                for query, total in zip(self._queries, totals, strict=True):
-                    for row, sign in query.entries(first, second):
-                        if impulse is None:
-                            impulse = np.sum([p.impulse for p in contact.points], axis=0)
-                        total[row] += sign * impulse
+                pair = tuple(contact.bodies)
+                entries = self._known_pairs.get(pair)
+                if entries is None:
+                    entries = self._known_pairs[pair] = self._entries(*pair)
+                if entries:
+                    impulse = np.sum([point.impulse for point in contact.points], axis=0)
+                    found.extend((query, row, sign * impulse) for query, row, sign in entries)
+        self._must_read = False
+        self._must_sum = True
+
+    def _entries(self, first: Any, second: Any) -> list[tuple[int, int, int]]:
+        return [
+            (index, row, sign)
+            for index, query in enumerate(self._queries)
+            for row, sign in query.entries(first, second)
+        ]
+
+    def _sum(self) -> None:
+        totals = [np.zeros(query.cuda_impulses.array.shape) for query in self._queries]
+        for found in self._found:
+            for index, row, impulse in found:
+                totals[index][row] += impulse
         for query, total in zip(self._queries, totals, strict=True):
             query.cuda_impulses.array[:] = total
-        self._answered = True
+        self._must_sum = False

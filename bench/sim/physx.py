@@ -13,6 +13,11 @@ share memory with numpy arrays. What differs from the GPU is invisible to task c
 - *Contacts are forgotten when a scene is reset*, so what a reset reports depends on the state
   it sets and not on the episode before.
 
+Repeats are exact to the last bit, with one limit of PhysX itself: the order in which it solves
+contacts that begin in the same substep follows the scene's history. A scene that must not show
+its past at all is made anew by ``env.reset(options={"reconfigure": True})``, in milliseconds
+per environment.
+
 Rows of the body buffer: rigid bodies first (dynamic and kinematic, scene by scene), then
 articulation links. Columns: position (3), quaternion wxyz (4), linear velocity (3), angular
 velocity (3), in metres, radians and seconds, in the world frame.
