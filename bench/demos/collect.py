@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 import torch
 
+from bench.sim.environment import Simulator
 from bench.tasks import make
 from bench.tasks.base import SymmetricTask
 from bench.tasks.experts import Expert
@@ -30,7 +31,8 @@ class Diversity:
     """How demonstrations differ from one another beyond their initial states."""
 
     noise: float = 0.3
-    """Standard deviation of the action noise, in normalized action units."""
+    """Standard deviation of the action noise, in normalized action units of the floating gripper
+    (the Panda's larger steps take 0.6 of it)."""
     correlation: float = 0.8
     """Correlation of the noise from one step to the next (first-order autoregressive)."""
     scale: tuple[float, float] = (0.3, 1.7)
@@ -71,7 +73,7 @@ def collect(
     *,
     num_envs: int = 32,
     variant: str = "none",
-    sim: str = "cpu",
+    sim: Simulator = "cpu",
     diversity: Diversity | None = None,
     progress: Progress | None = None,
 ) -> Path:
@@ -175,7 +177,7 @@ def _disturbances(
     for i, seed in enumerate(seeds):
         # A stream of its own: the environment seeds another generator with the same number.
         rng = np.random.default_rng([seed, 1])
-        scale = settings.noise * rng.uniform(*settings.scale)
+        scale = settings.noise * env.body.noise_scale * rng.uniform(*settings.scale)
         radius, bearing = settings.offset * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
         offsets[i, :2] = radius * np.cos(bearing), radius * np.sin(bearing)
         draws = rng.standard_normal((steps, dim))
@@ -187,8 +189,9 @@ def _disturbances(
     # A noisy finger command would drop the object; a noisy tilt does not help to steer.
     for name in ("gripper", "tilt"):
         noise[:, :, env.action_layout.slice(name)] = 0.0
-    return tuple(
-        torch.as_tensor(array, dtype=torch.float32, device=env.device) for array in (noise, offsets)
+    return (
+        torch.as_tensor(noise, dtype=torch.float32, device=env.device),
+        torch.as_tensor(offsets, dtype=torch.float32, device=env.device),
     )
 
 

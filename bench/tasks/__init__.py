@@ -17,6 +17,7 @@ import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
 from mani_skill import logger
 
 from bench.sim import create, rendering_works
+from bench.sim.environment import Simulator
 from bench.tasks.base import SymmetricTask
 from bench.tasks.embodiments import EMBODIMENTS
 from bench.tasks.pick_cube import PickCube
@@ -61,7 +62,7 @@ def make(
     embodiment: str = "floating",
     variant: str = "none",
     strength: Strength | None = None,
-    sim: str = "cpu",
+    sim: Simulator = "cpu",
     obs_mode: str = "state",
     reward_mode: str = "sparse",
     render: bool = False,

@@ -62,6 +62,7 @@ class SymmetricTask(BaseEnv):
     action_layout: ClassVar[Layout] = ACTION_LAYOUT
     workspace_center: ClassVar[tuple[float, float]] = (0.0, 0.0)
     observation_layout: ClassVar[Layout]
+    _main_seed: list[int]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -79,6 +80,13 @@ class SymmetricTask(BaseEnv):
         self.embodiment = embodiment
         self.body: Embodiment = EMBODIMENTS[embodiment]
         self.variants = parse(variant, strength)
+        num_envs = kwargs.get("num_envs", 1)
+        for part in self.variants:
+            if torch.is_tensor(part.strength) and len(part.strength) != num_envs:
+                raise UserError(
+                    f"{len(part.strength)} strengths of {part.name!r} were given for {num_envs} "
+                    "environments; give one number, or one for each environment"
+                )
         self._reset_rows: torch.Tensor | None = None
         kwargs.setdefault("control_mode", self.body.control_mode)
         kwargs.setdefault("robot_uids", self.body.robot_uid)
@@ -130,9 +138,9 @@ class SymmetricTask(BaseEnv):
     # ------------------------------------------------------------------- step
 
     def step(self, action: Any) -> tuple:
-        """As ManiSkill's; ``truncated`` is set after ``max_episode_steps``."""
+        """As ManiSkill's; ``truncated`` is set after ``max_episode_steps``, reward is float32."""
         obs, reward, terminated, _, info = super().step(action)
-        return obs, reward, terminated, self.elapsed_steps >= self.max_episode_steps, info
+        return obs, reward.float(), terminated, self.elapsed_steps >= self.max_episode_steps, info
 
     def _step_action(self, action: Any) -> Any:
         if self.variants and isinstance(action, np.ndarray | torch.Tensor):
@@ -190,7 +198,7 @@ class SymmetricTask(BaseEnv):
             obs, info = super().reset(seed=seed, options=options)
         finally:
             self._reset_rows = None
-        if kept:
+        if kept and partial is not None:
             fresh = self.agent.get_controller_state()
             _copy_rows(fresh, kept, partial)
             self.agent.set_controller_state(kept)

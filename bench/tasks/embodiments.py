@@ -39,6 +39,8 @@ class Embodiment:
     robot_uid: str
     root_position: tuple[float, float, float]
     control_mode: str = "pd_ee_delta_pose"
+    noise_scale: float = 1.0
+    """How much action noise demonstrations bear here, relative to the floating gripper."""
 
     def initial_qpos(self, rng: Any, count: int) -> np.ndarray:
         """Joint positions at a reset, ``[count, dof]``, from one random generator per row."""
@@ -160,6 +162,7 @@ class PandaArm(Embodiment):
     # controller covers about 40 %.
     step: float = 0.1
     gain: float = 2.0
+    noise_scale: float = 0.6
 
     def initial_qpos(self, rng: Any, count: int) -> np.ndarray:
         qpos = np.tile(np.asarray(Panda.keyframes["rest"].qpos, dtype=np.float64), (count, 1))

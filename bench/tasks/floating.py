@@ -68,6 +68,7 @@ class PlanarPoseController(PDJointPosController):
     """
 
     config: PlanarPoseControllerConfig
+    _target_qpos: torch.Tensor
 
     def _initialize_action_space(self) -> None:
         self.single_action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)

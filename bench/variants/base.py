@@ -36,18 +36,16 @@ class Variant:
     initial states."""
 
     def __init__(self, strength: Strength):
-        values = torch.as_tensor(strength, dtype=torch.float32)
+        try:
+            values = torch.as_tensor(strength, dtype=torch.float32)
+        except (TypeError, ValueError):
+            values = torch.tensor(math.nan)
         if values.ndim > 1 or not bool(((values >= 0) & (values <= 1)).all()):
             raise UserError(
                 f"the strength of variant {self.name!r} must lie in [0, 1], one number or one per "
                 f"environment; it is {strength}"
             )
-        self.strength = strength
-
-    @property
-    def column(self) -> Strength:
-        """The strength in a form that broadcasts against ``[N, 1]``."""
-        return self.strength[:, None] if _per_environment(self.strength) else self.strength
+        self.strength: Strength = values if values.ndim == 1 else float(values)
 
     def action(self, action: torch.Tensor) -> torch.Tensor:
         """What is executed for a bounded ``action [N, 7]``; by default the action itself."""
@@ -99,7 +97,7 @@ def parse(text: str, strength: Strength | None = None) -> tuple[Variant, ...]:
         if value is None:
             raise UserError(f"the variant {name!r} needs a strength in [0, 1], e.g. {name}:0.5")
         variants.append(registry()[name](value))
-    return tuple(v for v in variants if _per_environment(v.strength) or float(v.strength) != 0)
+    return tuple(v for v in variants if torch.is_tensor(v.strength) or v.strength != 0)
 
 
 def describe(variants: tuple[Variant, ...]) -> str:
@@ -108,10 +106,6 @@ def describe(variants: tuple[Variant, ...]) -> str:
         return "none"
     means = (float(torch.as_tensor(v.strength, dtype=torch.float32).mean()) for v in variants)
     return "+".join(f"{v.name}:{mean:g}" for v, mean in zip(variants, means, strict=True))
-
-
-def _per_environment(strength: Strength) -> bool:
-    return torch.is_tensor(strength) and strength.ndim == 1
 
 
 def _number(name: str, number: str, text: str) -> float:

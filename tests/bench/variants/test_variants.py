@@ -45,6 +45,10 @@ def test_parse_and_describe():
         parse("action_gain:0.5", 0.5)
     with pytest.raises(UserError, match=r"\[0, 1\]"):
         parse("action_gain", torch.tensor([0.5, 1.2]))
+    with pytest.raises(UserError, match=r"\[0, 1\]"):
+        parse("action_gain", "a lot")
+    with pytest.raises(UserError, match=r"2 strengths .* for 3 environments"):
+        make("PickCube-v1", num_envs=3, variant="action_gain", strength=[0.5, 0.2])
 
 
 def rollout(**kwargs):
