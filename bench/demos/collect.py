@@ -123,7 +123,7 @@ def collect(
                 f"the expert of {task!r} ({embodiment}, variant {variant}) succeeded only "
                 f"{len(kept)} times in {tried} attempts; ask for less diversity or a milder variant"
             )
-        batch = seeds.randint(0, 2**31, size=env.num_envs, dtype=np.int64).tolist()
+        batch = np.asarray(seeds.randint(2**31, size=env.num_envs)).tolist()
         kept += _run(env, batch, settings)
         tried += len(batch)
         if progress is not None:
