@@ -69,7 +69,7 @@ class PolicyConfig:
     """The network inside: residual MLP on the flattened chunk, or temporal U-Net."""
     channels: int = 64
     """Features of the observation embedding per group element."""
-    width: int = 128
+    width: int = 64
     """Features of the chunk per group element."""
     depth: int = 3
     """Residual blocks of the MLP."""
@@ -90,7 +90,7 @@ class PolicyConfig:
     spread the actions more over the noise, values of 0.05 or less weigh all levels alike."""
     steps: int = 1500
     """Gradient steps."""
-    batch_size: int = 256
+    batch_size: int = 128
     """Chunks in a gradient step."""
     learning_rate: float = 1e-3
     """Peak learning rate of AdamW; cosine decay to zero."""

@@ -48,7 +48,7 @@ class Denoiser(nn.Module):
         group: Group,
         network: str = "mlp",
         channels: int = 64,
-        width: int = 128,
+        width: int = 64,
         depth: int = 3,
     ):
         super().__init__()
@@ -100,10 +100,12 @@ class Denoiser(nn.Module):
         """A copy for inference whose equivariant layers hold their dense matrices ready."""
         fast = copy.deepcopy(self).requires_grad_(False).eval()
         order = self.group.order
-        fast.obs_lift = _Dense(self.obs_lift, 1, (order, self.obs_lift.channels))
-        fast.obs_mix = _Dense(self.obs_mix, 2, (order, self.obs_mix.out_channels))
-        fast.chunk_lift = _Dense(self.chunk_lift, 1, (order, self.chunk_lift.channels))
-        fast.project = _Dense(self.project, 2, (self.project.layout.dim,))
+        fast.register_module("obs_lift", _Dense(self.obs_lift, 1, (order, self.obs_lift.channels)))
+        fast.register_module("obs_mix", _Dense(self.obs_mix, 2, (order, self.obs_mix.out_channels)))
+        fast.register_module(
+            "chunk_lift", _Dense(self.chunk_lift, 1, (order, self.chunk_lift.channels))
+        )
+        fast.register_module("project", _Dense(self.project, 2, (self.project.layout.dim,)))
         return fast
 
 

@@ -46,23 +46,29 @@ class Normalizer(nn.Module):
         layout: geometry of the vectors.
         scale: ``[dim]``, positive, equal within each block of frequency >= 1.
         offset: ``[dim]``, zero except for scalars that reflections leave alone.
+        deviation: ``[dim]``, how much the data vary, data units; see :meth:`fit`.
 
-    The state dict holds ``scale`` and ``offset``.
+    The state dict holds ``scale``, ``offset`` and ``deviation``.
     """
 
     scale: torch.Tensor
     offset: torch.Tensor
+    deviation: torch.Tensor
 
     def __init__(
         self,
         layout: Layout,
         scale: torch.Tensor | None = None,
         offset: torch.Tensor | None = None,
+        deviation: torch.Tensor | None = None,
     ):
         super().__init__()
         self.layout = layout
         self.register_buffer("scale", torch.ones(layout.dim) if scale is None else scale)
         self.register_buffer("offset", torch.zeros(layout.dim) if offset is None else offset)
+        self.register_buffer(
+            "deviation", torch.ones(layout.dim) if deviation is None else deviation
+        )
 
     @classmethod
     def fit(cls, layout: Layout, data: torch.Tensor) -> Normalizer:
@@ -71,6 +77,9 @@ class Normalizer(nn.Module):
         Scalars: the middle and half the range between minimum and maximum. Odd scalars (they
         change sign under reflections): the largest magnitude, no offset. Vectors: the largest
         norm, no offset. What varies by less than ``MINIMUM_RANGE`` keeps scale 1.
+
+        ``deviation`` is the standard deviation of a scalar, and of a vector the root mean square
+        of its components about zero: the value over all rotations of the data.
 
         Raises:
             UserError: if the data are empty, not finite or of another width.
@@ -84,13 +93,18 @@ class Normalizer(nn.Module):
         if not data.isfinite().all():
             raise UserError("the data to normalise hold NaN or infinite numbers; remove them")
         low, high = data.min(dim=0).values, data.max(dim=0).values
-        radius = ((data * data) @ _same_block(layout, data.dtype, data.device)).max(dim=0).values
+        squares = (data * data) @ _same_block(layout, data.dtype, data.device)
+        radius = squares.max(dim=0).values.sqrt()
         # What reflections leave alone may have an offset; everything else is fixed at zero.
         shiftable = layout.invariant_mask(reflections=True).to(data.device)
         offset = torch.where(shiftable, (low + high) / 2, 0.0)
-        scale = torch.where(shiftable, (high - low) / 2, radius.sqrt())
+        scale = torch.where(shiftable, (high - low) / 2, radius)
         scale = torch.where(scale < MINIMUM_RANGE, 1.0, scale)
-        return cls(layout, scale.float(), offset.float())
+        sizes = layout.block_index.bincount()[layout.block_index].to(data.device)
+        centered = torch.where(
+            shiftable, data.var(dim=0, correction=0), squares.mean(dim=0) / sizes
+        )
+        return cls(layout, scale.float(), offset.float(), centered.sqrt().float())
 
     def normalize(self, x: torch.Tensor) -> torch.Tensor:
         """Data units to unit size; shapes ``[..., dim] -> [..., dim]``."""

@@ -7,25 +7,32 @@ draws is measured in the bench.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 
 from policies.base import ChunkPolicy
+from policies.errors import UserError
 
 DESIRED_ACTION_STD = 0.3
 """Below this spread of normalised actions steering gained little in pilot runs."""
+
+STILL = 1e-2
+"""Action blocks that vary less in the demonstrations are left out of the mean."""
 
 
 @torch.no_grad()
 def action_spread(
     policy: ChunkPolicy, observations: torch.Tensor, draws: int = 16, seed: int = 0
 ) -> dict[str, Any]:
-    """Spread of the executed actions over the noise, at given observations.
+    """Spread of the executed actions over the noise, relative to the demonstrations' variety.
 
-    Actions are normalised by the policy's own statistics (1 is half the demonstrated range of a
-    scalar, or the largest demonstrated norm of a vector). For each observation, executed step
-    and number, take the standard deviation over ``draws`` standard normal noises; report means.
+    For each irrep block: the root mean square, over observations, executed steps and components,
+    of the standard deviation over ``draws`` standard normal noises, divided by the block's
+    standard deviation over all demonstrated actions. 0: observations decide everything; 1: the
+    noise alone decides as much as all that differs between demonstrated actions. Invariant under
+    rotations.
 
     Args:
         policy: the base policy.
@@ -34,21 +41,44 @@ def action_spread(
         seed: of the noises.
 
     Returns:
-        ``action_std`` (mean over all numbers), ``action_std_by_field`` (by action field),
-        ``observations``, ``draws`` and ``seed``; JSON-ready.
+        ``action_std`` (mean over the blocks that move in the demonstrations),
+        ``action_std_by_field`` (mean over the field's blocks; ``None`` where nothing moves),
+        ``raw_std_by_field`` (environment units), ``observations``, ``draws`` and ``seed``;
+        JSON-ready.
+
+    Raises:
+        UserError: if there are no observations or fewer than 2 draws.
     """
-    count = len(observations)
+    if draws < 2 or len(observations) == 0:
+        raise UserError(
+            f"the spread over the noise needs at least 1 observation and 2 draws, not "
+            f"{len(observations)} and {draws}"
+        )
+    count, layout = len(observations), policy.act_layout
     generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(
-        draws, count, policy.horizon, policy.act_layout.dim, generator=generator
-    ).to(observations)
-    actions = torch.stack([policy.decode(observations, w) for w in noise])
-    spread = policy.act_normalizer.normalize(actions[:, :, : policy.execute]).std(dim=0)
-    layout = policy.act_layout
+    noise = torch.randn(draws, count, policy.horizon, layout.dim, generator=generator)
+    actions = torch.stack([policy.decode(observations, w.to(observations)) for w in noise])
+    variance = actions[:, :, : policy.execute].var(dim=0).mean(dim=(0, 1))
+    deviation = policy.act_normalizer.deviation
+    ratios: list[float] = []
+    by_field: dict[str, float | None] = {}
+    for field in layout.fields:
+        blocks = [
+            math.sqrt(float(v.mean())) / float(d[0])
+            for v, d in zip(
+                variance[layout.slice(field.name)].split(field.block_dim),
+                deviation[layout.slice(field.name)].split(field.block_dim),
+                strict=True,
+            )
+            if d[0] >= STILL
+        ]
+        ratios += blocks
+        by_field[field.name] = sum(blocks) / len(blocks) if blocks else None
     return {
-        "action_std": float(spread.mean()),
-        "action_std_by_field": {
-            field.name: float(spread[..., layout.slice(field.name)].mean())
+        "action_std": sum(ratios) / len(ratios) if ratios else 0.0,
+        "action_std_by_field": by_field,
+        "raw_std_by_field": {
+            field.name: math.sqrt(float(variance[layout.slice(field.name)].mean()))
             for field in layout.fields
         },
         "observations": count,

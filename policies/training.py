@@ -143,7 +143,7 @@ def train_policy(
     network = policy.denoiser
     average = [p.detach().clone() for p in network.parameters()]
     network.requires_grad_(True).train()
-    parameters = list(network.parameters())
+    parameters: list[torch.Tensor] = list(network.parameters())
     optimizer = torch.optim.AdamW(
         parameters,
         lr=config.learning_rate,

@@ -40,6 +40,11 @@ def test_statistics():
         assert y[:, block].norm(dim=-1).max().item() == pytest.approx(1.0, abs=1e-6)
     moved = ~LAYOUT.invariant_mask(reflections=True)
     assert (fitted.offset[moved] == 0).all()
+    assert fitted.deviation[LAYOUT.slice("z")].item() == pytest.approx(float(z.std(correction=0)))
+    for block in vectors:
+        assert fitted.deviation[block].tolist() == pytest.approx(
+            [float(x[:, block].square().mean().sqrt())] * 2
+        )
     # Blocks of one field keep scales of their own.
     assert fitted.scale[0] != fitted.scale[2]
 
