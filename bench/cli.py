@@ -15,8 +15,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from bench.runs.config import RunConfig
+from bench.runs.config import DemonstrationConfig, RunConfig
 from leaderboard.errors import RecordError
+from policies.base import PolicyName
 from policies.errors import UserError
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
@@ -161,6 +162,47 @@ def demos(
         collect(task, embodiment, count, mode, seed, path, progress=advance)
     steps = load(path, task, embodiment).meta["steps"]
     print(f"wrote {count} demonstrations, {steps} steps, to {path}")
+    return 0
+
+
+@app.command
+def base(
+    task: str = "PickCube-v1",
+    embodiment: str = "floating",
+    mode: Literal["clean", "diverse"] = "diverse",
+    policies: tuple[PolicyName, ...] = ("edp", "plain", "plain-augmented"),
+    demonstrations: tuple[int, ...] = (5, 10, 20, 50),
+    seeds: int = 3,
+    episodes: int = 200,
+    workers: int = 0,
+    out: Path = Path("runs"),
+) -> int:
+    """Train base policies from few demonstrations and compare their success.
+
+    Args:
+        task: Task; `symsteer list` names them.
+        embodiment: floating or panda.
+        mode: Kind of demonstrations.
+        policies: Which policies.
+        demonstrations: Numbers of demonstrations.
+        seeds: Seeds a cell; each has its own demonstrations.
+        episodes: Held-out episodes a policy.
+        workers: Policies side by side; 0 means one a core.
+        out: Folder for demonstrations and the table's data.
+    """
+    from bench.runs.base_study import study, table, write_study
+    from bench.runs.run import check
+
+    config = RunConfig(
+        task=task, embodiment=embodiment, demonstrations=DemonstrationConfig(mode=mode)
+    )
+    check(config)
+    workers = workers or os.cpu_count() or 1
+    rows = study(config, out, policies, demonstrations, seeds, episodes, workers)
+    path = out / "base" / f"study-{task}-{embodiment}-{mode}.json"
+    write_study(path, config, rows)
+    print(table(rows))
+    print(f"wrote {path}")
     return 0
 
 

@@ -75,7 +75,9 @@ class LatentNoiseEnv:
     def reset(self, seeds: list[int]) -> torch.Tensor:
         """Start an episode everywhere, environment i from ``seeds[i]``; ``[N, obs_dim]``."""
         start = time.perf_counter()
-        obs, _ = self.env.reset(seed=seeds)
+        # PhysX orders contacts by a scene's history: only fresh scenes give the same episodes
+        # whatever was played before.
+        obs, _ = self.env.reset(seed=seeds, options={"reconfigure": True})
         self._obs = obs.to(self.device)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._return = torch.zeros(self.num_envs, device=self.device)

@@ -41,7 +41,10 @@ def snapshot(task: str, embodiment: str, seed: int, steps: int) -> np.ndarray:
 def contact_sheet(seed: int = 1, steps: int = 5) -> np.ndarray:
     """Tasks from left to right, embodiments from top to bottom, uint8."""
     rows = [
-        np.concatenate([snapshot(task, embodiment, seed, steps) for task in task_names()], axis=1)
+        np.concatenate(
+            [snapshot(task, embodiment, seed, steps)[SIZE * 3 // 10 :] for task in task_names()],
+            axis=1,
+        )
         for embodiment in embodiments()
     ]
     return np.concatenate(rows, axis=0)

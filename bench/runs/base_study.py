@@ -1,0 +1,142 @@
+"""How good are base policies at few demonstrations? EDP against its plain rivals."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import statistics
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from bench.demos import load
+from bench.runs.base_policy import demonstration_file
+from bench.runs.config import DemonstrationConfig, RunConfig
+from bench.runs.folder import write_json
+from bench.steering.evaluation import held_out_seeds, rollout
+from bench.steering.latent_env import LatentNoiseEnv
+from bench.tasks import make
+from policies.base import PolicyName
+from policies.errors import UserError
+from policies.training import train_policy
+
+EVALUATION_ENVS = 100
+
+
+@dataclass(frozen=True)
+class BaseCell:
+    """One base policy: which, from how many demonstrations, with which seed."""
+
+    name: PolicyName
+    count: int
+    seed: int
+
+
+def study(
+    config: RunConfig,
+    out: Path,
+    names: Sequence[PolicyName],
+    counts: Sequence[int],
+    seeds: int,
+    episodes: int,
+    workers: int,
+) -> list[dict[str, Any]]:
+    """Train every policy at every number of demonstrations and play held-out episodes.
+
+    Seed s has its own demonstrations, initialisation and noise; the policies of one seed share the
+    demonstrations, and fewer demonstrations are the first of the more.
+
+    Args:
+        config: task, embodiment, kind of demonstrations and the policies' common settings.
+        out: folder that keeps demonstrations in ``out/base``.
+        names: kinds of policy.
+        counts: numbers of demonstrations.
+        seeds: number of seeds, from 0.
+        episodes: held-out episodes of each policy, with noise from N(0, I).
+        workers: processes side by side.
+
+    Returns:
+        One plain dictionary a policy: its cell, ``success``, ``successes``, ``episodes``,
+        ``parameters``, ``training_seconds``.
+
+    Raises:
+        UserError: if a number is not positive.
+    """
+    if min(*counts, seeds, episodes, workers) < 1:
+        raise UserError("numbers of demonstrations, seeds, episodes and workers must be positive")
+    files = {}
+    for seed in range(seeds):
+        wanted = DemonstrationConfig(config.demonstrations.mode, max(counts), seed)
+        files[seed] = demonstration_file(dataclasses.replace(config, demonstrations=wanted), out)
+    cells = [BaseCell(n, c, s) for c in counts for n in names for s in range(seeds)]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        jobs = [pool.submit(_play, config, cell, files[cell.seed], episodes) for cell in cells]
+        rows = [job.result() for job in tqdm(jobs, desc="base policies")]
+    return rows
+
+
+def write_study(path: Path, config: RunConfig, rows: Sequence[dict[str, Any]]) -> None:
+    """Write the rows and what made them as JSON."""
+    write_json(
+        path,
+        {
+            "task": config.task,
+            "embodiment": config.embodiment,
+            "demonstrations": config.demonstrations.mode,
+            "policy": config.policy.to_json(),
+            "rows": list(rows),
+        },
+    )
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """A markdown table: success, mean over seeds and the seeds' range."""
+    names = list(dict.fromkeys(row["name"] for row in rows))
+    counts = list(dict.fromkeys(row["count"] for row in rows))
+    lines = [
+        "| demonstrations | " + " | ".join(f"`{name}`" for name in names) + " |",
+        "| --: |" + " --: |" * len(names),
+    ]
+    for count in counts:
+        texts = []
+        for name in names:
+            found = [r["success"] for r in rows if (r["name"], r["count"]) == (name, count)]
+            texts.append(f"{statistics.mean(found):.2f} [{min(found):.2f}, {max(found):.2f}]")
+        lines.append(f"| {count} | " + " | ".join(texts) + " |")
+    return "\n".join(lines)
+
+
+def _play(config: RunConfig, cell: BaseCell, demos: Path, episodes: int) -> dict[str, Any]:
+    torch.set_num_threads(1)
+    data = load(demos, config.task, config.embodiment, cell.count)
+    policy = train_policy(
+        dataclasses.replace(config.policy, name=cell.name),
+        data.episodes,
+        data.observation_layout,
+        data.action_layout,
+        cell.seed,
+    )
+    env = make(config.task, num_envs=min(EVALUATION_ENVS, episodes), embodiment=config.embodiment)
+    generator = torch.Generator().manual_seed(cell.seed)
+
+    def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        return torch.randn(len(obs), policy.horizon, policy.act_layout.dim, generator=generator)
+
+    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
+    result = rollout(latent, act, held_out_seeds(episodes))
+    latent.close()
+    successes = int(result.episodes["success_once"].sum())
+    return {
+        **dataclasses.asdict(cell),
+        "success": successes / episodes,
+        "successes": successes,
+        "episodes": episodes,
+        "parameters": policy.parameter_count(),
+        "training_seconds": round(policy.training_record["seconds"], 1),
+    }
