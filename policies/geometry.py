@@ -17,14 +17,19 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 
 from policies.errors import UserError
 
 if TYPE_CHECKING:
+    import escnn.group
     import escnn.nn
+
+
+# Inside Layout the name `slice` is a method.
+Slice: TypeAlias = slice
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,7 @@ class Layout:
         parts = (f"{f.name}:{f.multiplicity}x{f.frequency}{'-' * f.odd}" for f in self.fields)
         return f"Layout({', '.join(parts)})"
 
-    def slice(self, name: str) -> slice:
+    def slice(self, name: str) -> Slice:
         """Where the field lies in the vector.
 
         Raises:
@@ -102,7 +107,7 @@ class Layout:
         return self._slices[name]
 
     @functools.cached_property
-    def blocks(self) -> tuple[slice, ...]:
+    def blocks(self) -> tuple[Slice, ...]:
         """One slice per irrep block, in order; each of size 1 or 2."""
         return tuple(
             slice(start, start + field.block_dim)
@@ -286,7 +291,7 @@ class Group:
         """Every element's matrix on ``layout``, ``[order, dim, dim]``; computed in float64."""
         return _representation(self, layout, dtype, torch.device(device))
 
-    def escnn_group(self, maximum_frequency: int = 1):
+    def escnn_group(self, maximum_frequency: int = 1) -> escnn.group.Group:
         """The same group in escnn."""
         from escnn import group
 
@@ -313,7 +318,9 @@ def _cos_sin(angle: float) -> tuple[float, float]:
     return math.cos(angle), math.sin(angle)
 
 
-def _escnn_representation(fibergroup, group: Group, field: Field):
+def _escnn_representation(
+    fibergroup: escnn.group.Group, group: Group, field: Field
+) -> escnn.group.Representation:
     """One irrep block of ``field`` as an escnn representation in the layout's basis."""
     import numpy as np
     from escnn.group import Representation

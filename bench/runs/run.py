@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tqdm import tqdm
@@ -298,8 +298,8 @@ class _Run:
                 updates=self.updates,
                 wall_clock=time.perf_counter() - self.start,
                 final=final,
-                episodes=Episodes(**columns),
-                diagnostics=diagnostics,
+                episodes=Episodes.model_validate(columns),
+                diagnostics=dict(diagnostics),
             )
         )
         self._update_totals(env_steps)
@@ -356,7 +356,7 @@ class _Run:
         self._close("interrupted" if interrupted else "failed")
         self.log.close()
 
-    def _close(self, status: str) -> None:
+    def _close(self, status: Literal["finished", "failed", "interrupted"]) -> None:
         self.record.ended = datetime.now(UTC)
         self.record.status = status
         self.record.wall_clock.total = time.perf_counter() - self.start
@@ -391,7 +391,7 @@ class _Run:
         self._write_scalars(values, env_steps)
         return values
 
-    def _write_scalars(self, values: dict[str, float | None], step: int) -> None:
+    def _write_scalars(self, values: Mapping[str, float | None], step: int) -> None:
         for name, value in values.items():
             namespace, _, rest = name.partition("/")
             self.log.scalars(namespace, {rest: value}, step)

@@ -6,15 +6,15 @@ from policies.base import PolicyConfig
 
 
 def tiny_config(**changes) -> RunConfig:
-    values = dict(
-        agent="equivariant",
-        env_steps=320,
-        num_envs=4,
-        demonstrations=DemonstrationConfig(count=3),
-        policy=PolicyConfig(channels=8, width=16, depth=1, steps=20, batch_size=32, execute=4),
-        sac=SacConfig(width=16, batch_size=16, warmup=16, group="C4"),
-        evaluation=EvaluationConfig(
+    values = {
+        "agent": "equivariant",
+        "env_steps": 320,
+        "num_envs": 4,
+        "demonstrations": DemonstrationConfig(count=3),
+        "policy": PolicyConfig(channels=8, width=16, depth=1, steps=20, batch_size=32, execute=4),
+        "sac": SacConfig(width=16, batch_size=16, warmup=16, group="C4"),
+        "evaluation": EvaluationConfig(
             every=160, episodes=3, final_episodes=5, diagnostic_episodes=2, steerability_states=2
         ),
-    )
+    }
     return RunConfig(**{**values, **changes})

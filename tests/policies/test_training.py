@@ -13,7 +13,9 @@ from policies.training import Augmentation, make_chunks, train_policy
 
 
 def train(world, seed=0, progress=None, episodes=None, **fields):
-    config = PolicyConfig(**{**world.small, "steps": 30, "batch_size": 32, **fields})
+    config = PolicyConfig(
+        **{**world.small, "steps": 30, "batch_size": 32, "match_compute": False, **fields}
+    )
     episodes = world.episodes(6, noise=0.2) if episodes is None else episodes
     return train_policy(config, episodes, world.obs_layout, world.act_layout, seed, progress)
 
@@ -139,8 +141,12 @@ def test_plain_policies_have_matched_parameters_and_no_group(world, name, networ
         assert str(policy.group) == ("C8" if kind == "edp" else "C1")
         assert policy.config == policy.config.resolved(world.obs_layout, world.act_layout)
     assert abs(sizes[name] / sizes["edp"] - 1) < 0.05
-    free = PolicyConfig(name=name, network=network, width=64, match_parameters=False)
-    assert free.resolved(world.obs_layout, world.act_layout).width == 64
+    assert policy.config.steps == 4 * config.steps
+    free = PolicyConfig(
+        name=name, network=network, width=64, match_parameters=False, match_compute=False
+    ).resolved(world.obs_layout, world.act_layout)
+    assert free.width == 64
+    assert free.steps == config.steps
 
 
 @pytest.mark.parametrize(
