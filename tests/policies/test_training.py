@@ -88,6 +88,20 @@ def test_the_same_seed_gives_the_same_policy(world, name):
     assert first.content_hash() != other.content_hash()
 
 
+def test_the_policy_keeps_averaged_weights(world):
+    last, averaged = (train(world, ema_decay=decay) for decay in (0.0, 0.9))
+    assert last.training_record["losses"] == averaged.training_record["losses"]
+    assert last.content_hash() != averaged.content_hash()
+    # The average is a point on the way there.
+    start = train(world, steps=1, ema_decay=0.0)
+
+    def distance(a, b):
+        pairs = zip(a.denoiser.parameters(), b.denoiser.parameters(), strict=True)
+        return sum((x - y).square().sum() for x, y in pairs).sqrt()
+
+    assert 0 < distance(averaged, start) < distance(last, start)
+
+
 def test_training_leaves_the_global_generator_alone(world):
     torch.manual_seed(5)
     before = torch.get_rng_state()
