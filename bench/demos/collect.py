@@ -30,14 +30,14 @@ from policies.errors import UserError
 class Diversity:
     """How demonstrations differ from one another beyond their initial states."""
 
-    noise: float = 0.3
+    noise: float = 0.6
     """Standard deviation of the action noise, in normalized action units of the floating gripper
     (the Panda's larger steps take 0.6 of it)."""
     correlation: float = 0.8
     """Correlation of the noise from one step to the next (first-order autoregressive)."""
     scale: tuple[float, float] = (0.3, 1.7)
     """The noise of each demonstration is multiplied by a uniform draw from this range."""
-    offset: float = 0.0125
+    offset: float = 0.02
     """Radius of the disc from which the grasp or contact offset is drawn, metres."""
 
 

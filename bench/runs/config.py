@@ -42,6 +42,22 @@ class EvaluationConfig:
     """Initial states of the base policy's steerability report, each with 16 noise draws."""
 
 
+STEERING = SacConfig(
+    lr=6e-4,
+    alpha_lr=6e-4,
+    tau=0.015,
+    width=128,
+    batch_size=192,
+    utd=0.3,
+    warmup=1280,
+    # The cost of one decision of four steps becomes 1.
+    reward_scale=0.25,
+)
+"""The learner's settings: many environments and few updates, because data are cheap here and a
+critic trained hard on few decisions is exploited by the actor. Chosen on PickCube, floating,
+unbroken, with the equivariant and the standard agent, seeds 0 and 1."""
+
+
 @dataclass(frozen=True)
 class RunConfig:
     """One steering run."""
@@ -58,17 +74,17 @@ class RunConfig:
     """Seed of the run: networks, exploration, training episodes."""
     env_steps: int = 50_000
     """Budget in control steps, summed over the parallel environments."""
-    num_envs: int = 8
+    num_envs: int = 64
     """Parallel training environments."""
     sim: Literal["cpu", "cuda"] = "cpu"
     """Where physics runs."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where networks run."""
     demonstrations: DemonstrationConfig = field(default_factory=DemonstrationConfig)
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(execute=4, sampling_steps=4))
     policy_seed: int = 0
     """Seed of the base policy's training; runs that share it share the base policy."""
-    sac: SacConfig = field(default_factory=SacConfig)
+    sac: SacConfig = field(default_factory=lambda: STEERING)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:

@@ -7,7 +7,6 @@ configuration is.
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import itertools
 import tomllib
@@ -73,24 +72,34 @@ def build_config(data: dict[str, Any], source: str) -> RunConfig:
     Raises:
         UserError: on an unknown key (with the nearest valid one) or a value of a wrong type.
     """
-    _check_nested_keys(data, RunConfig, source, "")
+    defaults = RunConfig().to_json()
+    _check_nested_keys(data, defaults, source, "")
     try:
-        return TypeAdapter(RunConfig).validate_python(data)
+        return TypeAdapter(RunConfig).validate_python(_merge(defaults, data))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise UserError(f"{source}: {key}: {first['msg']} (got {first['input']!r})") from error
 
 
-def _check_nested_keys(data: dict[str, Any], cls: type, source: str, prefix: str) -> None:
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    _check_keys(data, set(fields), source, prefix)
+def _merge(defaults: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: _merge(value, data[key])
+        if key in data and isinstance(value, dict)
+        else data.get(key, value)
+        for key, value in defaults.items()
+    }
+
+
+def _check_nested_keys(
+    data: dict[str, Any], defaults: dict[str, Any], source: str, prefix: str
+) -> None:
+    _check_keys(data, set(defaults), source, prefix)
     for key, value in data.items():
-        factory = fields[key].default_factory
-        if dataclasses.is_dataclass(factory):
+        if isinstance(defaults[key], dict):
             if not isinstance(value, dict):
                 raise UserError(f"{source}: {prefix}{key} must be a table, not {value!r}")
-            _check_nested_keys(value, factory, source, f"{prefix}{key}.")
+            _check_nested_keys(value, defaults[key], source, f"{prefix}{key}.")
 
 
 def _check_keys(data: dict[str, Any], valid: set[str], source: str, prefix: str = "") -> None:
