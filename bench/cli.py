@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 import tyro
 
 from bench.runs.config import DemonstrationConfig, RunConfig
@@ -246,6 +247,8 @@ def main() -> int:
     # Notes of third-party packages about optional parts that SymSteer does not use.
     warnings.filterwarnings("ignore", message=".*py3nj.*")
     warnings.filterwarnings("ignore", message="Failed to find system libvulkan.*")
+    # The networks are small: more threads cost more than they give, above all beside other runs.
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     try:
         return app.cli(prog="symsteer", description=ABOUT, sort_subcommands=False)
     except (UserError, RecordError) as error:

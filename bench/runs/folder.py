@@ -1,4 +1,4 @@
-"""The folder of a run: config.json, record.json, checkpoint.pt, tensorboard/."""
+"""The folder of a run: config.json, record.json, checkpoint.pt, TensorBoard events."""
 
 from __future__ import annotations
 

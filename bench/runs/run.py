@@ -171,7 +171,7 @@ class _Run:
             else None,
         )
         write_record(self.record, self._record_path)
-        self.log = RunLog(folder / "tensorboard", resolved)
+        self.log = RunLog(folder, resolved)
         evaluation = config.evaluation
         extra = evaluation.diagnostic_episodes if self.agent.learns else 0
         self.evaluator = self._make_env(evaluation.episodes + extra, ignore_terminations=True)

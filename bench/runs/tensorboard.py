@@ -9,16 +9,17 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
+# The tags of a Multiline chart are regular expressions.
 LAYOUT = {
     "SymSteer": {
-        "Success on held-out episodes": ["Multiline", ["eval/success_once", "eval/success_at_end"]],
-        "Q against its feasible band": ["Margin", ["diag/q_mean", "diag/q_low", "diag/q_high"]],
-        "Q bias against fresh returns": ["Multiline", ["diag/q_bias", "diag/q_bias_hard"]],
-        "Equivariance errors": [
+        "Success on held-out episodes": [
             "Multiline",
-            ["diag/equivariance_decode", "diag/equivariance_actor", "diag/equivariance_critic"],
+            ["^eval/success_once$", "^eval/success_at_end$"],
         ],
-        "Temperature": ["Multiline", ["diag/alpha"]],
+        "Q against its feasible band": ["Margin", ["diag/q_mean", "diag/q_low", "diag/q_high"]],
+        "Q bias against fresh returns": ["Multiline", ["^diag/q_bias$"]],
+        "Equivariance errors": ["Multiline", ["^diag/equivariance_(decode|actor|critic)$"]],
+        "Temperature": ["Multiline", ["^diag/alpha$"]],
     }
 }
 

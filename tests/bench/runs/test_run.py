@@ -55,7 +55,7 @@ def test_no_path_of_this_machine_is_recorded(finished):
 def test_tensorboard_shows_the_same_numbers(finished):
     _, folder = finished
     record = read_record(folder / "record.json")
-    events = EventAccumulator(str(folder / "tensorboard"))
+    events = EventAccumulator(str(folder))
     events.Reload()
     tags = set(events.Tags()["scalars"])
     assert {"eval/success_once", "eval/return", "diag/q_mean", "diag/q_low", "diag/alpha"} <= tags
