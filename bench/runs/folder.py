@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import torch
 
 from bench.runs.config import RunConfig, content_key
 from leaderboard.errors import RecordError
-from leaderboard.records import read_record
+from leaderboard.records import read_record, write_atomically
 from policies.errors import UserError
 
 
@@ -60,16 +60,6 @@ def open_run_folder(folder: Path) -> None:
         ) from error
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write so that a reader, or a crash, sees the old file or the new one, never half of it."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    with open(temporary, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
 def write_json(path: Path, data: Any) -> None:
     """Write indented JSON atomically; refuses NaN and infinities."""
     write_atomically(path, (json.dumps(data, indent=2, allow_nan=False) + "\n").encode())
@@ -77,9 +67,6 @@ def write_json(path: Path, data: Any) -> None:
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write a checkpoint of tensors and plain data atomically (loads with weights_only)."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    with open(temporary, "wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    write_atomically(path, buffer.getvalue())

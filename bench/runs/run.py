@@ -19,7 +19,7 @@ from bench.runs.folder import open_run_folder, run_id, save_checkpoint, write_js
 from bench.runs.tensorboard import RunLog
 from bench.steering.diagnostics import OnPolicy, measure
 from bench.steering.evaluation import HELD_OUT_SEED, Rollout, held_out_seeds, rollout
-from bench.steering.latent_env import LatentNoiseEnv
+from bench.steering.latent_env import Clock, LatentNoiseEnv
 from bench.tasks import embodiments, make, task_class
 from bench.variants import parse
 from leaderboard.records import (
@@ -140,6 +140,8 @@ class _Run:
         self.timer = _Timer()
         self.means = _Means()
         self.decisions = self.updates = 0
+        self.training_env: LatentNoiseEnv | None = None
+        self.last_scalars: dict[str, float | None] = {}
         self.device = torch.device(config.device)
         self.agent = self._make_agent(config.agent)
         self.feasible = task_class(config.task).feasible_return(config.sac.gamma, base.execute)
@@ -208,6 +210,7 @@ class _Run:
         if self.agent.learns:
             env_steps = self._train()
         self.evaluate(env_steps, final=True)
+        self.evaluator.close()
         self._close("finished")
         self.log.finish(
             {
@@ -308,7 +311,7 @@ class _Run:
             self.folder / "checkpoint.pt",
             {"agent": agent.state_dict(), "env_steps": env_steps, "decisions": self.decisions},
         )
-        self.last_scalars: dict[str, float | None] = {
+        self.last_scalars = {
             f"eval/{name}": columns[name].double().mean().item()
             for name in ("success_once", "success_at_end", "return", "episode_len")
         }
@@ -363,13 +366,13 @@ class _Run:
         write_record(self.record, self._record_path)
 
     def _update_totals(self, env_steps: int) -> None:
-        clock = self.training_env.clock if env_steps else None
+        clock = self.training_env.clock if self.training_env else Clock()
         self.record.budget = Budget(
             env_steps=env_steps, decisions=self.decisions, updates=self.updates
         )
         self.record.wall_clock = WallClock(
-            simulate=clock.simulate if clock else 0.0,
-            decode=clock.decode if clock else 0.0,
+            simulate=clock.simulate,
+            decode=clock.decode,
             update=self.timer.update,
             evaluate=self.timer.evaluate,
             total=time.perf_counter() - self.start,
@@ -377,7 +380,7 @@ class _Run:
 
     def _rates(self, env_steps: int) -> dict[str, float]:
         seconds = time.perf_counter() - self.start
-        clock = self.training_env.clock
+        clock = self.training_env.clock if self.training_env else Clock()
         return {
             "time/env_steps_per_second": env_steps / seconds,
             "time/simulate": clock.simulate,

@@ -15,7 +15,7 @@ from policies.steerability import DESIRED_ACTION_STD, action_spread
 
 HELD_OUT_SEED = 1_000_000
 """Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
-and run; training, demonstrations and steerability draw their seeds below it."""
+and run. Training and steerability draw their seeds below it, demonstrations at random from 2^31."""
 
 
 def held_out_seeds(count: int) -> list[int]:
