@@ -49,7 +49,7 @@ def run(
     folder = execute(config, out, demos, base_policy, progress=not quiet)
     print(f"record:      {folder / 'record.json'}")
     print(f"TensorBoard: tensorboard --logdir {out}")
-    print(f"leaderboard: symsteer report {out}")
+    print(f"leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
     return 0
 
 
