@@ -1,15 +1,16 @@
 """How symmetric is a task, measured in simulation.
 
 The measure is a whole episode: put a copy of its initial state, turned by each element of a
-planar group, into an environment of its own; let every copy execute the same actions, turned
-alike; turn the paths back and compare them. In a world with the symmetry they coincide.
+planar group, into an environment of its own; let every copy execute the same actions, or decode
+the same latent noise, turned alike; turn the paths back and compare them. In a world with the
+symmetry they coincide.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -18,10 +19,11 @@ from bench.tasks import make
 from bench.tasks.base import SymmetricTask
 from bench.tasks.experts import Expert
 from bench.tasks.rotations import planar_matrix
+from policies.base import ChunkPolicy
 from policies.errors import UserError
 from policies.geometry import Group
 
-Actions = Literal["random", "expert"]
+Actions = Literal["random", "expert", "policy"]
 
 MOVED = 1e-4
 """An object that is further than this from where it began (metres) has been touched."""
@@ -99,6 +101,7 @@ def rotated_rollout_error(
     variant: str = "none",
     batch: int = 25,
     env_options: dict[str, Any] | None = None,
+    policy: ChunkPolicy | None = None,
 ) -> RolloutError:
     """Compare episodes of the floating gripper with their rotated copies.
 
@@ -106,26 +109,30 @@ def rotated_rollout_error(
         task: name of a task.
         episodes: how many, with seeds ``seed``, ``seed + 1``, ...
         actions: ``random`` (correlated noise in all seven dimensions, heights kept clear of the
-            objects) or ``expert`` (the scripted expert of the original; its actions are turned
-            for the copies, no copy sees its own state).
+            objects), ``expert`` (the scripted expert of the original; its actions are turned
+            for the copies, no copy sees its own state) or ``policy`` (closed loop: every copy
+            decodes its own observation with the original's latent noise, turned).
         group: a finite planar group, e.g. ``C8`` or ``D4``.
         steps: per episode; by default the task's limit.
         seed: of the first episode.
         variant: symmetry-breaking variant that acts on all copies.
         batch: episodes that run side by side, each with one environment per group element.
         env_options: further arguments of :func:`bench.tasks.make`.
+        policy: the base policy that ``policy`` needs.
 
     Raises:
-        UserError: for an unknown kind of actions, task, group or variant.
+        UserError: for an unknown kind of actions, task, group or variant, or a missing policy.
     """
-    if actions not in ("random", "expert"):
-        raise UserError(f"actions must be 'random' or 'expert', not {actions!r}")
+    if actions not in get_args(Actions):
+        raise UserError(f"actions must be 'random' or 'expert' or 'policy', not {actions!r}")
+    if (actions == "policy") != (policy is not None):
+        raise UserError("a policy is needed for actions='policy', and only there")
     elements = Group.parse(group).elements
     env = make(task, num_envs=batch * len(elements), variant=variant, **(env_options or {}))
     steps = env.max_episode_steps if steps is None else steps
     parts = []
     for start in range(seed, seed + episodes, batch):
-        parts.append(_rollout(env, start, batch, elements, steps, actions))
+        parts.append(_rollout(env, start, batch, elements, steps, actions, policy))
     env.close()
     merged = {
         name: np.concatenate([getattr(part, name) for part in parts])[:episodes]
@@ -141,6 +148,7 @@ def _rollout(
     elements: tuple[tuple[float, bool], ...],
     steps: int,
     kind: Actions,
+    policy: ChunkPolicy | None,
 ) -> RolloutError:
     """``count`` episodes; environment g * count + i is copy g of episode i."""
     order = len(elements)
@@ -148,12 +156,15 @@ def _rollout(
     state = env.get_state_dict()
     copies = [env.transform_state(state, angle, reflect) for angle, reflect in elements]
     env.set_state_dict(_interleave(copies, count))
-    choose = _expert_actions(env, count) if kind == "expert" else _noise(env, start, count, steps)
+    if policy is not None:
+        choose = _policy_actions(env, policy, start, count, elements)
+    elif kind == "expert":
+        choose = _turned(env, _expert_actions(env, count), elements)
+    else:
+        choose = _turned(env, _noise(env, start, count, steps), elements)
     tcp, objects, success = [_tcp(env)], [_objects(env)], []
     for step in range(steps):
-        original = choose(step)
-        turned = [env.action_layout.transform(original, *element) for element in elements]
-        _, _, _, _, info = env.step(torch.cat(turned))
+        _, _, _, _, info = env.step(choose(step))
         tcp.append(_tcp(env))
         objects.append(_objects(env))
         success.append(info["success"].clone())
@@ -193,6 +204,44 @@ def _turn_back(points: torch.Tensor, back: list[torch.Tensor], count: int) -> to
     """``[steps, order * count, ..., 3]`` to ``[steps, order, count, ..., 3]``, turned back."""
     split = points.unflatten(1, (len(back), count))
     return torch.stack([split[:, g] @ matrix.T for g, matrix in enumerate(back)], dim=1)
+
+
+def _turned(
+    env: SymmetricTask,
+    choose: Callable[[int], torch.Tensor],
+    elements: tuple[tuple[float, bool], ...],
+) -> Callable[[int], torch.Tensor]:
+    """The originals' actions ``[count, 7]``, turned for every copy, ``[order * count, 7]``."""
+
+    def chosen(step: int) -> torch.Tensor:
+        original = choose(step)
+        return torch.cat([env.action_layout.transform(original, *element) for element in elements])
+
+    return chosen
+
+
+def _policy_actions(
+    env: SymmetricTask,
+    policy: ChunkPolicy,
+    start: int,
+    count: int,
+    elements: tuple[tuple[float, bool], ...],
+) -> Callable[[int], torch.Tensor]:
+    """Each copy's own decoding ``[order * count, 7]`` of noise that is turned alike."""
+    layout = policy.act_layout
+    streams = [np.random.default_rng([start + i, 3]) for i in range(count)]
+    chunk = torch.zeros(0)
+
+    def choose(step: int) -> torch.Tensor:
+        nonlocal chunk
+        if step % policy.execute == 0:
+            draws = [stream.standard_normal((policy.horizon, layout.dim)) for stream in streams]
+            noise = torch.as_tensor(np.stack(draws), dtype=torch.float32)
+            turned = torch.cat([layout.transform(noise, *element) for element in elements])
+            chunk = policy.decode(env.get_obs(), turned)
+        return chunk[:, step % policy.execute]
+
+    return choose
 
 
 def _expert_actions(env: SymmetricTask, count: int) -> Callable[[int], torch.Tensor]:

@@ -1,9 +1,14 @@
 """The unbroken floating task has the symmetry; a variant breaks it, and the audit sees that."""
 
 import pytest
+import torch
 
 from bench.audit import rotated_rollout_error
+from bench.demos import collect, load
+from bench.tasks import task_class
+from policies.base import ChunkPolicy, PolicyConfig
 from policies.errors import UserError
+from policies.training import train_policy
 
 TASKS = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
 
@@ -18,6 +23,39 @@ def test_rotated_episodes_coincide(actions):
     assert result.contact_free_tcp.max() < 1e-3
     # Float32 physics is not exact: an error of nothing would mean that nothing was compared.
     assert result.contact_free_tcp.min() > 1e-8
+
+
+def fresh_policy(name: str = "edp") -> ChunkPolicy:
+    torch.manual_seed(0)
+    task = task_class("PickCube-v1")
+    config = PolicyConfig(name=name, channels=16, width=32, depth=1, execute=4, sampling_steps=4)
+    return ChunkPolicy(config, task.observation_layout, task.action_layout)
+
+
+def test_turned_noise_gives_the_turned_episode():
+    options = {"episodes": 8, "batch": 8, "actions": "policy", "steps": 20}
+    result = rotated_rollout_error("PickCube-v1", policy=fresh_policy(), **options)
+    assert result.share_within(0.01) == 1.0
+    assert result.contact_free_path.min() > 0.02
+    # A policy without the symmetry takes the copies elsewhere.
+    plain = rotated_rollout_error("PickCube-v1", policy=fresh_policy("plain"), **options)
+    assert plain.share_within(0.01) == 0.0
+
+
+@pytest.mark.slow
+def test_turned_noise_of_a_trained_policy_over_200(tmp_path):
+    """State and noise of whole closed-loop episodes, turned by every element of C8."""
+    path = collect("PickCube-v1", "floating", 50, "diverse", 0, tmp_path / "pick.h5")
+    demos = load(path, "PickCube-v1", "floating")
+    policy = train_policy(
+        PolicyConfig(execute=4, sampling_steps=4),
+        demos.episodes,
+        demos.observation_layout,
+        demos.action_layout,
+    )
+    result = rotated_rollout_error("PickCube-v1", episodes=200, actions="policy", policy=policy)
+    print(f"PickCube-v1 policy\n{result.summary()}")
+    assert result.share_within(0.01) >= 0.95
 
 
 def test_reflections_too():
@@ -41,6 +79,8 @@ def test_a_variant_breaks_it():
 def test_bad_arguments_are_explained():
     with pytest.raises(UserError, match="'random' or 'expert'"):
         rotated_rollout_error("PickCube-v1", episodes=1, actions="none")
+    with pytest.raises(UserError, match="policy is needed"):
+        rotated_rollout_error("PickCube-v1", episodes=1, actions="policy")
     with pytest.raises(UserError, match="floating"):
         rotated_rollout_error(
             "PickCube-v1", episodes=1, batch=1, env_options={"embodiment": "panda"}
