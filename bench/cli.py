@@ -155,7 +155,7 @@ def demos(
 
     from bench.demos import collect, load
 
-    with tqdm(total=count, desc="demonstrations") as bar:
+    with tqdm(total=count, desc="demonstrations", disable=None) as bar:
 
         def advance(done: int, total: int) -> None:
             bar.update(done - bar.n)

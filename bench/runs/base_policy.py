@@ -84,7 +84,9 @@ def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> P
         return path
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tqdm(total=wanted.count, desc="demonstrations", disable=not progress) as bar:
+        with tqdm(
+            total=wanted.count, desc="demonstrations", disable=None if progress else True
+        ) as bar:
 
             def advance(done: int, total: int) -> None:
                 bar.update(done - bar.n)
@@ -123,7 +125,9 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
 
 
 def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPolicy:
-    with tqdm(total=config.policy.steps, desc="base policy", disable=not progress) as bar:
+    with tqdm(
+        total=config.policy.steps, desc="base policy", disable=None if progress else True
+    ) as bar:
 
         def advance(step: int, steps: int, loss: float) -> None:
             bar.update(step - bar.n)

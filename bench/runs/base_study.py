@@ -77,7 +77,7 @@ def study(
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         jobs = [pool.submit(_play, config, cell, files[cell.seed], episodes) for cell in cells]
-        rows = [job.result() for job in tqdm(jobs, desc="base policies")]
+        rows = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
     return rows
 
 

@@ -240,7 +240,10 @@ class _Run:
         owed = 0.0
         rounds = 0
         with tqdm(
-            total=config.env_steps, desc=_title(config), unit="step", disable=not self.progress
+            total=config.env_steps,
+            desc=_title(config),
+            unit="step",
+            disable=None if self.progress else True,
         ) as bar:
             while env.control_steps < config.env_steps:
                 warming = self.decisions < config.sac.warmup
