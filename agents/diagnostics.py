@@ -7,7 +7,6 @@ All values are in the environment's reward units, per decision. ``q`` arrays hol
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 
@@ -22,7 +21,7 @@ def bound_violation(q: torch.Tensor, low: float, high: float) -> Scalars:
     """How many values no return can explain.
 
     - ``violation_share`` = mean over critics and states of [Q < low or Q > high or Q not finite],
-      with the interval of :func:`agents.sac.feasible_q`;
+      with the interval of returns that the task allows;
     - ``max_abs_q`` = max |Q|; ``q_min``, ``q_mean``, ``q_max``;
     - ``finite`` = 1 if every value is finite, else 0.
 
@@ -39,30 +38,6 @@ def bound_violation(q: torch.Tensor, low: float, high: float) -> Scalars:
         "q_max": q.max().item(),
         "finite": float(finite.all()),
     }
-
-
-def diverged(
-    violation_shares: Sequence[float],
-    finite: Sequence[float] | None = None,
-    threshold: float = 0.05,
-    consecutive: int = 3,
-) -> bool:
-    """The project's rule: violation above 5 % at 3 consecutive evaluations, or anything non-finite.
-
-    Args:
-        violation_shares: one number per evaluation, in order.
-        finite: the ``finite`` flags of the same evaluations.
-    """
-    if not all(math.isfinite(share) for share in violation_shares):
-        return True
-    if finite is not None and not all(finite):
-        return True
-    run = 0
-    for share in violation_shares:
-        run = run + 1 if share > threshold else 0
-        if run >= consecutive:
-            return True
-    return False
 
 
 def q_bias(
@@ -103,7 +78,7 @@ def q_bias(
             ``truncated`` by time-out. What follows an episode's end in a column is the next
             episode; the last row cuts whatever still runs there.
         gamma, alpha: discount and entropy weight.
-        tail: smallest and largest value that a state can have, e.g. ``feasible_q(gamma, None)``.
+        tail: smallest and largest value that a state can have, the feasible returns.
         tail_tolerance: largest weight of the unknown tail in a covered state.
 
     Raises:

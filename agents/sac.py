@@ -361,45 +361,6 @@ class SacAgent:
         return noise.unflatten(-1, (self.horizon, self.act_layout.dim))
 
 
-def feasible_q(
-    gamma: float,
-    decisions: int | None,
-    reward: tuple[float, float] = (-1.0, 0.0),
-    entropy_allowance: float = 0.0,
-) -> tuple[float, float]:
-    """The interval in which every correct Q value lies, in the environment's reward units.
-
-    With ``k = 1 + gamma + ... + gamma^(decisions - 1) = (1 - gamma^decisions) / (1 - gamma)``:
-
-        [k * min(r_low, 0) - allowance, k * max(r_high, 0) + allowance] if episodes may end early.
-
-    Args:
-        gamma: discount per decision.
-        decisions: most decisions before the return ends, or None where time-outs bootstrap: the
-            critics then value a future without end, k = 1 / (1 - gamma).
-        reward: smallest and largest reward of one decision; 0 is added because success ends the
-            episode and with it the rewards.
-        entropy_allowance: width added on both sides; 0 for the hard backup, see
-            :func:`entropy_allowance` for the soft one.
-
-    Raises:
-        UserError: if gamma or the rewards make no sense.
-    """
-    low, high = reward
-    if not 0 <= gamma < 1 or low > high or (decisions is not None and decisions < 1):
-        raise UserError(
-            "feasible Q needs 0 <= gamma < 1, reward low <= high and at least one decision, not "
-            f"gamma {gamma}, reward {reward}, decisions {decisions}"
-        )
-    tail = 0.0 if decisions is None else gamma**decisions
-    weight = (1 - tail) / (1 - gamma)
-    # A single decision is always played, so its reward alone bounds the return from inside.
-    return (
-        min(low, weight * low) - entropy_allowance,
-        max(high, weight * high) + entropy_allowance,
-    )
-
-
 def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float:
     """Room that soft Q may need: ``alpha * gamma / (1 - gamma) * |log pi|``.
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from bench.demos import Demonstrations, collect, load
+from bench.demos import MODES, Demonstrations, collect, load
 from bench.runs.config import RunConfig, content_key
 from bench.steering.evaluation import DRAWS, Steerability, steerability
 from bench.steering.latent_env import LatentNoiseEnv
@@ -75,11 +75,10 @@ def prepare_base(
 def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> Path:
     """The scripted expert's demonstrations of the unbroken task, collected if need be."""
     wanted = config.demonstrations
-    path = (
-        out
-        / "base"
-        / f"{config.task}-{config.embodiment}-{wanted.mode}-{wanted.count}-s{wanted.seed}.h5"
-    )
+    # The mode's own settings are part of the name: a change of theirs must not find old files.
+    key = content_key(dataclasses.asdict(MODES[wanted.mode]))
+    name = f"{config.task}-{config.embodiment}-{wanted.mode}-{wanted.count}-s{wanted.seed}-{key}.h5"
+    path = out / "base" / name
     if path.is_file():
         return path
     try:

@@ -11,7 +11,7 @@ from agents import AGENTS, ReplayBuffer, SacConfig
 from agents.approximate import paths
 from agents.diagnostics import equivariance_error
 from agents.networks import count
-from agents.sac import entropy_allowance, feasible_q
+from agents.sac import entropy_allowance
 from policies.errors import UserError
 from policies.geometry import Field, Group, Layout
 
@@ -324,17 +324,6 @@ def test_bad_groups_are_refused(problem):
             problem.agent("equivariant", group=name)
 
 
-def test_feasible_q():
-    assert feasible_q(0.5, 3) == pytest.approx((-1.75, 0.0))
-    assert feasible_q(0.95, None) == pytest.approx((-20.0, 0.0))
-    assert feasible_q(0.95, 25, (-4.0, 0.0)) == pytest.approx((-4 * (1 - 0.95**25) / 0.05, 0.0))
-    assert feasible_q(0.5, 2, (0.0, 1.0), 0.25) == pytest.approx((-0.25, 1.75))
-    assert feasible_q(0.5, 2, (-2.0, -1.0)) == pytest.approx((-3.0, -1.0))
-    assert entropy_allowance(0.9, 0.1, -20.0) == pytest.approx(18.0)
-    with pytest.raises(UserError):
-        feasible_q(1.0, None)
-
-
 # A bandit: the best noise is a known function of what is seen, the reward is minus the squared
 # distance to it. Unbroken, it turns with the scene; broken, a part of it is fixed in the room.
 
@@ -397,3 +386,7 @@ def test_a_broken_problem_needs_a_free_path(problem):
     assert strict < -0.8
     assert error > 0.5
     assert approximate > -0.5
+
+
+def test_entropy_allowance():
+    assert entropy_allowance(0.9, 0.1, -20.0) == pytest.approx(18.0)

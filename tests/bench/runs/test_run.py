@@ -1,5 +1,6 @@
 """One run from demonstrations to the record: what it leaves, what it refuses, that it repeats."""
 
+import itertools
 import json
 
 import pytest
@@ -113,6 +114,28 @@ def test_evaluating_more_often_does_not_change_training(finished, tmp_path):
     last = [without_clock(f)["evaluations"][-1] for f in (folder, often)]
     assert last[0]["episodes"] == last[1]["episodes"]
     assert last[0]["diagnostics"] == last[1]["diagnostics"]
+
+
+def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
+    """No success here, so nothing is terminal, and the last observation is the old episode's."""
+    stored = []
+
+    class Spy(run_module.ReplayBuffer):
+        def add(self, obs, noise, reward, next_obs, terminal):
+            stored.append((obs.clone(), next_obs.clone(), terminal.clone()))
+            super().add(obs, noise, reward, next_obs, terminal)
+
+    monkeypatch.setattr(run_module, "ReplayBuffer", Spy)
+    _, folder = finished
+    config = tiny_config(seed=2)
+    execute(config, folder.parent, progress=False)
+    assert not any(terminal.any() for _, _, terminal in stored)
+    jumps = sum(
+        (next_obs != following[0]).any(dim=1).int()
+        for (_, next_obs, _), following in itertools.pairwise(stored)
+    )
+    # 320 steps in 4 environments: each passes the limit of 50 steps once.
+    assert jumps.tolist() == [1] * config.num_envs
 
 
 @pytest.mark.parametrize("agent", ["standard", "standard-matched", "approximate", "base", "zero"])
