@@ -18,9 +18,10 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils import common
-from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs import Actor, Pose
 
 from bench.tasks.embodiments import EMBODIMENTS, Embodiment
+from bench.tasks.experts import Intent
 from bench.tasks.floating import ACTION_LAYOUT
 from bench.tasks.rotations import (
     planar_matrix,
@@ -28,7 +29,7 @@ from bench.tasks.rotations import (
     transform_angular,
     transform_quaternion,
 )
-from bench.variants import Strength, parse
+from bench.variants import Role, Strength, parse
 from policies.errors import UserError
 from policies.geometry import Field, Layout
 
@@ -106,6 +107,19 @@ class SymmetricTask(BaseEnv):
             self.agent.robot.set_pose(sapien.Pose(p=self.body.root_position))
             self._place_objects(rng, len(env_idx))
 
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """What the scripted expert wants in the present state.
+
+        Args:
+            offset: moves the point that is grasped or pushed, ``[N, 3]`` metres.
+        """
+        raise NotImplementedError
+
+    @property
+    def manipulated(self) -> Actor:
+        """The object that the robot has to move."""
+        raise NotImplementedError
+
     def _place_objects(self, rng: BatchedRNG, count: int) -> None:
         """Sample objects and goal of ``count`` environments, one generator each."""
         raise NotImplementedError
@@ -113,7 +127,7 @@ class SymmetricTask(BaseEnv):
     # ------------------------------------------------------------- observation
 
     def _get_obs_agent(self) -> dict[str, torch.Tensor]:
-        tcp = self.agent.tcp_pose
+        tcp = self.seen(self.agent.tcp_pose, "tool")
         axes = quaternion_to_matrix(tcp.q)
         width = self.agent.robot.get_qpos()[:, -2:].sum(dim=1, keepdim=True)
         return {
@@ -124,6 +138,17 @@ class SymmetricTask(BaseEnv):
             "tcp_z_axis": axes[:, :2, 2],
             "gripper_width": width,
         }
+
+    def seen(self, pose: Pose, role: Role) -> Pose:
+        """A true pose as the observation reports it: variants of perception distort it.
+
+        Args:
+            pose: of N bodies.
+            role: what is looked at.
+        """
+        for variant in self.variants:
+            pose = variant.perceive(pose, role)
+        return pose
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         fields = self._observe_task()
@@ -315,51 +340,6 @@ class SymmetricTask(BaseEnv):
             return -steps_per_decision / (1 - gamma), 0.0
         decisions = math.ceil(cls.max_episode_steps / steps_per_decision)
         return -steps_per_decision * sum(gamma**i for i in range(decisions)), 0.0
-
-
-# ---------------------------------------------------------------------- features
-
-
-def fourfold_yaw(q: torch.Tensor) -> torch.Tensor:
-    """Yaw of a cube up to its symmetry, ``[N, 2]``: a frequency-4 vector.
-
-    Half the sum over the body's axes of (x + i y)^4 of their horizontal parts: (cos 4 yaw,
-    sin 4 yaw) for a cube that lies flat, and the same for all 24 ways to name a cube's axes.
-    """
-    axes = quaternion_to_matrix(q)[:, :2]
-    return _fourth_power(axes[:, 0], axes[:, 1]).sum(dim=1) / 2
-
-
-def grasp_yaw(tcp_q: torch.Tensor, cube_q: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Cosine and sine ``[N, 1]`` of four times the yaw from the fingers to the cube's faces."""
-    axis = quaternion_to_matrix(tcp_q)[:, :2, 0]
-    gripper, cube = _fourth_power(axis[:, 0], axis[:, 1]), fourfold_yaw(cube_q)
-    cosine = (gripper * cube).sum(dim=1, keepdim=True)
-    sine = gripper[:, :1] * cube[:, 1:] - gripper[:, 1:] * cube[:, :1]
-    return {"grasp_yaw_cos": cosine, "grasp_yaw_sin": sine}
-
-
-def _fourth_power(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    """Real and imaginary part of (x + i y)^4 along a new last axis."""
-    re, im = x * x - y * y, 2 * x * y
-    return torch.stack([re * re - im * im, 2 * re * im], dim=-1)
-
-
-def disc(u: np.ndarray, radius: float) -> np.ndarray:
-    """Points ``[N, 2]`` uniform in a disc about the centre, from uniform numbers ``u [N, 2]``."""
-    r, bearing = radius * np.sqrt(u[:, 0]), 2 * np.pi * u[:, 1]
-    return np.stack([r * np.cos(bearing), r * np.sin(bearing)], axis=1)
-
-
-def flat_pose(xy: np.ndarray, z: np.ndarray | float, yaw: np.ndarray, device: Any) -> Pose:
-    """Poses upright at ``xy [N, 2]``, height ``z`` (m), turned by ``yaw [N]`` (rad)."""
-    zero = np.zeros_like(yaw)
-    p = np.concatenate([xy, np.broadcast_to(z, yaw.shape)[:, None]], axis=1)
-    q = np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1)
-    return Pose.create_from_pq(
-        torch.as_tensor(p, dtype=torch.float32, device=device),
-        torch.as_tensor(q, dtype=torch.float32, device=device),
-    )
 
 
 # ------------------------------------------------------------------------- helpers

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
-from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs import Actor, Pose
 
-from bench.tasks.base import SymmetricTask, disc, flat_pose, fourfold_yaw, grasp_yaw
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import CLOSED, Intent, choose, funnel, grasp
+from bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
 from policies.geometry import Field
 
 
@@ -51,8 +53,15 @@ class PickCube(SymmetricTask, PickCubeEnv):
             Pose.create_from_pq(torch.as_tensor(goal, dtype=torch.float32, device=self.device))
         )
 
+    @property
+    def manipulated(self) -> Actor:
+        """The cube."""
+        return self.cube
+
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp, cube, goal = self.agent.tcp_pose, self.cube.pose, self.goal_site.pose.p
+        tcp = self.seen(self.agent.tcp_pose, "tool")
+        cube = self.seen(self.cube.pose, "object")
+        goal = self.seen(self.goal_site.pose, "goal").p
         to_cube, to_goal = cube.p - tcp.p, goal - cube.p
         return {
             "cube_xy": cube.p[:, :2],
@@ -66,3 +75,17 @@ class PickCube(SymmetricTask, PickCubeEnv):
             "cube_to_goal_xy": to_goal[:, :2],
             "cube_to_goal_z": to_goal[:, 2:],
         }
+
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """Grasp the cube, then carry it to the goal."""
+        cube = self.cube.pose
+        approach, held = grasp(self, cube.p, cube.q, offset)
+        to_goal = self.goal_site.pose.p - cube.p
+        far = to_goal[:, :2].norm(dim=1)
+        rise = funnel(far, 0.02, 0.5, 0.03)
+        carry = Intent(
+            move=torch.cat([to_goal[:, :2], to_goal[:, 2:] + rise[:, None]], dim=1),
+            yaw=torch.zeros_like(approach.yaw),
+            gripper=torch.full_like(approach.gripper, CLOSED),
+        )
+        return choose(held, carry, approach)

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
-from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs import Actor, Pose
 
-from bench.tasks.base import SymmetricTask, disc, flat_pose, fourfold_yaw
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import CLOSED, HOVER, Intent, funnel
+from bench.tasks.features import disc, flat_pose, fourfold_yaw
 from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
 from policies.geometry import Field
 
@@ -49,12 +51,19 @@ class PushCube(SymmetricTask, PushCubeEnv):
         flat = goal.q.new_tensor([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]).expand_as(goal.q)
         self.goal_region.set_pose(Pose.create_from_pq(goal.p, quaternion_multiply(goal.q, flat)))
 
+    @property
+    def manipulated(self) -> Actor:
+        """The cube."""
+        return self.obj
+
     def push_direction(self) -> torch.Tensor:
         """Unit vectors ``[N, 2]`` from the cube's spawn point to the goal."""
         return quaternion_to_matrix(self.goal_region.pose.q)[:, :2, 2]
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp, cube, goal = self.agent.tcp_pose.p, self.obj.pose, self.goal_region.pose.p[:, :2]
+        tcp = self.seen(self.agent.tcp_pose, "tool").p
+        cube = self.seen(self.obj.pose, "object")
+        goal = self.seen(self.goal_region.pose, "goal").p[:, :2]
         to_cube = cube.p - tcp
         return {
             "cube_xy": cube.p[:, :2],
@@ -78,3 +87,31 @@ class PushCube(SymmetricTask, PushCubeEnv):
         level = 1 - torch.tanh(5 * (cube[:, 2] - self.cube_half_size).abs())
         reward = 1 - torch.tanh(5 * gap) + (placing + placing * level) * (gap < 0.01)
         return torch.where(info["success"], torch.full_like(reward, 4.0), reward)
+
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """Close the fingers, come down behind the cube, push it towards the goal."""
+        tcp, cube = self.agent.tcp_pose.p, self.obj.pose.p + offset
+        to_goal = self.goal_region.pose.p[:, :2] - self.obj.pose.p[:, :2]
+        ahead = to_goal / to_goal.norm(dim=1, keepdim=True).clamp_min(1e-6)
+        side = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=1)
+        relative = tcp[:, :2] - cube[:, :2]
+        along, across = (relative * ahead).sum(dim=1), (relative * side).sum(dim=1)
+        # Behind the cube, near its line to the goal: go down and push, steering back to the line.
+        behind = (along < -0.025) & (across.abs() < 0.02)
+        start = cube[:, :2] - 0.055 * ahead - tcp[:, :2]
+        lift = funnel(start.norm(dim=1), 0.015, 3.0, HOVER)
+        height = cube[:, 2] - tcp[:, 2]
+        low = tcp[:, 2] < cube[:, 2] + 0.015
+        pushing = behind & low
+        push = 0.03 * ahead - 1.0 * across[:, None] * side
+        return Intent(
+            move=torch.cat(
+                [
+                    torch.where(pushing[:, None], push, start),
+                    torch.where(pushing, height, height + lift)[:, None],
+                ],
+                dim=1,
+            ),
+            yaw=torch.zeros_like(along),
+            gripper=torch.full_like(along, CLOSED),
+        )

@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.stack_cube import StackCubeEnv
+from mani_skill.utils.structs import Actor
 
-from bench.tasks.base import SymmetricTask, disc, flat_pose, fourfold_yaw, grasp_yaw
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import CLOSED, OPEN, Intent, choose, finger_width, funnel, grasp
+from bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
 from policies.geometry import Field
 
 
@@ -50,8 +53,14 @@ class StackCube(SymmetricTask, StackCubeEnv):
         self.cubeA.set_pose(flat_pose(middle + offset, height, yaw_a, self.device))
         self.cubeB.set_pose(flat_pose(middle - offset, height, yaw_b, self.device))
 
+    @property
+    def manipulated(self) -> Actor:
+        """The cube that is stacked."""
+        return self.cubeA
+
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp, a, b = self.agent.tcp_pose, self.cubeA.pose, self.cubeB.pose
+        tcp = self.seen(self.agent.tcp_pose, "tool")
+        a, b = self.seen(self.cubeA.pose, "object"), self.seen(self.cubeB.pose, "object")
         to_a, a_to_b = a.p - tcp.p, b.p - a.p
         return {
             "cube_a_xy": a.p[:, :2],
@@ -66,3 +75,27 @@ class StackCube(SymmetricTask, StackCubeEnv):
             "a_to_b_xy": a_to_b[:, :2],
             "a_to_b_z": a_to_b[:, 2:],
         }
+
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """Grasp A, bring it above B, lower it, let go, rise."""
+        a, b = self.cubeA.pose, self.cubeB.pose
+        approach, held = grasp(self, a.p, a.q, offset)
+        top = b.p - a.p
+        top = torch.cat([top[:, :2], top[:, 2:] + 2 * self.cube_half_size[2]], dim=1)
+        aside = top[:, :2].norm(dim=1)
+        rise = funnel(aside, 0.006, 3.0, 0.05)
+        carry = Intent(
+            move=torch.cat([top[:, :2], top[:, 2:] + rise[:, None]], dim=1),
+            yaw=torch.zeros_like(approach.yaw),
+            gripper=torch.full_like(approach.gripper, CLOSED),
+        )
+        placed = (aside < 0.012) & (top[:, 2].abs() < 0.004)
+        free = placed & (finger_width(self) > 0.06)
+        up = torch.zeros_like(top)
+        up[:, 2] = torch.where(free, 0.03, 0.0)
+        release = Intent(
+            move=up,
+            yaw=torch.zeros_like(approach.yaw),
+            gripper=torch.full_like(approach.gripper, OPEN),
+        )
+        return choose(placed, release, choose(held, carry, approach))

@@ -1,5 +1,5 @@
 """Ways to break the symmetry, each with one dial; see :mod:`bench.variants.base`."""
 
-from bench.variants.base import Strength, Variant, describe, parse, variant_names
+from bench.variants.base import Role, Strength, Variant, describe, parse, variant_names
 
-__all__ = ["Strength", "Variant", "describe", "parse", "variant_names"]
+__all__ = ["Role", "Strength", "Variant", "describe", "parse", "variant_names"]

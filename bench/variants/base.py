@@ -10,14 +10,21 @@ from __future__ import annotations
 
 import difflib
 import math
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
 from policies.errors import UserError
 
+if TYPE_CHECKING:
+    from mani_skill.utils.structs import Pose
+
 Strength = float | torch.Tensor
 """One strength for all environments, or one each as a tensor ``[N]``; in [0, 1]."""
+
+
+Role = Literal["tool", "object", "goal"]
+"""What a pose in the observation belongs to."""
 
 
 class Variant:
@@ -50,6 +57,10 @@ class Variant:
     def action(self, action: torch.Tensor) -> torch.Tensor:
         """What is executed for a bounded ``action [N, 7]``; by default the action itself."""
         return action
+
+    def perceive(self, pose: Pose, role: Role) -> Pose:
+        """What the observation reports for a true ``pose`` of N bodies; by default the pose."""
+        return pose
 
 
 def registry() -> dict[str, type[Variant]]:

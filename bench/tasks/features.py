@@ -1,0 +1,53 @@
+"""Geometry that tasks share: where things are placed, and what is observed of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.utils.structs import Pose
+
+from bench.tasks.rotations import quaternion_to_matrix
+
+
+def fourfold_yaw(q: torch.Tensor) -> torch.Tensor:
+    """Yaw of a cube up to its symmetry, ``[N, 2]``: a frequency-4 vector.
+
+    Half the sum over the body's axes of (x + i y)^4 of their horizontal parts: (cos 4 yaw,
+    sin 4 yaw) for a cube that lies flat, and the same for all 24 ways to name a cube's axes.
+    """
+    axes = quaternion_to_matrix(q)[:, :2]
+    return _fourth_power(axes[:, 0], axes[:, 1]).sum(dim=1) / 2
+
+
+def grasp_yaw(tcp_q: torch.Tensor, cube_q: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Cosine and sine ``[N, 1]`` of four times the yaw from the fingers to the cube's faces."""
+    axis = quaternion_to_matrix(tcp_q)[:, :2, 0]
+    gripper, cube = _fourth_power(axis[:, 0], axis[:, 1]), fourfold_yaw(cube_q)
+    cosine = (gripper * cube).sum(dim=1, keepdim=True)
+    sine = gripper[:, :1] * cube[:, 1:] - gripper[:, 1:] * cube[:, :1]
+    return {"grasp_yaw_cos": cosine, "grasp_yaw_sin": sine}
+
+
+def _fourth_power(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Real and imaginary part of (x + i y)^4 along a new last axis."""
+    re, im = x * x - y * y, 2 * x * y
+    return torch.stack([re * re - im * im, 2 * re * im], dim=-1)
+
+
+def disc(u: np.ndarray, radius: float) -> np.ndarray:
+    """Points ``[N, 2]`` uniform in a disc about the centre, from uniform numbers ``u [N, 2]``."""
+    r, bearing = radius * np.sqrt(u[:, 0]), 2 * np.pi * u[:, 1]
+    return np.stack([r * np.cos(bearing), r * np.sin(bearing)], axis=1)
+
+
+def flat_pose(xy: np.ndarray, z: np.ndarray | float, yaw: np.ndarray, device: Any) -> Pose:
+    """Poses upright at ``xy [N, 2]``, height ``z`` (m), turned by ``yaw [N]`` (rad)."""
+    zero = np.zeros_like(yaw)
+    p = np.concatenate([xy, np.broadcast_to(z, yaw.shape)[:, None]], axis=1)
+    q = np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1)
+    return Pose.create_from_pq(
+        torch.as_tensor(p, dtype=torch.float32, device=device),
+        torch.as_tensor(q, dtype=torch.float32, device=device),
+    )
