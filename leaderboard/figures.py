@@ -254,7 +254,7 @@ def _panels(tables: Sequence[Table], ylabel: str) -> tuple[Figure, list[Axes]]:
 
 def _title(table: Table, tables: Sequence[Table]) -> str:
     key, keys = table.key, [other.key for other in tables]
-    parts = ["unbroken" if key.variant == "none" else key.variant]
+    parts = list(key.broken_by) or ["unbroken"]
     if len({other.base + other.group for other in keys}) > 1:
         parts.append(f"{key.base} {key.group}".strip())
     if len({(other.mode, other.demonstrations) for other in keys}) > 1:

@@ -25,6 +25,11 @@ from leaderboard.statistics import (
     two_stage_bootstrap,
 )
 
+SYMMETRIC_EMBODIMENT = "floating"
+"""The embodiment whose states turn with the world; any other one has an arm."""
+
+ARM = "arm kinematics"
+
 AGENTS = ("base", "zero", "standard", "standard-matched", "equivariant", "approximate")
 """The order of the rows; agents that are not listed follow in alphabetical order."""
 
@@ -106,6 +111,15 @@ class Key:
     @property
     def variant(self) -> str:
         return self.breaking[1]
+
+    @property
+    def broken_by(self) -> tuple[str, ...]:
+        """What breaks the symmetry; empty for the unbroken control.
+
+        An arm counts: unlike an arm-less gripper, its kinematics have no rotational symmetry.
+        """
+        arm = () if self.embodiment == SYMMETRIC_EMBODIMENT else (ARM,)
+        return arm if self.variant == "none" else (*arm, self.variant)
 
     @classmethod
     def of(cls, record: RunRecord) -> Key:

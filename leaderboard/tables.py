@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from leaderboard.records import DIVERGED_EVALUATIONS, DIVERGED_SHARE
 from leaderboard.statistics import Interval
-from leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary, Table
+from leaderboard.summary import ARM, MIN_SEEDS, THRESHOLD, Key, Row, Run, Summary, Table
 
 NOTHING = "\u2013"
 MINUS = "\u2212"
@@ -173,11 +173,14 @@ def _glance(row: Row) -> str:
     return f"{value}{mark}{dagger}".replace(" ", "\u00a0") + f"<br>{bounds}"
 
 
+def _broken_by(key: Key) -> str:
+    return " and ".join(part if part == ARM else code(part) for part in key.broken_by)
+
+
 def _cell_name(table: Table, summary: Summary) -> str:
     """Task, embodiment and variant, and of the rest of the key what tells the tables apart."""
     key = table.key
-    variant = "unbroken" if key.variant == "none" else code(key.variant)
-    name = f"{code(key.task)} {code(key.embodiment)} {variant}"
+    name = f"{code(key.task)} {code(key.embodiment)} {_broken_by(key) or 'unbroken'}"
     keys = [other.key for other in summary.tables]
     if len({other.base + other.group for other in keys}) > 1:
         name += f" {code((key.base + ' ' + key.group).strip())}"
@@ -190,8 +193,9 @@ def _cell_name(table: Table, summary: Summary) -> str:
 
 def _section(table: Table) -> list[str]:
     key = table.key
-    variant = "Unbroken symmetry" if key.variant == "none" else f"Broken by {code(key.variant)}"
-    parts = [f"### {variant}", _base_line(table)]
+    broken = _broken_by(key)
+    heading = f"Broken by {broken}" if broken else "Unbroken symmetry"
+    parts = [f"### {heading}", _base_line(table)]
     header = ["Agent", "Success (IQM)", "Against base", "AUC", "Steps", "Dip", "Episodes", "Runs"]
     if table.is_ranked:
         header.insert(0, "Rank")

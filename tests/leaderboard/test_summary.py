@@ -14,6 +14,7 @@ from record_factory import START, make_curve, make_evaluation, make_record
 from leaderboard.errors import RecordError
 from leaderboard.records import RunRecord, config_hash, write_record
 from leaderboard.summary import Row, Run, Summary, base_success, load_runs, recipe_of, summarize
+from leaderboard.tables import render_page
 
 
 def run(record: RunRecord, name: str = "") -> Run:
@@ -66,6 +67,25 @@ def test_what_cannot_be_compared_is_in_different_tables() -> None:
         ("floating", "action_gain:0.5"),
         ("panda", "none"),
     ]
+
+
+def test_an_arm_breaks_the_symmetry_by_itself() -> None:
+    runs = [
+        of(0.5),
+        of(0.5, variant="action_gain:0.5"),
+        of(0.5, embodiment="panda"),
+        of(0.5, embodiment="panda", variant="action_gain:0.5"),
+    ]
+    keys = [table.key for table in summarize(runs).tables]
+    assert [key.broken_by for key in keys] == [
+        (),
+        ("action_gain:0.5",),
+        ("arm kinematics",),
+        ("arm kinematics", "action_gain:0.5"),
+    ]
+    page = render_page(summarize(runs), {}, {run.path: None for run in runs})
+    assert "### Broken by arm kinematics and `action_gain:0.5`" in page
+    assert page.count("### Unbroken symmetry") == 1
 
 
 def test_seeds_and_machine_settings_do_not_split_a_row_but_hyperparameters_do() -> None:
