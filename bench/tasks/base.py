@@ -25,6 +25,7 @@ from bench.tasks.experts import Intent
 from bench.tasks.floating import ACTION_LAYOUT
 from bench.tasks.rotations import (
     planar_matrix,
+    quaternion_multiply,
     quaternion_to_matrix,
     transform_angular,
     transform_quaternion,
@@ -62,6 +63,9 @@ class SymmetricTask(BaseEnv):
     task_fields: ClassVar[tuple[Field, ...]]
     action_layout: ClassVar[Layout] = ACTION_LAYOUT
     workspace_center: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    mirrored_across_yz: ClassVar[frozenset[str]] = frozenset()
+    """Names of actors that are their own mirror image across their body y-z plane but not across
+    x-z, the plane by which a reflection mirrors all others."""
     observation_layout: ClassVar[Layout]
     _main_seed: list[int]
 
@@ -295,7 +299,9 @@ class SymmetricTask(BaseEnv):
         robot = self.agent.robot.name
         turned = {
             "actors": {
-                name: value if name in fixed else _transform_body(value, angle, reflect)
+                name: value
+                if name in fixed
+                else _transform_body(value, angle, reflect, name in self.mirrored_across_yz)
                 for name, value in state["actors"].items()
             },
             "articulations": {
@@ -345,13 +351,19 @@ class SymmetricTask(BaseEnv):
 # ------------------------------------------------------------------------- helpers
 
 
-def _transform_body(state: torch.Tensor, angle: float, reflect: bool) -> torch.Tensor:
+def _transform_body(
+    state: torch.Tensor, angle: float, reflect: bool, across_yz: bool = False
+) -> torch.Tensor:
     """Act on rigid-body states ``[N, 13]``: position, quaternion, velocity, angular velocity."""
     world = planar_matrix(angle, reflect, state)
+    q = transform_quaternion(state[:, 3:7], angle, reflect)
+    if reflect and across_yz:
+        # Mirroring the body's frame in x instead of y differs by half a turn about its z axis.
+        q = quaternion_multiply(q, q.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(q))
     return torch.cat(
         [
             state[:, :3] @ world.T,
-            transform_quaternion(state[:, 3:7], angle, reflect),
+            q,
             state[:, 7:10] @ world.T,
             transform_angular(state[:, 10:13], angle, reflect),
         ],
