@@ -81,19 +81,44 @@ def yaw_to_grasp(env: SymmetricTask, cube_q: torch.Tensor) -> torch.Tensor:
     return wrap(torch.atan2(cube[:, 1], cube[:, 0]) / 4 - gripper, math.pi / 2)
 
 
+def yaw_along(env: SymmetricTask, axis: torch.Tensor) -> torch.Tensor:
+    """Smallest turn ``[N]`` that sets the fingers on both sides of a bar along ``axis [N, 2]``."""
+    hand = quaternion_to_matrix(env.agent.tcp_pose.q)[:, :2, 0]
+    bar = torch.atan2(axis[:, 1], axis[:, 0])
+    return wrap(bar - torch.atan2(hand[:, 1], hand[:, 0]), math.pi)
+
+
 def grasp(
     env: SymmetricTask, cube_p: torch.Tensor, cube_q: torch.Tensor, offset: torch.Tensor
 ) -> tuple[Intent, torch.Tensor]:
     """Approach a cube from above and close on it; also whether it is held, ``[N]`` bool."""
+    return grasp_at(env, cube_p + offset, cube_p, yaw_to_grasp(env, cube_q), 0.04)
+
+
+def grasp_at(
+    env: SymmetricTask,
+    target: torch.Tensor,
+    body: torch.Tensor,
+    yaw: torch.Tensor,
+    width: float,
+) -> tuple[Intent, torch.Tensor]:
+    """Come down on a point and close the fingers; also whether something is held, ``[N]`` bool.
+
+    Args:
+        env: the task.
+        target: where the tool centre point shall be when the fingers close, ``[N, 3]``.
+        body: the point of the object that must be near for it to be held, ``[N, 3]``.
+        yaw: turn that sets the fingers right, ``[N]``; zeros where any will do.
+        width: of the object between the fingers, metres.
+    """
     tcp = env.agent.tcp_pose.p
-    move = cube_p + offset - tcp
+    move = target - tcp
     aside = move[:, :2].norm(dim=1)
-    yaw = yaw_to_grasp(env, cube_q)
-    width = finger_width(env)
-    # The cube is 4 cm wide: fingers that stopped there around it hold it.
-    around = (cube_p - tcp).norm(dim=1) < 0.03
-    held = around & (width < 0.045) & (width > 0.03)
-    closing = width < 0.075
+    opening = finger_width(env)
+    # Fingers that stopped at the object's width around it hold it.
+    around = (body - tcp).norm(dim=1) < 0.03
+    held = around & (opening < width + 0.005) & (opening > width - 0.01)
+    closing = opening < 0.075
     reach = torch.where(closing, 0.02, 0.008)
     ready = (aside < reach) & (move[:, 2].abs() < reach) & (yaw.abs() < 0.15) | (around & closing)
     lift = funnel(aside, 0.012, 3.0, HOVER).maximum(funnel(yaw.abs(), 0.12, 0.2, HOVER))

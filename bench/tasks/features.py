@@ -21,6 +21,17 @@ def fourfold_yaw(q: torch.Tensor) -> torch.Tensor:
     return _fourth_power(axes[:, 0], axes[:, 1]).sum(dim=1) / 2
 
 
+def twofold_yaw(q: torch.Tensor) -> torch.Tensor:
+    """Direction of a bar's axis (body x) up to its sign, ``[N, 2]``: a frequency-2 vector.
+
+    (x + i y)^2 of the axis's horizontal part: (cos 2 yaw, sin 2 yaw) for a bar that lies flat,
+    shorter for one that stands up.
+    """
+    axis = quaternion_to_matrix(q)[:, :2, 0]
+    x, y = axis.unbind(dim=1)
+    return torch.stack([x * x - y * y, 2 * x * y], dim=1)
+
+
 def grasp_yaw(tcp_q: torch.Tensor, cube_q: torch.Tensor) -> dict[str, torch.Tensor]:
     """Cosine and sine ``[N, 1]`` of four times the yaw from the fingers to the cube's faces."""
     axis = quaternion_to_matrix(tcp_q)[:, :2, 0]
