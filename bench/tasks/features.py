@@ -41,6 +41,14 @@ def grasp_yaw(tcp_q: torch.Tensor, cube_q: torch.Tensor) -> dict[str, torch.Tens
     return {"grasp_yaw_cos": cosine, "grasp_yaw_sin": sine}
 
 
+def bar_grasp_yaw(tcp_q: torch.Tensor, bar_q: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Cosine and sine ``[N, 1]`` of twice the yaw from the fingers to a bar (its body x axis)."""
+    gripper, bar = twofold_yaw(tcp_q), twofold_yaw(bar_q)
+    cosine = (gripper * bar).sum(dim=1, keepdim=True)
+    sine = gripper[:, :1] * bar[:, 1:] - gripper[:, 1:] * bar[:, :1]
+    return {"grasp_yaw_cos": cosine, "grasp_yaw_sin": sine}
+
+
 def _fourth_power(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     """Real and imaginary part of (x + i y)^4 along a new last axis."""
     re, im = x * x - y * y, 2 * x * y
