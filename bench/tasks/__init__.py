@@ -2,6 +2,7 @@
 
 - `make(task, num_envs=...)`: N parallel environments of a task.
 - `gym.make("SymSteer/PickCube-v1", num_envs=...)`: the same for users of gymnasium.
+- `gym.make("SymSteer/PickCube-single-v1")`: one environment on NumPy arrays.
 - `task_class(task)`: layouts, limits and feasible returns without making an environment.
 - `task_names()`, `embodiments()`: what there is.
 """
@@ -12,24 +13,33 @@ import difflib
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
-from mani_skill import logger
 
-from bench.sim import create, rendering_works
+from bench.sim import create
 from bench.sim.environment import Simulator
 from bench.tasks.base import SymmetricTask
 from bench.tasks.embodiments import EMBODIMENTS
 from bench.tasks.pick_cube import PickCube
+from bench.tasks.place_sphere import PlaceSphere
+from bench.tasks.pull_cube import PullCube
 from bench.tasks.push_cube import PushCube
+from bench.tasks.registration import make_batched, make_single, register
 from bench.tasks.stack_cube import StackCube
 from bench.variants import Strength
 from policies.errors import UserError
 
-__all__ = ["SymmetricTask", "embodiments", "make", "task_class", "task_names"]
+__all__ = [
+    "SymmetricTask",
+    "embodiments",
+    "make",
+    "make_batched",
+    "make_single",
+    "task_class",
+    "task_names",
+]
 
 _TASKS: dict[str, type[SymmetricTask]] = {
-    task.task_id: task for task in (PushCube, PickCube, StackCube)
+    task.task_id: task for task in (PushCube, PullCube, PickCube, StackCube, PlaceSphere)
 }
 
 
@@ -51,7 +61,7 @@ def task_class(task: str) -> type[SymmetricTask]:
     """
     task = task.removeprefix("SymSteer/")
     if task not in _TASKS:
-        raise UserError(_unknown("task", task, task_names()))
+        raise UserError(unknown_name("task", task, task_names()))
     return _TASKS[task]
 
 
@@ -87,7 +97,7 @@ def make(
     """
     env_class = task_class(task)
     if embodiment not in EMBODIMENTS:
-        raise UserError(_unknown("embodiment", embodiment, embodiments()))
+        raise UserError(unknown_name("embodiment", embodiment, embodiments()))
     return create(
         env_class,
         num_envs=num_envs,
@@ -102,45 +112,11 @@ def make(
     )
 
 
-def _make_for_gym(task: str, num_envs: int = 1, **kwargs: Any) -> SymmetricTask:
-    """Entry point of ``gym.make``: understands ManiSkill's way of naming a simulator.
-
-    As in ManiSkill, whose tools always name one, a render mode on a machine that cannot render
-    is no error until something is rendered.
-    """
-    backend = str(kwargs.pop("sim_backend", "auto"))
-    if kwargs.get("render_mode") is not None and not rendering_works():
-        logger.warning("render_mode=%r is left out: nothing renders here", kwargs["render_mode"])
-        kwargs["render_mode"] = None
-    if "cuda" in backend or "gpu" in backend:
-        kwargs.setdefault("sim", "cuda")
-    return make(task, num_envs=num_envs, **kwargs)
-
-
-def _unknown(kind: str, name: str, valid: Sequence[str]) -> str:
+def unknown_name(kind: str, name: str, valid: Sequence[str]) -> str:
+    """The sentence for a name that is none of the valid ones, with the nearest of them."""
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.4)
     hint = f", did you mean {near[0]!r}?" if near else "."
     return f"there is no {kind} {name!r}{hint} Valid: {', '.join(valid)}"
 
 
-def _register() -> None:
-    for name, task in _TASKS.items():
-        gym.register(
-            f"SymSteer/{name}",
-            entry_point="bench.tasks:_make_for_gym",
-            max_episode_steps=task.max_episode_steps,
-            # Batched torch observations and rewards are not what gymnasium's checker expects.
-            disable_env_checker=True,
-            order_enforce=False,
-            kwargs={"task": name},
-            additional_wrappers=(
-                gym.envs.registration.WrapperSpec(
-                    "MSTimeLimit",
-                    entry_point="mani_skill.utils.registration:TimeLimitWrapper",
-                    kwargs={"max_episode_steps": task.max_episode_steps},
-                ),
-            ),
-        )
-
-
-_register()
+register(_TASKS)

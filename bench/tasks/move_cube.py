@@ -1,0 +1,117 @@
+"""What PushCube and PullCube share: a cube on the table and a goal disc 20 cm away from it."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from mani_skill.utils.structs import Actor, Pose
+
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import CLOSED, HOVER, Intent, funnel
+from bench.tasks.features import disc, flat_pose, fourfold_yaw
+from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
+from policies.geometry import Field
+
+
+class MoveCube(SymmetricTask):
+    """A cube that closed fingers move over the table into a goal disc, in any direction.
+
+    Reset: cube uniform in a disc of 10 cm radius about the centre; direction uniform on the
+    circle; the cube's yaw is that direction and the goal lies 20 cm ahead, as in the stock
+    scenes, turned about the vertical. The goal disc's pose carries the direction (its body z
+    axis), so the simulation state does too.
+    """
+
+    task_fields = (
+        Field("cube_xy", 1),
+        Field("cube_z", 0),
+        Field("cube_yaw", 4),
+        Field("tcp_to_cube_xy", 1),
+        Field("tcp_to_cube_z", 0),
+        Field("goal_xy", 1),
+        Field("cube_to_goal_xy", 1),
+        Field("tcp_to_goal_xy", 1),
+    )
+    max_episode_steps = 50
+    spawn_radius = 0.1
+    spawn_extent: ClassVar[float] = 0.13
+
+    obj: Actor
+    goal_region: Actor
+    cube_half_size: float
+    goal_radius: float
+
+    def _place_objects(self, rng: Any, count: int) -> None:
+        u = rng.uniform(size=3)
+        xy, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
+        self.obj.set_pose(flat_pose(xy, self.cube_half_size, yaw, self.device))
+        ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        goal = flat_pose(xy + (0.1 + self.goal_radius) * ahead, 1e-3, yaw, self.device)
+        # The disc's axis is its body x axis: lay it flat, then turn it into the direction.
+        flat = goal.q.new_tensor([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]).expand_as(goal.q)
+        self.goal_region.set_pose(Pose.create_from_pq(goal.p, quaternion_multiply(goal.q, flat)))
+
+    @property
+    def manipulated(self) -> Actor:
+        """The cube."""
+        return self.obj
+
+    def direction(self) -> torch.Tensor:
+        """Unit vectors ``[N, 2]`` from the cube's spawn point to the goal."""
+        return quaternion_to_matrix(self.goal_region.pose.q)[:, :2, 2]
+
+    def _observe_task(self) -> dict[str, torch.Tensor]:
+        tcp = self.seen(self.agent.tcp_pose, "tool").p
+        cube = self.seen(self.obj.pose, "object")
+        goal = self.seen(self.goal_region.pose, "goal").p[:, :2]
+        to_cube = cube.p - tcp
+        return {
+            "cube_xy": cube.p[:, :2],
+            "cube_z": cube.p[:, 2:],
+            "cube_yaw": fourfold_yaw(cube.q),
+            "tcp_to_cube_xy": to_cube[:, :2],
+            "tcp_to_cube_z": to_cube[:, 2:],
+            "goal_xy": goal,
+            "cube_to_goal_xy": goal - cube.p[:, :2],
+            "tcp_to_goal_xy": goal - tcp[:, :2],
+        }
+
+    def _gap_behind(self, margin: float) -> torch.Tensor:
+        """Distance ``[N]`` of the tool from the point ``margin`` (m) behind the cube's rear."""
+        behind = self.obj.pose.p.clone()
+        behind[:, :2] -= (self.cube_half_size + margin) * self.direction()
+        return (behind - self.agent.tcp_pose.p).norm(dim=1)
+
+    def _goal_distance(self) -> torch.Tensor:
+        """Horizontal distance ``[N]`` of the cube from the goal, metres."""
+        return (self.obj.pose.p - self.goal_region.pose.p)[:, :2].norm(dim=1)
+
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """Close the fingers, come down behind the cube, push it towards the goal."""
+        tcp, cube = self.agent.tcp_pose.p, self.obj.pose.p + offset
+        to_goal = self.goal_region.pose.p[:, :2] - self.obj.pose.p[:, :2]
+        ahead = to_goal / to_goal.norm(dim=1, keepdim=True).clamp_min(1e-6)
+        side = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=1)
+        relative = tcp[:, :2] - cube[:, :2]
+        along, across = (relative * ahead).sum(dim=1), (relative * side).sum(dim=1)
+        # Behind the cube, near its line to the goal: go down and push, steering back to the line.
+        behind = (along < -0.025) & (across.abs() < 0.02)
+        start = cube[:, :2] - 0.055 * ahead - tcp[:, :2]
+        lift = funnel(start.norm(dim=1), 0.015, 3.0, HOVER)
+        height = cube[:, 2] - tcp[:, 2]
+        low = tcp[:, 2] < cube[:, 2] + 0.015
+        pushing = behind & low
+        push = 0.03 * ahead - 1.0 * across[:, None] * side
+        return Intent(
+            move=torch.cat(
+                [
+                    torch.where(pushing[:, None], push, start),
+                    torch.where(pushing, height, height + lift)[:, None],
+                ],
+                dim=1,
+            ),
+            yaw=torch.zeros_like(along),
+            gripper=torch.full_like(along, CLOSED),
+        )

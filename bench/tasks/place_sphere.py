@@ -1,0 +1,105 @@
+"""Put a sphere into a shallow bin and let go."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from mani_skill.envs.tasks.tabletop.place_sphere import PlaceSphereEnv
+from mani_skill.utils.structs import Actor
+
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import CLOSED, OPEN, Intent, choose, finger_width, funnel, grasp_at
+from bench.tasks.features import disc, flat_pose, fourfold_yaw
+from policies.geometry import Field
+
+
+class PlaceSphere(SymmetricTask, PlaceSphereEnv):
+    """ManiSkill's PlaceSphere-v1 with rotation-symmetric resets.
+
+    Reset: the midpoint of sphere and bin is uniform in a disc of 7 cm radius about the centre,
+    their bearing uniform on the circle, their distance uniform in 11 to 18 cm (so that open
+    fingers around the sphere clear the bin whichever way they are turned), the bin's yaw uniform
+    (stock: sphere and bin in two rectangles side by side along x, bin parallel to the axes).
+    Success (sphere at rest in the bin, within 5 mm of its centre, let go) and reward are
+    ManiSkill's. A square bin is its own image under quarter turns: its yaw has frequency 4. A
+    sphere has no orientation to observe.
+    """
+
+    task_id = "PlaceSphere-v1"
+    max_episode_steps = 50
+    task_fields = (
+        Field("sphere_xy", 1),
+        Field("sphere_z", 0),
+        Field("tcp_to_sphere_xy", 1),
+        Field("tcp_to_sphere_z", 0),
+        Field("bin_xy", 1),
+        Field("bin_yaw", 4),
+        Field("sphere_to_bin_xy", 1),
+        Field("sphere_to_bin_z", 0),
+    )
+    spawn_radius = 0.07
+    distance_range = (0.11, 0.18)
+    spawn_extent: ClassVar[float] = 0.2
+
+    def _place_objects(self, rng: Any, count: int) -> None:
+        u = rng.uniform(size=5)
+        middle, bearing = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
+        low, high = self.distance_range
+        half = (low + (high - low) * u[:, 3]) / 2
+        offset = half[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        still, yaw = np.zeros(count), 2 * np.pi * u[:, 4]
+        self.obj.set_pose(flat_pose(middle + offset, self.radius, still, self.device))
+        floor = self.block_half_size[0]
+        self.bin.set_pose(flat_pose(middle - offset, floor, yaw, self.device))
+
+    @property
+    def manipulated(self) -> Actor:
+        """The sphere."""
+        return self.obj
+
+    def _observe_task(self) -> dict[str, torch.Tensor]:
+        tcp = self.seen(self.agent.tcp_pose, "tool").p
+        sphere = self.seen(self.obj.pose, "object").p
+        bin_pose = self.seen(self.bin.pose, "goal")
+        to_sphere, to_bin = sphere - tcp, bin_pose.p - sphere
+        return {
+            "sphere_xy": sphere[:, :2],
+            "sphere_z": sphere[:, 2:],
+            "tcp_to_sphere_xy": to_sphere[:, :2],
+            "tcp_to_sphere_z": to_sphere[:, 2:],
+            "bin_xy": bin_pose.p[:, :2],
+            "bin_yaw": fourfold_yaw(bin_pose.q),
+            "sphere_to_bin_xy": to_bin[:, :2],
+            "sphere_to_bin_z": to_bin[:, 2:],
+        }
+
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """Grasp the sphere, carry it over the bin, lower it, let go, rise."""
+        sphere, floor = self.obj.pose.p, self.bin.pose.p
+        # Above the equator, where the finger tips (9 mm below the tool centre point) clear the
+        # walls of the bin.
+        target = sphere + offset + sphere.new_tensor([0.0, 0.0, 0.005])
+        any_yaw = torch.zeros_like(sphere[:, 0])
+        approach, held = grasp_at(self, target, sphere, any_yaw, 2 * self.radius)
+        place = floor - sphere
+        drop = place[:, 2] + self.radius + self.block_half_size[0]
+        aside = place[:, :2].norm(dim=1)
+        # Tips that press on a wall cannot open: let the sphere fall the last millimetres.
+        wall = floor[:, 2] + self.block_half_size[0] + 2 * self.edge_block_half_size[2]
+        lowest = wall + 0.012 - self.agent.tcp_pose.p[:, 2]
+        rise = funnel(aside, 0.003, 4.0, 0.05)
+        carry = Intent(
+            move=torch.cat([place[:, :2], (drop.maximum(lowest) + rise)[:, None]], dim=1),
+            yaw=any_yaw,
+            gripper=torch.full_like(any_yaw, CLOSED),
+        )
+        opening = finger_width(self)
+        # Once the fingers let go, the sphere may settle where the walls leave it.
+        near = torch.where(opening > 0.045, 0.007, 0.003)
+        placed = (aside < near) & (drop > -0.01)
+        up = torch.zeros_like(place)
+        up[:, 2] = torch.where(placed & (opening > 0.06), 0.03, 0.0)
+        release = Intent(move=up, yaw=any_yaw, gripper=torch.full_like(any_yaw, OPEN))
+        return choose(placed, release, choose(held, carry, approach))
