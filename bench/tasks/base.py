@@ -23,6 +23,7 @@ from mani_skill.utils.structs import Actor, Pose
 from bench.tasks.embodiments import EMBODIMENTS, Embodiment
 from bench.tasks.experts import Intent
 from bench.tasks.floating import ACTION_LAYOUT
+from bench.tasks.gym_env import GymEnv
 from bench.tasks.rotations import (
     planar_matrix,
     quaternion_multiply,
@@ -46,7 +47,7 @@ GRIPPER_FIELDS = (
 )
 
 
-class SymmetricTask(BaseEnv):
+class SymmetricTask(GymEnv):
     """Mixin; list it before the ManiSkill task class.
 
     Args:

@@ -1,0 +1,80 @@
+"""What gymnasium and ManiSkill's wrappers ask of an environment, and ManiSkill leaves open."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from bench.sim import rendering_works
+
+
+class GymEnv(BaseEnv):
+    """A ManiSkill environment as gymnasium's checker and ``CPUGymWrapper`` expect it.
+
+    ``gpu_sim_enabled`` has two readers in ManiSkill. Its own methods choose the batched branch by
+    it, which is the one that runs here, on any device. Wrappers conclude from it that tensors
+    live on a GPU: ``CPUGymWrapper`` refuses such an environment. So it is true while the former
+    run, and for one environment on the CPU false to everybody else.
+    """
+
+    _batched_branch = False
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # Of this environment alone (ManiSkill's belongs to the class), and of this machine.
+        self.metadata = {
+            "render_modes": [mode for mode in self.SUPPORTED_RENDER_MODES if _renders(mode)],
+            "render_fps": self.control_freq,
+        }
+
+    @property
+    def gpu_sim_enabled(self) -> bool:
+        """Whether ManiSkill's batched branch is what a caller has to deal with."""
+        one_on_cpu = self.num_envs == 1 and self.device.type == "cpu"
+        return self.scene.gpu_sim_enabled and (self._batched_branch or not one_on_cpu)
+
+    @contextmanager
+    def _in_batched_branch(self) -> Iterator[None]:
+        before, self._batched_branch = self._batched_branch, True
+        try:
+            yield
+        finally:
+            self._batched_branch = before
+
+    def reset(self, seed: Any = None, options: dict | None = None) -> tuple:
+        """As ManiSkill's; a seed also seeds ``np_random``, as gymnasium wants it."""
+        if seed is not None:
+            gym.Env.reset(self, seed=int(np.atleast_1d(seed)[0]))
+        with self._in_batched_branch():
+            return super().reset(seed=seed, options=options)
+
+    def get_info(self) -> dict:
+        """As ManiSkill's."""
+        with self._in_batched_branch():
+            return super().get_info()
+
+    def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
+        """As ManiSkill's."""
+        with self._in_batched_branch():
+            super().set_state_dict(state, env_idx)
+
+    def render_human(self) -> Any:
+        """As ManiSkill's."""
+        with self._in_batched_branch():
+            return super().render_human()
+
+    def _step_action(self, action: Any) -> Any:
+        with self._in_batched_branch():
+            return super()._step_action(action)
+
+
+def _renders(mode: str) -> bool:
+    """Whether a render mode works on this machine: all need a GPU driver, one a display too."""
+    return rendering_works() and (mode != "human" or "DISPLAY" in os.environ)
