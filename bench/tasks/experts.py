@@ -101,6 +101,7 @@ def grasp_at(
     body: torch.Tensor,
     yaw: torch.Tensor,
     width: float,
+    haste: float = 1.0,
 ) -> tuple[Intent, torch.Tensor]:
     """Come down on a point and close the fingers; also whether something is held, ``[N]`` bool.
 
@@ -110,6 +111,7 @@ def grasp_at(
         body: the point of the object that must be near for it to be held, ``[N, 3]``.
         yaw: turn that sets the fingers right, ``[N]``; zeros where any will do.
         width: of the object between the fingers, metres.
+        haste: share of the last 4 cm that is asked for in one step; less is slower and closer.
     """
     tcp = env.agent.tcp_pose.p
     move = target - tcp
@@ -123,6 +125,9 @@ def grasp_at(
     ready = (aside < reach) & (move[:, 2].abs() < reach) & (yaw.abs() < 0.15) | (around & closing)
     lift = funnel(aside, 0.012, 3.0, HOVER).maximum(funnel(yaw.abs(), 0.12, 0.2, HOVER))
     approach = torch.cat([move[:, :2], move[:, 2:] + lift[:, None]], dim=1)
+    if haste != 1.0:
+        last = approach.norm(dim=1, keepdim=True) < 0.04
+        approach = torch.where(last, haste * approach, approach)
     still = ready[:, None]
     return (
         Intent(

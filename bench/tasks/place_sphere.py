@@ -82,7 +82,7 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
         # walls of the bin.
         target = sphere + offset + sphere.new_tensor([0.0, 0.0, 0.005])
         any_yaw = torch.zeros_like(sphere[:, 0])
-        approach, held = grasp_at(self, target, sphere, any_yaw, 2 * self.radius)
+        approach, held = grasp_at(self, target, sphere, any_yaw, 2 * self.radius, haste=0.6)
         place = floor - sphere
         drop = place[:, 2] + self.radius + self.block_half_size[0]
         aside = place[:, :2].norm(dim=1)
@@ -90,15 +90,18 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
         wall = floor[:, 2] + self.block_half_size[0] + 2 * self.edge_block_half_size[2]
         lowest = wall + 0.012 - self.agent.tcp_pose.p[:, 2]
         rise = funnel(aside, 0.003, 4.0, 0.05)
+        # Slowly at the end: a sphere that is let go in motion spins in the bin for seconds.
+        move = torch.cat([place[:, :2], (drop.maximum(lowest) + rise)[:, None]], dim=1)
+        last = move.norm(dim=1, keepdim=True) < 0.04
         carry = Intent(
-            move=torch.cat([place[:, :2], (drop.maximum(lowest) + rise)[:, None]], dim=1),
+            move=torch.where(last, 0.6 * move, move),
             yaw=any_yaw,
             gripper=torch.full_like(any_yaw, CLOSED),
         )
         opening = finger_width(self)
         # Once the fingers let go, the sphere may settle where the walls leave it.
         near = torch.where(opening > 0.045, 0.007, 0.003)
-        placed = (aside < near) & (drop > -0.01)
+        placed = (aside < near) & (drop > -0.013)
         up = torch.zeros_like(place)
         up[:, 2] = torch.where(placed & (opening > 0.06), 0.03, 0.0)
         release = Intent(move=up, yaw=any_yaw, gripper=torch.full_like(any_yaw, OPEN))
