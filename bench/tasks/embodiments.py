@@ -74,6 +74,21 @@ class Embodiment:
         """Act with (angle, reflect) on the controller's state."""
         return state
 
+    def shift_robot(self, state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+        """Move the hand of articulation states ``[N, 13 + 2 dof]`` by ``offset [N, 2]`` metres.
+
+        Raises:
+            UserError: if a shifted hand is not a matter of other joint positions alone.
+        """
+        raise UserError(
+            f"states of the {self.name!r} embodiment cannot be shifted exactly: its base stands "
+            "still; use embodiment 'floating'"
+        )
+
+    def shift_controller(self, state: dict, offset: torch.Tensor) -> dict:
+        """Move the controller's targets by ``offset [N, 2]`` metres."""
+        return state
+
 
 @dataclass(frozen=True)
 class Floating(Embodiment):
@@ -134,6 +149,16 @@ class Floating(Embodiment):
             **state,
             "root": {"target_qpos": self._transform_root_joints(target, angle, reflect)},
         }
+
+    def shift_robot(self, state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+        moved = state.clone()
+        moved[:, 13:15] += offset
+        return moved
+
+    def shift_controller(self, state: dict, offset: torch.Tensor) -> dict:
+        target = state["root"]["target_qpos"].clone()
+        target[:, :2] += offset
+        return {**state, "root": {"target_qpos": target}}
 
     @staticmethod
     def _transform_root_joints(q: torch.Tensor, angle: float, reflect: bool) -> torch.Tensor:
