@@ -21,6 +21,7 @@ from bench.tasks.base import SymmetricTask
 from bench.tasks.embodiments import EMBODIMENTS
 from bench.tasks.pick_cube import PickCube
 from bench.tasks.place_sphere import PlaceSphere
+from bench.tasks.poke_cube import PokeCube
 from bench.tasks.pull_cube import PullCube
 from bench.tasks.push_cube import PushCube
 from bench.tasks.registration import make_batched, make_single, register
@@ -39,7 +40,15 @@ __all__ = [
 ]
 
 _TASKS: dict[str, type[SymmetricTask]] = {
-    task.task_id: task for task in (PushCube, PullCube, PickCube, StackCube, PlaceSphere)
+    task.task_id: task
+    for task in (
+        PushCube,
+        PullCube,
+        PickCube,
+        StackCube,
+        PlaceSphere,
+        PokeCube,
+    )
 }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from mani_skill.utils.structs import Pose
 
-from bench.tasks.rotations import quaternion_to_matrix
+from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
 
 
 def fourfold_yaw(q: torch.Tensor) -> torch.Tensor:
@@ -70,3 +70,14 @@ def flat_pose(xy: np.ndarray, z: np.ndarray | float, yaw: np.ndarray, device: An
         torch.as_tensor(p, dtype=torch.float32, device=device),
         torch.as_tensor(q, dtype=torch.float32, device=device),
     )
+
+
+def goal_disc_pose(xy: np.ndarray, yaw: np.ndarray, device: Any) -> Pose:
+    """Poses of ManiSkill's target discs, flat on the table at ``xy [N, 2]``.
+
+    A disc's axis is its body x axis; its body z axis is laid into the direction ``yaw [N]``
+    (rad), so that the pose carries a direction that nobody sees.
+    """
+    upright = flat_pose(xy, 1e-3, yaw, device)
+    flat = upright.q.new_tensor([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]).expand_as(upright.q)
+    return Pose.create_from_pq(upright.p, quaternion_multiply(upright.q, flat))

@@ -6,12 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Actor
 
 from bench.tasks.base import SymmetricTask
 from bench.tasks.experts import CLOSED, HOVER, Intent, funnel
-from bench.tasks.features import disc, flat_pose, fourfold_yaw
-from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
+from bench.tasks.features import disc, flat_pose, fourfold_yaw, goal_disc_pose
+from bench.tasks.rotations import quaternion_to_matrix
 from policies.geometry import Field
 
 
@@ -48,10 +48,8 @@ class MoveCube(SymmetricTask):
         xy, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
         self.obj.set_pose(flat_pose(xy, self.cube_half_size, yaw, self.device))
         ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        goal = flat_pose(xy + (0.1 + self.goal_radius) * ahead, 1e-3, yaw, self.device)
-        # The disc's axis is its body x axis: lay it flat, then turn it into the direction.
-        flat = goal.q.new_tensor([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]).expand_as(goal.q)
-        self.goal_region.set_pose(Pose.create_from_pq(goal.p, quaternion_multiply(goal.q, flat)))
+        goal = xy + (0.1 + self.goal_radius) * ahead
+        self.goal_region.set_pose(goal_disc_pose(goal, yaw, self.device))
 
     @property
     def manipulated(self) -> Actor:

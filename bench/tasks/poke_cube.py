@@ -1,0 +1,175 @@
+"""Poke a cube into a disc on the table with a peg, in any direction."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from mani_skill.envs.tasks.tabletop.poke_cube import PokeCubeEnv
+from mani_skill.utils.structs import Actor
+
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import CLOSED, Intent, choose, funnel, grasp_at, yaw_along
+from bench.tasks.features import (
+    bar_grasp_yaw,
+    disc,
+    flat_pose,
+    fourfold_yaw,
+    goal_disc_pose,
+    twofold_yaw,
+)
+from bench.tasks.rotations import quaternion_to_matrix, wrap
+from policies.geometry import Field
+
+
+class PokeCube(SymmetricTask, PokeCubeEnv):
+    """ManiSkill's PokeCube-v1 turned by a uniform angle in every episode.
+
+    Stock PokeCube always pokes along +x. Here the direction is uniform on the circle; seen along
+    it, the peg (24 cm long, lying on the table, parallel to the direction) has its middle 7 cm
+    before a point uniform in a disc of 5 cm radius about the centre, the cube stands 22 cm ahead
+    of the peg's middle and the goal 10 cm ahead of the cube, as in stock; peg and cube are up to
+    10 cm apart across (stock: up to 20 cm), and the cube is turned by up to 30 degrees against
+    the direction, as in stock. The goal disc's pose carries the direction (its body z axis).
+
+    The peg is its own image under a half turn, paint included: its yaw is observed with
+    frequency 2, and the point of it that is observed against the cube is its end that is nearer
+    to the cube. ManiSkill calls the end at the frame's +x the head; at a reset the head is the
+    end that faces the cube, and only the dense reward depends on that name.
+
+    Success (cube within 5 cm of the goal, robot static) is ManiSkill's. Two quantities of its
+    dense reward that pin the world's axes are replaced by what they are in the stock scene: the
+    head's position (stock adds 12 cm along the world's x to the peg's middle, whichever way it
+    is turned) and the angle between peg and cube (stock subtracts Euler angles; here it is the
+    one to the cube's nearest face).
+    """
+
+    task_id = "PokeCube-v1"
+    max_episode_steps = 50
+    task_fields = (
+        Field("peg_xy", 1),
+        Field("peg_z", 0),
+        Field("peg_yaw", 2),
+        Field("tcp_to_peg_xy", 1),
+        Field("tcp_to_peg_z", 0),
+        Field("grasp_yaw_cos", 0),
+        Field("grasp_yaw_sin", 0, odd=True),
+        Field("cube_xy", 1),
+        Field("cube_z", 0),
+        Field("cube_yaw", 4),
+        Field("peg_end_to_cube_xy", 1),
+        Field("goal_xy", 1),
+        Field("cube_to_goal_xy", 1),
+    )
+    spawn_radius = 0.05
+    peg_behind = 0.07
+    peg_to_cube = 0.22
+    across = 0.1
+    cube_turn = math.pi / 6
+    spawn_extent: ClassVar[float] = 0.26
+
+    def _place_objects(self, rng: Any, count: int) -> None:
+        u = rng.uniform(size=5)
+        middle, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
+        ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        side = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        aside = self.across * (u[:, 3:4] - 0.5) * side
+        peg = middle - self.peg_behind * ahead - aside
+        cube = middle + (self.peg_to_cube - self.peg_behind) * ahead + aside
+        self.peg.set_pose(flat_pose(peg, self.peg_half_width, yaw, self.device))
+        turn = self.cube_turn * (2 * u[:, 4] - 1)
+        self.cube.set_pose(flat_pose(cube, self.cube_half_size, yaw + turn, self.device))
+        goal = cube + (0.05 + self.goal_radius) * ahead
+        self.goal_region.set_pose(goal_disc_pose(goal, yaw, self.device))
+
+    @property
+    def manipulated(self) -> Actor:
+        """The cube, which the peg pokes."""
+        return self.cube
+
+    @property
+    def peg_head_pos(self) -> torch.Tensor:
+        """Where the head of the peg is, ``[N, 3]`` metres."""
+        return self.peg_head_pose.p
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """ManiSkill's, with the angle between peg and cube whichever way they lie."""
+        info = super().evaluate()
+        peg, cube = (quaternion_to_matrix(b.pose.q)[:, :2, 0] for b in (self.peg, self.cube))
+        yaw = torch.atan2(peg[:, 1], peg[:, 0]) - torch.atan2(cube[:, 1], cube[:, 0])
+        info["angle_diff"] = wrap(yaw, math.pi / 2).abs()
+        close = info["head_to_cube_dist"] <= self.cube_half_size + 0.005
+        info["is_peg_cube_fit"] = (info["angle_diff"] < 0.05) & close
+        return info
+
+    def _observe_task(self) -> dict[str, torch.Tensor]:
+        tcp = self.seen(self.agent.tcp_pose, "tool")
+        peg, cube = self.seen(self.peg.pose, "object"), self.seen(self.cube.pose, "object")
+        goal = self.seen(self.goal_region.pose, "goal").p
+        to_peg, peg_to_cube = peg.p - tcp.p, cube.p - peg.p
+        end = self._half_peg(quaternion_to_matrix(peg.q)[:, :, 0], peg_to_cube)
+        return {
+            "peg_xy": peg.p[:, :2],
+            "peg_z": peg.p[:, 2:],
+            "peg_yaw": twofold_yaw(peg.q),
+            "tcp_to_peg_xy": to_peg[:, :2],
+            "tcp_to_peg_z": to_peg[:, 2:],
+            **bar_grasp_yaw(tcp.q, peg.q),
+            "cube_xy": cube.p[:, :2],
+            "cube_z": cube.p[:, 2:],
+            "cube_yaw": fourfold_yaw(cube.q),
+            "peg_end_to_cube_xy": (peg_to_cube - end)[:, :2],
+            "goal_xy": goal[:, :2],
+            "cube_to_goal_xy": (goal - cube.p)[:, :2],
+        }
+
+    def _half_peg(self, axis: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
+        """From the peg's middle to its end on the side of ``towards [N, 3]``, ``[N, 3]``."""
+        same_side = (axis * towards).sum(dim=1, keepdim=True) >= 0
+        return self.peg_half_length * torch.where(same_side, axis, -axis)
+
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """Grasp the peg by its middle, bring it behind the cube, poke, stand still."""
+        tcp, peg, cube = self.agent.tcp_pose.p, self.peg.pose, self.cube.pose.p
+        to_goal = (self.goal_region.pose.p - cube)[:, :2]
+        distance = to_goal.norm(dim=1)
+        ahead = to_goal / distance[:, None].clamp_min(1e-6)
+        side = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=1)
+
+        axis = quaternion_to_matrix(peg.q)[:, :, 0]
+        # Where the fingers are along the peg.
+        slide = ((tcp - peg.p) * axis).sum(dim=1, keepdim=True)
+        here = peg.p + slide.clamp(-self.peg_half_length, self.peg_half_length) * axis
+        # The peg leaves 15 mm on either side of the fingers, less than an offset may be: most of
+        # it moves the grasp along the peg.
+        along_peg = (offset * axis).sum(dim=1, keepdim=True) * axis
+        target = peg.p + along_peg + 0.3 * (offset - along_peg)
+        approach, held = grasp_at(
+            self, target, here, yaw_along(self, axis[:, :2]), 2 * self.peg_half_width
+        )
+
+        end = peg.p + self._half_peg(axis, torch.cat([ahead, 0 * ahead[:, :1]], dim=1))
+        pointing = (end - peg.p)[:, :2]
+        turn = torch.atan2((pointing * side).sum(dim=1), (pointing * ahead).sum(dim=1))
+        # The peg turns about the fingers: where its end will be once it points ahead.
+        lever = (end - here).norm(dim=1)
+        relative = (here - cube)[:, :2]
+        along = (relative * ahead).sum(dim=1) + lever
+        across = (relative * side).sum(dim=1)
+        back = funnel(across.abs(), 0.008, 3.0, 0.06).maximum(funnel(turn.abs(), 0.06, 0.5, 0.06))
+        lined_up = back <= 0.0
+        gap = (-along - self.cube_half_size).clamp_min(0.0)
+        forward = (gap + 0.5 * (distance - 0.02)).clamp(0.0, 0.03)
+        retreat = -(self.cube_half_size + 0.015) - back - along
+        move = torch.where(lined_up, forward, retreat)[:, None] * ahead - across[:, None] * side
+        lift = self.peg_half_width + 0.005 - peg.p[:, 2:]
+        poke = Intent(
+            move=torch.cat([move, lift], dim=1),
+            yaw=-turn,
+            gripper=torch.full_like(turn, CLOSED),
+        )
+        still = torch.zeros_like(turn)
+        stand = Intent(move=torch.zeros_like(tcp), yaw=still, gripper=poke.gripper)
+        return choose(distance < 0.035, stand, choose(held, poke, approach))
