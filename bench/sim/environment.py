@@ -14,6 +14,7 @@ from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.system.backend import BackendInfo
+from mani_skill.utils.structs import Actor
 
 from bench.sim import patches, rendering
 from bench.sim.headless import prepare_headless
@@ -134,6 +135,17 @@ class BatchedCpuMixin(BaseEnv):
                             'support: use "pd_ee_delta_pose" or a joint-space mode.'
                         ) from error
 
+    def hold_force(self, body: Actor, force: torch.Tensor) -> None:
+        """Push a dynamic body in every substep from now on, until this is called again.
+
+        Substeps are still taken scene by scene: nothing has to run between them.
+
+        Args:
+            body: of all environments.
+            force: at its centre of mass, ``[N, 3]`` newtons in the world frame.
+        """
+        self.scene.px.hold_forces(body._body_data_index.numpy(), force.numpy())
+
     def _step_action(self, action: Any) -> Any:
         if self._code_runs_between_substeps():
             return super()._step_action(action)
@@ -177,6 +189,7 @@ class CudaMixin(BaseEnv):
     ) -> None:
         if sim_backend == "auto":
             sim_backend = "physx_cuda"
+        self._held: dict[str, tuple[Actor, torch.Tensor]] = {}
         check_cuda()
         patches.check_versions()
         prepare_headless()
@@ -197,6 +210,19 @@ class CudaMixin(BaseEnv):
             obs_mode=obs_mode,
             **kwargs,
         )
+
+    def hold_force(self, body: Actor, force: torch.Tensor) -> None:
+        """Push a dynamic body in every substep; see `BatchedCpuMixin.hold_force`."""
+        self._held[body.name] = (body, force)
+
+    def _setup_scene(self) -> None:
+        self._held.clear()
+        super()._setup_scene()
+
+    def _before_simulation_step(self) -> None:
+        for body, force in self._held.values():
+            body.apply_force(force)
+        super()._before_simulation_step()
 
 
 def check_cuda() -> None:

@@ -85,6 +85,8 @@ class BatchedPhysx:
         self._pending_substeps = 0
         self._deferring = False
         self._initialized = False
+        # Per scene: forces by row of the body that they act on in every substep.
+        self._held: list[dict[int, np.ndarray]] = [{} for _ in self.systems]
 
     # ------------------------------------------------------------------ plain system surface
     @property
@@ -306,9 +308,18 @@ class BatchedPhysx:
         if count == 0:
             return
         substeps = range(count)
-        for step in self._step_calls:
-            for _ in substeps:
-                step()
+        if not any(self._held):
+            for step in self._step_calls:
+                for _ in substeps:
+                    step()
+        else:
+            nothing = np.zeros(3, dtype=np.float32)
+            for step, held in zip(self._step_calls, self._held, strict=True):
+                pushes = [(self._bodies[row].add_force_torque, f) for row, f in held.items()]
+                for _ in substeps:
+                    for push, force in pushes:
+                        push(force, nothing)
+                    step()
         if self._initialized:
             self._stale[:] = True
             self._contacts.invalidate()
@@ -534,6 +545,25 @@ class BatchedPhysx:
     def gpu_apply_rigid_dynamic_force(self) -> None:
         """Apply forces (newtons, world frame) at the centres of mass for the next substep."""
         self._apply_forces(self.cuda_rigid_body_force, is_force=True)
+
+    def hold_forces(self, rows: np.ndarray, forces: np.ndarray) -> None:
+        """Forces that act on bodies in every substep from now on, until they are set anew.
+
+        Unlike `gpu_apply_rigid_dynamic_force` they need no code between substeps, which can
+        therefore be taken scene by scene.
+
+        Args:
+            rows: of dynamic bodies in the body buffer, ``[k]``.
+            forces: at their centres of mass, ``[k, 3]`` newtons in the world frame; a body
+                without force is left alone, also asleep.
+        """
+        self.finish_substeps()
+        for row, force in zip(rows.tolist(), forces, strict=True):
+            held = self._held[self._body_scene[row]]
+            if force.any() and not self._kinematic[row]:
+                held[row] = force.astype(np.float32)
+            else:
+                held.pop(row, None)
 
     def gpu_apply_rigid_dynamic_torque(self) -> None:
         """Apply torques (newton metres, world frame) for the next substep."""

@@ -170,6 +170,40 @@ def test_force_acts_once(playground):
         torch.testing.assert_close(velocity, torch.tensor([0, expected, 0]), atol=1e-3, rtol=0)
 
 
+def test_held_force_acts_in_every_substep(playground):
+    """A force of m g changes the velocity by g a second, in one scene, until it is lifted."""
+    box, dt = playground.boxes["dynamic"], playground.scene.timestep
+    force = torch.zeros(3, 3)
+    force[1, 0] = box.mass[1] * 9.81
+    playground.hold_force(box, force)
+    substeps = playground.sim_freq // playground.control_freq
+    playground.step(None)
+    speed = torch.tensor([0, 9.81 * dt * substeps, 0])
+    torch.testing.assert_close(box.linear_velocity[:, 0], speed, atol=1e-3, rtol=0)
+    playground.hold_force(box, torch.zeros(3, 3))
+    playground.step(None)
+    torch.testing.assert_close(box.linear_velocity[:, 0], speed, atol=1e-3, rtol=0)
+
+
+def test_held_force_equals_one_set_between_substeps(playground):
+    """Bit for bit what a hook that pushes before each substep does."""
+    force = torch.tensor([[1.0, 2, 0], [0, 0, 0], [-3, 0, 1]])
+
+    class Pushed(Playground):
+        def _before_simulation_step(self):
+            self.boxes["dynamic"].apply_force(force)
+
+    pushed = create(Pushed, 3, obs_mode="state_dict")
+    for env in (pushed, playground):
+        env.reset(seed=[1, 2, 3])
+    playground.hold_force(playground.boxes["dynamic"], force)
+    for _ in range(12):
+        pushed.step(None)
+        playground.step(None)
+        expected = pushed.boxes["dynamic"].pose.raw_pose
+        assert torch.equal(playground.boxes["dynamic"].pose.raw_pose, expected)
+
+
 def test_fetch_discards_what_was_not_applied(playground):
     """As on CUDA: the simulation wins over a buffer that was written and not applied."""
     box = playground.boxes["dynamic"]
