@@ -11,7 +11,7 @@ from mani_skill.envs.tasks.tabletop.poke_cube import PokeCubeEnv
 from mani_skill.utils.structs import Actor
 
 from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import CLOSED, Intent, choose, funnel, grasp_at, yaw_along
+from bench.tasks.experts import CLOSED, OPEN, Intent, choose, funnel, grasp_at, yaw_along
 from bench.tasks.features import (
     bar_grasp_yaw,
     disc,
@@ -47,7 +47,7 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
     """
 
     task_id = "PokeCube-v1"
-    max_episode_steps = 50
+    max_episode_steps = 60
     task_fields = (
         Field("peg_xy", 1),
         Field("peg_z", 0),
@@ -131,7 +131,7 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         return self.peg_half_length * torch.where(same_side, axis, -axis)
 
     def intent(self, offset: torch.Tensor) -> Intent:
-        """Grasp the peg by its middle, bring it behind the cube, poke, stand still."""
+        """Grasp the peg by its middle, bring it behind the cube, poke, let go."""
         tcp, peg, cube = self.agent.tcp_pose.p, self.peg.pose, self.cube.pose.p
         to_goal = (self.goal_region.pose.p - cube)[:, :2]
         distance = to_goal.norm(dim=1)
@@ -171,5 +171,6 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
             gripper=torch.full_like(turn, CLOSED),
         )
         still = torch.zeros_like(turn)
-        stand = Intent(move=torch.zeros_like(tcp), yaw=still, gripper=poke.gripper)
-        return choose(distance < 0.035, stand, choose(held, poke, approach))
+        # Letting go: a hand that squeezes a peg is not quite at rest.
+        stand = Intent(move=torch.zeros_like(tcp), yaw=still, gripper=torch.full_like(turn, OPEN))
+        return choose(distance < 0.045, stand, choose(held, poke, approach))
