@@ -202,11 +202,13 @@ class SymmetricTask(GymEnv):
             options: ``env_idx`` selects the environments to reset; the others are untouched.
 
         Raises:
-            UserError: if the list of seeds has another length.
+            UserError: if the list of seeds has another length, or ``env_idx`` names environments
+                that are not there.
         """
         options = dict(options or {})
         partial = options.get("env_idx")
         if partial is not None:
+            self._check_rows(partial)
             # ManiSkill writes the rows of a partial reset in the order of the environments.
             partial, order = torch.as_tensor(partial, dtype=torch.long, device=self.device).sort()
             options["env_idx"] = partial
@@ -233,6 +235,15 @@ class SymmetricTask(GymEnv):
             _copy_rows(fresh, kept, partial)
             self.agent.set_controller_state(kept)
         return obs, info
+
+    def _check_rows(self, env_idx: Any) -> None:
+        rows = np.atleast_1d(common.to_numpy(env_idx))
+        named = rows.dtype != bool and ((rows >= 0) & (rows < self.num_envs)).all()
+        if not named or len(np.unique(rows)) != len(rows):
+            raise UserError(
+                f"env_idx lists environments by number, each once, from 0 to {self.num_envs - 1}; "
+                f"it is {rows.tolist()}"
+            )
 
     def _set_main_rng(self, seed: list[int] | None) -> None:
         if seed is not None and self._reset_rows is not None:

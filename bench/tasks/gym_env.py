@@ -13,6 +13,7 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
 from bench.sim import rendering_works
+from policies.errors import UserError
 
 
 class GymEnv(BaseEnv):
@@ -71,6 +72,11 @@ class GymEnv(BaseEnv):
             return super().render_human()
 
     def _step_action(self, action: Any) -> Any:
+        if isinstance(action, list | tuple):
+            raise UserError(
+                f"an action is a tensor or array of shape {self.action_space.shape}, not a "
+                f"{type(action).__name__}"
+            )
         with self._in_batched_branch():
             return super()._step_action(action)
 

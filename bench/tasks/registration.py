@@ -9,18 +9,36 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from mani_skill import logger
+from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
+from mani_skill.utils import common
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 from bench.sim import rendering_works
+from bench.tasks.embodiments import EMBODIMENTS
 from policies.errors import UserError
 
 if TYPE_CHECKING:
     from bench.tasks.base import SymmetricTask
+
+
+_SIMULATORS = {
+    "auto": "",
+    **dict.fromkeys(("cpu", "physx_cpu", "physx_cpu_batched"), "cpu"),
+    **dict.fromkeys(("cuda", "gpu", "physx_cuda"), "cuda"),
+}
+"""What ManiSkill's ``sim_backend`` names, as our ``sim``."""
+
+_OBS_MODES = (
+    *("state", "state_dict", "none", "sensor_data", "pointcloud", "rgbd"),
+    *ALL_VISUAL_TEXTURES,
+)
 
 
 class EpisodeLimit(gym.Wrapper, gym.utils.RecordConstructorArgs):
@@ -40,7 +58,7 @@ class EpisodeLimit(gym.Wrapper, gym.utils.RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
 
     @property
-    def spec(self) -> EnvSpec | None:
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
         """How ``gym.make`` makes this environment again, limit included."""
         spec = super().spec
         if spec is not None:
@@ -60,26 +78,31 @@ class EpisodeLimit(gym.Wrapper, gym.utils.RecordConstructorArgs):
 def make_batched(task: str, num_envs: int = 1, **kwargs: Any) -> SymmetricTask:
     """Entry point of ``gym.make("SymSteer/PickCube-v1", num_envs=N, ...)``.
 
-    Takes the options of :func:`bench.tasks.make`, and ManiSkill's way of naming a simulator. As
-    in ManiSkill, whose tools always name one, a render mode on a machine that cannot render is
-    no error until something is rendered.
+    Takes the options of :func:`bench.tasks.make`, where ``None`` means that an option is not
+    given, and ManiSkill's ways of naming simulator and robot. As in ManiSkill, whose tools always
+    name one, a render mode on a machine that cannot render is no error until something is
+    rendered.
 
     Raises:
-        UserError: as :func:`bench.tasks.make`, and for an option that neither it nor the task has.
+        UserError: as :func:`bench.tasks.make`, and for an option that neither it nor the task
+            has, or whose value they do not know.
     """
-    from bench.tasks import make, task_class, unknown_name
+    from bench.tasks import make
 
-    backend = str(kwargs.pop("sim_backend", "auto"))
-    if kwargs.get("render_mode") is not None and not rendering_works():
-        logger.warning("render_mode=%r is left out: nothing renders here", kwargs["render_mode"])
-        kwargs["render_mode"] = None
-    if "cuda" in backend or "gpu" in backend:
-        kwargs.setdefault("sim", "cuda")
-    valid = _options(make, *(c.__init__ for c in task_class(task).__mro__))
-    for name in kwargs:
-        if name not in valid:
-            raise UserError(unknown_name("option", name, sorted(valid)))
-    return make(task, num_envs=num_envs, **kwargs)
+    options = {name: value for name, value in kwargs.items() if value is not None}
+    _check(task, num_envs, options)
+    backend = str(options.pop("sim_backend", "auto")).partition(":")[0]
+    if (
+        backend != "auto"
+        and options.setdefault("sim", _SIMULATORS[backend]) != _SIMULATORS[backend]
+    ):
+        raise UserError(
+            f"sim={options['sim']!r} contradicts sim_backend={backend!r}; leave one of them out"
+        )
+    if "render_mode" in options and not rendering_works():
+        mode = options.pop("render_mode")
+        logger.warning("render_mode=%r is left out: nothing renders here", mode)
+    return make(task, num_envs=int(num_envs), **options)
 
 
 def make_single(task: str, **kwargs: Any) -> gym.Env:
@@ -138,8 +161,57 @@ def register(tasks: Mapping[str, type[SymmetricTask]]) -> None:
         )
 
 
-def _options(*functions: Any) -> set[str]:
+def _check(task: str, num_envs: Any, options: dict[str, Any]) -> None:
+    """Refuse options that would fail far from their cause, or be ignored."""
+    from bench.tasks import make, task_class, unknown_name
+
+    env_class = task_class(task)
+    constructors = [vars(c)["__init__"] for c in env_class.__mro__ if "__init__" in vars(c)]
+    names = _keywords(make, *constructors) - {"self", "task"}
+    for name in options:
+        if name not in names:
+            raise UserError(unknown_name("option", name, sorted(names)))
+    if not isinstance(num_envs, Integral):
+        raise UserError(f"num_envs must be a whole number; it is {num_envs!r}")
+    for name, valid in {
+        "sim_backend": list(_SIMULATORS),
+        "reward_mode": env_class.SUPPORTED_REWARD_MODES,
+        "render_mode": env_class.SUPPORTED_RENDER_MODES,
+        "obs_mode": _OBS_MODES,
+    }.items():
+        # Several kinds of observation are joined by "+", a device follows a simulator after ":".
+        for part in str(options.get(name, valid[0])).partition(":")[0].split("+"):
+            if part not in valid:
+                raise UserError(unknown_name(name, part, valid))
+    variant = options.get("variant", "none")
+    if not isinstance(variant, str):
+        raise UserError(
+            f"variant is a text such as 'action_gain:0.5', several joined by '+'; it is {variant!r}"
+        )
+    if variant == "none" and np.any(common.to_numpy(options.get("strength", 0)) != 0):
+        raise UserError(
+            f"strength={options['strength']} was given without a variant; name one, e.g. "
+            "variant='action_gain'"
+        )
+    body = EMBODIMENTS.get(options.get("embodiment", "floating"))
+    if body and options.get("robot_uids", body.robot_uid) != body.robot_uid:
+        raise UserError(
+            f"robot_uids={options['robot_uids']!r} is not the robot of embodiment {body.name!r}; "
+            f"leave robot_uids out and choose an embodiment: {', '.join(EMBODIMENTS)}"
+        )
+    if (
+        body
+        and variant != "none"
+        and options.get("control_mode", body.control_mode) != (body.control_mode)
+    ):
+        raise UserError(
+            f"variants act on control mode {body.control_mode!r}, not on "
+            f"{options['control_mode']!r}; leave control_mode out"
+        )
+
+
+def _keywords(*functions: Any) -> set[str]:
     """Names of the arguments that may be given by keyword to any of the functions."""
     kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     parameters = (p for f in functions for p in inspect.signature(f).parameters.values())
-    return {p.name for p in parameters if p.kind in kinds} - {"self", "task"}
+    return {p.name for p in parameters if p.kind in kinds}
