@@ -162,6 +162,18 @@ class Layout:
         """Act with (angle, reflect) on the last axis of ``x [..., dim]``."""
         return x @ self.matrix(angle, reflect, x.dtype).to(x.device).T
 
+    def rotate(self, x: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+        """Turn every row of ``x [N, dim]`` by its own ``angle [N]`` (radians)."""
+        frequency = torch.cat([torch.full((f.dim,), float(f.frequency)) for f in self.fields]).to(x)
+        turn = frequency * angle.to(x)[:, None]
+        partner = torch.arange(self.dim)
+        sign = torch.zeros(self.dim)
+        for block in self.blocks:
+            if block.stop - block.start == 2:
+                partner[block] = partner[block].flip(0)
+                sign[block] = torch.tensor([-1.0, 1.0])
+        return turn.cos() * x + turn.sin() * sign.to(x) * x[:, partner.to(x.device)]
+
     def field_type(self, group: Group) -> escnn.nn.FieldType:
         """escnn's field type over a point, in the same basis as :meth:`matrix`."""
         import escnn.nn

@@ -31,7 +31,8 @@ from bench.tasks.rotations import (
     transform_angular,
     transform_quaternion,
 )
-from bench.variants import Role, Strength, parse
+from bench.variants import Role, Strength, overriding, parse
+from bench.variants.friction import Frictions
 from policies.errors import UserError
 from policies.geometry import Field, Layout
 
@@ -45,6 +46,9 @@ GRIPPER_FIELDS = (
     Field("tcp_z_axis", 1),
     Field("gripper_width", 0),
 )
+
+
+GRIPPER_LAYOUT = Layout(GRIPPER_FIELDS)
 
 
 class SymmetricTask(GymEnv):
@@ -64,6 +68,9 @@ class SymmetricTask(GymEnv):
     task_fields: ClassVar[tuple[Field, ...]]
     action_layout: ClassVar[Layout] = ACTION_LAYOUT
     workspace_center: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    spawn_extent: ClassVar[float]
+    """Radius about the origin, metres, within which every body that can collide stands at a reset
+    as a whole, as far as it is below 10 cm."""
     mirrored_across_yz: ClassVar[frozenset[str]] = frozenset()
     """Names of actors that are their own mirror image across their body y-z plane but not across
     x-z, the plane by which a reflection mirrors all others."""
@@ -93,6 +100,7 @@ class SymmetricTask(GymEnv):
                     f"{len(part.strength)} strengths of {part.name!r} were given for {num_envs} "
                     "environments; give one number, or one for each environment"
                 )
+            part.bind(self)
         self._reset_rows: torch.Tensor | None = None
         kwargs.setdefault("control_mode", self.body.control_mode)
         kwargs.setdefault("robot_uids", self.body.robot_uid)
@@ -103,6 +111,19 @@ class SymmetricTask(GymEnv):
     def _load_agent(self, options: dict) -> None:
         BaseEnv._load_agent(self, options, sapien.Pose(p=self.body.root_position))
 
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        for variant in self.variants:
+            variant.load_scene()
+        self._forces_held = False
+        self._extra_cost = torch.zeros(self.num_envs, device=self.device)
+        self._frictions = Frictions(self, overriding(self.variants, "friction"))
+
+    @property
+    def moving_bodies(self) -> list[Actor]:
+        """The task's dynamic bodies: everything that is neither robot nor furniture nor goal."""
+        return [a for a in self.scene.actors.values() if a.px_body_type == "dynamic"]
+
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         with torch.device(self.device):
             rng = self._batched_episode_rng[env_idx]
@@ -111,6 +132,8 @@ class SymmetricTask(GymEnv):
             self.agent.reset(torch.as_tensor(qpos, device=self.device))
             self.agent.robot.set_pose(sapien.Pose(p=self.body.root_position))
             self._place_objects(rng, len(env_idx))
+            for variant in self.variants:
+                variant.reset(env_idx)
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """What the scripted expert wants in the present state.
@@ -135,7 +158,7 @@ class SymmetricTask(GymEnv):
         tcp = self.seen(self.agent.tcp_pose, "tool")
         axes = quaternion_to_matrix(tcp.q)
         width = self.agent.robot.get_qpos()[:, -2:].sum(dim=1, keepdim=True)
-        return {
+        fields = {
             "tcp_xy": tcp.p[:, :2],
             "tcp_z": tcp.p[:, 2:],
             "tcp_x_axis": axes[:, :2, 0],
@@ -143,6 +166,7 @@ class SymmetricTask(GymEnv):
             "tcp_z_axis": axes[:, :2, 2],
             "gripper_width": width,
         }
+        return self._reported(fields, GRIPPER_LAYOUT)
 
     def seen(self, pose: Pose, role: Role) -> Pose:
         """A true pose as the observation reports it: variants of perception distort it.
@@ -159,7 +183,32 @@ class SymmetricTask(GymEnv):
         fields = self._observe_task()
         expected = [field.name for field in self.task_fields]
         assert list(fields) == expected, f"fields {list(fields)} are not the layout's {expected}"
-        return fields
+        return self._reported(fields, self._task_layout)
+
+    @functools.cached_property
+    def _task_layout(self) -> Layout:
+        return Layout(self.task_fields)
+
+    def _reported(self, fields: dict[str, torch.Tensor], layout: Layout) -> dict[str, torch.Tensor]:
+        """The fields as variants of observation report them."""
+        distorting = overriding(self.variants, "observation")
+        if not distorting:
+            return fields
+        values = torch.cat(list(fields.values()), dim=1)
+        for variant in distorting:
+            values = variant.observation(values, layout)
+        return {name: values[:, layout.slice(name)] for name in fields}
+
+    @functools.cached_property
+    def policy_origin(self) -> torch.Tensor:
+        """Where the policy takes the workspace's centre to be, ``[N, 2]`` metres in the world."""
+        center = torch.tensor(self.workspace_center, device=self.device)
+        origin = center.expand(self.num_envs, 2)
+        for variant in self.variants:
+            shift = variant.origin()
+            if shift is not None:
+                origin = origin + shift
+        return origin
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         """The task's own fields ``[N, dim]``, in the order of ``task_fields``."""
@@ -173,14 +222,57 @@ class SymmetricTask(GymEnv):
         return obs, reward.float(), terminated, self.elapsed_steps >= self.max_episode_steps, info
 
     def _step_action(self, action: Any) -> Any:
-        if self.variants and isinstance(action, np.ndarray | torch.Tensor):
+        if not self.variants:
+            return super()._step_action(action)
+        if isinstance(action, np.ndarray | torch.Tensor):
             commanded = common.to_tensor(action, device=self.device).reshape(self.num_envs, -1)
             executed = self.body.bound(commanded)
             for variant in self.variants:
                 executed = variant.action(executed)
             # Where no variant acts, not even the rounding of the bound may.
             action = torch.where(self._broken[:, None], executed, commanded)
-        return super()._step_action(action)
+        self._hold_forces()
+        self._frictions.update()
+        costly = overriding(self.variants, "extra_cost")
+        before = self.agent.tcp_pose.p.clone() if costly else None
+        action = super()._step_action(action)
+        if before is not None:
+            moved = self.agent.tcp_pose.p - before
+            self._extra_cost = torch.stack([v.extra_cost(moved) for v in costly]).sum(dim=0)
+        return action
+
+    def _hold_forces(self) -> None:
+        """Let the variants' forces, which depend on masses alone, act in all substeps."""
+        if self._forces_held:
+            return
+        self._forces_held = True
+        for body in self.moving_bodies:
+            parts = [v.force(body) for v in overriding(self.variants, "force")]
+            forces = [force for force in parts if force is not None]
+            if forces:
+                self.hold_force(body, torch.stack(forces).sum(dim=0))
+
+    def get_info(self) -> dict:
+        """As ManiSkill's; where a variant makes steps costly, also ``extra_cost [N]``.
+
+        That is what the last control step cost beside the usual -1: it has been subtracted from
+        the reward, and is 0 at success.
+        """
+        info = super().get_info()
+        if overriding(self.variants, "extra_cost"):
+            info["extra_cost"] = torch.where(
+                info["success"] | (self._elapsed_steps == 0),
+                torch.zeros_like(self._extra_cost),
+                self._extra_cost,
+            )
+        return info
+
+    def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """As ManiSkill's, less the ``extra_cost`` of ``info`` (reward mode ``none`` aside)."""
+        reward = super().get_reward(obs=obs, action=action, info=info)
+        if "extra_cost" in info and self.reward_mode != "none":
+            reward = reward.float() - info["extra_cost"]
+        return reward
 
     @functools.cached_property
     def _broken(self) -> torch.Tensor:
@@ -265,6 +357,22 @@ class SymmetricTask(GymEnv):
             self._episode_rng = self._batched_episode_rng[0]
         else:
             super()._set_episode_rng(seed, env_idx)
+        self._advance_episode_keys(seed is not None)
+
+    def _advance_episode_keys(self, seeded: bool) -> None:
+        """A number for each episode that starts now: its seed, or the successor of the last key.
+
+        ManiSkill keeps an environment's seed over resets without one; variants that draw noise
+        need another key then, and must not draw from the generators that place the objects.
+        """
+        keys = torch.as_tensor(self._episode_seed, dtype=torch.int64, device=self.device)
+        if not hasattr(self, "episode_key"):
+            self.episode_key = keys.clone()
+        rows = slice(None) if self._reset_rows is None else self._reset_rows
+        if seeded:
+            self.episode_key[rows] = keys[rows]
+        else:
+            self.episode_key[rows] = self.episode_key[rows] * 6364136223846793005 + 1
 
     # ------------------------------------------------------------------- state
 

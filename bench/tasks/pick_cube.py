@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -39,6 +39,7 @@ class PickCube(SymmetricTask, PickCubeEnv):
         Field("cube_to_goal_z", 0),
     )
     spawn_radius = 0.1
+    spawn_extent: ClassVar[float] = 0.13
     goal_lift = 0.2
 
     def _place_objects(self, rng: Any, count: int) -> None:

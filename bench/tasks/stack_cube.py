@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -40,6 +40,7 @@ class StackCube(SymmetricTask, StackCubeEnv):
         Field("a_to_b_z", 0),
     )
     spawn_radius = 0.07
+    spawn_extent: ClassVar[float] = 0.18
     distance_range = (0.08, 0.16)
 
     def _place_objects(self, rng: Any, count: int) -> None:

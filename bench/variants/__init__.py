@@ -1,5 +1,27 @@
 """Ways to break the symmetry, each with one dial; see :mod:`bench.variants.base`."""
 
-from bench.variants.base import Role, Strength, Variant, describe, parse, variant_names
+from bench.variants.base import (
+    Role,
+    Strength,
+    Variant,
+    describe,
+    evaluated,
+    highest_cost,
+    overriding,
+    parse,
+    registry,
+    variant_names,
+)
 
-__all__ = ["Role", "Strength", "Variant", "describe", "parse", "variant_names"]
+__all__ = [
+    "Role",
+    "Strength",
+    "Variant",
+    "describe",
+    "evaluated",
+    "highest_cost",
+    "overriding",
+    "parse",
+    "registry",
+    "variant_names",
+]

@@ -19,6 +19,7 @@ class ActionGain(Variant):
 
     name = "action_gain"
     breaks = "actuation"
+    moves = frozenset({"dynamics"})
 
     def action(self, action: torch.Tensor) -> torch.Tensor:
         x = ACTION_LAYOUT.slice("xy").start

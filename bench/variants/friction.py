@@ -1,0 +1,89 @@
+"""Friction per environment: what variants add to the coefficients of bodies and table.
+
+PhysX takes the mean of two shapes' coefficients where they touch (SAPIEN does not offer another
+rule). A material may be shared between environments, so bodies in environments where a variant
+acts on friction get materials of their own, before the simulation starts; all others keep theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import sapien.physx as physx
+import torch
+from mani_skill.utils.structs import Actor
+
+if TYPE_CHECKING:
+    from bench.tasks.base import SymmetricTask
+    from bench.variants.base import Variant
+
+
+@dataclass
+class _Surface:
+    """A body's own materials in the environments where a variant acts, with their first values."""
+
+    body: Actor
+    materials: dict[int, list[tuple[physx.PhysxMaterial, float, float]]]
+    written: torch.Tensor
+
+
+class Frictions:
+    """Keeps the friction of the dynamic bodies and the table at what the variants make of it.
+
+    Args:
+        env: whose scene is complete and not yet simulated.
+        variants: those that add to friction.
+    """
+
+    def __init__(self, env: SymmetricTask, variants: Sequence[Variant]):
+        self.variants = variants
+        self.surfaces: list[_Surface] = []
+        if not variants:
+            return
+        active = torch.stack([variant.active for variant in variants]).any(dim=0).tolist()
+        for body in [env.table_scene.table, *env.moving_bodies]:
+            materials = {
+                scene: [_own_material(shape) for shape in part.collision_shapes]
+                for scene, part in zip(body._scene_idxs.tolist(), body._bodies, strict=True)
+                if active[scene]
+            }
+            self.surfaces.append(
+                _Surface(body, materials, torch.zeros(env.num_envs, device=env.device))
+            )
+        self.update()
+
+    def update(self) -> None:
+        """Write the coefficients that have changed since they were last written."""
+        for surface in self.surfaces:
+            parts = [variant.friction(surface.body) for variant in self.variants]
+            added = torch.zeros_like(surface.written)
+            for part in parts:
+                if part is not None:
+                    added = added + part
+            for row in (added != surface.written).nonzero().flatten().tolist():
+                extra = float(added[row])
+                for material, static, dynamic in surface.materials[row]:
+                    material.static_friction = static + extra
+                    material.dynamic_friction = dynamic + extra
+            surface.written = added
+
+
+def _own_material(shape: physx.PhysxCollisionShape) -> tuple[physx.PhysxMaterial, float, float]:
+    """Give a shape a copy of its material; also its static and dynamic friction."""
+    old = shape.physical_material
+    static, dynamic = old.static_friction, old.dynamic_friction
+    shape.physical_material = physx.PhysxMaterial(
+        static_friction=static, dynamic_friction=dynamic, restitution=old.restitution
+    )
+    return shape.physical_material, static, dynamic
+
+
+def friction_of(body: Actor, num_envs: int) -> torch.Tensor:
+    """Smallest static friction among the shapes of a body, ``[N]``."""
+    values = torch.zeros(num_envs, device=body.device)
+    for scene, part in zip(body._scene_idxs.tolist(), body._bodies, strict=True):
+        shapes = part.collision_shapes
+        values[scene] = min(shape.physical_material.static_friction for shape in shapes)
+    return values
