@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import sapien
 import sapien.physx as physx
@@ -269,6 +269,7 @@ def create(
     num_envs: int,
     sim: Simulator = "cpu",
     render: bool = False,
+    workers: int = 1,
     **kwargs: Any,
 ) -> BaseEnv:
     """Make N parallel environments of a ManiSkill task.
@@ -278,6 +279,8 @@ def create(
         num_envs: how many environments.
         sim: ``"cpu"`` or ``"cuda"``.
         render: whether ``env.render()`` must give pictures; needs a Vulkan driver.
+        workers: processes that share the environments; see `bench.sim.shards.ShardedEnv`, which
+            is what is returned for more than one.
         kwargs: passed on to the class.
 
     Raises:
@@ -288,4 +291,13 @@ def create(
         raise UserError(f"num_envs is {num_envs}, but at least one environment is needed.")
     if render:
         kwargs.setdefault("render_mode", "rgb_array")
+    if workers != 1:
+        if sim != "cpu":
+            raise UserError(
+                f"workers={workers} divides CPU physics among processes; the GPU simulates all "
+                "environments in one: leave workers out, or use sim='cpu'"
+            )
+        from bench.sim.shards import ShardedEnv
+
+        return cast(BaseEnv, ShardedEnv(env_cls, num_envs, workers, **kwargs))
     return make_env_class(env_cls, sim)(num_envs=num_envs, **kwargs)  # type: ignore[arg-type]

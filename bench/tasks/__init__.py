@@ -14,19 +14,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
+import numpy as np
+import torch
 
 from bench.sim import create
 from bench.sim.environment import Simulator
 from bench.tasks.base import SymmetricTask
 from bench.tasks.embodiments import EMBODIMENTS
+from bench.tasks.lift_peg_upright import LiftPegUpright
 from bench.tasks.pick_cube import PickCube
 from bench.tasks.place_sphere import PlaceSphere
 from bench.tasks.poke_cube import PokeCube
 from bench.tasks.pull_cube import PullCube
 from bench.tasks.push_cube import PushCube
+from bench.tasks.push_t import PushT
 from bench.tasks.registration import make_batched, make_single, register
 from bench.tasks.stack_cube import StackCube
-from bench.variants import Strength
+from bench.variants import Strength, parse
 from policies.errors import UserError
 
 __all__ = [
@@ -47,7 +51,9 @@ _TASKS: dict[str, type[SymmetricTask]] = {
         PickCube,
         StackCube,
         PlaceSphere,
+        LiftPegUpright,
         PokeCube,
+        PushT,
     )
 }
 
@@ -85,6 +91,7 @@ def make(
     obs_mode: str = "state",
     reward_mode: str = "sparse",
     render: bool = False,
+    workers: int = 1,
     **kwargs: Any,
 ) -> SymmetricTask:
     """Make N parallel environments of a task.
@@ -99,17 +106,19 @@ def make(
         obs_mode: ManiSkill's; ``state`` is what ``observation_layout`` describes.
         reward_mode: ManiSkill's.
         render: whether ``env.render()`` must work.
+        workers: processes that share the environments, at most ``num_envs``. More than one give
+            the same numbers from more cores; what lives in the simulation (``env.agent``,
+            ``env.scene``, a task's actors) is then out of reach.
         kwargs: further arguments of ManiSkill's task class.
 
     Raises:
-        UserError: unknown task, embodiment, variant or simulator, or a strength out of range.
+        UserError: unknown task, embodiment, variant or simulator, a strength or the number of
+            workers out of range.
     """
     env_class = task_class(task)
     if embodiment not in EMBODIMENTS:
         raise UserError(unknown_name("embodiment", embodiment, embodiments()))
-    return create(
-        env_class,
-        num_envs=num_envs,
+    kwargs.update(
         sim=sim,
         render=render,
         embodiment=embodiment,
@@ -117,8 +126,16 @@ def make(
         strength=strength,
         obs_mode=obs_mode,
         reward_mode=reward_mode,
-        **kwargs,
     )
+    if workers == 1:
+        return create(env_class, num_envs, **kwargs)
+    variants = parse(variant, strength)
+    if np.ndim(strength):
+        kwargs.update(strength=None, per_env={"strength": torch.as_tensor(strength)})
+    env = create(env_class, num_envs, workers=workers, attributes={"variants": variants}, **kwargs)
+    for part in variants:
+        part.bind(env)
+    return env
 
 
 def unknown_name(kind: str, name: str, valid: Sequence[str]) -> str:

@@ -1,0 +1,484 @@
+"""N parallel environments in W processes, for a user who need not know."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+import signal
+import weakref
+from collections.abc import Mapping, Sequence
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Any, NoReturn
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from bench.sim.shards.block import (
+    Field,
+    SharedBlock,
+    put_together,
+    select,
+    take_apart,
+)
+from bench.sim.shards.messages import FAILURE, MISTAKE, SAME, Recipe, divide
+from bench.sim.shards.server import WorkerProcess
+from policies.errors import UserError
+
+_BYTES_PER_ENV = 2**16
+"""Room for one environment's actions, and for its results; what is larger goes through a pipe."""
+
+_GOODBYE_SECONDS = 5.0
+"""How long a worker may take to end once it is told to."""
+
+
+class WorkerError(Exception):
+    """A worker process failed or ended; its cause holds the worker's own traceback, if any."""
+
+
+class NotHere(UserError, AttributeError):
+    """Something was asked for that lives in the worker processes."""
+
+
+class ShardedEnv(gym.Env):
+    """N environments of a ManiSkill task in W worker processes.
+
+    To its user it is the environment that one process would hold: resets (seeds, partial resets,
+    reconfiguration), steps, states, observations, info and spaces are the same, to the bit for
+    tasks that draw only from their environments' own generators (all of SymSteer's do;
+    ManiSkill's stock tasks draw for the batch). Tensors that it returns are the caller's own.
+
+    What cannot be had is what lives in the workers (``env.agent``, ``env.scene``, a task's
+    actors): asking for it raises one sentence.
+
+    Args:
+        env_cls: task class, importable by its name.
+        num_envs: N; uneven shards where W does not divide it.
+        workers: W, at most N; more than there are cores only costs time and memory.
+        per_env: arguments of the class with one entry per environment.
+        attributes: what the environment shall have besides, under these names.
+        kwargs: further arguments of `bench.sim.create`.
+
+    Raises:
+        UserError: the number of workers is out of range, an argument cannot be sent to another
+            process, or the environments cannot be made.
+        WorkerError: a worker failed or ended.
+    """
+
+    def __init__(
+        self,
+        env_cls: type,
+        num_envs: int,
+        workers: int,
+        per_env: Mapping[str, Any] | None = None,
+        attributes: Mapping[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if not 1 <= workers <= num_envs:
+            raise UserError(
+                f"workers is {workers}; it must be at least 1 and at most the number of "
+                f"environments, {num_envs}"
+            )
+        for name, values in (per_env or {}).items():
+            if len(values) != num_envs:
+                raise UserError(
+                    f"{name} has {len(values)} entries for {num_envs} environments; give one "
+                    "number, or one for each environment"
+                )
+        self.num_envs, self.workers = num_envs, workers
+        self.device = torch.device("cpu")
+        self._env_cls = env_cls
+        self._rows = divide(num_envs, workers)
+        self._closed: str | None = None
+        self._pool = _Pool(
+            [
+                _recipe(env_cls, rows, i, {k: v[rows] for k, v in (per_env or {}).items()}, kwargs)
+                for i, rows in enumerate(self._rows)
+            ],
+            num_envs,
+            preload=env_cls.__module__,
+        )
+        self._end = weakref.finalize(self, self._pool.close)
+        try:
+            facts = self._ask("facts", [()] * workers)
+        except BaseException:
+            self._end()
+            raise
+        self._elapsed: torch.Tensor = facts.pop("elapsed_steps")
+        for name in ("observation_space", "action_space"):
+            single = facts.get(f"single_{name}")
+            if single is not None:
+                facts[name] = gym.vector.utils.batch_space(single, n=num_envs)
+        for name, value in {**facts, **(attributes or {})}.items():
+            setattr(self, name, value)
+
+    # ------------------------------------------------------------------ stepping
+    @property
+    def elapsed_steps(self) -> torch.Tensor:
+        """Control steps since each environment's last reset, ``[N]``."""
+        return self._elapsed
+
+    def step(self, action: Any) -> tuple:
+        """One control step of every environment; see ManiSkill's ``BaseEnv.step``."""
+        if action is None or isinstance(action, dict):
+            parts = [select(_tensors(action), self.num_envs, rows) for rows in self._rows]
+            *result, elapsed = self._ask("step", [(None, part) for part in parts])
+        else:
+            given = self._give(action, "step")
+            *result, elapsed = self._ask("step", [(given,)] * self.workers)
+        self._elapsed = elapsed
+        return tuple(result)
+
+    def step_chunk(self, actions: Any) -> tuple:
+        """The steps of an action chunk with one exchange between processes.
+
+        Args:
+            actions: ``[N, T, action_dim]``.
+
+        Returns:
+            What T calls of :meth:`step` return, with a second axis for the step: observations
+            ``[N, T, ...]``, rewards, terminated and truncated ``[N, T]``, info. Nothing is reset
+            on the way.
+        """
+        given = self._give(actions, "step_chunk")
+        if len(given.shape) != 2 or given.shape[0] == 0:
+            raise UserError(
+                "step_chunk takes actions of shape [environments, steps, action]; their shape is "
+                f"{[self.num_envs, *given.shape]}"
+            )
+        *result, self._elapsed = self._ask("step_chunk", [(given,)] * self.workers)
+        return tuple(result)
+
+    def _give(self, actions: Any, method: str) -> Field:
+        """Lay actions into the shared memory; says what lies there."""
+        actions = _tensors(actions if hasattr(actions, "dtype") else np.asarray(actions))
+        if not actions.ndim or len(actions) != self.num_envs:
+            raise UserError(
+                f"{method} takes one row of actions for each of the {self.num_envs} environments; "
+                f"the actions' shape is {list(actions.shape)}"
+            )
+        given = Field.of(actions)
+        inbox = self._pool.inbox
+        if not inbox.fits((given,)):
+            raise UserError(
+                f"{method} takes at most {_BYTES_PER_ENV} bytes of actions per environment; these "
+                f"are {given.bytes(1)}"
+            )
+        inbox.fields((given,))[0][:] = actions
+        return given
+
+    # ------------------------------------------------------------------ resets
+    def reset(self, *, seed: Any = None, options: dict | None = None) -> tuple:
+        """As one process would: see ``SymmetricTask.reset``.
+
+        Args:
+            seed: one integer (expanded as ManiSkill does), one per environment that is reset,
+                or None.
+            options: ``env_idx`` selects the environments to reset, in any order.
+
+        Raises:
+            UserError: there are fewer or more seeds than environments, or some environments
+                alone are to be reconfigured.
+        """
+        options = dict(options or {})
+        partial = options.pop("env_idx", None)
+        if partial is None:
+            index, order = torch.arange(self.num_envs), torch.arange(self.num_envs)
+        else:
+            index, order = _index(partial).sort()
+            if options.get("reconfigure") and len(index) != self.num_envs:
+                raise UserError(
+                    "some environments alone cannot be reconfigured: leave out env_idx or "
+                    "reconfigure"
+                )
+        seeds = None
+        if seed is not None:
+            seeds = [int(s) for s in np.atleast_1d(np.asarray(seed))]
+            if len(seeds) not in (1, len(index)):
+                raise UserError(
+                    f"{len(seeds)} seeds were given for {len(index)} environments; give one each"
+                )
+            if len(seeds) == len(index):
+                seeds = [seeds[i] for i in order.tolist()]
+            else:
+                more = np.random.RandomState(seeds[0]).randint(2**31, size=len(index) - 1)
+                seeds += more.tolist()
+        states = options.pop("reset_to_env_states", None)
+        requests = []
+        for rows in self._rows:
+            mine = ((index >= rows.start) & (index < rows.stop)).nonzero().flatten()
+            part = dict(options)
+            if partial is not None:
+                part["env_idx"] = index[mine] - rows.start
+            if states is not None:
+                part["reset_to_env_states"] = select(_tensors(states), len(index), mine)
+            requests.append((None if seeds is None else [seeds[i] for i in mine.tolist()], part))
+        obs, info, self._elapsed = self._ask("reset", requests)
+        info["reconfigure"] = bool(options.get("reconfigure", False))
+        return obs, info
+
+    # ------------------------------------------------------------------ reading and writing
+    def _call(self, name: str, *args: Any) -> Any:
+        result, self._elapsed = self._ask("call", [(name, *args)] * self.workers)
+        return result
+
+    def get_obs(self, info: dict | None = None) -> Any:
+        """The present observation."""
+        return self._call("get_obs")
+
+    def get_info(self) -> dict:
+        """The present info."""
+        return self._call("get_info")
+
+    def evaluate(self) -> dict:
+        """Success and what else the task says about the present state."""
+        return self._call("evaluate")
+
+    def get_state_dict(self) -> dict:
+        """State of simulation and controllers, tensors ``[N, ...]``."""
+        return self._call("get_state_dict")
+
+    def get_state(self) -> torch.Tensor:
+        """The state dictionary as one tensor ``[N, ...]``."""
+        return self._call("get_state")
+
+    def set_state_dict(self, state: dict, env_idx: Any = None) -> None:
+        """Restore a state; see ``SymmetricTask.set_state_dict``.
+
+        Args:
+            state: tensors or arrays with a row per environment that is set.
+            env_idx: which environments, in the order of the rows; None for all.
+        """
+        self._set("set_state_dict", state, env_idx)
+
+    def set_state(self, state: Any, env_idx: Any = None) -> None:
+        """The same for a state as one tensor."""
+        self._set("set_state", state, env_idx)
+
+    def _set(self, name: str, state: Any, env_idx: Any) -> None:
+        index = torch.arange(self.num_envs) if env_idx is None else _index(env_idx)
+        state = _batched(_tensors(state))
+        requests: list[tuple | None] = []
+        for rows in self._rows:
+            mine = ((index >= rows.start) & (index < rows.stop)).nonzero().flatten()
+            part = select(state, len(index), mine)
+            local = None if env_idx is None else index[mine] - rows.start
+            requests.append((name, part, local) if len(mine) else None)
+        self._ask("call", requests)
+
+    def transform_state(self, state: dict, angle: float, reflect: bool = False) -> dict:
+        """Turn a state about the workspace centre; see ``SymmetricTask.transform_state``."""
+        request = ("transform_state", _tensors(state), angle, reflect)
+        requests: list[tuple | None] = [request, *[None] * (self.workers - 1)]
+        turned, _ = self._ask("call", requests)
+        return turned
+
+    def render(self) -> Any:
+        """Pictures of all environments, where ``render_mode`` asked for them."""
+        return self._call("render")
+
+    # ------------------------------------------------------------------ the rest
+    def close(self) -> None:
+        """End the workers. What was returned stays valid."""
+        self._closed = self._closed or "it was closed"
+        self._end()
+
+    def __getattr__(self, name: str) -> Any:
+        """Constants of the task class; all else lives in the workers."""
+        if name.startswith("_"):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        missing = object()
+        found = inspect.getattr_static(self._env_cls, name, missing)
+        if found is not missing:
+            if isinstance(found, classmethod | staticmethod):
+                return getattr(self._env_cls, name)
+            if not (callable(found) or hasattr(type(found), "__get__")) and found is not None:
+                return found
+        raise NotHere(
+            f"env.{name} lives in the worker processes of this environment: make it with "
+            "workers=1 to reach it"
+        )
+
+    def __str__(self) -> str:
+        return f"<{self.workers} workers with {self.num_envs} environments of {self._env_cls}>"
+
+    def _ask(self, name: str, requests: Sequence[tuple | None]) -> Any:
+        """Send every worker its request (None: none) and join the answers."""
+        if self._closed:
+            raise UserError(f"this environment cannot be used any more, {self._closed}")
+        try:
+            return self._pool.ask(name, requests)
+        except (UserError, WorkerError):
+            if self._pool.lost:
+                self._closed = f"because {self._pool.lost}"
+            raise
+        except BaseException as error:
+            # Interrupted between question and answer: what comes next would answer the wrong one.
+            self._closed = f"because {type(error).__name__} interrupted it"
+            self._end()
+            raise
+
+
+class _Pool:
+    """The worker processes, the memory shared with them, and one exchange with all."""
+
+    def __init__(self, recipes: list[bytes], num_envs: int, preload: str) -> None:
+        self.rows = divide(num_envs, len(recipes))
+        self.inbox = SharedBlock(_BYTES_PER_ENV * num_envs, num_envs)
+        self.outbox = SharedBlock(_BYTES_PER_ENV * num_envs, num_envs)
+        self.lost = ""
+        self.processes: list[WorkerProcess] = []
+        self.connections: list[Connection] = []
+        self.answers: list[dict[str, tuple]] = [{} for _ in recipes]
+        WorkerProcess.preload(preload)
+        from bench.sim.shards.serve import serve
+
+        try:
+            for i, recipe in enumerate(recipes):
+                ours, theirs = Pipe()
+                self.connections.append(ours)
+                process = WorkerProcess(
+                    target=serve,
+                    args=(theirs, self.inbox, self.outbox),
+                    name=f"symsteer-shard-{i + 1}-of-{len(recipes)}",
+                    daemon=True,
+                )
+                with theirs:
+                    process.start()
+                self.processes.append(process)
+                ours.send_bytes(recipe)
+        except BaseException:
+            self.close()
+            raise
+        finally:
+            self.inbox.close_descriptor()
+            self.outbox.close_descriptor()
+
+    def ask(self, name: str, requests: Sequence[tuple | None]) -> Any:
+        asked = [i for i, request in enumerate(requests) if request is not None]
+        for i in asked:
+            try:
+                self.connections[i].send_bytes(pickle.dumps((name, requests[i])))
+            except (BrokenPipeError, ConnectionResetError):
+                self._mourn(i)
+        # All answers are taken before any error is raised: none is left for the next question.
+        errors: list[Exception] = []
+        for i in asked:
+            try:
+                answer = self.connections[i].recv_bytes()
+            except (EOFError, ConnectionResetError):
+                self._mourn(i)
+            kind, content = answer[:1], answer[1:]
+            if kind == MISTAKE:
+                errors.append(UserError(content.decode()))
+            elif kind == FAILURE:
+                errors.append(self._failure(i, *pickle.loads(content)))
+            elif kind != SAME:
+                self.answers[i][name] = pickle.loads(content)
+        if errors:
+            # The cause of all is more likely a bug than one user's mistake seen by some.
+            raise next((e for e in errors if isinstance(e, WorkerError)), errors[0])
+        return self._join(name, asked)
+
+    def _join(self, name: str, asked: list[int]) -> Any:
+        answers = [self.answers[i][name] for i in asked]
+        fields, skeleton, carried = answers[0]
+        if any(answer[0] != fields for answer in answers):
+            raise RuntimeError(f"the workers' answers to {name!r} do not fit together")
+        if carried is not None:
+            rows = [
+                torch.cat([torch.from_numpy(answer[2][k]) for answer in answers])
+                for k in range(len(fields))
+            ]
+        elif len(asked) == len(self.rows):
+            rows = [view.clone() for view in self.outbox.fields(fields)]
+        else:
+            rows = [
+                torch.cat([view[self.rows[i]] for i in asked]) for view in self.outbox.fields(fields)
+            ]
+        return put_together(skeleton, rows)
+
+    def _failure(self, i: int, summary: str, trace: str) -> WorkerError:
+        error = WorkerError(f"{self._name(i)} failed with {summary}")
+        error.__cause__ = WorkerError(f"\n{trace}")
+        return error
+
+    def _mourn(self, i: int) -> NoReturn:
+        process = self.processes[i]
+        process.join(_GOODBYE_SECONDS)
+        code = process.exitcode
+        if code is None:
+            how = "hung up"
+        elif code < 0:
+            try:
+                how = f"was killed by {signal.Signals(-code).name}"
+            except ValueError:
+                how = f"was killed by signal {-code}"
+            if -code == signal.SIGKILL:
+                how += " (as the system does when memory runs out)"
+        else:
+            how = f"ended with exit code {code}"
+        self.lost = f"{self._name(i)} {how}"
+        self.close()
+        raise WorkerError(
+            f"{self.lost}, and the environments with it: make the environment again"
+        ) from None
+
+    def _name(self, i: int) -> str:
+        rows = self.rows[i]
+        return (
+            f"worker {i + 1} of {len(self.rows)} (environments {rows.start} to {rows.stop - 1})"
+        )
+
+    def close(self) -> None:
+        """Hang up, wait for the workers to end, kill those that do not."""
+        for connection in self.connections:
+            connection.close()
+        for process in self.processes:
+            process.join(_GOODBYE_SECONDS)
+            if process.is_alive():
+                process.kill()
+                process.join()
+            process.close()
+        self.processes.clear()
+
+
+def _recipe(
+    env_cls: type, rows: slice, number: int, per_env: dict[str, Any], kwargs: dict[str, Any]
+) -> bytes:
+    if env_cls.__module__ == "__main__" or "<locals>" in env_cls.__qualname__:
+        raise UserError(
+            f"workers import the task class {env_cls.__qualname__} by its name, which they cannot: "
+            "define it at the top level of a module other than the main program, or use workers=1"
+        )
+    seed = (torch.initial_seed() + number) % 2**63
+    recipe = Recipe(env_cls, rows.start, rows.stop - rows.start, seed, {**kwargs, **per_env})
+    try:
+        return pickle.dumps(recipe)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise UserError(
+            f"an argument of the environment cannot be sent to a worker process ({error}): "
+            "give plain data, or use workers=1"
+        ) from error
+
+
+def _index(env_idx: Any) -> torch.Tensor:
+    return torch.as_tensor(env_idx, dtype=torch.long).cpu().flatten()
+
+
+def _tensors(tree: Any) -> Any:
+    """The tree with its arrays as tensors, doubles as ManiSkill takes them."""
+    if isinstance(tree, dict):
+        return {key: _tensors(value) for key, value in tree.items()}
+    if isinstance(tree, np.ndarray):
+        tensor = torch.from_numpy(tree)
+        return tensor.float() if tensor.dtype == torch.float64 else tensor
+    return tree.detach().cpu() if isinstance(tree, torch.Tensor) else tree
+
+
+def _batched(tree: Any) -> Any:
+    """A leading axis of environments for a state that was given without one."""
+    if isinstance(tree, dict):
+        return {key: _batched(value) for key, value in tree.items()}
+    return tree[None] if isinstance(tree, torch.Tensor) and tree.ndim == 1 else tree
