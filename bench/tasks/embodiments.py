@@ -41,6 +41,8 @@ class Embodiment:
     control_mode: str = "pd_ee_delta_pose"
     noise_scale: float = 1.0
     """How much action noise demonstrations bear here, relative to the floating gripper."""
+    drag_gain: float = 1.0
+    """What an expert multiplies displacements by while it drags a load over the table."""
 
     def initial_qpos(self, rng: Any, count: int) -> np.ndarray:
         """Joint positions at a reset, ``[count, dof]``, from one random generator per row."""
@@ -58,6 +60,19 @@ class Embodiment:
             turn: wanted rotation vector in the world, ``[N, 3]`` radians.
         """
         raise NotImplementedError
+
+    def reachable_turn(
+        self, qpos: torch.Tensor, turn: torch.Tensor, period: float, later: torch.Tensor
+    ) -> torch.Tensor:
+        """Which of several turns of the tool that serve alike to take, ``[N]`` radians.
+
+        Args:
+            qpos: joint positions, ``[N, dof]``.
+            turn: the smallest of them, about the vertical, ``[N]``.
+            period: what they differ by; a half turn where the fingers may be exchanged.
+            later: further turn that is to follow, ``[N]``.
+        """
+        return turn
 
     def transform_robot(self, state: torch.Tensor, angle: float, reflect: bool) -> torch.Tensor:
         """Act with (angle, reflect) on an articulation state ``[N, 13 + 2 dof]``.
@@ -188,6 +203,9 @@ class PandaArm(Embodiment):
     step: float = 0.1
     gain: float = 2.0
     noise_scale: float = 0.6
+    # Of joint 7, whose stops are at 2.897 rad.
+    wrist_limit: float = 2.87
+    drag_gain: float = 1.8
 
     def initial_qpos(self, rng: Any, count: int) -> np.ndarray:
         qpos = np.tile(np.asarray(Panda.keyframes["rest"].qpos, dtype=np.float64), (count, 1))
@@ -210,6 +228,23 @@ class PandaArm(Embodiment):
         move = scale * move
         move = move / move.abs().amax(dim=1, keepdim=True).clamp_min(1.0)
         return torch.cat([move, -scale * turn], dim=1)
+
+    def reachable_turn(
+        self, qpos: torch.Tensor, turn: torch.Tensor, period: float, later: torch.Tensor
+    ) -> torch.Tensor:
+        """The smallest turn that keeps joint 7 within its limits.
+
+        A grasp may end 0.2 rad short of its turn: closing fingers align the object.
+        """
+        turns = turn[:, None] + period * turn.new_tensor([0.0, -1.0, 1.0])
+        # Seen from above, the joint runs against the tool's yaw.
+        there = qpos[:, 6:7] - turns
+        excess = (there.abs() - self.wrist_limit - 0.2).maximum(
+            (there - later[:, None]).abs() - self.wrist_limit
+        )
+        excess = excess.clamp_min(0.0)
+        best = (turns.abs() + 100.0 * excess).argmin(dim=1, keepdim=True)
+        return turns.gather(1, best)[:, 0]
 
 
 EMBODIMENTS: dict[str, Embodiment] = {e.name: e for e in (Floating(), PandaArm())}

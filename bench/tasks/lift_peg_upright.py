@@ -1,0 +1,135 @@
+"""Set a lying peg upright."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.envs.tasks.tabletop.lift_peg_upright import LiftPegUprightEnv
+from mani_skill.utils.structs import Actor
+
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import CLOSED, OPEN, Intent, choose, finger_width, grasp_at, yaw_along
+from bench.tasks.features import bar_grasp_yaw, disc, flat_pose, twofold_yaw
+from bench.tasks.rotations import quaternion_to_matrix
+from policies.geometry import Field
+
+
+class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
+    """ManiSkill's LiftPegUpright-v1 with rotation-symmetric resets and success.
+
+    Reset: the peg lies with its centre uniform in a disc of 10 cm radius and its direction
+    uniform on the circle (stock: a square, always along x). Success is stock's (axis within
+    0.08 rad of the vertical, centre within 5 mm of half the peg's length) with the tilt measured
+    from the axis itself: stock takes it from an Euler angle, which is that tilt only while the
+    peg leans about its own body z axis, and which for some bearings calls any peg upright. The
+    dense reward is ManiSkill's, invariant as it stands.
+
+    The peg is a box with a square section whose two ends differ in paint only: it is its own
+    image under half turns, so its axis is observed up to its sign, as the three irreps of the
+    symmetric traceless tensor of the axis.
+    """
+
+    task_id = "LiftPegUpright-v1"
+    max_episode_steps = 50
+    task_fields = (
+        Field("peg_xy", 1),
+        Field("peg_z", 0),
+        Field("peg_line", 2),
+        Field("peg_lean", 1),
+        Field("peg_rise", 0),
+        Field("tcp_to_peg_xy", 1),
+        Field("tcp_to_peg_z", 0),
+        Field("grasp_yaw_cos", 0),
+        Field("grasp_yaw_sin", 0, odd=True),
+    )
+    spawn_radius = 0.1
+    spawn_extent = 0.223
+    upright_tolerance = 0.08
+    height_tolerance = 0.005
+    grip_from_end = 0.02
+    grip_force = 6.0
+
+    def _place_objects(self, rng: Any, count: int) -> None:
+        u = rng.uniform(size=3)
+        yaw = 2 * np.pi * u[:, 2]
+        xy = disc(u[:, :2], self.spawn_radius)
+        self.peg.set_pose(flat_pose(xy, self.peg_half_width, yaw, self.device))
+
+    @property
+    def manipulated(self) -> Actor:
+        """The peg."""
+        return self.peg
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """``success [N]``: the peg is upright to 0.08 rad and stands at its height to 5 mm."""
+        axis = quaternion_to_matrix(self.peg.pose.q)[:, :, 0]
+        tilt = torch.atan2(axis[:, :2].norm(dim=1), axis[:, 2].abs())
+        height = (self.peg.pose.p[:, 2] - self.peg_half_length).abs()
+        return {"success": (tilt < self.upright_tolerance) & (height < self.height_tolerance)}
+
+    def _observe_task(self) -> dict[str, torch.Tensor]:
+        tcp = self.seen(self.agent.tcp_pose, "tool")
+        peg = self.seen(self.peg.pose, "object")
+        axis = quaternion_to_matrix(peg.q)[:, :, 0]
+        to_peg = peg.p - tcp.p
+        return {
+            "peg_xy": peg.p[:, :2],
+            "peg_z": peg.p[:, 2:],
+            "peg_line": twofold_yaw(peg.q),
+            "peg_lean": axis[:, 2:] * axis[:, :2],
+            "peg_rise": axis[:, 2:] ** 2,
+            "tcp_to_peg_xy": to_peg[:, :2],
+            "tcp_to_peg_z": to_peg[:, 2:],
+            **bar_grasp_yaw(tcp.q, peg.q),
+        }
+
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """Grasp the peg near an end, raise that end about the other one, let go.
+
+        The grip is so loose that the peg turns between the fingers, and it is let go a little
+        early: a peg that leans less than 0.2 rad falls onto its foot.
+        """
+        tcp, peg = self.agent.tcp_pose.p, self.peg.pose
+        axis = quaternion_to_matrix(peg.q)[:, :, 0]
+        # The end to be raised: the higher one; of a lying peg the nearer one.
+        towards = tcp - peg.p
+        towards = torch.cat([towards[:, :2], torch.zeros_like(towards[:, 2:])], dim=1)
+        score = (axis * towards).sum(dim=1) + axis[:, 2]
+        axis = torch.where(score[:, None] < 0, -axis, axis)
+        handle = peg.p + (self.peg_half_length - self.grip_from_end) * axis
+        yaw = yaw_along(self, axis[:, :2])
+        qpos = self.agent.robot.get_qpos()
+        yaw = self.body.reachable_turn(qpos, yaw, math.pi, torch.zeros_like(yaw))
+        # Half the turn, so that fingers come down at twice the misalignment that others allow:
+        # they turn the peg as they close.
+        approach, held = grasp_at(self, handle + offset, handle, yaw / 2, 2 * self.peg_half_width)
+        approach = replace(approach, yaw=2 * approach.yaw)
+        # Along the circle about the other end, in the vertical plane of the axis.
+        rise = axis[:, 2]
+        flat = axis[:, :2].norm(dim=1)
+        bearing = axis[:, :2] / flat[:, None].clamp_min(1e-6)
+        tilt = torch.atan2(flat, rise)
+        step = (0.22 * tilt).clamp(0.0, 0.05)
+        foot = peg.p[:, 2] - self.peg_half_length * rise - self.peg_half_width * flat
+        raise_end = Intent(
+            move=torch.cat(
+                [-(step * rise)[:, None] * bearing, (step * flat - foot)[:, None]], dim=1
+            ),
+            yaw=torch.zeros_like(yaw),
+            gripper=torch.full_like(yaw, self._loose),
+        )
+        up = torch.zeros_like(peg.p)
+        up[:, 2] = torch.where(finger_width(self) > 0.06, 0.03, 0.0)
+        release = Intent(move=up, yaw=torch.zeros_like(yaw), gripper=torch.full_like(yaw, OPEN))
+        stands = (tilt < 0.06) & (foot.abs() < 0.004)
+        return choose(stands, release, choose(held, raise_end, approach))
+
+    @property
+    def _loose(self) -> float:
+        """Gripper action at which each finger presses the peg with ``grip_force`` newtons."""
+        target = self.peg_half_width - self.grip_force / 1e3
+        return CLOSED + (OPEN - CLOSED) * (target + 0.01) / 0.05

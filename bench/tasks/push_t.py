@@ -1,0 +1,165 @@
+"""Bring a T-shaped block onto a T drawn on the table."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
+from mani_skill.utils.structs import Actor, Pose
+
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import CLOSED, Intent, choose, grasp_at, yaw_along
+from bench.tasks.features import bar_grasp_yaw, disc, flat_pose
+from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
+from policies.geometry import Field
+
+
+class PushT(SymmetricTask, PushTEnv):
+    """ManiSkill's PushT-v1 with a goal anywhere and any gripper.
+
+    Reset: block and goal are uniform in discs of 10 and 5 cm radius, each with uniform yaw
+    (stock: one goal for ever, block in a rectangle beside it, yaw uniform). The goal is the pose
+    of ManiSkill's goal actor, hence part of the simulation state; stock keeps it in constants.
+
+    Success (the block covers 90 % of the goal in ManiSkill's drawing of both) and dense reward
+    are ManiSkill's, with these replacements: they read the goal from its actor; the yaw comes
+    from an arc tangent (stock's arc cosine loses half the digits where the yaw is near zero, and
+    is not a number where rounding makes the quaternion's w exceed 1); and the overlap is the mean
+    of that of block and goal and that of their mirror image, because the drawing is one pixel
+    (4.7 mm) off in both directions. Stock's stick must not return anywhere either, so its marker
+    lies under the goal.
+
+    Block and goal are their own mirror image across their body y-z plane.
+    """
+
+    task_id = "PushT-v1"
+    max_episode_steps = 100
+    mirrored_across_yz = frozenset({"Tee", "goal_Tee"})
+    task_fields = (
+        Field("tee_xy", 1),
+        Field("tee_z", 0),
+        Field("tee_stem", 1),
+        Field("tcp_to_tee_xy", 1),
+        Field("tcp_to_tee_z", 0),
+        Field("grasp_yaw_cos", 0),
+        Field("grasp_yaw_sin", 0, odd=True),
+        Field("goal_xy", 1),
+        Field("goal_stem", 1),
+        Field("tee_to_goal_xy", 1),
+        Field("turn_cos", 0),
+        Field("turn_sin", 0, odd=True),
+    )
+    spawn_radius = 0.1
+    goal_radius = 0.05
+    spawn_extent = 0.24
+    half_thickness = 0.02
+    max_turn = math.pi / 2
+    grip_on_stem = 0.04
+    """Where the expert grasps: metres along the stem from the centre of mass."""
+    drawing_offset = -0.0047
+    """Metres along the goal's stem at which ManiSkill's drawing puts a block that fits best."""
+
+    def _place_objects(self, rng: Any, count: int) -> None:
+        u = rng.uniform(size=6)
+        xy, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
+        self.tee.set_pose(flat_pose(xy, self.half_thickness, yaw, self.device))
+        xy, yaw = disc(u[:, 3:5], self.goal_radius), yaw + self.max_turn * (2 * u[:, 5] - 1)
+        goal = flat_pose(xy, 1e-3, yaw, self.device)
+        self.goal_tee.set_pose(goal)
+        flat = goal.q.new_tensor([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]).expand_as(goal.q)
+        self.ee_goal_pos.set_pose(Pose.create_from_pq(goal.p, quaternion_multiply(goal.q, flat)))
+
+    @property
+    def manipulated(self) -> Actor:
+        """The T-shaped block."""
+        return self.tee
+
+    # ------------------------------------------------------------ success, reward
+
+    def quat_to_z_euler(self, quats: torch.Tensor) -> torch.Tensor:
+        """Yaw ``[N]`` in [0, 2 pi) of quaternions ``[N, 4]``."""
+        return torch.remainder(2 * torch.atan2(quats[:, 3], quats[:, 0]), 2 * torch.pi)
+
+    def pseudo_render_intersection(self) -> torch.Tensor:
+        """Share ``[N]`` of the goal that the block covers, in ManiSkill's drawing."""
+        tee, goal = self._planar(self.tee.pose), self._planar(self.goal_tee.pose)
+        from_world = torch.linalg.inv(tee)
+        relative = torch.linalg.inv(goal) @ tee
+        mirror = torch.diag(relative.new_tensor([-1.0, 1.0, 1.0]))
+        shares = []
+        for placed in (relative, mirror @ relative @ mirror):
+            # Stock multiplies this by the block's own pose, which leaves ``placed``.
+            self.world_to_goal_trans = placed @ from_world
+            shares.append(super().pseudo_render_intersection())
+        return (shares[0] + shares[1]) / 2
+
+    def _planar(self, pose: Pose) -> torch.Tensor:
+        """Homogeneous planar transforms ``[N, 3, 3]`` from body to world."""
+        transform = self.quat_to_zrot(pose.q)
+        transform[:, :2, 2] = pose.p[:, :2]
+        return transform
+
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """ManiSkill's, with the goal's yaw read from its actor."""
+        self.goal_z_rot = self.quat_to_z_euler(self.goal_tee.pose.q)
+        try:
+            return super().compute_dense_reward(obs, action, info)
+        finally:
+            del self.goal_z_rot  # the class's number, which building the scene needs
+
+    # ---------------------------------------------------------------- observation
+
+    def _observe_task(self) -> dict[str, torch.Tensor]:
+        tcp = self.seen(self.agent.tcp_pose, "tool")
+        tee = self.seen(self.tee.pose, "object")
+        goal = self.seen(self.goal_tee.pose, "goal")
+        to_tee, stem, goal_stem = tee.p - tcp.p, _stem(tee.q), _stem(goal.q)
+        return {
+            "tee_xy": tee.p[:, :2],
+            "tee_z": tee.p[:, 2:],
+            "tee_stem": stem,
+            "tcp_to_tee_xy": to_tee[:, :2],
+            "tcp_to_tee_z": to_tee[:, 2:],
+            **bar_grasp_yaw(tcp.q, tee.q),
+            "goal_xy": goal.p[:, :2],
+            "goal_stem": goal_stem,
+            "tee_to_goal_xy": (goal.p - tee.p)[:, :2],
+            "turn_cos": (stem * goal_stem).sum(dim=1, keepdim=True),
+            "turn_sin": _cross(stem, goal_stem)[:, None],
+        }
+
+    # --------------------------------------------------------------------- expert
+
+    def intent(self, offset: torch.Tensor) -> Intent:
+        """Grasp the stem close to the centre of mass, drag and turn the block onto the goal."""
+        tcp, tee, goal = self.agent.tcp_pose.p, self.tee.pose, self.goal_tee.pose
+        stem, goal_stem = _stem(tee.q), _stem(goal.q)
+        handle = tee.p.clone()
+        handle[:, :2] += self.grip_on_stem * stem
+        turn = torch.atan2(_cross(stem, goal_stem), (stem * goal_stem).sum(dim=1))
+        yaw = yaw_along(self, stem)
+        yaw = self.body.reachable_turn(self.agent.robot.get_qpos(), yaw, math.pi, turn)
+        approach, held = grasp_at(self, handle + offset, handle, yaw, 0.053)
+        # Where the tool is in the block's frame, there it shall be in the goal's.
+        arm = (tcp - tee.p)[:, :2]
+        cos, sin = torch.cos(turn)[:, None], torch.sin(turn)[:, None]
+        turned = cos * arm + sin * torch.stack([-arm[:, 1], arm[:, 0]], dim=1)
+        fit = goal.p[:, :2] + self.drawing_offset * goal_stem
+        move = torch.cat(
+            [self.body.drag_gain * (fit + turned - tcp[:, :2]), self.half_thickness - tcp[:, 2:]], dim=1
+        )
+        drag = Intent(move=move, yaw=turn, gripper=torch.full_like(turn, CLOSED))
+        return choose(held, drag, approach)
+
+
+def _stem(q: torch.Tensor) -> torch.Tensor:
+    """Horizontal direction ``[N, 2]`` of a T's stem, its body y axis."""
+    return quaternion_to_matrix(q)[:, :2, 1]
+
+
+def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Vertical component ``[N]`` of the cross product of horizontal vectors ``[N, 2]``."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
