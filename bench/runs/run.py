@@ -21,7 +21,7 @@ from bench.steering.diagnostics import OnPolicy, measure
 from bench.steering.evaluation import HELD_OUT_SEED, Rollout, held_out_seeds, rollout
 from bench.steering.latent_env import Clock, LatentNoiseEnv
 from bench.tasks import embodiments, make, task_class
-from bench.variants import parse
+from bench.variants import evaluated, highest_cost, parse
 from leaderboard.records import (
     Budget,
     Episodes,
@@ -107,7 +107,11 @@ def execute(
     except BaseException:
         folder.rmdir()
         raise
-    resolved = {**config.to_json(), "files": files}
+    resolved = {
+        **config.to_json(),
+        "evaluation_variant": evaluated(config.variant),
+        "files": files,
+    }
     write_json(folder / "config.json", resolved)
     run = _Run(config, resolved, folder, base, progress)
     try:
@@ -144,7 +148,9 @@ class _Run:
         self.last_scalars: dict[str, float | None] = {}
         self.device = torch.device(config.device)
         self.agent = self._make_agent(config.agent)
-        self.feasible = task_class(config.task).feasible_return(config.sac.gamma, base.execute)
+        self.feasible = task_class(config.task).feasible_return(
+            config.sac.gamma, base.execute, step_cost=highest_cost(parse(config.variant))
+        )
         counts = self.agent.parameter_counts()
         self.record = RunRecord(
             run_id=folder.name,
@@ -176,7 +182,9 @@ class _Run:
         self.log = RunLog(folder, resolved)
         evaluation = config.evaluation
         extra = evaluation.diagnostic_episodes if self.agent.learns else 0
-        self.evaluator = self._make_env(evaluation.episodes + extra, ignore_terminations=True)
+        self.evaluator = self._make_env(
+            evaluation.episodes + extra, evaluated(config.variant), ignore_terminations=True
+        )
 
     @property
     def _record_path(self) -> Path:
@@ -194,12 +202,12 @@ class _Run:
             self.base.normalized_observation,
         )
 
-    def _make_env(self, num_envs: int, ignore_terminations: bool) -> LatentNoiseEnv:
+    def _make_env(self, num_envs: int, variant: str, ignore_terminations: bool) -> LatentNoiseEnv:
         env = make(
             self.config.task,
             num_envs=num_envs,
             embodiment=self.config.embodiment,
-            variant=self.config.variant,
+            variant=variant,
             sim=self.config.sim,
         )
         return LatentNoiseEnv(env, self.base, ignore_terminations)
@@ -222,7 +230,7 @@ class _Run:
 
     def _train(self) -> int:
         config, agent = self.config, self.agent
-        env = self._make_env(config.num_envs, ignore_terminations=False)
+        env = self._make_env(config.num_envs, config.variant, ignore_terminations=False)
         self.training_env = env
         warm_up = self._make_agent("base")
         replay = ReplayBuffer(

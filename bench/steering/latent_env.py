@@ -22,7 +22,8 @@ class Transition:
     Attributes:
         obs: observation to act on next, ``[N, obs_dim]``: the first one of a new episode where
             the last one ended.
-        reward: -1 for every executed step before success, summed, ``[N]``.
+        reward: -1 for every executed step before success, and what a variant makes it cost in
+            addition (``info["extra_cost"]``), summed, ``[N]``.
         next_obs: observation that the decision led to, also where the episode ended,
             ``[N, obs_dim]``.
         terminal: success; nothing is bootstrapped behind it, ``[N]`` bool.
@@ -106,7 +107,8 @@ class LatentNoiseEnv:
             next_obs = torch.where(alive[:, None], obs.to(self.device), next_obs)
             self._elapsed += alive
             self._success_once |= alive & success
-            reward -= (alive & ~self._success_once).float()
+            cost = 1 + info["extra_cost"].to(self.device) if "extra_cost" in info else 1
+            reward -= (alive & ~self._success_once).float() * cost
             if not self.ignore_terminations:
                 terminal |= alive & success
             timed_out = alive & ~terminal & (self._elapsed >= self.max_episode_steps)

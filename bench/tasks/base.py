@@ -439,18 +439,23 @@ class SymmetricTask(GymEnv):
 
     @classmethod
     def feasible_return(
-        cls, gamma: float, steps_per_decision: int = 1, bootstrap_truncation: bool = True
+        cls,
+        gamma: float,
+        steps_per_decision: int = 1,
+        bootstrap_truncation: bool = True,
+        step_cost: float = 1.0,
     ) -> tuple[float, float]:
-        """Bounds of the discounted return of -1 a step until success, 0 from then on.
+        """Bounds of the discounted return of -``step_cost`` a step until success, 0 from then on.
 
         The discount is per decision of ``steps_per_decision`` steps, whose rewards are summed:
-        [-c (1 - gamma^N) / (1 - gamma), 0] with c steps a decision and N decisions an episode
+        [-c (1 - gamma^N) / (1 - gamma), 0] with cost c a decision and N decisions an episode
         (DSRL, arXiv 2506.15799).
 
         Args:
             gamma: discount per decision, in [0, 1].
             steps_per_decision: executed steps of an action chunk.
             bootstrap_truncation: values bootstrap through time-outs, so that N is infinite.
+            step_cost: the largest cost of a step, see :func:`bench.variants.highest_cost`.
 
         Returns:
             (lowest, highest).
@@ -463,9 +468,9 @@ class SymmetricTask(GymEnv):
                 f"gamma must lie in [0, 1), or [0, 1] without bootstrapping; it is {gamma}"
             )
         if bootstrap_truncation:
-            return -steps_per_decision / (1 - gamma), 0.0
+            return -step_cost * steps_per_decision / (1 - gamma), 0.0
         decisions = math.ceil(cls.max_episode_steps / steps_per_decision)
-        return -steps_per_decision * sum(gamma**i for i in range(decisions)), 0.0
+        return -step_cost * steps_per_decision * sum(gamma**i for i in range(decisions)), 0.0
 
 
 # ------------------------------------------------------------------------- helpers
