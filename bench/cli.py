@@ -6,9 +6,12 @@ machine where the simulator does not.
 
 from __future__ import annotations
 
+import inspect
 import os
 import runpy
+import shutil
 import sys
+import textwrap
 import warnings
 from pathlib import Path
 from typing import Annotated, Literal
@@ -118,16 +121,25 @@ def list_names() -> int:
     """Name the tasks, embodiments, variants, agents and suites."""
     from agents import AGENTS
     from bench.sweep.suite import load_suite, suite_names
-    from bench.tasks import embodiments, task_names
-    from bench.variants import variant_names
+    from bench.tasks import task_class, task_names
+    from bench.tasks.embodiments import EMBODIMENTS
+    from bench.variants import registry
 
-    print("tasks:       " + ", ".join(task_names()))
-    print("embodiments: " + ", ".join(embodiments()))
-    print("variants:    none, " + ", ".join(f"{name}:STRENGTH" for name in variant_names()))
-    print("agents:      " + ", ".join(AGENTS))
-    for name in suite_names():
-        suite = load_suite(name)
-        print(f"suite:       {name}: {suite.description} ({len(suite.runs)} runs)")
+    tasks = {name: sys.modules[task_class(name).__module__] for name in task_names()}
+    suites = [load_suite(name) for name in suite_names()]
+    _print_names("tasks (--task)", {name: _summary(task) for name, task in tasks.items()})
+    _print_names(
+        "embodiments (--embodiment)", {name: _summary(e) for name, e in EMBODIMENTS.items()}
+    )
+    _print_names(
+        "variants (--variant NAME:STRENGTH, strength in [0, 1]; several joined by +; or none)",
+        {name: _summary(variant) for name, variant in registry().items()},
+    )
+    _print_names("agents (--agent)", {name: _summary(agent) for name, agent in AGENTS.items()})
+    _print_names(
+        "suites (symsteer sweep SUITE)",
+        {suite.name: f"{suite.description} ({len(suite.runs)} runs)" for suite in suites},
+    )
     return 0
 
 
@@ -227,6 +239,21 @@ def doctor(quiet: bool = False) -> int:
         if not check.ok and check.cure:
             print(f"{'':26s} -> {check.cure}")
     return 0 if all(check.ok or not check.required for check in checks) else 1
+
+
+def _summary(documented: object) -> str:
+    """First line of a docstring."""
+    return (inspect.getdoc(documented) or "").partition("\n")[0].replace("``", "")
+
+
+def _print_names(title: str, names: dict[str, str]) -> None:
+    """A paragraph of names with what they are, folded to the terminal."""
+    print(title)
+    columns = max(60, shutil.get_terminal_size().columns)
+    for name, text in names.items():
+        head = f"  {name:18s} "
+        print(textwrap.fill(text, columns, initial_indent=head, subsequent_indent=" " * len(head)))
+    print()
 
 
 def _program(name: str) -> str:

@@ -116,8 +116,9 @@ def test_an_unknown_suite(monkeypatch, capsys, tmp_path):
 def test_list_names_everything(monkeypatch, capsys):
     assert symsteer(monkeypatch, "list") == 0
     out = capsys.readouterr().out
+    lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
     for word in ("StackCube-v1", "panda", "action_gain", "approximate", "demo"):
-        assert word in out
+        assert len(lines[word].split()) > 3, word
 
 
 def test_demos_are_written(monkeypatch, capsys, tmp_path):
