@@ -7,6 +7,7 @@ are executed, rewards are summed over them (DSRL, arXiv 2506.15799; Equi-DSRL, a
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -100,8 +101,11 @@ class LatentNoiseEnv:
         reward = torch.zeros(self.num_envs, device=self.device)
         terminal, truncated = torch.zeros_like(alive), torch.zeros_like(alive)
         success_at_end = torch.zeros_like(alive)
-        for t in range(self.execute):
-            obs, _, _, _, info = self.env.step(actions[:, t])
+        # Where every episode reaches its limit within the chunk, nobody needs the rest of it.
+        steps = min(self.execute, self.max_episode_steps - int(self._elapsed.min()))
+        for obs, info in self._play(actions[:, :steps]):
+            if not alive.any():
+                continue
             self.control_steps += self.num_envs
             success = info["success"].to(self.device)
             next_obs = torch.where(alive[:, None], obs.to(self.device), next_obs)
@@ -115,8 +119,6 @@ class LatentNoiseEnv:
             truncated |= timed_out
             success_at_end |= success & (terminal | timed_out) & alive
             alive &= ~(terminal | truncated)
-            if not alive.any():
-                break
         self._return += reward
         success_once = self._success_once.clone()
         ended = (terminal | truncated).nonzero().flatten()
@@ -137,6 +139,22 @@ class LatentNoiseEnv:
         self.clock.decode += decoded - start
         self.clock.simulate += time.perf_counter() - decoded
         return Transition(self._obs, reward, next_obs, terminal, truncated, success_once, episodes)
+
+    def _play(self, actions: torch.Tensor) -> Iterator[tuple[torch.Tensor, dict[str, Any]]]:
+        """Observation and info after each step of ``actions [N, T, Da]``.
+
+        Environments in several processes take the whole chunk in one exchange. They therefore
+        play on after all episodes have ended, and one process does too: its scenes then have the
+        same history, and all that follows is the same to the bit.
+        """
+        if not hasattr(self.env, "step_chunk"):
+            for t in range(actions.shape[1]):
+                obs, _, _, _, info = self.env.step(actions[:, t])
+                yield obs, info
+            return
+        obs, _, _, _, info = self.env.step_chunk(actions)
+        for t in range(actions.shape[1]):
+            yield obs[:, t], {key: value[:, t] for key, value in info.items()}
 
     def close(self) -> None:
         """Free the simulation."""
