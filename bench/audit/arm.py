@@ -1,0 +1,216 @@
+"""Turned states of an arm whose base stands still, by inverse kinematics.
+
+The tool's pose is turned, and joint angles that reach it are searched for; the arm itself cannot
+turn, so its elbow is elsewhere than the turned elbow would be. That is the break of symmetry that
+the audit measures, apart from tool poses that no joint angles reach.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from pathlib import Path
+
+import pytorch_kinematics as pk
+import torch
+from mani_skill.agents.robots import Panda
+
+from bench.sim.kinematics import SerialChain
+from bench.tasks.base import SymmetricTask
+from bench.tasks.rotations import planar_matrix, transform_angular, wrap
+
+ITERATIONS = 60
+DAMPING = 0.02
+LARGEST_STEP = 0.3
+"""Of a joint in one iteration, radians."""
+POSITION_TOLERANCE, ANGLE_TOLERANCE = 1e-5, 1e-4
+"""A pose is reached within these, metres and radians."""
+SPREAD = 0.35
+"""Standard deviation of the random starts about the others, radians."""
+RANDOM_STARTS = 4
+
+
+class ArmTurner:
+    """Finds joint states of a Panda whose tool is the turned tool of given joint states.
+
+    Damped least squares from several starts: the state's own joints and ManiSkill's rest pose,
+    both with base joint and wrist set to the turned bearing and yaw, and random ones about them.
+    Of the solutions within the joint limits, the one whose first six joints are closest to the
+    state's own is taken: a turn should change the arm as little as it can.
+
+    Args:
+        env: a task with the ``panda`` embodiment.
+    """
+
+    def __init__(self, env: SymmetricTask) -> None:
+        urdf = Path(env.agent.urdf_path).read_bytes()
+        # The URDF has attributes that its parser reports one by one.
+        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+            chain = pk.build_serial_chain_from_urdf(urdf, end_link_name=env.agent.tcp.name)
+            self.chain = chain.to(dtype=torch.float64)
+            exact = pk.build_serial_chain_from_urdf(urdf, end_link_name=env.agent.tcp.name)
+        self.fast = SerialChain.replace(exact)
+        low, high = self.chain.get_joint_limits()
+        self.low = torch.tensor(low, dtype=torch.float64)
+        self.high = torch.tensor(high, dtype=torch.float64)
+        self.joints = len(low)
+        self.base = torch.tensor(env.body.root_position, dtype=torch.float64)
+        self.rest = torch.tensor(Panda.keyframes["rest"].qpos[: self.joints], dtype=torch.float64)
+
+    def turn(
+        self, state: torch.Tensor, angle: float, reflect: bool, offset: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Turn articulation states ``[S, 13 + 2 dof]`` about the world's origin, then shift them.
+
+        The tool's velocity is turned as well; joint velocities are the smallest that give it.
+        Fingers are copied (a mirror image swaps them).
+
+        Args:
+            state: articulation states.
+            angle: rotation, radians.
+            reflect: whether the reflection of y comes first.
+            offset: shift, ``[S, 2]`` metres.
+
+        Returns:
+            The states, and which of them are reachable ``[S]`` bool; rows that are not are copies
+            of the original.
+        """
+        n, dof = self.joints, (state.shape[1] - 13) // 2
+        joints, rates = state[:, 13 : 13 + dof].double(), state[:, 13 + dof :].double()
+        q, v = joints[:, :n], rates[:, :n]
+        position, rotation = self._tool(q)
+        world = planar_matrix(angle, reflect, position)
+        target = (position + self.base) @ world.T - self.base
+        target[:, :2] += offset
+        frame = world @ rotation
+        if reflect:
+            frame = frame * frame.new_tensor([1.0, -1.0, 1.0])
+        solution, reached = self.solve(target, frame, q, angle, reflect)
+
+        twist = (self._jacobian(q) @ v[:, :, None])[:, :, 0]
+        wanted = torch.cat(
+            [twist[:, :3] @ world.T, transform_angular(twist[:, 3:], angle, reflect)], dim=1
+        )
+        speed = torch.linalg.pinv(self._jacobian(solution), rtol=1e-3) @ wanted[:, :, None]
+        fingers = [n + 1, n] if reflect else [n, n + 1]
+        turned = torch.cat(
+            [
+                state[:, :13].double(),
+                solution,
+                joints[:, fingers],
+                speed[:, :, 0],
+                rates[:, fingers],
+            ],
+            dim=1,
+        ).to(state.dtype)
+        return torch.where(reached[:, None], turned, state), reached
+
+    def solve(
+        self,
+        target: torch.Tensor,
+        frame: torch.Tensor,
+        near: torch.Tensor,
+        angle: float,
+        reflect: bool,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Joint angles that reach tool poses in the base's frame.
+
+        Args:
+            target: positions ``[S, 3]``.
+            frame: orientations ``[S, 3, 3]``.
+            near: the joint angles before the turn ``[S, 7]``.
+            angle, reflect: the turn.
+
+        Returns:
+            Angles ``[S, 7]`` and whether they reach ``[S]`` bool.
+        """
+        starts = self._starts(target, near, angle, reflect)
+        count = len(starts)
+        q = starts.reshape(-1, self.joints)
+        goal, pose = target.repeat(count, 1), frame.repeat(count, 1, 1)
+        for _ in range(ITERATIONS):
+            error = self._error(q, goal, pose)
+            far = self._missed(error)
+            if not far.any():
+                break
+            q[far] = self._improve(q[far], error[far])
+        miss = self._missed(self._error(q, goal, pose)).view(count, -1)
+        q = q.view(count, -1, self.joints)
+        change = (q - near)[:, :, : self.joints - 1].norm(dim=-1)
+        best = torch.where(miss, torch.inf, change).argmin(dim=0)
+        rows = torch.arange(len(near))
+        return q[best, rows], ~miss[best, rows]
+
+    def _starts(
+        self, target: torch.Tensor, near: torch.Tensor, angle: float, reflect: bool
+    ) -> torch.Tensor:
+        """``[starts, S, 7]``."""
+        bearing = torch.atan2(target[:, 1], target[:, 0])
+        before, _ = self._tool(near)
+        swing = bearing - torch.atan2(before[:, 1], before[:, 0])
+        generator = torch.Generator().manual_seed(0)
+        chosen = []
+        for origin in (near, self.rest.expand_as(near)):
+            guess = origin.clone()
+            if reflect:
+                # The arm's own mirror image: every joint that turns out of its plane, reversed.
+                guess[:, ::2] *= -1
+            base = bearing if origin is not near else guess[:, 0] + swing
+            # Seen from above the last joint runs against the tool's yaw.
+            wrist = near[:, 6] * (-1 if reflect else 1) + (base - guess[:, 0]) - angle
+            guess[:, 0], guess[:, 6] = base, wrap(wrist, 2 * math.pi)
+            chosen.append(guess)
+        for i in range(RANDOM_STARTS):
+            noise = SPREAD * torch.randn(near.shape, generator=generator, dtype=near.dtype)
+            chosen.append(chosen[i % 2] + noise)
+        return torch.stack(chosen).clamp(self.low, self.high)
+
+    def _improve(self, q: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+        jacobian = self._jacobian(q)
+        # Damping fades with the error, so that the last iterations are plain Newton steps.
+        damping = DAMPING * error.norm(dim=1).clamp(max=1.0)
+        square = jacobian @ jacobian.transpose(1, 2)
+        square = square + (damping**2 + 1e-12)[:, None, None] * torch.eye(6, dtype=q.dtype)
+        step = jacobian.transpose(1, 2) @ torch.linalg.solve(square, error[:, :, None])
+        step = step[:, :, 0]
+        longest = step.abs().amax(dim=1, keepdim=True)
+        step = step * (LARGEST_STEP / longest.clamp_min(LARGEST_STEP))
+        return (q + step).clamp(self.low, self.high)
+
+    def _error(self, q: torch.Tensor, goal: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+        """Position and rotation vector from the tool to its goal, ``[B, 6]``."""
+        position, rotation = self._tool(q)
+        turn = pose @ rotation.transpose(1, 2)
+        return torch.cat([goal - position, _rotation_vector(turn)], dim=1)
+
+    @staticmethod
+    def _missed(error: torch.Tensor) -> torch.Tensor:
+        place, angle = error[:, :3].norm(dim=1), error[:, 3:].norm(dim=1)
+        return (place > POSITION_TOLERANCE) | (angle > ANGLE_TOLERANCE)
+
+    def _tool(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Position ``[B, 3]`` and orientation ``[B, 3, 3]`` of the tool in the base's frame."""
+        matrix = self.chain.forward_kinematics(q).get_matrix()
+        return matrix[:, :3, 3], matrix[:, :3, :3]
+
+    def _jacobian(self, q: torch.Tensor) -> torch.Tensor:
+        # Single precision is enough for a direction; the error is computed in double precision.
+        return self.fast.jacobian(q.float()).double()
+
+
+def _rotation_vector(matrix: torch.Tensor) -> torch.Tensor:
+    """Rotation vectors ``[B, 3]`` of matrices ``[B, 3, 3]``."""
+    axis = torch.stack(
+        [
+            matrix[:, 2, 1] - matrix[:, 1, 2],
+            matrix[:, 0, 2] - matrix[:, 2, 0],
+            matrix[:, 1, 0] - matrix[:, 0, 1],
+        ],
+        dim=1,
+    )
+    sine = axis.norm(dim=1) / 2
+    cosine = (matrix.diagonal(dim1=1, dim2=2).sum(dim=1) - 1) / 2
+    angle = torch.atan2(sine, cosine)
+    # Half a turn has a vanishing antisymmetric part; any step away from it will do there.
+    return axis / (2 * sine).clamp_min(1e-12)[:, None] * angle[:, None]

@@ -1,0 +1,404 @@
+"""Simulate every turned copy of visited states in a broken environment, and keep what came out.
+
+Copy g of state s starts in g s and executes g a. All copies of a batch start in scenes that are
+made anew, reset with the same seed and stepped equally often, so that PhysX's memory of earlier
+contacts cannot tell them apart. One more copy is the state itself, turned by one radian and back:
+it differs by rounding alone and shows what the measurement makes of nothing.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+
+from bench.audit.states import Element, Turner, Visited, join_trees, rows_of, seen_from, task_state
+from bench.sim.environment import Simulator
+from bench.tasks import make
+from bench.tasks.base import SymmetricTask
+from bench.tasks.rotations import planar_matrix, transform_quaternion
+from bench.variants import overriding
+from policies.errors import UserError
+from policies.geometry import Group
+
+SCENES = 320
+"""Scenes side by side. A process can hold about 1,000 (PhysX takes a thread-local key for each),
+and a rebuild holds the old and the new ones for a moment."""
+
+DRAWS = 24
+"""Observations of a state where the observation is random."""
+
+Tensors = dict[str, torch.Tensor]
+
+
+@dataclass(frozen=True)
+class Copies:
+    """What S states and their G copies did; the first copy is the state itself.
+
+    Lengths in metres, angles in radians. "Turned back" means acted upon by the inverse element.
+
+    Attributes:
+        moving, policy: of the states, ``[S]`` bool; see :class:`~bench.audit.states.Visited`.
+        reached: which copies exist, ``[S, G]`` bool (an arm cannot take every turned state).
+        place: where each copy's tool and object stand at first, seen from the policy's origin,
+            ``[S, G, 2]`` each.
+        poses: turned-back position ``[S, G + 1, W, 3]`` and quaternion ``[S, G + 1, W, 4]`` of tool
+            and object at the start, after one step and after all (W = 3); the last of the G + 1
+            is the copy that differs by rounding.
+        cost: 1 and what the variants add, summed over the steps before success, after one step
+            and after all, ``[S, G, 2]``.
+        dense: ManiSkill's normalised dense reward less what the variants add to the cost,
+            summed over all steps, likewise.
+        function_cost, function_dense: the same of one step whose outcome is the turned outcome
+            of the unbroken task, ``[S, G]``.
+        observations: turned-back observations of the copies, ``[S, G, K, obs_dim]``, and of the
+            state itself a second time (``[S, 0]``), K draws each.
+    """
+
+    moving: torch.Tensor
+    policy: torch.Tensor
+    reached: torch.Tensor
+    place: Tensors
+    positions: Tensors
+    quaternions: Tensors
+    cost: torch.Tensor
+    dense: torch.Tensor
+    function_cost: torch.Tensor
+    function_dense: torch.Tensor
+    observations: torch.Tensor
+    observations_again: torch.Tensor
+
+    @staticmethod
+    def join(parts: list[Copies]) -> Copies:
+        """All states of several batches."""
+        columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Copies)}
+        return Copies(**{name: join_trees(values) for name, values in columns.items()})
+
+    def first(self, count: int) -> Copies:
+        """The first states."""
+        rows = torch.arange(count)
+        return Copies(**{f.name: rows_of(getattr(self, f.name), rows) for f in fields(Copies)})
+
+
+@dataclass(frozen=True)
+class Resets:
+    """Features of resets, and of independent ones turned at random, ``[R, obs_dim]`` each."""
+
+    original: torch.Tensor
+    turned: torch.Tensor
+
+
+class Bench:
+    """Broken environments of one cell, and the unbroken ones that states are observed in.
+
+    Args:
+        reference: the unbroken task.
+        variant: what breaks it.
+        group: a finite group.
+        visited: the states; it sets how many scenes are needed.
+        seed: of resets and draws.
+        sim: ``cpu`` or ``cuda``.
+    """
+
+    def __init__(
+        self,
+        reference: SymmetricTask,
+        variant: str,
+        group: Group,
+        visited: Visited,
+        seed: int,
+        sim: Simulator = "cpu",
+    ) -> None:
+        self.reference, self.visited, self.seed = reference, visited, seed
+        self.elements: tuple[Element, ...] = group.elements
+        # Batches of equal size, so that few scenes are idle in the last one.
+        batches = math.ceil(len(visited) * (group.order + 1) / SCENES)
+        self.batch = math.ceil(len(visited) / batches)
+        self.turner = Turner(reference)
+        self.env = make(
+            reference.task_id,
+            num_envs=self.batch * (group.order + 1),
+            embodiment=reference.embodiment,
+            variant=variant,
+            sim=sim,
+            reward_mode="normalized_dense",
+        )
+        self.fresh = True
+        self.centre = self.env.policy_origin[0].cpu()
+
+    def close(self) -> None:
+        """Free the scenes, at once: a process can hold only so many."""
+        self.env.close()
+        del self.env
+        gc.collect()
+
+    # ------------------------------------------------------------------ copies
+
+    def copies(self) -> Copies:
+        """Simulate all copies of all states."""
+        random = self._observation_is_random()
+        parts = []
+        for start in range(0, len(self.visited), self.batch):
+            # The last batch may be short: its spare scenes repeat a state and are dropped.
+            rows = torch.arange(start, start + self.batch).clamp(max=len(self.visited) - 1)
+            keep = min(self.batch, len(self.visited) - start)
+            part = self._batch(rows, random)
+            parts.append(part.first(keep))
+        return Copies.join(parts)
+
+    def _batch(self, rows: torch.Tensor, random: bool) -> Copies:
+        env, visited, elements = self.env, self.visited, self.elements
+        order, count = len(elements), len(rows)
+        state, after = rows_of(visited.state, rows), rows_of(visited.after, rows)
+        turned = [self.turner.turn(state, g, self.centre) for g in elements]
+        starts = [copy for copy, _ in turned]
+        reached = torch.stack([mask for _, mask in turned], dim=1)
+        floor = self._rounded(state)
+        actions = visited.actions[rows]
+        layout = env.action_layout
+        plan = torch.cat([layout.transform(actions, *g) for g in elements] + [actions])
+
+        # Equal scenes for all copies, as if none had been simulated before.
+        if not self.fresh:
+            env.reset(seed=[self.seed] * env.num_envs, options={"reconfigure": True})
+        else:
+            env.reset(seed=[self.seed] * env.num_envs)
+        self.fresh = False
+        scenes = join_trees([*starts, floor])
+        self._put(scenes)
+        observations, again = self._observe(scenes, count, random)
+        if random:
+            env.reset(seed=[self.seed] * env.num_envs)
+            self._put(scenes)
+
+        poses = [self._poses()]
+        place = {
+            body: self._split(p[:, :2] - self.centre, count)[:, :order]
+            for body, (p, _) in poses[0].items()
+        }
+        costs, denses = [], []
+        alive = torch.ones(env.num_envs)
+        total_cost, total_dense = torch.zeros(env.num_envs), torch.zeros(env.num_envs)
+        steps = plan.shape[1]
+        for step in range(steps):
+            before = env.agent.tcp_pose.p.clone()
+            _, reward, _, _, info = env.step(plan[:, step].to(env.device))
+            alive = alive * (~info["success"].cpu()).float()
+            total_cost = total_cost + alive * (1 + self._extra_cost(before, info)).cpu()
+            total_dense = total_dense + reward.cpu()
+            if step in (0, steps - 1):
+                poses.append(self._poses())
+                costs.append(total_cost)
+                denses.append(total_dense)
+        if steps == 1:
+            poses.append(poses[-1])
+            costs, denses = costs * 2, denses * 2
+
+        function_cost, function_dense, both = self._reward_function(starts, after, actions[:, 0])
+        positions, quaternions = self._turned_back(poses, count)
+        split = [self._split(torch.stack(v, dim=1), count)[:, :order] for v in (costs, denses)]
+        return Copies(
+            moving=visited.moving[rows],
+            policy=visited.policy[rows],
+            reached=reached & both,
+            place=place,
+            positions=positions,
+            quaternions=quaternions,
+            cost=split[0],
+            dense=split[1],
+            function_cost=function_cost,
+            function_dense=function_dense,
+            observations=observations,
+            observations_again=again,
+        )
+
+    def _rounded(self, state: dict[str, Any]) -> dict[str, Any]:
+        """The state turned by one radian and back: the same but for rounding."""
+        if self.turner.arm is None:
+            there, _ = self.turner.turn(state, (1.0, False), self.centre)
+            return self.turner.turn(there, (-1.0, False), self.centre)[0]
+        # Only what stands on the table: an arm comes back with other joint angles.
+        bodies = {"actors": state["actors"], "articulations": {}}
+        there = self.reference.transform_state(bodies, 1.0)
+        back = self.reference.transform_state(there, -1.0)
+        return {**state, "actors": back["actors"]}
+
+    def _put(self, state: dict[str, Any]) -> None:
+        """Set all scenes; what a variant has added to them stays where it stands."""
+        whole = self.env.get_state_dict()
+        for kind in ("actors", "articulations"):
+            for name, value in state[kind].items():
+                whole[kind][name] = value
+        if "controller" in state:
+            whole["controller"] = state["controller"]
+        self.env.set_state_dict(whole)
+
+    def _poses(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        """Positions and quaternions of tool and object in every scene."""
+        tool, thing = self.env.agent.tcp_pose, self.env.manipulated.pose
+        return {
+            "tool": (tool.p.cpu().clone(), tool.q.cpu().clone()),
+            "object": (thing.p.cpu().clone(), thing.q.cpu().clone()),
+        }
+
+    def _split(self, values: torch.Tensor, count: int) -> torch.Tensor:
+        """``[(G + 1) * S, ...]``, copy after copy, to ``[S, G + 1, ...]``."""
+        return values.unflatten(0, (-1, count)).transpose(0, 1)
+
+    def _turned_back(
+        self, poses: list[dict[str, tuple[torch.Tensor, torch.Tensor]]], count: int
+    ) -> tuple[Tensors, Tensors]:
+        positions, quaternions = {}, {}
+        inverses = [_inverse(g) for g in self.elements] + [(0.0, False)]
+        for body in ("tool", "object"):
+            p = self._split(torch.stack([w[body][0] for w in poses], dim=1), count).double()
+            q = self._split(torch.stack([w[body][1] for w in poses], dim=1), count).double()
+            centre = torch.cat([self.centre.double(), torch.zeros(1, dtype=torch.float64)])
+            back_p, back_q = [], []
+            for g, inverse in enumerate(inverses):
+                matrix = planar_matrix(*inverse, p)
+                back_p.append((p[:, g] - centre) @ matrix.T + centre)
+                back_q.append(transform_quaternion(q[:, g], *inverse))
+            positions[body] = torch.stack(back_p, dim=1)
+            quaternions[body] = torch.stack(back_q, dim=1)
+        return positions, quaternions
+
+    # ------------------------------------------------------------------ reward
+
+    def _extra_cost(self, before: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
+        """What the variants add to the cost of a step whose tool came from ``before``, ``[N]``."""
+        moved = self.env.agent.tcp_pose.p - before
+        cost = torch.zeros(self.env.num_envs, device=self.env.device)
+        for variant in overriding(self.env.variants, "extra_cost"):
+            extra = variant.extra_cost(moved)
+            if extra is not None:
+                cost = cost + extra
+        return torch.where(info["success"], torch.zeros_like(cost), cost)
+
+    def _reward_function(
+        self, starts: list[dict[str, Any]], after: dict[str, Any], action: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Reward of turned transitions of the unbroken task; which exist, ``[S, G]``.
+
+        Dynamics play no part: the outcome is put there, so there are no contact forces either.
+        """
+        env, count = self.env, len(action)
+        turned = [self.turner.turn(after, g, self.centre) for g in self.elements]
+        reached = torch.stack([mask for _, mask in turned], dim=1)
+        self._put(join_trees([*starts, starts[0]]))
+        before = env.agent.tcp_pose.p.clone()
+        self._put(join_trees([*[copy for copy, _ in turned], after]))
+        layout = env.action_layout
+        actions = torch.cat([layout.transform(action, *g) for g in self.elements] + [action])
+        info = env.get_info()
+        extra = self._extra_cost(before, info)
+        dense = env.compute_normalized_dense_reward(
+            env.get_obs(info), action=actions.to(env.device), info=info
+        )
+        cost = (~info["success"]).float() + extra
+        order = len(self.elements)
+        return (
+            self._split(cost.cpu(), count)[:, :order],
+            self._split((dense - extra).cpu(), count)[:, :order],
+            reached,
+        )
+
+    # ------------------------------------------------------------- observation
+
+    def _observation_is_random(self) -> bool:
+        """Whether two resets with different seeds see one and the same state differently."""
+        rows = torch.zeros(self.env.num_envs, dtype=torch.long)
+        state = rows_of(self.visited.state, rows)
+        seen = []
+        for seed in (self.seed, self.seed + 1):
+            self.env.reset(seed=[seed] * self.env.num_envs)
+            self._put(state)
+            seen.append(self.env.get_obs().cpu().clone())
+        return not torch.equal(seen[0], seen[1])
+
+    def _observe(
+        self, states: dict[str, Any], count: int, random: bool
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Turned-back observations ``[S, G, K, dim]`` and of the states again ``[S, K, dim]``.
+
+        Random observations are drawn with a seed of their own for every scene and draw.
+        """
+        env, layout = self.env, self.env.observation_layout
+        draws = []
+        if random:
+            rng = np.random.default_rng([self.seed, 5])
+            for _ in range(DRAWS):
+                env.reset(seed=np.asarray(rng.integers(2**31, size=env.num_envs)).tolist())
+                self._put(states)
+                draws.append(env.get_obs().cpu().clone())
+        else:
+            draws.append(env.get_obs().cpu().clone())
+        seen = self._split(torch.stack(draws, dim=1), count).double()
+        order = len(self.elements)
+        back = [layout.transform(seen[:, g], *_inverse(self.elements[g])) for g in range(order)]
+        return torch.stack(back, dim=1), seen[:, order]
+
+    # ------------------------------------------------------------------ resets
+
+    def resets(self, count: int) -> Resets:
+        """True features of ``count`` resets and of as many other, randomly turned ones.
+
+        Features are what the unbroken task would show of the state, with the policy's origin at
+        the centre.
+        """
+        rng = np.random.default_rng([self.seed, 6])
+        features = self._features(rng, 2 * count)
+        original, turned = features[:count], features[count:].clone()
+        layout = self.env.observation_layout
+        choice = rng.integers(1, len(self.elements), size=count)
+        for g, element in enumerate(self.elements):
+            rows = torch.as_tensor(choice == g)
+            turned[rows] = layout.transform(turned[rows], *element)
+        return Resets(original, turned)
+
+    def _features(self, rng: np.random.Generator, count: int) -> torch.Tensor:
+        found: list[torch.Tensor] = []
+        known = self.visited.state
+        while sum(map(len, found)) < count:
+            seeds = np.asarray(rng.integers(2**31, size=self.env.num_envs)).tolist()
+            self.env.reset(seed=seeds)
+            state = task_state(self.env)
+            state = {k: {n: state[k][n] for n in known[k]} for k in ("actors", "articulations")}
+            found.append(self._observe_unbroken(seen_from(state, self.centre)))
+        return torch.cat(found)[:count].double()
+
+    def _observe_unbroken(self, state: dict[str, Any]) -> torch.Tensor:
+        env = self.reference
+        total = len(next(iter(state["actors"].values())))
+        seen = []
+        for start in range(0, total, env.num_envs):
+            rows = torch.arange(start, start + env.num_envs).clamp(max=total - 1)
+            env.set_state_dict(rows_of(state, rows))
+            seen.append(env.get_obs().cpu().clone())
+        # The base of a robot that was moved aside goes back.
+        env.reset(seed=0)
+        return torch.cat(seen)[:total]
+
+
+def _inverse(element: Element) -> Element:
+    angle, reflect = element
+    return element if reflect else (-angle, False)
+
+
+def check_group(name: str) -> Group:
+    """A finite group with something to compare.
+
+    Raises:
+        UserError: for an unknown, infinite or trivial group.
+    """
+    group = Group.parse(name)
+    if group.order < 2:
+        raise UserError(
+            f"{name} has no element beside the identity, so there is nothing to compare; "
+            "choose C2 to C99 or D2 to D99, e.g. C8"
+        )
+    return group

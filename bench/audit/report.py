@@ -1,0 +1,370 @@
+"""What the audit prints and writes: a readable page a cell, tables of many, a map."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from bench.audit.cell import BIN, Cell, Defect, Settings
+from bench.audit.estimates import Estimate
+from policies.errors import UserError
+
+EXACT = 1e-3
+"""Reward and observation defects below this are rounding."""
+
+SIGNIFICANT = 0.01
+"""Resets differ from their turned copies below this p-value."""
+
+MIN_COPIES = 3
+"""Squares of the map with fewer copies are not drawn."""
+
+
+def text(cell: Cell) -> str:
+    """A cell as a page for the terminal."""
+    s = cell.settings
+    visitors = " and ".join(f"{s.count} of the {v}" for v in s.visitors)
+    lines = [
+        f"{s.task}, {s.embodiment}, {_variant(cell)}: group {s.group}, {cell.states} states "
+        f"({visitors}; the object moves in {cell.moving})",
+        "",
+        f"{'dynamics':26s} {'one step':>28s}   {f'chunk of {s.chunk} steps':>28s}",
+    ]
+    for body in ("tool", "object"):
+        for subset in ("all", "moving") if body == "object" else ("all",):
+            found = [cell.defect(body, w, subset) for w in ("step", "chunk")]  # type: ignore
+            pair = [defect for defect in found if defect is not None]
+            if len(pair) < 2:
+                continue
+            name = body if subset == "all" else f"{body}, where it moves"
+            lines.append(f"  {name:24s} " + "   ".join(f"{_relative(d):>28s}" for d in pair))
+            lines.append(f"  {'':24s} " + "   ".join(f"{_millimetres(d):>28s}" for d in pair))
+            lines.append(f"  {'':24s} " + "   ".join(f"{_degrees(d):>28s}" for d in pair))
+    floors = [cell.defect(b, "chunk") for b in ("tool", "object")]  # type: ignore[arg-type]
+    lines.append(
+        f"  {'floor (rounding alone)':24s} "
+        + ", ".join(f"{d.body} {d.floor_mm:.2g} mm" for d in floors if d)
+        + " after the chunk"
+    )
+    r = cell.reward
+    lines += [
+        f"reward   cost {_number(r['cost'], 3)} a step, dense {_number(r['dense'], 4)}; "
+        f"by way of the dynamics {_number(r['outcome_cost_chunk'], 3)} and "
+        f"{_number(r['outcome_dense_chunk'], 4)} a chunk",
+        f"observed {_percent(cell.observation)} of its spread"
+        + (f"; most in {f.name}: {_number(f.value, 2)} mm" if (f := cell.worst_field) else "")
+        + (" (random: Gaussians compared)" if cell.random_observation else ""),
+        f"resets   energy distance {_number(cell.resets, 3)}, p = {cell.resets_p:.3g}",
+    ]
+    if any(cell.origin_mm):
+        x, y = cell.origin_mm
+        lines.append(f"origin   the group acts about ({x:.0f}, {y:.0f}) mm, the policy's origin")
+    if s.embodiment != "floating":
+        lines.append(f"reach    {cell.unreachable:.1%} of the turned states are out of reach")
+    top = _largest(cell)
+    if top is not None:
+        lines.append(f"where    {top}")
+    return "\n".join([*lines, "", meaning(cell), f"({cell.seconds:.1f} s)"])
+
+
+def meaning(cell: Cell) -> str:
+    """One sentence."""
+    tool, thing = cell.defect("tool", "step"), cell.defect("object", "chunk")
+    parts = []
+    if tool is not None and tool.relative is not None:
+        parts.append(
+            f"turned with the world, a step takes the tool elsewhere by "
+            f"{tool.relative.value:.2g} of its length"
+            if tool.relative.value >= 1
+            else f"turned with the world, a step takes the tool elsewhere by "
+            f"{100 * tool.relative.value:.2g} % of its length"
+        )
+    if thing is not None and thing.relative is not None:
+        parts.append(f"a chunk the object by {100 * thing.relative.value:.2g} %")
+    broken: list[str] = []
+    kept: list[str] = []
+    reward = max(cell.reward["cost"].value, cell.reward["dense"].value)
+    for name, is_broken in (
+        ("reward", reward > EXACT),
+        ("observation", cell.observation.value > EXACT),
+        ("resets", cell.resets_p < SIGNIFICANT),
+    ):
+        (broken if is_broken else kept).append(name)
+    parts.append(
+        " and ".join(
+            f"{_and(names)} {verb if len(names) == 1 and names != ['resets'] else plural}"
+            for names, verb, plural in (
+                (kept, "keeps the symmetry", "keep the symmetry"),
+                (broken, "breaks it", "break it"),
+            )
+            if names
+        )
+    )
+    sentence = "; ".join(parts)
+    return sentence[0].upper() + sentence[1:] + "."
+
+
+def _and(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def _variant(cell: Cell) -> str:
+    return "unbroken" if cell.settings.variant == "none" else cell.settings.variant
+
+
+def _largest(cell: Cell) -> str | None:
+    drawn = [b for b in cell.map if b.copies >= MIN_COPIES]
+    tops = []
+    for body in ("tool", "object"):
+        bins = [b for b in drawn if b.body == body]
+        if bins:
+            top = max(bins, key=lambda b: b.mm)
+            tops.append(f"{body} {top.mm:.2g} mm at ({top.x_mm:.0f}, {top.y_mm:.0f})")
+    return "largest mean departure of a square: " + "; ".join(tops) if tops else None
+
+
+def _relative(defect: Defect) -> str:
+    return _percent(defect.relative) if defect.relative else "at rest"
+
+
+def _millimetres(defect: Defect) -> str:
+    return f"{_number(defect.mm, 2)} of {defect.displacement_mm:.1f} mm"
+
+
+def _degrees(defect: Defect) -> str:
+    return f"{_number(defect.degrees, 2)} degrees"
+
+
+def _percent(estimate: Estimate) -> str:
+    value, low, high = (100 * v for v in (estimate.value, estimate.low, estimate.high))
+    digits = 2 if abs(value) < 1 else 1
+    return f"{value:.{digits}f} % [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def _number(estimate: Estimate, digits: int) -> str:
+    value, low, high = (_plain(v, digits) for v in (estimate.value, estimate.low, estimate.high))
+    return f"{value} [{low}, {high}]"
+
+
+def _plain(value: float, digits: int) -> str:
+    rounded = f"{value:.{digits}f}"
+    return rounded.lstrip("-") if float(rounded) == 0 else rounded
+
+
+# ------------------------------------------------------------------------- tables
+
+ESTIMATES = {
+    "tool_step": lambda c: _of(c.defect("tool", "step"), "relative"),
+    "tool_step_mm": lambda c: _of(c.defect("tool", "step"), "mm"),
+    "tool_step_deg": lambda c: _of(c.defect("tool", "step"), "degrees"),
+    "tool_chunk": lambda c: _of(c.defect("tool", "chunk"), "relative"),
+    "tool_chunk_mm": lambda c: _of(c.defect("tool", "chunk"), "mm"),
+    "object_step": lambda c: _of(c.defect("object", "step"), "relative"),
+    "object_chunk": lambda c: _of(c.defect("object", "chunk"), "relative"),
+    "object_chunk_mm": lambda c: _of(c.defect("object", "chunk"), "mm"),
+    "object_chunk_deg": lambda c: _of(c.defect("object", "chunk"), "degrees"),
+    "cost": lambda c: c.reward["cost"],
+    "dense": lambda c: c.reward["dense"],
+    "observation": lambda c: c.observation,
+    "field_mm": lambda c: c.worst_field.value if c.worst_field else None,
+    "resets": lambda c: c.resets,
+}
+"""Columns of the table, each a number with its interval."""
+
+PLAIN = {
+    "task": lambda c: c.settings.task,
+    "embodiment": lambda c: c.settings.embodiment,
+    "variant": lambda c: c.settings.variant,
+    "group": lambda c: c.settings.group,
+    "states": lambda c: c.states,
+    "moving": lambda c: c.moving,
+    "unreachable": lambda c: _short(c.unreachable),
+    "resets_p": lambda c: _short(c.resets_p),
+    "field": lambda c: c.worst_field.name if c.worst_field else None,
+    "tool_floor_mm": lambda c: _short(_of(c.defect("tool", "chunk"), "floor_mm")),
+    "object_floor_mm": lambda c: _short(_of(c.defect("object", "chunk"), "floor_mm")),
+}
+
+
+def _of(defect: Defect | None, name: str) -> Any:
+    return None if defect is None else getattr(defect, name)
+
+
+def _short(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.3g}")
+
+
+def summary(cell: Cell) -> dict[str, Any]:
+    """A row of the table: numbers to three digits, an interval as [value, low, high]."""
+    row: dict[str, Any] = {name: get(cell) for name, get in PLAIN.items()}
+    for name, get in ESTIMATES.items():
+        estimate = get(cell)
+        row[name] = (
+            None
+            if estimate is None
+            else [_short(v) for v in (estimate.value, estimate.low, estimate.high)]
+        )
+    return row
+
+
+def to_csv(rows: Sequence[dict[str, Any]]) -> str:
+    """Rows of :func:`summary` as CSV: three columns for each interval."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    head: list[str] = list(PLAIN)
+    for name in ESTIMATES:
+        head += [name, f"{name}_low", f"{name}_high"]
+    writer.writerow(head)
+    for row in rows:
+        values = [row[name] for name in PLAIN]
+        for name in ESTIMATES:
+            values += row[name] or [None] * 3
+        writer.writerow(["" if v is None else v for v in values])
+    return out.getvalue()
+
+
+def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """Rows of :func:`summary` as a table for readers, one row a cell."""
+    several = len({(r["task"], r["embodiment"], r["group"]) for r in rows}) > 1
+    head = ["variant", "tool, step", "tool, chunk", "object, chunk", "object, mm", "cost", "dense"]
+    head += ["observed", "field, mm", "resets", "p"]
+    lines = []
+    for row in rows:
+        name = "unbroken" if row["variant"] == "none" else f"`{row['variant']}`"
+        if several:
+            name = f"{row['task'].removesuffix('-v1')}, {row['embodiment']}, {name}"
+        cells = [name]
+        cells += [_cell(row[c], 100, "%") for c in ("tool_step", "tool_chunk", "object_chunk")]
+        cells += [_cell(row["object_chunk_mm"], 1)]
+        cells += [_cell(row[c], 1, exact=EXACT) for c in ("cost", "dense")]
+        cells += [_cell(row["observation"], 100, "%", EXACT), _cell(row["field_mm"], 1, "", 1e-2)]
+        cells += [_cell(row["resets"], 1, "", 5e-4), f"{row['resets_p']:.3f}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    rule = "|---|" + "--:|" * (len(head) - 1)
+    return "\n".join(["| " + " | ".join(head) + " |", rule, *lines]) + "\n"
+
+
+def _cell(interval: list[float] | None, scale: float, unit: str = "", exact: float = 0.0) -> str:
+    """``value [low, high]``; a plain 0 where all three are below ``exact``."""
+    if interval is None:
+        return "at rest"
+    if all(abs(v) < exact for v in interval):
+        return "0"
+    value, low, high = (_two(scale * v) for v in interval)
+    return f"{value}{unit and ' ' + unit} [{low}, {high}]"
+
+
+def _two(value: float) -> str:
+    """Two significant digits, without an exponent."""
+    if value == 0:
+        return "0"
+    if abs(value) >= 10:
+        return f"{value:.0f}"
+    rounded = f"{value:.2g}"
+    return f"{float(rounded):.5f}".rstrip("0").rstrip(".") if "e" in rounded else rounded
+
+
+# -------------------------------------------------------------------------- files
+
+
+def write_cell(cell: Cell, folder: Path) -> None:
+    """Write ``audit.json``, ``map.csv`` and ``map.png``.
+
+    Raises:
+        UserError: if the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "audit.json").write_text(json.dumps(cell.to_json(), indent=1) + "\n")
+        rows = ["body,x_mm,y_mm,copies,mm"]
+        rows += [f"{b.body},{b.x_mm:g},{b.y_mm:g},{b.copies},{b.mm:.4g}" for b in cell.map]
+        (folder / "map.csv").write_text("\n".join(rows) + "\n")
+        map_figure(cell).savefig(folder / "map.png", dpi=110, metadata={"Software": None})
+    except OSError as error:
+        raise UserError(f"cannot write the audit to {folder}: {error.strerror}") from error
+
+
+def read_cell(path: Path) -> Cell:
+    """Read an ``audit.json``.
+
+    Raises:
+        UserError: if it is missing or damaged.
+    """
+    try:
+        return Cell.from_json(json.loads(path.read_text()))
+    except OSError as error:
+        raise UserError(f"cannot read the audit {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"{path} is no audit ({error}); run the audit again") from error
+
+
+def write_table(cells: Sequence[Cell], folder: Path) -> None:
+    """Write ``table.csv``, ``table.md`` and ``summary.json`` of many cells.
+
+    Raises:
+        UserError: if the folder cannot be written.
+    """
+    rows = [summary(cell) for cell in cells]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "table.csv").write_text(to_csv(rows))
+        (folder / "table.md").write_text(to_markdown(rows))
+        (folder / "summary.json").write_text(summary_json(rows))
+    except OSError as error:
+        raise UserError(f"cannot write the table to {folder}: {error.strerror}") from error
+
+
+def summary_json(rows: Sequence[dict[str, Any]]) -> str:
+    """Rows of :func:`summary`, a line each."""
+    return "[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n"
+
+
+def same_settings(found: Cell, wanted: Settings) -> bool:
+    """Whether a cell on disk is what would be measured."""
+    return found.settings == wanted
+
+
+def map_figure(cell: Cell) -> Figure:
+    """Where in the workspace copies depart from the majority, for tool and object."""
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    axes = figure.subplots(1, 2)
+    side = 1e3 * BIN
+    reach = max([abs(v) for b in cell.map for v in (b.x_mm, b.y_mm)], default=100.0) + side
+    for ax, body in zip(axes, ("tool", "object"), strict=True):
+        bins = [b for b in cell.map if b.body == body and b.copies >= MIN_COPIES]
+        top = max((b.mm for b in bins), default=0.0) or 1.0
+        for b in bins:
+            shade = b.mm / top
+            ax.add_patch(
+                Rectangle((b.x_mm - side / 2, b.y_mm - side / 2), side, side, color=_color(shade))
+            )
+            ax.text(
+                b.x_mm,
+                b.y_mm,
+                f"{b.mm:.2g}",
+                ha="center",
+                va="center",
+                fontsize=6,
+                color="white" if shade > 0.55 else "black",
+            )
+        ax.plot(0, 0, "+", color="#0072B2", markersize=9)
+        ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+        ax.set(xlabel="x from the policy's origin, mm", ylabel="y, mm")
+        ax.set_title(f"{body}: mm after {cell.settings.chunk} steps", fontsize=10)
+    s = cell.settings
+    figure.suptitle(f"{s.task}, {s.embodiment}, {_variant(cell)}, {s.group}", fontsize=11)
+    return figure
+
+
+def _color(shade: float) -> tuple[float, float, float]:
+    """White to vermilion to dark."""
+    low, middle, high = (0.97, 0.97, 0.97), (0.84, 0.37, 0.0), (0.25, 0.06, 0.0)
+    first, second, part = (low, middle, 2 * shade) if shade < 0.5 else (middle, high, 2 * shade - 1)
+    r, g, b = (p + part * (q - p) for p, q in zip(first, second, strict=True))
+    return r, g, b

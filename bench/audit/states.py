@@ -1,0 +1,242 @@
+"""States that an expert or a base policy visits, and their turned copies.
+
+Visited are states of the unbroken task, one of each episode, so that they are independent of one
+another. Copies are made by a planar group that acts about a given centre on the whole simulation
+state: bodies, robot, controller targets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from bench.audit.arm import ArmTurner
+from bench.tasks.base import SymmetricTask
+from bench.tasks.experts import Expert
+from bench.tasks.rotations import planar_matrix
+from policies.base import ChunkPolicy
+
+Visitor = Literal["expert", "policy"]
+Element = tuple[float, bool]
+"""A planar symmetry: angle in radians, and whether the reflection of y comes first."""
+
+MOVED = 1e-4
+"""An object that is further than this from where it was (metres) is in motion."""
+
+
+@dataclass(frozen=True)
+class Visited:
+    """S states on the way, with what was done there; tensors on the CPU.
+
+    Attributes:
+        state: simulation states, a tree of ``[S, ...]``.
+        actions: the visitor's next actions from there on, ``[S, T, 7]``.
+        after: the states one control step later.
+        moving: whether the manipulated object moves during these T steps (in the unbroken task:
+            it is pushed, carried, falling), ``[S]`` bool.
+        policy: whether the base policy came by, and not the expert, ``[S]`` bool.
+    """
+
+    state: dict[str, Any]
+    actions: torch.Tensor
+    after: dict[str, Any]
+    moving: torch.Tensor
+    policy: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    @staticmethod
+    def join(parts: Sequence[Visited]) -> Visited:
+        """All states of several visits."""
+        return Visited(
+            **{f.name: join_trees([getattr(p, f.name) for p in parts]) for f in fields(Visited)}
+        )
+
+
+def visit(
+    env: SymmetricTask,
+    visitor: Visitor,
+    count: int,
+    steps: int,
+    seed: int,
+    policy: ChunkPolicy | None = None,
+) -> Visited:
+    """Sample a state from each of ``count`` episodes, uniformly in time until its success.
+
+    Args:
+        env: the unbroken task; its parallel environments play an episode each at a time.
+        visitor: ``expert`` acts in closed loop; ``policy`` decodes standard normal noise and
+            executes its chunks, and its states are those in which it decides.
+        count: number of states.
+        steps: number T of following actions to keep.
+        seed: of episodes, noise and choice.
+        policy: the base policy.
+    """
+    parts = []
+    for start in range(0, count, env.num_envs):
+        part = _visit_batch(env, visitor, steps, [seed, start], policy)
+        keep = torch.arange(min(env.num_envs, count - start))
+        parts.append(
+            Visited(**{f.name: rows_of(getattr(part, f.name), keep) for f in fields(Visited)})
+        )
+    return Visited.join(parts)
+
+
+def _visit_batch(
+    env: SymmetricTask,
+    visitor: Visitor,
+    steps: int,
+    seeds: list[int],
+    policy: ChunkPolicy | None,
+) -> Visited:
+    rng = np.random.default_rng([*seeds, visitor == "policy"])
+    episodes = np.asarray(rng.integers(2**31, size=env.num_envs)).tolist()
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    obs, _ = env.reset(seed=episodes, options={"reconfigure": True})
+    expert = Expert(env)
+    chunk = torch.zeros(0)
+    trail, actions, objects = [task_state(env)], [], [env.manipulated.pose.p.cpu().clone()]
+    length = torch.full((env.num_envs,), env.max_episode_steps - steps + 1)
+    for step in range(env.max_episode_steps):
+        if policy is None:
+            action = expert.act()
+        else:
+            if step % policy.execute == 0:
+                noise = torch.randn(
+                    env.num_envs, policy.horizon, policy.act_layout.dim, generator=generator
+                )
+                device = next(policy.parameters()).device
+                chunk = policy.decode(obs.to(device), noise.to(device)).to(env.device)
+            action = chunk[:, step % policy.execute]
+        obs, _, _, _, info = env.step(action)
+        trail.append(task_state(env))
+        actions.append(action.cpu().clone())
+        objects.append(env.manipulated.pose.p.cpu().clone())
+        won = info["success"].cpu() & (length > step + 1)
+        length = torch.where(won, step + 1, length)
+        if step + 1 >= int(length.max()) - 1 + steps:
+            break
+    stride = 1 if policy is None else policy.execute
+    choices = (length + stride - 1) // stride
+    drawn = torch.as_tensor(rng.uniform(size=env.num_envs)) * choices
+    time = stride * drawn.long()
+    every = torch.arange(env.num_envs)
+    path = torch.stack(objects)
+    window = torch.stack([path[time + k, every] for k in range(steps + 1)])
+    return Visited(
+        state=_pick(trail, time),
+        actions=torch.stack([torch.stack(actions)[time + k, every] for k in range(steps)], dim=1),
+        after=_pick(trail, time + 1),
+        moving=((window - window[0]).norm(dim=-1) > MOVED).any(dim=0),
+        policy=torch.full((env.num_envs,), policy is not None),
+    )
+
+
+def _pick(trail: list[Any], time: torch.Tensor) -> Any:
+    """Row i of the tree at ``time[i]``."""
+    if isinstance(trail[0], dict):
+        return {key: _pick([tree[key] for tree in trail], time) for key in trail[0]}
+    return torch.stack([trail[int(t)][i] for i, t in enumerate(time)])
+
+
+def task_state(env: SymmetricTask) -> dict[str, Any]:
+    """The simulation state of all environments on the CPU, without what stands still."""
+    state = env.get_state_dict()
+    actors = {k: v for k, v in state["actors"].items() if k != env.table_scene.table.name}
+    return _to_cpu({**state, "actors": actors})
+
+
+def _to_cpu(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {key: _to_cpu(value) for key, value in tree.items()}
+    return tree.detach().cpu().clone()
+
+
+class Turner:
+    """Acts with planar symmetries on simulation states, about any centre.
+
+    Args:
+        env: a task that knows how its states turn; it is asked, not stepped.
+    """
+
+    def __init__(self, env: SymmetricTask) -> None:
+        self.env = env
+        self.arm = ArmTurner(env) if env.embodiment == "panda" else None
+
+    def turn(
+        self, state: dict[str, Any], element: Element, centre: torch.Tensor
+    ) -> tuple[dict[str, Any], torch.Tensor]:
+        """Turn states; which of them the robot can take, ``[S]`` bool, comes along.
+
+        Args:
+            state: tree of ``[S, ...]``.
+            element: what acts; the identity returns the states to the bit.
+            centre: about which it acts, ``[2]`` metres from the workspace centre.
+        """
+        count = len(next(iter(state["actors"].values())))
+        reached = torch.ones(count, dtype=torch.bool)
+        if element == (0.0, False):
+            return state, reached
+        # x -> M x + (1 - M) c: the turn about the workspace centre, then a shift.
+        matrix = planar_matrix(*element, centre)[:2, :2]
+        offset = (centre - matrix @ centre).expand(count, 2)
+        shifted = bool(centre.any())
+        bodies = {"actors": state["actors"], "articulations": {}}
+        if self.arm is not None:
+            turned = self.env.transform_state(bodies, *element)
+            robot = self.env.agent.robot.name
+            arm, reached = self.arm.turn(state["articulations"][robot], *element, offset)
+            turned["articulations"] = {**state["articulations"], robot: arm}
+            if "controller" in state:
+                turned["controller"] = state["controller"]
+        else:
+            turned = self.env.transform_state(state, *element)
+            if shifted:
+                robot = self.env.agent.robot.name
+                body = self.env.body
+                joints = body.shift_robot(turned["articulations"][robot], offset)
+                turned["articulations"] = {**turned["articulations"], robot: joints}
+                if "controller" in turned:
+                    turned["controller"] = body.shift_controller(turned["controller"], offset)
+        if shifted:
+            turned["actors"] = {k: _shift(v, offset) for k, v in turned["actors"].items()}
+        return turned, reached
+
+
+def seen_from(state: dict[str, Any], centre: torch.Tensor) -> dict[str, Any]:
+    """The same states with ``centre [2]`` moved to the workspace centre, for observing only.
+
+    The robot's base moves too, which leaves joint angles as they are but is no state of the task.
+    """
+    offset = -centre.expand(len(next(iter(state["actors"].values()))), 2)
+    moved = {
+        kind: {name: _shift(value, offset) for name, value in state[kind].items()}
+        for kind in ("actors", "articulations")
+    }
+    return {**state, **moved}
+
+
+def _shift(state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
+    """Move bodies or robot bases, whose first two numbers are x and y, by ``offset [S, 2]``."""
+    moved = state.clone()
+    moved[:, :2] += offset
+    return moved
+
+
+def join_trees(trees: Sequence[Any]) -> Any:
+    """Concatenate trees of ``[S_i, ...]``."""
+    if isinstance(trees[0], dict):
+        return {key: join_trees([tree[key] for tree in trees]) for key in trees[0]}
+    return torch.cat(list(trees))
+
+
+def rows_of(tree: Any, rows: torch.Tensor) -> Any:
+    """Some rows of a tree of ``[S, ...]``."""
+    if isinstance(tree, dict):
+        return {key: rows_of(value, rows) for key, value in tree.items()}
+    return tree[rows]
