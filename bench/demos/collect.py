@@ -32,7 +32,7 @@ class Diversity:
 
     noise: float = 0.6
     """Standard deviation of the action noise, in normalized action units of the floating gripper
-    (the Panda's larger steps take 0.6 of it)."""
+    (the Panda's larger steps take 0.6 of it, tasks their own ``noise_scale``)."""
     correlation: float = 0.8
     """Correlation of the noise from one step to the next (first-order autoregressive)."""
     scale: tuple[float, float] = (0.3, 1.7)
@@ -177,7 +177,8 @@ def _disturbances(
     for i, seed in enumerate(seeds):
         # A stream of its own: the environment seeds another generator with the same number.
         rng = np.random.default_rng([seed, 1])
-        scale = settings.noise * env.body.noise_scale * rng.uniform(*settings.scale)
+        tolerance = env.body.noise_scale * env.noise_scale
+        scale = settings.noise * tolerance * rng.uniform(*settings.scale)
         radius, bearing = settings.offset * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
         offsets[i, :2] = radius * np.cos(bearing), radius * np.sin(bearing)
         draws = rng.standard_normal((steps, dim))

@@ -71,6 +71,8 @@ class SymmetricTask(GymEnv):
     spawn_extent: ClassVar[float]
     """Radius about the origin, metres, within which every body that can collide stands at a reset
     as a whole, as far as it is below 10 cm."""
+    noise_scale: ClassVar[float] = 1.0
+    """How much action noise diverse demonstrations bear in this task, relative to the others."""
     mirrored_across_yz: ClassVar[frozenset[str]] = frozenset()
     """Names of actors that are their own mirror image across their body y-z plane but not across
     x-z, the plane by which a reflection mirrors all others."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ class MoveCube(SymmetricTask):
     )
     max_episode_steps = 50
     spawn_radius = 0.1
-    spawn_extent: ClassVar[float] = 0.13
+    spawn_extent = 0.13
 
     obj: Actor
     goal_region: Actor

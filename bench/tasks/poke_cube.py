@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -68,7 +68,8 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
     peg_to_cube = 0.22
     across = 0.1
     cube_turn = math.pi / 6
-    spawn_extent: ClassVar[float] = 0.26
+    spawn_extent = 0.26
+    noise_scale = 0.7
 
     def _place_objects(self, rng: Any, count: int) -> None:
         u = rng.uniform(size=5)
@@ -146,9 +147,13 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         # it moves the grasp along the peg.
         along_peg = (offset * axis).sum(dim=1, keepdim=True) * axis
         target = peg.p + along_peg + 0.3 * (offset - along_peg)
-        approach, held = grasp_at(
-            self, target, here, yaw_along(self, axis[:, :2]), 2 * self.peg_half_width
+        straddle = self.body.reachable_turn(
+            self.agent.robot.get_qpos(),
+            yaw_along(self, axis[:, :2]),
+            math.pi,
+            torch.zeros_like(distance),
         )
+        approach, held = grasp_at(self, target, here, straddle, 2 * self.peg_half_width)
 
         end = peg.p + self._half_peg(axis, torch.cat([ahead, 0 * ahead[:, :1]], dim=1))
         pointing = (end - peg.p)[:, :2]
