@@ -53,9 +53,10 @@ class PushT(SymmetricTask, PushTEnv):
         Field("turn_sin", 0, odd=True),
     )
     spawn_radius = 0.1
-    goal_radius = 0.05
+    goal_spawn_radius = 0.05
     spawn_extent = 0.24
     half_thickness = 0.02
+    lowest_grip = 0.014
     max_turn = math.pi / 2
     grip_on_stem = 0.04
     """Where the expert grasps: metres along the stem from the centre of mass."""
@@ -66,7 +67,7 @@ class PushT(SymmetricTask, PushTEnv):
         u = rng.uniform(size=6)
         xy, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
         self.tee.set_pose(flat_pose(xy, self.half_thickness, yaw, self.device))
-        xy, yaw = disc(u[:, 3:5], self.goal_radius), yaw + self.max_turn * (2 * u[:, 5] - 1)
+        xy, yaw = disc(u[:, 3:5], self.goal_spawn_radius), yaw + self.max_turn * (2 * u[:, 5] - 1)
         goal = flat_pose(xy, 1e-3, yaw, self.device)
         self.goal_tee.set_pose(goal)
         flat = goal.q.new_tensor([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]).expand_as(goal.q)
@@ -148,9 +149,9 @@ class PushT(SymmetricTask, PushTEnv):
         cos, sin = torch.cos(turn)[:, None], torch.sin(turn)[:, None]
         turned = cos * arm + sin * torch.stack([-arm[:, 1], arm[:, 0]], dim=1)
         fit = goal.p[:, :2] + self.drawing_offset * goal_stem
-        move = torch.cat(
-            [self.body.drag_gain * (fit + turned - tcp[:, :2]), self.half_thickness - tcp[:, 2:]], dim=1
-        )
+        # Keep the block on the table, and the finger tips, 9 mm below the tool, above it.
+        height = self.half_thickness - tee.p[:, 2:] + (self.lowest_grip - tcp[:, 2:]).clamp_min(0.0)
+        move = torch.cat([self.body.drag_gain * (fit + turned - tcp[:, :2]), height], dim=1)
         drag = Intent(move=move, yaw=turn, gripper=torch.full_like(turn, CLOSED))
         return choose(held, drag, approach)
 

@@ -1,0 +1,169 @@
+"""PushT: the goal is part of the state, and success turns with it."""
+
+import math
+
+import pytest
+import torch
+from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
+from mani_skill.utils.structs import Pose
+
+from bench.sim import create
+from bench.tasks import make
+from bench.tasks.experts import Expert
+from bench.tasks.rotations import quaternion_to_matrix, yaw_quaternion
+from policies.geometry import Group
+
+COUNT = 48
+PIXELS = 825
+"""Of a whole T in ManiSkill's drawing."""
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = make("PushT-v1", num_envs=COUNT, reward_mode="dense")
+    yield env
+    env.close()
+
+
+def uniform(low, high, seed):
+    return low + (high - low) * torch.rand(COUNT, generator=torch.Generator().manual_seed(seed))
+
+
+def flat(x, y, yaw, z=0.02):
+    return Pose.create_from_pq(torch.stack([x, y, torch.full_like(x, z)], 1), yaw_quaternion(yaw))
+
+
+def place_near_goal(env):
+    """Blocks up to 1 cm and 0.1 rad off their goals."""
+    env.reset(seed=list(range(COUNT)))
+    goal = env.goal_tee.pose
+    yaw = 2 * torch.atan2(goal.q[:, 3], goal.q[:, 0])
+    x, y = goal.p[:, 0] + uniform(-0.01, 0.01, 0), goal.p[:, 1] + uniform(-0.01, 0.01, 1)
+    env.tee.set_pose(flat(x, y, yaw + uniform(-0.1, 0.1, 2)))
+
+
+def test_yaw_of_any_quaternion(env):
+    yaw = torch.linspace(0.01, 2 * math.pi - 0.01, 200)
+    q = yaw_quaternion(yaw)
+    for sign in (1, -1):
+        assert torch.allclose(env.quat_to_z_euler(sign * q), yaw, atol=1e-5)
+        assert torch.allclose(PushTEnv.quat_to_z_euler(env, sign * q), yaw, atol=1e-3)
+    rounded = torch.tensor([[1.0000001, 0.0, 0.0, 1e-4]])
+    assert torch.allclose(env.quat_to_z_euler(rounded), torch.tensor([2e-4]), atol=1e-6)
+    assert PushTEnv.quat_to_z_euler(env, rounded).isnan().all()  # why it is replaced
+
+
+def test_overlap_is_the_mean_of_stocks_for_both_mirror_images(env):
+    stock = create(PushTEnv, num_envs=COUNT)
+    stock.reset(seed=0)
+    dx, dy = uniform(-0.02, 0.02, 3), uniform(-0.02, 0.02, 4)
+    turn = uniform(-0.3, 0.3, 5)
+
+    def on_goal(goal_x, goal_y, goal_yaw, dx, dy, turn):
+        cos, sin = torch.cos(goal_yaw), torch.sin(goal_yaw)
+        return flat(goal_x + cos * dx - sin * dy, goal_y + sin * dx + cos * dy, goal_yaw + turn)
+
+    def stock_overlap(*offset):
+        at = torch.ones(COUNT)
+        goal = (stock.goal_offset[0] * at, stock.goal_offset[1] * at, stock.goal_z_rot * at)
+        stock.tee.set_pose(on_goal(*goal, *offset))
+        return stock.pseudo_render_intersection()
+
+    expected = (stock_overlap(dx, dy, turn) + stock_overlap(-dx, dy, -turn)) / 2
+    goal = (uniform(-0.05, 0.05, 6), uniform(-0.05, 0.05, 7), uniform(-3, 3, 8))
+    env.reset(seed=list(range(COUNT)))
+    env.goal_tee.set_pose(flat(*goal, z=1e-3))
+    env.tee.set_pose(on_goal(*goal, dx, dy, turn))
+    # A point on the edge of a pixel may be rounded to either side.
+    assert torch.allclose(env.pseudo_render_intersection(), expected, atol=3 / PIXELS)
+    assert expected.std() > 0.02
+    stock.close()
+
+
+def test_success_turns_with_block_and_goal(env):
+    place_near_goal(env)
+    state = env.get_state_dict()
+    share, won = env.pseudo_render_intersection(), env.evaluate()["success"]
+    assert 5 < won.sum() < COUNT - 5
+    clear = (share - env.intersection_thresh).abs() > 3 / PIXELS
+    assert clear.sum() > COUNT / 2
+    for angle, reflect in [*Group.parse("D8").elements, (0.3, False), (-2.0, True)]:
+        env.set_state_dict(env.transform_state(state, angle, reflect))
+        turned = env.pseudo_render_intersection()
+        assert torch.allclose(turned, share, atol=3 / PIXELS), (angle, reflect)
+        assert torch.equal(env.evaluate()["success"][clear], won[clear])
+
+
+def test_goal_is_where_its_actor_is(env):
+    """Stock's constants play no part: block on goal succeeds anywhere, goal moved away fails."""
+    env.reset(seed=list(range(COUNT)))
+    goal = env.goal_tee.pose
+    stem = quaternion_to_matrix(goal.q)[:, :, 1]
+    p = goal.p + env.drawing_offset * stem
+    env.tee.set_pose(Pose.create_from_pq(p, goal.q))
+    assert env.evaluate()["success"].all()
+    env.goal_tee.set_pose(Pose.create_from_pq(goal.p + torch.tensor([0.03, 0.0, 0.0]), goal.q))
+    assert not env.evaluate()["success"].any()
+
+
+def test_reward_at_stocks_goal_is_stocks(env):
+    env.reset(seed=list(range(COUNT)))
+    at = torch.ones(COUNT)
+    env.goal_tee.set_pose(
+        flat(env.goal_offset[0] * at, env.goal_offset[1] * at, env.goal_z_rot * at, z=1e-3)
+    )
+    info = env.evaluate()
+    ours = env.compute_dense_reward(None, None, info)
+    stock = PushTEnv.compute_dense_reward(env, None, None, info)
+    assert torch.allclose(ours, stock, atol=1e-5)
+    assert ours.std() > 0.05
+
+
+def test_a_mirrored_block_covers_the_mirrored_points(env):
+    env.reset(seed=list(range(COUNT)))
+    # Ends of the bar and of the stem: the T is their mirror image only across its y-z plane.
+    marks = torch.tensor([[-0.1, -0.0375, 0.0], [0.1, -0.0375, 0.0], [0.0, 0.1375, 0.0]])
+
+    def points(actor):
+        return actor.pose.p[:, None] + marks @ quaternion_to_matrix(actor.pose.q).mT
+
+    state = env.get_state_dict()
+    before = [points(actor) for actor in (env.tee, env.goal_tee)]
+    env.set_state_dict(env.transform_state(state, 0.0, True))
+    for actor, old in zip((env.tee, env.goal_tee), before, strict=True):
+        mirrored = old * torch.tensor([1.0, -1.0, 1.0])
+        # The ends of the bar change places.
+        assert torch.allclose(points(actor), mirrored[:, [1, 0, 2]], atol=1e-6)
+
+
+def test_resets():
+    env = make("PushT-v1", num_envs=400)
+    obs, _ = env.reset(seed=list(range(400)))
+    layout = env.observation_layout
+    assert obs[:, layout.slice("tee_xy")].norm(dim=1).max() <= env.spawn_radius + 1e-6
+    assert obs[:, layout.slice("goal_xy")].norm(dim=1).max() <= env.goal_spawn_radius + 1e-6
+    for name in ("tee_stem", "goal_stem"):
+        assert (obs[:, layout.slice(name)].mean(dim=0).abs() < 5 * 0.71 / 20).all(), name
+    turn = torch.atan2(obs[:, layout.slice("turn_sin")], obs[:, layout.slice("turn_cos")])
+    assert turn.abs().max() <= env.max_turn + 1e-5
+    assert turn.min() < -0.9 * env.max_turn
+    assert turn.max() > 0.9 * env.max_turn
+    corners = torch.tensor([[0.1, -0.0625], [-0.1, -0.0625], [0.025, 0.1375], [-0.025, 0.1375]])
+    for actor in (env.tee, env.goal_tee):
+        rotation = quaternion_to_matrix(actor.pose.q)[:, :2, :2]
+        reach = (actor.pose.p[:, None, :2] + corners @ rotation.mT).norm(dim=2).max()
+        assert reach <= env.spawn_extent
+    assert env.evaluate()["success"].float().mean() < 0.02
+    env.close()
+
+
+def test_the_expert_drags_on_the_table(env):
+    env.reset(seed=list(range(COUNT)))
+    expert = Expert(env)
+    won = torch.zeros(COUNT, dtype=torch.bool)
+    highest = torch.zeros(COUNT)
+    for _ in range(30):
+        won |= env.step(expert.act())[-1]["success"]
+        highest = highest.maximum(env.tee.pose.p[:, 2])
+    assert won.float().mean() > 0.9
+    assert highest.quantile(0.9) < env.half_thickness + 0.003
