@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from bench.tasks import make
+from bench.tasks import make, task_names
 from bench.tasks.experts import Expert
 from policies.geometry import Group
 
-TASKS = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
+TASKS = task_names()
 
 
 def success_rate(task, embodiment, episodes, first_seed=0):
@@ -28,7 +28,7 @@ def success_rate(task, embodiment, episodes, first_seed=0):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_expert_solves_the_floating_task(task):
-    assert success_rate(task, "floating", 32) >= 0.9
+    assert success_rate(task, "floating", 24) >= 0.9
 
 
 @pytest.mark.slow
@@ -43,14 +43,16 @@ def test_expert_is_equivariant(task):
     env = make(task, num_envs=8)
     env.reset(seed=list(range(8)))
     expert = Expert(env)
-    for step in range(12):
-        state = env.get_state_dict()
+    # Far enough for every expert to have its object in hand.
+    for step in range(24):
         action = expert.act()
-        for angle, reflect in Group.parse("D8").elements[:: 3 if step % 4 else 1]:
-            env.set_state_dict(env.transform_state(state, angle, reflect))
-            expected = env.action_layout.transform(action, angle, reflect)
-            # A float error may tip a threshold for one state in many, no more.
-            close = torch.isclose(expert.act(), expected, atol=2e-3).all(dim=1)
-            assert close.float().mean() >= 7 / 8, (step, angle, reflect)
-        env.set_state_dict(state)
+        if step % 2 == 0:
+            state = env.get_state_dict()
+            for angle, reflect in Group.parse("D8").elements[:: 3 if step % 4 else 1]:
+                env.set_state_dict(env.transform_state(state, angle, reflect))
+                expected = env.action_layout.transform(action, angle, reflect)
+                # A float error may tip a threshold for one state in many, no more.
+                close = torch.isclose(expert.act(), expected, atol=2e-3).all(dim=1)
+                assert close.float().mean() >= 7 / 8, (step, angle, reflect)
+            env.set_state_dict(state)
         env.step(action)
