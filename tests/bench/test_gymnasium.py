@@ -1,9 +1,11 @@
 """Environments for others: gymnasium's API, ManiSkill's wrappers, NumPy."""
 
 import json
+import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import h5py
@@ -18,6 +20,7 @@ from mani_skill.utils.wrappers.frame_stack import FrameStack
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+from stable_baselines3 import SAC
 
 from bench.sim import rendering_works
 from bench.tasks import make, task_class, task_names
@@ -451,6 +454,59 @@ def test_environments_in_processes_are_those_of_a_batch():
         assert info["episode"]["episode_len"].tolist() == [5, 5]
     finally:
         envs.close()
+
+
+def test_environments_spread_over_workers_are_those_of_one_process():
+    one, two = (
+        ManiSkillVectorEnv(
+            gym.make(BATCHED, num_envs=3, max_episode_steps=4, workers=workers, **BROKEN),
+            record_metrics=True,
+        )
+        for workers in (1, 2)
+    )
+    try:
+        assert two.single_observation_space == one.single_observation_space
+        assert torch.equal(two.reset(seed=[3, 4, 5])[0], one.reset(seed=[3, 4, 5])[0])
+        one.action_space.seed(0)
+        for step in range(9):
+            action = one.action_space.sample()
+            (ours, *_, info), (theirs, *_, other) = two.step(action), one.step(action)
+            assert torch.equal(ours, theirs)
+            assert ("final_info" in info) == (step in (3, 7))
+            if "final_info" in info:
+                episode, expected = info["final_info"]["episode"], other["final_info"]["episode"]
+                assert episode.keys() == expected.keys()
+                assert all(torch.equal(episode[key], expected[key]) for key in expected)
+    finally:
+        one.close()
+        two.close()
+
+
+def blocks():
+    """Python blocks of the page, by their number."""
+    page = Path(__file__).parents[2] / "docs" / "gymnasium.md"
+    return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(i, marks=[pytest.mark.slow] if "learn(" in block else [])
+        for i, block in enumerate(blocks())
+    ],
+)
+def test_the_page_runs(number, monkeypatch):
+    learn = SAC.learn
+    monkeypatch.setattr(SAC, "learn", lambda self, total_timesteps: learn(self, 150))
+    before = set(gym.registry)
+    try:
+        exec(
+            compile(blocks()[number], f"gymnasium.md, block {number}", "exec"),
+            {"__name__": "__main__"},
+        )
+    finally:
+        for name in set(gym.registry) - before:
+            gym.registry.pop(name)
 
 
 def test_make_vec_takes_single_environments_only():
