@@ -157,9 +157,11 @@ class ArmTurner:
                 # The arm's own mirror image: every joint that turns out of its plane, reversed.
                 guess[:, ::2] *= -1
             base = bearing if origin is not near else guess[:, 0] + swing
-            # Seen from above the last joint runs against the tool's yaw.
-            wrist = near[:, 6] * (-1 if reflect else 1) + (base - guess[:, 0]) - angle
-            guess[:, 0], guess[:, 6] = base, wrap(wrist, 2 * math.pi)
+            # Seen from above the last joint runs against the tool's yaw; with base joint and wrist
+            # at 0 the fingers stand at an eighth of a turn.
+            yaw = near[:, 0] - near[:, 6] + math.pi / 4
+            yaw = (-yaw if reflect else yaw) + angle
+            guess[:, 0], guess[:, 6] = base, wrap(base + math.pi / 4 - yaw, 2 * math.pi)
             chosen.append(guess)
         for i in range(RANDOM_STARTS):
             noise = SPREAD * torch.randn(near.shape, generator=generator, dtype=near.dtype)

@@ -152,6 +152,8 @@ class Cell:
     """All numbers of one cell."""
 
     settings: Settings
+    base_policy: str | None
+    """Start of the content hash of the policy that visited states."""
     states: int
     moving: int
     unreachable: float
@@ -252,13 +254,19 @@ def reference_task(settings: Settings) -> SymmetricTask:
     )
 
 
-def audit(settings: Settings, reference: SymmetricTask, visited: Visited) -> Cell:
+def audit(
+    settings: Settings,
+    reference: SymmetricTask,
+    visited: Visited,
+    policy: ChunkPolicy | None = None,
+) -> Cell:
     """Measure one cell.
 
     Args:
         settings: what to measure.
         reference: the unbroken task, from :func:`reference_task`.
         visited: its states, from :func:`visit_all`; cells of a task share them.
+        policy: the policy among the visitors, to be named in the result.
     """
     settings.check()
     begin = time.perf_counter()
@@ -276,6 +284,7 @@ def audit(settings: Settings, reference: SymmetricTask, visited: Visited) -> Cel
     observation, fields = _observation_defect(copies, layout, seed)
     return Cell(
         settings=settings,
+        base_policy=policy.content_hash()[:12] if policy is not None else None,
         states=len(visited),
         moving=int(visited.moving.sum()),
         unreachable=float((~copies.reached).double().mean()),

@@ -54,22 +54,26 @@ def text(cell: Cell) -> str:
     )
     r = cell.reward
     lines += [
-        f"reward   cost {_number(r['cost'], 3)} a step, dense {_number(r['dense'], 4)}; "
-        f"by way of the dynamics {_number(r['outcome_cost_chunk'], 3)} and "
+        f"{'reward, a step':26s} cost {_number(r['cost'], 3)}, dense {_number(r['dense'], 4)}",
+        f"{'  by way of the dynamics':26s} cost {_number(r['outcome_cost_chunk'], 3)}, dense "
         f"{_number(r['outcome_dense_chunk'], 4)} a chunk",
-        f"observed {_percent(cell.observation)} of its spread"
-        + (f"; most in {f.name}: {_number(f.value, 2)} mm" if (f := cell.worst_field) else "")
+        f"{'observation':26s} {_percent(cell.observation)} of its spread"
         + (" (random: Gaussians compared)" if cell.random_observation else ""),
-        f"resets   energy distance {_number(cell.resets, 3)}, p = {cell.resets_p:.3g}",
     ]
+    worst = cell.worst_field
+    if worst is not None and worst.value.value > EXACT:
+        lines.append(f"{'  most in ' + worst.name:26s} {_number(worst.value, 1)} mm")
+    lines.append(
+        f"{'resets':26s} energy distance {_number(cell.resets, 3)}, p = {cell.resets_p:.3g}"
+    )
     if any(cell.origin_mm):
         x, y = cell.origin_mm
-        lines.append(f"origin   the group acts about ({x:.0f}, {y:.0f}) mm, the policy's origin")
+        lines.append(f"{'origin':26s} the group acts about ({x:.0f}, {y:.0f}) mm, the policy's")
     if s.embodiment != "floating":
-        lines.append(f"reach    {cell.unreachable:.1%} of the turned states are out of reach")
+        lines.append(f"{'reach':26s} {cell.unreachable:.1%} of the turned states are out of reach")
     top = _largest(cell)
     if top is not None:
-        lines.append(f"where    {top}")
+        lines.append(f"{'where':26s} {top}")
     return "\n".join([*lines, "", meaning(cell), f"({cell.seconds:.1f} s)"])
 
 
@@ -125,8 +129,8 @@ def _largest(cell: Cell) -> str | None:
         bins = [b for b in drawn if b.body == body]
         if bins:
             top = max(bins, key=lambda b: b.mm)
-            tops.append(f"{body} {top.mm:.2g} mm at ({top.x_mm:.0f}, {top.y_mm:.0f})")
-    return "largest mean departure of a square: " + "; ".join(tops) if tops else None
+            tops.append(f"({top.x_mm:.0f}, {top.y_mm:.0f}) mm: {body} {top.mm:.2g} mm")
+    return "most in the square at " + "; ".join(tops) if tops else None
 
 
 def _relative(defect: Defect) -> str:
@@ -258,6 +262,17 @@ def _cell(interval: list[float] | None, scale: float, unit: str = "", exact: flo
         return "0"
     value, low, high = (_two(scale * v) for v in interval)
     return f"{value}{unit and ' ' + unit} [{low}, {high}]"
+
+
+def percent_range(intervals: Sequence[list[float] | None], exact: float) -> str:
+    """Smallest to largest value in per cent; a plain 0 where all are below ``exact``."""
+    values = [i[0] for i in intervals if i is not None]
+    if not values:
+        return "at rest"
+    if max(values) < exact:
+        return "0"
+    low, high = _two(100 * min(values)), _two(100 * max(values))
+    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _two(value: float) -> str:

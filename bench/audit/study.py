@@ -111,7 +111,7 @@ def run_cells(
         reference = reference_task(todo[0])
         visited = visit_all(reference, todo[0], policy)
         for settings in todo:
-            cell = audit(settings, reference, visited)
+            cell = audit(settings, reference, visited, policy)
             results[settings] = cell
             folder = _folder(out, settings, len(cells))
             if folder is not None:

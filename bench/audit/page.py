@@ -1,0 +1,96 @@
+"""The tables of docs/audit.md, from the committed summary of all cells.
+
+python -m bench.audit.page                      # from docs/audit/summary.json
+python -m bench.audit.page OUT/summary.json     # takes a new summary over first
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.audit.report import EXACT, percent_range, summary_json, to_markdown
+from policies.errors import UserError
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "audit.md"
+SUMMARY = ROOT / "docs" / "audit" / "summary.json"
+BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
+
+
+def render(rows: Sequence[dict[str, Any]]) -> str:
+    """Overview and one table for each task and embodiment, in markdown."""
+    places = list(dict.fromkeys((r["task"], r["embodiment"], r["group"]) for r in rows))
+    parts = [_overview(rows)]
+    for place in places:
+        own = [r for r in rows if (r["task"], r["embodiment"], r["group"]) == place]
+        task, embodiment, group = place
+        states = f"{own[0]['states']} states, the object moves in {own[0]['moving']}"
+        reach = max(r["unreachable"] for r in own)
+        if reach > 0:
+            states += f"; up to {100 * reach:.1f} % of the turned states are out of reach"
+        parts.append(f"### {task}, {embodiment}, {group}\n\n{states}.\n\n{to_markdown(own)}")
+    return "\n".join(parts)
+
+
+def _overview(rows: Sequence[dict[str, Any]]) -> str:
+    """Range over the tasks of each component, one row for each embodiment and variant."""
+    head = ["variant", "tasks", "tool, step", "object, chunk", "cost", "observed", "resets"]
+    lines = ["| " + " | ".join(head) + " |", "|---|" + "--:|" * (len(head) - 1)]
+    for embodiment, group, variant in dict.fromkeys(
+        (r["embodiment"], r["group"], r["variant"]) for r in rows
+    ):
+        own = [
+            r
+            for r in rows
+            if (r["embodiment"], r["group"], r["variant"]) == (embodiment, group, variant)
+        ]
+        name = "unbroken" if variant == "none" else f"`{variant}`"
+        if (embodiment, group) != ("floating", "C8"):
+            name = f"{embodiment}, {group}, {name}"
+        cells = [name, str(len(own))]
+        cells += [percent_range([r[c] for r in own], 0) for c in ("tool_step", "object_chunk")]
+        cells += [percent_range([r[c] for r in own], EXACT) for c in ("cost", "observation")]
+        differ = sum(r["resets_p"] < 0.01 for r in own)
+        cells += [f"{differ} of {len(own)} differ" if differ else "alike"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def generate(page: str, rows: Sequence[dict[str, Any]]) -> str:
+    """The page with its tables made from ``rows``.
+
+    Raises:
+        UserError: if the page has lost the marks between which the tables stand.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise UserError(f"docs/audit.md has lost its marks {BEGIN.strip()} and {END.strip()}")
+    return f"{before}{BEGIN}\n{render(rows)}\n{END}{after}"
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write docs/audit.md; the exit code."""
+    try:
+        source = Path(arguments[0]) if arguments else SUMMARY
+        try:
+            rows = json.loads(source.read_text())
+        except (OSError, ValueError) as error:
+            raise UserError(f"cannot read the summary {source}: {error}") from error
+        if source != SUMMARY:
+            SUMMARY.parent.mkdir(exist_ok=True)
+            SUMMARY.write_text(summary_json(rows))
+        PAGE.write_text(generate(PAGE.read_text(), rows))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"wrote the tables of {len(rows)} cells to {PAGE}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
