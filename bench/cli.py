@@ -14,12 +14,13 @@ import sys
 import textwrap
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
 
 from bench.runs.config import DemonstrationConfig, RunConfig
+from bench.sim.errors import WorkerLostError
 from leaderboard.errors import RecordError
 from policies.base import PolicyName
 from policies.errors import UserError
@@ -35,6 +36,7 @@ def run(
     out: Path = Path("runs"),
     demos: Path | None = None,
     base_policy: Path | None = None,
+    workers: int = 1,
     quiet: bool = False,
 ) -> int:
     """Steer a base policy with one agent on one task, and record what happens.
@@ -45,11 +47,12 @@ def run(
         demos: Trajectory file (.h5 with .json) to train the base policy on, instead of the
             scripted expert's demonstrations.
         base_policy: Saved base policy (policy.safetensors) to steer, instead of training one.
+        workers: Processes that share the simulation; the record is the same but for the clock.
         quiet: No progress bars.
     """
     from bench.runs.run import execute
 
-    folder = execute(config, out, demos, base_policy, progress=not quiet)
+    folder = execute(config, out, demos, base_policy, progress=not quiet, workers=workers)
     print(f"record:      {folder / 'record.json'}")
     print(f"TensorBoard: tensorboard --logdir {out}")
     print(f"leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
@@ -220,6 +223,79 @@ def base(
 
 
 @app.command
+def audit(
+    task: tuple[str, ...] = ("PickCube-v1",),
+    embodiment: tuple[str, ...] = ("floating",),
+    variant: tuple[str, ...] = ("none",),
+    strength: tuple[float, ...] = (),
+    group: str = "C8",
+    states: Literal["both", "expert", "policy"] = "both",
+    count: int = 32,
+    chunk: int = 4,
+    resets: int = 256,
+    seed: int = 0,
+    sim: Literal["cpu", "cuda"] = "cpu",
+    base_policy: Path | None = None,
+    runs: Path = Path("runs"),
+    out: Path | None = None,
+    resume: bool = False,
+    json: bool = False,
+) -> int:
+    """Measure how broken the symmetry of a task is, in simulation (docs/audit.md).
+
+    Several tasks, embodiments, variants and strengths fill a table, a cell each.
+
+    Args:
+        task: Tasks, or all; `symsteer list` names them.
+        embodiment: floating, panda, or all.
+        variant: none, names, name:strength, several of these joined with +, or all.
+        strength: Strengths of the variants that are named without one.
+        group: Symmetry group, e.g. C8, D4 (with reflections).
+        states: Who visits the states: the scripted expert, random noise through the base policy.
+        count: States of each visitor, each from an episode of its own.
+        chunk: Control steps of an action chunk.
+        resets: Initial states that are compared with as many turned ones.
+        seed: Seed of states, draws and intervals.
+        sim: Where physics runs.
+        base_policy: Saved base policy, instead of the one that `run` would train.
+        runs: Folder of the runs; demonstrations and base policies are kept in RUNS/base.
+        out: Folder for audit.json, map.csv and map.png; several cells get a folder each and
+            table.csv, table.md and summary.json beside them.
+        resume: Take cells with the same settings from OUT instead of measuring them again.
+        json: Print JSON and nothing else.
+    """
+    from json import dumps
+
+    from bench.audit.cell import Settings
+    from bench.audit.report import summary, text, to_markdown, write_table
+    from bench.audit.study import grid, run_cells
+
+    template = Settings(
+        group=group, states=states, count=count, chunk=chunk, resets=resets, seed=seed, sim=sim
+    )
+    cells = grid(task, embodiment, variant, strength, template)
+    several = len(cells) > 1
+
+    def done(cell: Any) -> None:
+        if several:
+            print(f"{cell.settings.name}: {cell.seconds:.1f} s", file=sys.stderr, flush=True)
+
+    found = run_cells(cells, runs, base_policy, out, resume, progress=not json, done=done)
+    if several and out is not None:
+        write_table(found, out)
+    if json:
+        plain = [cell.to_json() for cell in found]
+        print(dumps(plain if several else plain[0]))
+    elif several:
+        print(to_markdown([summary(cell) for cell in found]), end="")
+    else:
+        print(text(found[0]))
+    if out is not None and not json:
+        print(f"wrote {out}")
+    return 0
+
+
+@app.command
 def doctor(quiet: bool = False) -> int:
     """Say what this machine can do, and what to install for more.
 
@@ -281,6 +357,9 @@ def main() -> int:
     except (UserError, RecordError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except WorkerLostError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

@@ -30,6 +30,7 @@ def prepare_base(
     demonstrations: Path | None = None,
     policy: Path | None = None,
     progress: bool = True,
+    workers: int = 1,
 ) -> ChunkPolicy:
     """The frozen base policy of a run, with its steerability report.
 
@@ -42,6 +43,7 @@ def prepare_base(
         demonstrations: a trajectory file to train on instead of the scripted expert's.
         policy: a saved policy to use instead of training one.
         progress: whether to show progress bars.
+        workers: processes that share the environments of the steerability report.
 
     Raises:
         UserError: if a file does not fit the task, or nothing can be written to ``out``.
@@ -51,7 +53,7 @@ def prepare_base(
     if policy is not None:
         base = load_policy(policy, *layouts)
         if "steerability" not in base.report:
-            base.report["steerability"] = dataclasses.asdict(_measure(config, base))
+            base.report["steerability"] = dataclasses.asdict(_measure(config, base, workers))
         return base.to(config.device)
     if demonstrations is None:
         demonstrations = demonstration_file(config, out, progress)
@@ -61,7 +63,7 @@ def prepare_base(
     if policy_path(folder).is_file():
         return load_policy(folder, *layouts).to(config.device)
     base = _train(config, demos, progress)
-    report = _measure(config, base)
+    report = _measure(config, base, workers)
     if report.warning and progress:
         tqdm.write(f"warning: {report.warning}")
     base.report["steerability"] = dataclasses.asdict(report)
@@ -143,12 +145,14 @@ def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPol
         )
 
 
-def _measure(config: RunConfig, policy: ChunkPolicy) -> Steerability:
+def _measure(config: RunConfig, policy: ChunkPolicy, workers: int) -> Steerability:
+    num_envs = min(STEERABILITY_ENVS, DRAWS * config.evaluation.steerability_states)
     env = make(
         config.task,
-        num_envs=min(STEERABILITY_ENVS, DRAWS * config.evaluation.steerability_states),
+        num_envs=num_envs,
         embodiment=config.embodiment,
         sim=config.sim,
+        workers=min(workers, num_envs),
     )
     latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
     try:

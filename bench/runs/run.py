@@ -82,6 +82,7 @@ def execute(
     demonstrations: Path | None = None,
     policy: Path | None = None,
     progress: bool = True,
+    workers: int = 1,
 ) -> Path:
     """Run one configuration from demonstrations to the final evaluation.
 
@@ -91,6 +92,8 @@ def execute(
         demonstrations: a trajectory file instead of the scripted expert's.
         policy: a saved base policy instead of a trained one.
         progress: whether to show progress bars.
+        workers: processes that share the environments. They are no part of the configuration:
+            the record is the same but for the clock.
 
     Returns:
         The run's folder.
@@ -99,11 +102,16 @@ def execute(
         UserError: if the input is wrong, or the run is finished already.
     """
     check(config)
+    if workers < 1 or (workers > 1 and config.sim == "cuda"):
+        raise UserError(
+            f"--workers is {workers}; it must be at least 1, and 1 with --sim cuda, which "
+            "simulates all environments in one process"
+        )
     files = origin(demonstrations, policy)
     folder = out / run_id(config, files)
     open_run_folder(folder)
     try:
-        base = prepare_base(config, out, demonstrations, policy, progress)
+        base = prepare_base(config, out, demonstrations, policy, progress, workers)
     except BaseException:
         folder.rmdir()
         raise
@@ -113,7 +121,7 @@ def execute(
         "files": files,
     }
     write_json(folder / "config.json", resolved)
-    run = _Run(config, resolved, folder, base, progress)
+    run = _Run(config, resolved, folder, base, progress, workers)
     try:
         run.play()
     except BaseException as error:
@@ -138,8 +146,10 @@ class _Run:
         folder: Path,
         base: ChunkPolicy,
         progress: bool,
+        workers: int,
     ):
         self.config, self.folder, self.base, self.progress = config, folder, base, progress
+        self.workers = workers
         self.start = time.perf_counter()
         self.timer = _Timer()
         self.means = _Means()
@@ -209,6 +219,7 @@ class _Run:
             embodiment=self.config.embodiment,
             variant=variant,
             sim=self.config.sim,
+            workers=min(self.workers, num_envs),
         )
         return LatentNoiseEnv(env, self.base, ignore_terminations)
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
-import numpy as np
 import torch
 
 from bench.sim import create
@@ -130,7 +129,7 @@ def make(
     if workers == 1:
         return create(env_class, num_envs, **kwargs)
     variants = parse(variant, strength)
-    if np.ndim(strength):
+    if strength is not None and torch.as_tensor(strength).ndim:
         kwargs.update(strength=None, per_env={"strength": torch.as_tensor(strength)})
     env = create(env_class, num_envs, workers=workers, attributes={"variants": variants}, **kwargs)
     for part in variants:

@@ -15,13 +15,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from bench.sim.shards.block import (
-    Field,
-    SharedBlock,
-    put_together,
-    select,
-    take_apart,
-)
+from bench.sim.errors import WorkerError, WorkerLostError
+from bench.sim.shards.block import Field, SharedBlock, put_together, select
 from bench.sim.shards.messages import FAILURE, MISTAKE, SAME, Recipe, divide
 from bench.sim.shards.server import WorkerProcess
 from policies.errors import UserError
@@ -33,11 +28,7 @@ _GOODBYE_SECONDS = 5.0
 """How long a worker may take to end once it is told to."""
 
 
-class WorkerError(Exception):
-    """A worker process failed or ended; its cause holds the worker's own traceback, if any."""
-
-
-class NotHere(UserError, AttributeError):
+class NotHereError(UserError, AttributeError):
     """Something was asked for that lives in the worker processes."""
 
 
@@ -63,7 +54,7 @@ class ShardedEnv(gym.Env):
     Raises:
         UserError: the number of workers is out of range, an argument cannot be sent to another
             process, or the environments cannot be made.
-        WorkerError: a worker failed or ended.
+        WorkerError: a worker failed, or (`WorkerLostError`) its process ended.
     """
 
     def __init__(
@@ -295,7 +286,7 @@ class ShardedEnv(gym.Env):
                 return getattr(self._env_cls, name)
             if not (callable(found) or hasattr(type(found), "__get__")) and found is not None:
                 return found
-        raise NotHere(
+        raise NotHereError(
             f"env.{name} lives in the worker processes of this environment: make it with "
             "workers=1 to reach it"
         )
@@ -395,7 +386,8 @@ class _Pool:
             rows = [view.clone() for view in self.outbox.fields(fields)]
         else:
             rows = [
-                torch.cat([view[self.rows[i]] for i in asked]) for view in self.outbox.fields(fields)
+                torch.cat([view[self.rows[i]] for i in asked])
+                for view in self.outbox.fields(fields)
             ]
         return put_together(skeleton, rows)
 
@@ -421,15 +413,13 @@ class _Pool:
             how = f"ended with exit code {code}"
         self.lost = f"{self._name(i)} {how}"
         self.close()
-        raise WorkerError(
+        raise WorkerLostError(
             f"{self.lost}, and the environments with it: make the environment again"
         ) from None
 
     def _name(self, i: int) -> str:
         rows = self.rows[i]
-        return (
-            f"worker {i + 1} of {len(self.rows)} (environments {rows.start} to {rows.stop - 1})"
-        )
+        return f"worker {i + 1} of {len(self.rows)} (environments {rows.start} to {rows.stop - 1})"
 
     def close(self) -> None:
         """Hang up, wait for the workers to end, kill those that do not."""
@@ -442,6 +432,9 @@ class _Pool:
                 process.join()
             process.close()
         self.processes.clear()
+        # The mapping goes with the last tensor over it.
+        self.__dict__.pop("inbox", None)
+        self.__dict__.pop("outbox", None)
 
 
 def _recipe(

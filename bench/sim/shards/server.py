@@ -16,8 +16,8 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import context, forkserver, popen_forkserver, spawn, util
-from multiprocessing.context import reduction, set_spawning_popen
+from multiprocessing import context, forkserver, popen_forkserver, reduction, spawn, util
+from multiprocessing.context import set_spawning_popen
 from typing import Any
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -73,10 +73,11 @@ class _Popen(popen_forkserver.Popen):
             reduction.dump(process_obj, message)
         finally:
             set_spawning_popen(None)
-        self.sentinel, writer = _SERVER.connect_to_new_process(self._fds)
+        self.sentinel, writer = _SERVER.connect_to_new_process(self._fds)  # type: ignore[attr-defined]
         # The worker watches this end to notice that its parent has gone.
         parent = os.dup(writer)
-        self.finalizer = util.Finalize(self, util.close_fds, (parent, self.sentinel))
+        ends = (parent, self.sentinel)
+        self.finalizer = util.Finalize(self, util.close_fds, ends)  # type: ignore[attr-defined]
         with open(writer, "wb", closefd=True) as file:
             file.write(message.getbuffer())
         self.pid = forkserver.read_signed(self.sentinel)

@@ -97,9 +97,10 @@ def without_clock(folder):
     return data
 
 
-def test_the_same_configuration_gives_the_same_record(finished, tmp_path):
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_path):
     config, folder = finished
-    again = execute(config, tmp_path, progress=False)
+    again = execute(config, tmp_path, progress=False, workers=workers)
     assert again.name == folder.name
     assert without_clock(again) == without_clock(folder)
 
@@ -202,6 +203,14 @@ def test_mistakes_are_refused_before_anything_is_built(change, words, tmp_path):
 def test_missing_cuda_is_refused(option, tmp_path):
     with pytest.raises(UserError, match="no CUDA device"):
         execute(tiny_config(**{option: "cuda"}), tmp_path, progress=False)
+
+
+@pytest.mark.parametrize("change", [{"workers": 0}, {"workers": 2, "sim": "cuda"}])
+def test_bad_numbers_of_workers_are_refused(change, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    workers = change.pop("workers")
+    with pytest.raises(UserError, match=f"--workers is {workers}"):
+        execute(tiny_config(**change), tmp_path, progress=False, workers=workers)
 
 
 def test_an_unwritable_folder_is_refused(tmp_path):

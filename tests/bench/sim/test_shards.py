@@ -1,0 +1,424 @@
+"""Environments in several processes against the same in one, and what becomes of the processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+from bench.sim import create
+from bench.sim.errors import WorkerError, WorkerLostError
+from bench.sim.shards import ShardedEnv
+from bench.sim.shards.messages import divide
+from bench.steering.latent_env import LatentNoiseEnv
+from bench.tasks import make
+from bench.variants import variant_names
+from policies.base import ChunkPolicy, PolicyConfig
+from policies.errors import UserError
+from tests.bench.steering.test_latent_env import NoiseIsAction
+
+TASK = "PickCube-v1"
+
+
+def both(num_envs: int, workers: int = 2, **options: Any) -> tuple[Any, Any]:
+    """The same environments in one process and in several."""
+    task = options.pop("task", TASK)
+    one = make(task, num_envs=num_envs, **options)
+    return one, make(task, num_envs=num_envs, workers=workers, **options)
+
+
+def assert_same(a: Any, b: Any) -> None:
+    """Equal to the last bit, in structure, type and value."""
+    if isinstance(a, dict):
+        assert list(a) == list(b)
+        for key in a:
+            assert_same(a[key], b[key])
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_same(x, y)
+    elif isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype
+        assert torch.equal(a, b)
+    else:
+        assert a == b
+
+
+def actions(steps: int, num_envs: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    low = torch.rand(steps, num_envs, 7, generator=generator) * 2 - 1
+    low[: steps // 2, :, 2] = -1  # down, where there are contacts
+    return low
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Uneven shards, strengths of their own, zero among them."""
+    strengths = torch.tensor([0.0, 0.3, 0.5, 0.0, 1.0])
+    one, two = both(5, variant="action_gain", strength=strengths, reward_mode="dense")
+    yield one, two
+    two.close()
+
+
+def test_divide():
+    assert divide(7, 3) == [slice(0, 3), slice(3, 5), slice(5, 7)]
+    assert divide(4, 4) == [slice(i, i + 1) for i in range(4)]
+
+
+def test_same_trajectories(pair):
+    """Seeds of every kind, partial resets in any order, contacts, per-environment strengths."""
+    resets = {
+        0: {"seed": 3},
+        4: {"seed": [8, 9], "options": {"env_idx": torch.tensor([4, 1])}},
+        7: {"options": {"env_idx": torch.tensor([0])}},
+        9: {"seed": 5, "options": {"env_idx": torch.tensor([3, 0, 2])}},
+        11: {"seed": [1, 2, 3, 4, 5], "options": {"reconfigure": True}},
+        14: {"seed": None},
+        16: {"options": {"reconfigure": True}},
+    }
+    for step, action in enumerate(actions(18, 5)):
+        if step in resets:
+            assert_same(*(env.reset(**resets[step]) for env in pair))
+            assert_same(*(env.get_state_dict() for env in pair))
+        assert_same(*(env.step(action) for env in pair))
+        assert_same(*(env.elapsed_steps for env in pair))
+    assert_same(*(env.get_info() for env in pair))
+    assert_same(*(env.get_obs() for env in pair))
+
+
+def test_same_before_the_first_reset_and_other_kinds_of_action():
+    one, two = both(3, obs_mode="state_dict")
+    assert_same(one.get_obs(), two.get_obs())
+    assert_same(one.step(None), two.step(None))
+    action = actions(1, 3)[0].numpy()
+    assert_same(one.step(action.astype("f8")), two.step(action.astype("f8")))
+    mode = {"control_mode": "pd_joint_delta_pos", "action": torch.full((3, 7), 0.2)}
+    assert_same(one.step(mode), two.step(mode))
+    two.close()
+
+
+def test_same_interface(pair):
+    one, two = pair
+    for name in ("single_action_space", "action_space"):
+        assert getattr(one, name) == getattr(two, name)
+    for name in ("single_observation_space", "observation_space"):
+        assert getattr(one, name).shape == getattr(two, name).shape
+    for name in (
+        *("num_envs", "device", "obs_mode", "reward_mode", "control_mode", "embodiment", "body"),
+        *("max_episode_steps", "task_id", "action_layout", "observation_layout", "control_freq"),
+        *("reconfiguration_freq", "workspace_center", "robot_uids"),
+    ):
+        assert getattr(one, name) == getattr(two, name), name
+    assert one.feasible_return(0.9, 4) == two.feasible_return(0.9, 4)
+    assert_same(one.variants[0].strength, two.variants[0].strength)
+    assert two.unwrapped is two
+
+
+def test_states(pair):
+    """Save, turn and restore, for all and for some environments in any order."""
+    one, two = pair
+    for env in pair:
+        env.reset(seed=[4, 5, 6, 7, 8])
+        for action in actions(6, 5):
+            env.step(action)
+    state = one.get_state_dict()
+    assert_same(state, two.get_state_dict())
+    assert_same(one.get_state(), two.get_state())
+    turned = one.transform_state(state, 1.0, True)
+    assert_same(turned, two.transform_state(state, 1.0, True))
+    for env in pair:
+        env.set_state_dict(turned)
+    assert_same(one.get_state_dict(), two.get_state_dict())
+    some = {k: {n: v[[0, 2, 4]] for n, v in turned[k].items()} for k in ("actors", "articulations")}
+    index = torch.tensor([4, 0, 2])
+    for env in pair:
+        env.set_state_dict(some, env_idx=index)
+    assert_same(one.get_state_dict(), two.get_state_dict())
+    first = one.get_state()[:1]
+    for env in pair:
+        env.set_state(first, env_idx=torch.tensor([3]))
+        env.reset(options={"env_idx": index, "reset_to_env_states": {"env_states": some}})
+    assert_same(one.get_state_dict(), two.get_state_dict())
+    assert_same(*(env.step(actions(1, 5)[0]) for env in pair))
+
+
+def test_all_variants_and_the_arm():
+    """Every variant at once, each with its own reset and forces, also for the panda arm."""
+    variant = "+".join(f"{name}:0.4" for name in variant_names())
+    one, two = both(3, task="StackCube-v1", embodiment="panda", variant=variant, workers=3)
+    assert_same(one.reset(seed=1), two.reset(seed=1))
+    for step, action in enumerate(actions(6, 3)):
+        if step == 4:
+            partial = {"seed": [7], "options": {"env_idx": torch.tensor([1])}}
+            assert_same(one.reset(**partial), two.reset(**partial))
+        assert_same(one.step(action), two.step(action))
+    two.close()
+
+
+def test_a_chunk_is_its_steps(pair):
+    one, two = pair
+    chunk = actions(4, 5, seed=2)
+    for env in pair:
+        env.reset(seed=[1, 2, 3, 4, 5])
+    steps = [one.step(action) for action in chunk]
+    obs, reward, terminated, truncated, info = two.step_chunk(chunk.transpose(0, 1))
+    for t, step in enumerate(steps):
+        info_t = {key: value[:, t] for key, value in info.items()}
+        assert_same(step, (obs[:, t], reward[:, t], terminated[:, t], truncated[:, t], info_t))
+    assert_same(one.elapsed_steps, two.elapsed_steps)
+
+
+def test_results_are_the_callers_own(pair):
+    two = pair[1]
+    obs, *_ = two.step(actions(1, 5)[0])
+    kept = obs.clone()
+    two.step(actions(2, 5)[1])
+    assert torch.equal(obs, kept)
+
+
+def decided(one: Any, two: Any, execute: int) -> tuple[LatentNoiseEnv, LatentNoiseEnv]:
+    """Latent-noise environments in which the first two decisions of a test are the same."""
+    return tuple(LatentNoiseEnv(env, NoiseIsAction(execute)) for env in (one, two))
+
+
+@pytest.mark.parametrize("solved", [[1, 3], [0, 1, 2, 3]])
+def test_same_latent_noise_environment(solved):
+    """Successes within a chunk, in some and in all environments, and time limits."""
+    one, two = both(4)
+    pairs = decided(one, two, execute=4)
+    seeds = [3, 4, 5, 6]
+    assert_same(*(env.reset(seeds) for env in pairs))
+    state = one.get_state_dict()
+    # Cubes that lie in their goals, and hands that do not move.
+    state["actors"]["goal_site"][solved, :3] = state["actors"]["cube"][solved, :3]
+    for env in (one, two):
+        env.set_state_dict(state)
+    noise = torch.randn(14, 4, 4, 7, generator=torch.Generator().manual_seed(0))
+    noise[0] = 0
+    for i, w in enumerate(noise):
+        ours, theirs = (vars(env.step(w)) for env in pairs)
+        assert_same(ours, theirs)
+        if i == 0:
+            assert ours["terminal"].nonzero().flatten().tolist() == solved
+    assert pairs[0].control_steps == pairs[1].control_steps
+    two.close()
+
+
+def test_same_with_a_policy():
+    one, two = both(3, workers=3)
+    torch.manual_seed(0)
+    config = PolicyConfig(channels=8, width=16, depth=1, execute=4, sampling_steps=2)
+    policy = ChunkPolicy(config, one.observation_layout, one.action_layout)
+    envs = [LatentNoiseEnv(env, policy, ignore_terminations=True) for env in (one, two)]
+    assert_same(*(env.reset([1, 2, 3]) for env in envs))
+    for w in torch.randn(13, 3, policy.horizon, 7):
+        assert_same(*(vars(env.step(w)) for env in envs))
+    assert envs[0].control_steps == envs[1].control_steps == 3 * one.max_episode_steps
+    two.close()
+
+
+def test_gymnasium_and_maniskills_vector_environment():
+    """``gym.make(..., workers=2)`` in ManiSkill's wrapper: automatic resets, metrics."""
+    options: dict[str, Any] = {"num_envs": 3, "variant": "action_gain", "strength": 0.5}
+    envs = [
+        ManiSkillVectorEnv(
+            gym.make(f"SymSteer/{TASK}", max_episode_steps=4, workers=workers, **options),
+            record_metrics=True,
+        )
+        for workers in (1, 2)
+    ]
+    assert isinstance(envs[1].unwrapped, ShardedEnv)
+    assert_same(*(env.reset(seed=2) for env in envs))
+    for action in actions(9, 3):
+        assert_same(*(env.step(action) for env in envs))
+    envs[1].close()
+
+
+def test_stock_tasks_do_not_repeat_themselves():
+    """Without a seed, workers draw different episodes of tasks that use torch's generator."""
+    env = create(PickCubeEnv, 2, workers=2, robot_uids="panda", obs_mode="state")
+    env.reset()
+    cubes = env.get_state_dict()["actors"]["cube"][:, :2]
+    assert not torch.equal(cubes[0], cubes[1])
+    env.close()
+
+
+def test_what_lives_elsewhere(pair):
+    two = pair[1]
+    for name in ("agent", "scene", "cube", "step_nothing"):
+        with pytest.raises(UserError, match=rf"env\.{name} lives in .* workers=1"):
+            getattr(two, name)
+        assert not hasattr(two, name)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"workers": 0}, "at least 1 and at most"),
+        ({"workers": 5}, "at most the number of environments, 4"),
+        ({"workers": 2, "sim": "cuda"}, "leave workers out"),
+        ({"workers": 2, "variant": "action_gain", "strength": torch.ones(3)}, "3 entries for 4"),
+        ({"workers": 2, "variant": "action_gian:1"}, "action_gain"),
+        ({"workers": 2, "control_mode": "pd_ee_body_pose"}, "pd_ee_body_pose"),
+        ({"workers": 2, "robot_uids": lambda: None}, "cannot be sent"),
+    ],
+)
+def test_bad_options(options, words):
+    with pytest.raises((UserError, WorkerError), match=words):
+        make(TASK, num_envs=4, **options)
+
+
+def test_bad_input(pair):
+    two = pair[1]
+    before = two.get_state_dict()
+    with pytest.raises(UserError, match="one row of actions for each of the 5"):
+        two.step(torch.zeros(4, 7))
+    with pytest.raises(UserError, match=r"\[environments, steps, action\]"):
+        two.step_chunk(torch.zeros(5, 7))
+    with pytest.raises(UserError, match="3 seeds were given for 5"):
+        two.reset(seed=[1, 2, 3])
+    with pytest.raises(UserError, match="env_idx or reconfigure"):
+        two.reset(options={"env_idx": torch.tensor([1]), "reconfigure": True})
+    assert_same(two.get_state_dict(), before)
+
+
+class Local(PickCubeEnv):
+    """Fails when it is told to."""
+
+    def evaluate(self):
+        if self.elapsed_steps.max() == 1 and self.num_envs == 1:
+            raise UserError("this task takes one step")
+        if self.elapsed_steps.max() == 2:
+            raise ZeroDivisionError("two steps are too many")
+        return super().evaluate()
+
+
+def test_errors_of_a_worker():
+    """A mistake is raised as itself, another error with the worker's traceback; both at once end
+    nothing, and the answers of the other workers do not get mixed up."""
+    env = create(Local, 3, workers=2, robot_uids="panda", obs_mode="state")
+    dim = env.action_space.shape[1]
+    env.reset(seed=1)
+    with pytest.raises(UserError, match="takes one step"):
+        env.step(torch.zeros(3, dim))
+    with pytest.raises(WorkerError, match=r"worker 1 of 2 .*ZeroDivisionError: two") as raised:
+        env.step(torch.zeros(3, dim))
+    assert "in evaluate" in str(raised.value.__cause__)
+    assert env.reset(seed=1)[0].shape[0] == 3
+    env.close()
+    with pytest.raises(UserError, match="closed"):
+        env.step(torch.zeros(3, dim))
+    env.close()
+
+
+def test_local_classes_are_refused():
+    class Mine(PickCubeEnv):
+        pass
+
+    with pytest.raises(UserError, match="by its name"):
+        create(Mine, 2, workers=2)
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def running(pid: int) -> bool:
+    """Whether there is such a process, be it a zombie."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def wait_until_gone(pids: list[int], seconds: float = 20) -> None:
+    end = time.monotonic() + seconds
+    while any(running(pid) for pid in pids):
+        assert time.monotonic() < end, "processes are left"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("when", ["between", "during"])
+def test_a_killed_worker_is_reported(when):
+    before = open_files()
+    env = make(TASK, num_envs=4, workers=2)
+    env.reset(seed=1)
+    pids = [process.pid for process in env._pool.processes]
+    if when == "during":
+        os.kill(pids[1], signal.SIGSTOP)  # it will not have answered when it dies
+        killer = subprocess.Popen(["sh", "-c", f"sleep 0.5; kill -9 {pids[1]}"])
+    else:
+        os.kill(pids[1], signal.SIGKILL)
+        killer = None
+        wait_until_gone(pids[1:])
+    with pytest.raises(WorkerLostError, match=r"worker 2 of 2 \(environments 2 to 3\) .*SIGKILL"):
+        env.step(torch.zeros(4, 7))
+    if killer:
+        killer.wait()
+    wait_until_gone(pids)
+    assert open_files() == before
+    with pytest.raises(UserError, match="worker 2 of 2"):
+        env.reset()
+
+
+def test_nothing_is_left_behind():
+    """Closed, forgotten or never finished: no process, no descriptor."""
+    before = open_files()
+    env = make(TASK, num_envs=2, workers=2)
+    pids = [process.pid for process in env._pool.processes]
+    del env
+    wait_until_gone(pids)
+    with pytest.raises(WorkerError):
+        make(TASK, num_envs=2, workers=2, reward_mode="generous")
+    assert open_files() == before
+
+
+PROGRAM = f"""
+import torch
+from bench.tasks import make
+env = make("{TASK}", num_envs=2, workers=2)
+env.reset(seed=1)
+print(*(process.pid for process in env._pool.processes), flush=True)
+while True:
+    env.step(torch.zeros(2, 7))
+"""
+
+
+@pytest.mark.parametrize(
+    "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
+)
+def test_workers_end_with_the_program(end, tmp_path):
+    """Ctrl-C reaches the whole process group; a killed program cannot say goodbye. The program
+    has no guard against being imported by its workers."""
+    script = tmp_path / "program.py"
+    script.write_text(PROGRAM)
+    program = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.getcwd()},
+        start_new_session=True,
+    )
+    pids = [int(pid) for pid in program.stdout.readline().split()]
+    assert len(pids) == 2
+    time.sleep(0.3)
+    if end == signal.SIGINT:
+        os.killpg(program.pid, end)
+    else:
+        program.kill()
+    _, errors = program.communicate(timeout=30)
+    wait_until_gone(pids)
+    if end == signal.SIGINT:
+        assert errors.count("Traceback") == 1
+        assert "KeyboardInterrupt" in errors
