@@ -8,6 +8,7 @@ from mani_skill.envs.tasks.tabletop.lift_peg_upright import LiftPegUprightEnv
 from mani_skill.utils.structs import Pose
 
 from bench.tasks import make
+from bench.tasks.embodiments import EMBODIMENTS
 from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix, yaw_quaternion
 from policies.geometry import Group
 
@@ -117,3 +118,20 @@ def test_resets_lie_in_the_disc_and_point_everywhere():
     assert 0.9 * env.spawn_extent < reach <= env.spawn_extent
     assert not env.evaluate()["success"].any()
     env.close()
+
+
+def test_the_pandas_wrist_takes_the_turn_that_its_joint_allows():
+    panda, floating = EMBODIMENTS["panda"], EMBODIMENTS["floating"]
+    qpos = torch.zeros(4, 9)
+    qpos[:, 6] = torch.tensor([0.0, 2.0, 2.0, -2.0])
+    turn = torch.tensor([1.5, 1.5, -1.5, 1.5])
+    none = torch.zeros(4)
+    # Turning the tool by +1 rad turns joint 7, whose stops are at 2.9 rad, by -1 rad.
+    other = math.pi - 1.5
+    expected = torch.tensor([1.5, 1.5, other, -other])
+    assert torch.allclose(panda.reachable_turn(qpos, turn, math.pi, none), expected)
+    assert torch.equal(floating.reachable_turn(qpos, turn, math.pi, none), turn)
+    # A load that is to be turned by 1.5 rad afterwards in the same sense leaves less room.
+    later = torch.full((4,), 1.5)
+    expected = torch.tensor([-other, 1.5, other, -other])
+    assert torch.allclose(panda.reachable_turn(qpos, turn, math.pi, later), expected)
