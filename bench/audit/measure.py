@@ -254,6 +254,7 @@ class Bench:
     ) -> tuple[Tensors, Tensors]:
         positions, quaternions = {}, {}
         inverses = [_inverse(g) for g in self.elements] + [(0.0, False)]
+        mirrored = self.env.manipulated.name in self.env.mirrored_across_yz
         for body in ("tool", "object"):
             p = self._split(torch.stack([w[body][0] for w in poses], dim=1), count).double()
             q = self._split(torch.stack([w[body][1] for w in poses], dim=1), count).double()
@@ -262,7 +263,8 @@ class Bench:
             for g, inverse in enumerate(inverses):
                 matrix = planar_matrix(*inverse, p)
                 back_p.append((p[:, g] - centre) @ matrix.T + centre)
-                back_q.append(transform_quaternion(q[:, g], *inverse))
+                across_yz = body == "object" and mirrored
+                back_q.append(transform_quaternion(q[:, g], *inverse, across_yz))
             positions[body] = torch.stack(back_p, dim=1)
             quaternions[body] = torch.stack(back_q, dim=1)
         return positions, quaternions

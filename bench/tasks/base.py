@@ -26,7 +26,6 @@ from bench.tasks.floating import ACTION_LAYOUT
 from bench.tasks.gym_env import GymEnv
 from bench.tasks.rotations import (
     planar_matrix,
-    quaternion_multiply,
     quaternion_to_matrix,
     transform_angular,
     transform_quaternion,
@@ -483,14 +482,10 @@ def _transform_body(
 ) -> torch.Tensor:
     """Act on rigid-body states ``[N, 13]``: position, quaternion, velocity, angular velocity."""
     world = planar_matrix(angle, reflect, state)
-    q = transform_quaternion(state[:, 3:7], angle, reflect)
-    if reflect and across_yz:
-        # Mirroring the body's frame in x instead of y differs by half a turn about its z axis.
-        q = quaternion_multiply(q, q.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(q))
     return torch.cat(
         [
             state[:, :3] @ world.T,
-            q,
+            transform_quaternion(state[:, 3:7], angle, reflect, across_yz),
             state[:, 7:10] @ world.T,
             transform_angular(state[:, 10:13], angle, reflect),
         ],

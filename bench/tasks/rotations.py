@@ -106,10 +106,22 @@ def planar_matrix(angle: float, reflect: bool, like: torch.Tensor) -> torch.Tens
     return like.new_tensor([[c, -s * flip, 0.0], [s, c * flip, 0.0], [0.0, 0.0, 1.0]])
 
 
-def transform_quaternion(q: torch.Tensor, angle: float, reflect: bool) -> torch.Tensor:
-    """Act with (angle, reflect) on orientations ``q [..., 4]``."""
+def transform_quaternion(
+    q: torch.Tensor, angle: float, reflect: bool, across_yz: bool = False
+) -> torch.Tensor:
+    """Act with (angle, reflect) on orientations ``q [..., 4]``.
+
+    Args:
+        q: of bodies that are their own mirror image across their body x-z plane.
+        angle: radians.
+        reflect: whether (x, y) -> (x, -y) comes first.
+        across_yz: the bodies' mirror plane is y-z instead.
+    """
     if reflect:
         q = q * q.new_tensor([1.0, -1.0, 1.0, -1.0])
+        if across_yz:
+            # Mirroring the body's frame in x instead of y differs by half a turn about its z axis.
+            q = quaternion_multiply(q, q.new_tensor([0.0, 0.0, 0.0, 1.0]).expand_as(q))
     return quaternion_multiply(yaw_quaternion(q.new_tensor(angle)).expand_as(q), q)
 
 
