@@ -296,6 +296,46 @@ def audit(
 
 
 @app.command
+def throughput(
+    task: str = "PickCube-v1",
+    num_envs: tuple[int, ...] = (1, 4, 16, 64, 256),
+    repeats: int = 5,
+    seconds: float = 0.7,
+    cores: int = 0,
+    memory: bool = False,
+    json: bool = False,
+) -> int:
+    """Measure simulation against stock ManiSkill and against the physics alone; minutes.
+
+    Args:
+        task: Task; `symsteer list` names them. ManiSkill's stock class and controller are used.
+        num_envs: Numbers of environments.
+        repeats: Turns of each contender.
+        seconds: Least length of a turn.
+        cores: Processes where all cores are used; 0 means all.
+        memory: Only watch the memory over 10,000 steps with resets.
+        json: Machine-readable output.
+    """
+    from bench import throughput as speed
+
+    def report(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    if memory:
+        growth = speed.memory_growth(task, report=report)
+        print(
+            speed.dump(growth)
+            if json
+            else f"memory grew by {growth['growth_kib']:.0f} KiB from step {growth['steps'][1]} to "
+            f"{growth['steps'][-1]} of {growth['num_envs']} environments"
+        )
+        return 0
+    data = speed.measure(task, num_envs, repeats, seconds, cores or None, report)
+    print(speed.dump(data) if json else speed.table(data))
+    return 0
+
+
+@app.command
 def doctor(quiet: bool = False) -> int:
     """Say what this machine can do, and what to install for more.
 

@@ -346,6 +346,11 @@ class _Pool:
             self.inbox.close_descriptor()
             self.outbox.close_descriptor()
 
+    @property
+    def pids(self) -> list[int]:
+        """Process ids of the workers."""
+        return [process.pid for process in self.processes if process.pid is not None]
+
     def ask(self, name: str, requests: Sequence[tuple | None]) -> Any:
         asked = [i for i, request in enumerate(requests) if request is not None]
         for i in asked:

@@ -353,7 +353,7 @@ def test_a_killed_worker_is_reported(when):
     before = open_files()
     env = make(TASK, num_envs=4, workers=2)
     env.reset(seed=1)
-    pids = [process.pid for process in env._pool.processes]
+    pids = env._pool.pids
     if when == "during":
         os.kill(pids[1], signal.SIGSTOP)  # it will not have answered when it dies
         killer = subprocess.Popen(["sh", "-c", f"sleep 0.5; kill -9 {pids[1]}"])
@@ -375,7 +375,7 @@ def test_nothing_is_left_behind():
     """Closed, forgotten or never finished: no process, no descriptor."""
     before = open_files()
     env = make(TASK, num_envs=2, workers=2)
-    pids = [process.pid for process in env._pool.processes]
+    pids = env._pool.pids
     del env
     wait_until_gone(pids)
     with pytest.raises(WorkerError):
@@ -388,7 +388,7 @@ import torch
 from bench.tasks import make
 env = make("{TASK}", num_envs=2, workers=2)
 env.reset(seed=1)
-print(*(process.pid for process in env._pool.processes), flush=True)
+print(*env._pool.pids, flush=True)
 while True:
     env.step(torch.zeros(2, 7))
 """

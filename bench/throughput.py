@@ -1,0 +1,659 @@
+"""How fast simulation is, against stock ManiSkill and against the physics alone.
+
+Everything is measured in one run: machines differ and drift, so only ratios of numbers taken side
+by side say something. The contenders take turns (a b c d a b c d ...), each turn plays whole
+episodes of random actions, one reset each, and a clock stops only after all work is done.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from importlib.metadata import version
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  (fills ManiSkill's registry)
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
+
+from bench.sim import create, prepare_headless
+from bench.sim.shards.messages import divide
+from bench.sim.shards.server import WorkerProcess
+from bench.tasks import task_class
+from policies.errors import UserError
+
+EPISODE = 50
+"""Control steps between two resets."""
+
+CONTROLLER = "pd_ee_delta_pose"
+
+MIN_STOCK_RATIO, MIN_LIMIT_SHARE = 6.0, 0.55
+"""What ours should reach: times stock in as many processes, and share of the physics alone."""
+
+_SETTINGS = {"obs_mode": "state", "control_mode": CONTROLLER}
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What one turn took: control steps summed over environments, wall and processor seconds."""
+
+    steps: int
+    seconds: float
+    cpu: float
+
+
+@dataclass
+class Row:
+    """One contender's result.
+
+    Attributes:
+        letter: ``a`` stock, ``b`` stock in several processes, ``c`` ours, ``d`` physics alone,
+            ``g`` ours on CUDA.
+        name: in words.
+        processes: that simulate.
+        num_envs: environments, summed over the processes.
+        turns: one each repeat.
+    """
+
+    letter: str
+    name: str
+    processes: int
+    num_envs: int
+    turns: list[Turn] = field(default_factory=list)
+
+    @property
+    def rates(self) -> list[float]:
+        """Control steps a second of wall clock, a turn."""
+        return [turn.steps / turn.seconds for turn in self.turns]
+
+    @property
+    def median(self) -> float:
+        """Median of the rates."""
+        return statistics.median(self.rates)
+
+    @property
+    def cpu_rate(self) -> float:
+        """Control steps a second of processor time and process; noise of other programs aside."""
+        return statistics.median(t.steps / t.cpu for t in self.turns) * self.processes
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data, with the figures that the table shows."""
+        figures = {
+            "median": self.median,
+            "min": min(self.rates),
+            "max": max(self.rates),
+            "cpu_rate": self.cpu_rate,
+        }
+        return {**asdict(self), **figures}
+
+
+class Contender:
+    """Something that plays episodes; subclasses say how."""
+
+    def __init__(self, letter: str, name: str, processes: int, num_envs: int) -> None:
+        self.row = Row(letter, name, processes, num_envs)
+        self.episodes = 1
+
+    def play(self, episodes: int) -> Turn:
+        """Play whole episodes and time them."""
+        raise NotImplementedError
+
+    def warm_up(self, seconds: float) -> None:
+        """Play one episode, unmeasured, and set how many make a turn of ``seconds``."""
+        self.play(1)
+        self.episodes = max(1, round(seconds / self.play(1).seconds))
+
+    def turn(self) -> None:
+        """A measured turn."""
+        self.row.turns.append(self.play(self.episodes))
+
+    def close(self) -> None:
+        """End what was started."""
+
+
+class Environments(Contender):
+    """Batched or single environments that are reset and stepped from this process.
+
+    Args:
+        env: with ``reset`` and ``step``.
+        dim: of an action.
+        pids: processes that work for it, besides this one.
+        numpy: whether it takes numpy actions.
+    """
+
+    def __init__(
+        self,
+        letter: str,
+        name: str,
+        env: Any,
+        num_envs: int,
+        dim: int,
+        pids: Sequence[int] = (),
+        numpy: bool = False,
+    ) -> None:
+        super().__init__(letter, name, len(pids) or 1, num_envs)
+        self.env, self.pids = env, list(pids)
+        device = getattr(env, "device", torch.device("cpu"))
+        self.cuda = torch.device(device).type == "cuda"
+        generator = torch.Generator().manual_seed(0)
+        actions = torch.rand(EPISODE, num_envs, dim, generator=generator) * 2 - 1
+        self.actions: Any = actions.numpy() if numpy else actions.to(device)
+
+    def _now(self) -> tuple[float, float]:
+        if self.cuda:
+            torch.cuda.synchronize()
+        cpu = time.process_time() + sum(_cpu_seconds(pid) for pid in self.pids)
+        return time.perf_counter(), cpu
+
+    def play(self, episodes: int) -> Turn:
+        wall, cpu = self._now()
+        for _ in range(episodes):
+            self.env.reset()
+            for action in self.actions:
+                self.env.step(action)
+        end_wall, end_cpu = self._now()
+        steps = episodes * EPISODE * self.row.num_envs
+        return Turn(steps, end_wall - wall, end_cpu - cpu)
+
+    def close(self) -> None:
+        self.env.close()
+
+
+class PhysicsAlone(Contender):
+    """The substeps of an episode of ours, replayed in one or several processes.
+
+    Args:
+        pool: the processes.
+        processes: how many of them take part.
+    """
+
+    def __init__(self, pool: PhysicsPool, name: str, processes: int, num_envs: int) -> None:
+        super().__init__("d", name, processes, num_envs)
+        self.pool = pool
+        self.parts = [rows.stop - rows.start for rows in divide(num_envs, processes)]
+        self.pool.ask("record", self.parts)
+
+    def play(self, episodes: int) -> Turn:
+        answers = self.pool.ask("play", [(count, episodes) for count in self.parts])
+        steps = episodes * EPISODE * self.row.num_envs
+        # All start together; the last one to finish decides.
+        return Turn(steps, max(a[0] for a in answers), sum(a[1] for a in answers))
+
+
+class PhysicsPool:
+    """Processes that replay physics; each is asked over a pipe."""
+
+    def __init__(self, env_cls: type[BaseEnv], processes: int) -> None:
+        self.connections: list[Connection] = []
+        self.processes: list[WorkerProcess] = []
+        WorkerProcess.preload(env_cls.__module__)
+        for _ in range(processes):
+            ours, theirs = Pipe()
+            with theirs:
+                process = WorkerProcess(target=_serve_physics, args=(theirs, env_cls), daemon=True)
+                process.start()
+            self.connections.append(ours)
+            self.processes.append(process)
+
+    def ask(self, name: str, requests: Sequence[Any]) -> list[Any]:
+        """Ask the first processes, one request each, and wait for all answers."""
+        for connection, request in zip(self.connections, requests, strict=False):
+            connection.send((name, request))
+        return [c.recv() for c, _ in zip(self.connections, requests, strict=False)]
+
+    def close(self) -> None:
+        """End the processes."""
+        for connection in self.connections:
+            connection.close()
+        for process in self.processes:
+            process.join(10)
+
+
+class Replay:
+    """An episode of ours, recorded so that its substeps can be taken again and nothing else.
+
+    Args:
+        env_cls: stock task class.
+        num_envs: how many environments.
+    """
+
+    def __init__(self, env_cls: type[BaseEnv], num_envs: int) -> None:
+        env = create(env_cls, num_envs, **_SETTINGS)
+        env.reset(seed=0)
+        self.env, px = env, env.scene.px
+        self.systems = px.systems
+        self.start = [system.pack() for system in self.systems]
+        generator = torch.Generator().manual_seed(0)
+        dim = env.single_action_space.shape[0]
+        self.targets: list[list[list[float]]] = []
+        for _ in range(EPISODE):
+            env.step(torch.rand(num_envs, dim, generator=generator) * 2 - 1)
+            self.targets.append(px.cuda_articulation_target_qpos.array.tolist())
+        self.end = [system.pack() for system in self.systems]
+        self.drives = [[j.set_drive_target for j in a.active_joints] for a in px._articulations]
+        self.substeps = range(env._sim_steps_per_control)
+
+    def play(self) -> tuple[float, float]:
+        """Wall and processor seconds of the substeps of an episode; the rest is not counted."""
+        wall = cpu = 0.0
+        for system, packed in zip(self.systems, self.start, strict=True):
+            system.unpack(packed)
+        steps, substeps = [system.step for system in self.systems], self.substeps
+        for targets in self.targets:
+            for drives, values in zip(self.drives, targets, strict=True):
+                for drive, value in zip(drives, values, strict=False):
+                    drive(value)
+            begin, begin_cpu = time.perf_counter(), time.process_time()
+            # Scene by scene, as ours takes them: their data stay in the processor's cache.
+            for step in steps:
+                for _ in substeps:
+                    step()
+            wall += time.perf_counter() - begin
+            cpu += time.process_time() - begin_cpu
+        return wall, cpu
+
+
+def _serve_physics(connection: Connection, env_cls: type[BaseEnv]) -> None:
+    torch.set_num_threads(1)
+    replays: dict[int, Replay] = {}
+    while True:
+        try:
+            name, request = connection.recv()
+        except (EOFError, KeyboardInterrupt):
+            return
+        if name == "record":
+            if request not in replays:
+                replays[request] = Replay(env_cls, request)
+            connection.send(None)
+        else:
+            count, episodes = request
+            times = [replays[count].play() for _ in range(episodes)]
+            connection.send(tuple(map(sum, zip(*times, strict=True))))
+
+
+def _stock(env_cls: type[BaseEnv]) -> gym.Env:
+    """Stock ManiSkill as its own documentation runs it on the CPU: one environment, NumPy."""
+    prepare_headless()
+    torch.set_num_threads(1)
+    env = env_cls(num_envs=1, sim_backend="physx_cpu", render_backend="none", **_SETTINGS)
+    return CPUGymWrapper(env)
+
+
+def stock_class(task: str) -> type[BaseEnv]:
+    """ManiSkill's own class of one of our tasks.
+
+    Raises:
+        UserError: there is no such task.
+    """
+    return REGISTERED_ENVS[task_class(task).task_id].cls
+
+
+def _contenders(
+    env_cls: type[BaseEnv], num_envs: Sequence[int], cores: int
+) -> tuple[list[Contender], PhysicsPool]:
+    stock = _stock(env_cls)
+    dim = stock.action_space.shape[0]  # type: ignore[index]
+    found: list[Contender] = [Environments("a", "stock", stock, 1, dim, numpy=True)]
+    found[0].actions = found[0].actions[:, 0]  # type: ignore[attr-defined]
+    for processes in sorted({1, cores}):
+        vector = gym.vector.AsyncVectorEnv([partial(_stock, env_cls)] * processes, context="spawn")
+        pids = [process.pid for process in vector.processes]
+        name = "stock in AsyncVectorEnv"
+        found.append(Environments("b", name, vector, processes, dim, pids, numpy=True))
+    pool = PhysicsPool(env_cls, cores)
+    for processes in sorted({1, cores}):
+        for count in num_envs:
+            if count < processes:
+                continue
+            env = create(env_cls, count, workers=processes, **_SETTINGS)
+            pids = [] if processes == 1 else env._pool.pids  # type: ignore[attr-defined]
+            found.append(Environments("c", "ours", env, count, dim, pids))
+            found.append(PhysicsAlone(pool, "physics alone", processes, count))
+    if torch.cuda.is_available():
+        for count in num_envs:
+            try:
+                env = create(env_cls, count, sim="cuda", **_SETTINGS)
+            except UserError:
+                break  # PhysX's GPU library is missing
+            found.append(Environments("g", "ours on CUDA", env, count, dim))
+    return found, pool
+
+
+def measure(
+    task: str = "PickCube-v1",
+    num_envs: Sequence[int] = (1, 4, 16, 64, 256),
+    repeats: int = 5,
+    seconds: float = 0.7,
+    cores: int | None = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Measure all contenders in turns, and where time and memory go.
+
+    Args:
+        task: one of ours, by name; it is measured with ManiSkill's stock class and controller.
+        num_envs: numbers of environments of ours and of the physics alone.
+        repeats: turns of each contender, at least 5 to show a spread.
+        seconds: least length of a turn; it is rounded to whole episodes of 50 steps.
+        cores: processes of those contenders that use all cores; by default, all cores.
+        report: told what is going on.
+
+    Returns:
+        Plain data: ``rows`` (one a contender), ``summary`` (ratios), ``step`` (where a step's
+        time goes), ``creation``, ``machine``, ``settings``.
+
+    Raises:
+        UserError: an unknown task, or a number out of range.
+    """
+    env_cls = stock_class(task)
+    if repeats < 1 or seconds <= 0 or not num_envs or min(num_envs) < 1:
+        raise UserError("repeats, seconds and every number of environments must be positive")
+    cores = cores or len(os.sched_getaffinity(0))
+    if cores < 1:
+        raise UserError(f"cores is {cores}; it must be at least 1")
+    torch.set_num_threads(1)
+    report("making environments")
+    contenders, pool = _contenders(env_cls, sorted(set(num_envs)), cores)
+    try:
+        report("warming up")
+        for contender in contenders:
+            contender.warm_up(seconds)
+        for repeat in range(repeats):
+            report(f"repeat {repeat + 1} of {repeats}")
+            for contender in contenders:
+                contender.turn()
+    finally:
+        pool.close()
+        for contender in contenders:
+            contender.close()
+    rows = [contender.row for contender in contenders]
+    report("looking into a step")
+    size = min((n for n in num_envs if n >= 64), default=max(num_envs))
+    return {
+        "settings": {
+            "task": task,
+            "controller": CONTROLLER,
+            "repeats": repeats,
+            "seconds": seconds,
+            "episode": EPISODE,
+            "cores": cores,
+        },
+        "machine": _machine(),
+        "rows": [row.to_json() for row in rows],
+        "summary": summarise(rows, cores),
+        "step": split_step(env_cls, size),
+        "creation": creation(env_cls, max(num_envs)),
+    }
+
+
+def summarise(rows: Sequence[Row], cores: int) -> dict[str, dict[str, float]]:
+    """Best rates of ours, stock and physics alone on one core and on all, and their ratios."""
+    found = {}
+    for processes in sorted({1, cores}):
+        best = {
+            letter: max(
+                (row for row in rows if (row.letter, row.processes) == (letter, processes)),
+                key=lambda row: row.median,
+            )
+            for letter in "bcd"
+        }
+        ours = best["c"]
+        found[str(processes)] = {
+            "ours": ours.median,
+            "num_envs": ours.num_envs,
+            "times_stock": ours.median / best["b"].median,
+            "share_of_limit": ours.median / best["d"].median,
+            "times_stock_cpu": ours.cpu_rate / best["b"].cpu_rate,
+            "share_of_limit_cpu": ours.cpu_rate / best["d"].cpu_rate,
+        }
+    return found
+
+
+# ---------------------------------------------------------------------------- inside a step
+
+
+class _Stopwatch:
+    """Seconds by part, a nested part not counted in the one around it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._parts: list[str] = []
+        self._since = 0.0
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        self._charge()
+        self._parts.append(name)
+        try:
+            yield
+        finally:
+            self._charge()
+            self._parts.pop()
+
+    def _charge(self) -> None:
+        now = time.process_time()
+        if self._parts:
+            name = self._parts[-1]
+            self.seconds[name] = self.seconds.get(name, 0.0) + now - self._since
+        self._since = now
+
+    def watch(self, owner: Any, method: str, part: str) -> None:
+        """Count the method of an object as a part."""
+        original = getattr(owner, method)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            with self.part(part):
+                return original(*args, **kwargs)
+
+        setattr(owner, method, timed)
+
+
+def split_step(env_cls: type[BaseEnv], num_envs: int, episodes: int = 2) -> dict[str, float]:
+    """Milliseconds of processor time that the parts of a step of ours take.
+
+    Returns:
+        ``physics`` (substeps), ``fetch`` (reading the scenes, contacts included), ``apply``
+        (writing drive targets), ``controller`` (action to drive targets), ``task`` (success,
+        observation, reward), ``other``, ``total``, ``reset`` (of all environments, at once) and
+        ``num_envs``.
+    """
+    env = create(env_cls, num_envs, **_SETTINGS)
+    player = Environments("c", "ours", env, num_envs, env.single_action_space.shape[0])
+    player.play(1)
+    watch, px = _Stopwatch(), env.scene.px
+    watch.watch(px, "finish_substeps", "physics")
+    for name in dir(px):
+        if name.startswith(("gpu_fetch", "fetch_", "gpu_query")):
+            watch.watch(px, name, "fetch")
+        elif name.startswith(("gpu_apply", "apply_")):
+            watch.watch(px, name, "apply")
+    watch.watch(env.agent, "set_action", "controller")
+    for name in ("get_info", "get_obs", "get_reward"):
+        watch.watch(env, name, "task")
+    reset = 0.0
+    for _ in range(episodes):
+        begin = time.process_time()
+        env.reset()
+        reset += time.process_time() - begin
+        watch.seconds.pop("begin", None)
+        for action in player.actions:
+            with watch.part("other"):
+                env.step(action)
+    env.close()
+    steps = episodes * EPISODE
+    parts = ("physics", "fetch", "apply", "controller", "task", "other")
+    split = {part: 1e3 * watch.seconds.get(part, 0.0) / steps for part in parts}
+    return {
+        **split,
+        "total": sum(split.values()),
+        "reset": 1e3 * reset / episodes,
+        "num_envs": num_envs,
+    }
+
+
+# ---------------------------------------------------------------------------- memory
+
+
+def creation(env_cls: type[BaseEnv], num_envs: int) -> dict[str, float]:
+    """Time and memory that environments take, measured in a fresh process.
+
+    Returns:
+        ``first_ms`` (of one environment, with what is loaded once), ``per_env_ms``,
+        ``per_env_kib`` (from the difference of ``num_envs`` and one), ``process_mib`` (resident
+        before any environment), ``num_envs``.
+    """
+    ours, theirs = Pipe()
+    with theirs:
+        process = WorkerProcess(target=_creation, args=(theirs, env_cls, num_envs), daemon=True)
+        process.start()
+    try:
+        return ours.recv()
+    except EOFError as error:
+        raise UserError("the process that measures memory ended: free some memory") from error
+    finally:
+        ours.close()
+        process.join()
+
+
+def _creation(connection: Connection, env_cls: type[BaseEnv], num_envs: int) -> None:
+    torch.set_num_threads(1)
+    before = _resident()
+    seconds, sizes = [], [before]
+    kept = []
+    for count in (1, num_envs):
+        begin = time.process_time()
+        kept.append(create(env_cls, count, **_SETTINGS))
+        seconds.append(time.process_time() - begin)
+        kept[-1].step(torch.zeros(count, kept[-1].single_action_space.shape[0]))
+        gc.collect()
+        sizes.append(_resident())
+    result = {
+        "num_envs": num_envs,
+        "first_ms": 1e3 * seconds[0],
+        "per_env_ms": 1e3 * seconds[1] / num_envs,
+        "per_env_kib": (sizes[2] - sizes[1]) / num_envs / 2**10,
+        "process_mib": before / 2**20,
+    }
+    connection.send(result)
+
+
+def memory_growth(
+    task: str = "PickCube-v1",
+    num_envs: int = 4,
+    steps: int = 10_000,
+    report: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Resident memory of this process while environments are stepped and reset.
+
+    Returns:
+        ``steps`` and ``mib`` of ten samples, and ``growth_kib``, from the second to the last.
+    """
+    env = create(stock_class(task), num_envs, **_SETTINGS)
+    player = Environments("c", "ours", env, num_envs, env.single_action_space.shape[0])
+    samples: dict[int, float] = {}
+    every = max(1, steps // EPISODE // 10)
+    for episode in range(1, steps // EPISODE + 1):
+        player.play(1)
+        if episode % every == 0:
+            gc.collect()
+            samples[episode * EPISODE] = _resident() / 2**20
+            report(f"{episode * EPISODE:6d} steps: {samples[episode * EPISODE]:.1f} MiB")
+    env.close()
+    mib = list(samples.values())
+    growth = 2**10 * (mib[-1] - mib[min(1, len(mib) - 1)])
+    return {
+        "num_envs": num_envs,
+        "steps": list(samples),
+        "mib": mib,
+        "growth_kib": growth,
+    }
+
+
+def _resident() -> int:
+    """Resident bytes of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _cpu_seconds(pid: int) -> float:
+    """User and system time of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _machine() -> dict[str, Any]:
+    names = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ]
+    return {
+        "cpu": names[0] if names else platform.processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "load": os.getloadavg()[0],
+        "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        **{package: version(package) for package in ("mani-skill", "sapien", "torch", "gymnasium")},
+    }
+
+
+# ---------------------------------------------------------------------------- table
+
+
+def table(data: dict[str, Any]) -> str:
+    """What `measure` found, for people."""
+    settings, rows = data["settings"], data["rows"]
+    lines = [
+        f"{settings['task']} with ManiSkill's own class and controller {settings['controller']}; "
+        f"{data['machine']['cpu']}",
+        f"median of {settings['repeats']} turns (smallest to largest), all contenders in turns; "
+        f"episodes of {settings['episode']} random steps, resets included",
+        "",
+        "                            processes   envs   steps/s                     a CPU second",
+    ]
+    for row in rows:
+        spread = f"({row['min']:,.0f} to {row['max']:,.0f})"
+        lines.append(
+            f"{row['letter']}  {row['name']:25s} {row['processes']:8d} {row['num_envs']:6d} "
+            f"{row['median']:9,.0f} {spread:20s} {row['cpu_rate'] / row['processes']:9,.0f}"
+        )
+    lines.append("")
+    for processes, found in data["summary"].items():
+        cores = "one core" if processes == "1" else f"{processes} cores"
+        lines.append(
+            f"ours on {cores}: {found['ours']:,.0f} steps/s with {found['num_envs']} environments, "
+            f"{found['times_stock']:.1f} x stock (b), {found['share_of_limit']:.0%} of the physics "
+            f"alone (d); by CPU time {found['times_stock_cpu']:.1f} x and "
+            f"{found['share_of_limit_cpu']:.0%}"
+        )
+    lines.append(f"wanted: {MIN_STOCK_RATIO:g} x and {MIN_LIMIT_SHARE:.0%}")
+    step, made = data["step"], data["creation"]
+    parts = ", ".join(
+        f"{part} {step[part]:.2f} ({step[part] / step['total']:.0%})"
+        for part in ("physics", "fetch", "apply", "controller", "task", "other")
+    )
+    lines += [
+        "",
+        f"a step of {step['num_envs']} environments, ms of CPU time: {step['total']:.2f} = {parts}; "
+        f"a reset of all {step['reset']:.1f}",
+        f"an environment: {made['per_env_ms']:.1f} ms to make, {made['per_env_kib']:.0f} KiB "
+        f"(first one {made['first_ms']:.0f} ms; a process without any {made['process_mib']:.0f} "
+        "MiB resident, mostly shared libraries)",
+    ]
+    return "\n".join(lines)
+
+
+def dump(data: dict[str, Any]) -> str:
+    """The same for programs."""
+    return json.dumps(data, indent=2, allow_nan=False)
