@@ -73,15 +73,23 @@ def generate(page: str, rows: Sequence[dict[str, Any]]) -> str:
     return f"{before}{BEGIN}\n{render(rows)}\n{END}{after}"
 
 
+def read_summary(path: Path) -> list[dict[str, Any]]:
+    """Rows of a ``summary.json``.
+
+    Raises:
+        UserError: if there is none.
+    """
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read the summary {path}: {error}") from error
+
+
 def main(arguments: Sequence[str]) -> int:
     """Write docs/audit.md; the exit code."""
     try:
-        source = Path(arguments[0]) if arguments else SUMMARY
-        try:
-            rows = json.loads(source.read_text())
-        except (OSError, ValueError) as error:
-            raise UserError(f"cannot read the summary {source}: {error}") from error
-        if source != SUMMARY:
+        rows = [row for path in arguments or [SUMMARY] for row in read_summary(Path(path))]
+        if arguments:
             SUMMARY.parent.mkdir(exist_ok=True)
             SUMMARY.write_text(summary_json(rows))
         PAGE.write_text(generate(PAGE.read_text(), rows))

@@ -248,7 +248,8 @@ def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
         cells += [_cell(row["object_chunk_mm"], 1)]
         cells += [_cell(row[c], 1, exact=EXACT) for c in ("cost", "dense")]
         cells += [_cell(row["observation"], 100, "%", EXACT), _cell(row["field_mm"], 1, "", 1e-2)]
-        cells += [_cell(row["resets"], 1, "", 5e-4), f"{row['resets_p']:.3f}"]
+        differ = row["resets_p"] < SIGNIFICANT
+        cells += [_cell(row["resets"], 1) if differ else "alike", f"{row['resets_p']:.3f}"]
         lines.append("| " + " | ".join(cells) + " |")
     rule = "|---|" + "--:|" * (len(head) - 1)
     return "\n".join(["| " + " | ".join(head) + " |", rule, *lines]) + "\n"
