@@ -88,7 +88,7 @@ def read_summary(path: Path) -> list[dict[str, Any]]:
 def main(arguments: Sequence[str]) -> int:
     """Write docs/audit.md; the exit code."""
     try:
-        rows = [row for path in arguments or [SUMMARY] for row in read_summary(Path(path))]
+        rows = [row for path in arguments or [str(SUMMARY)] for row in read_summary(Path(path))]
         if arguments:
             SUMMARY.parent.mkdir(exist_ok=True)
             SUMMARY.write_text(summary_json(rows))
