@@ -485,10 +485,10 @@ def split_step(env_cls: type[BaseEnv], num_envs: int, episodes: int = 2) -> dict
         watch.watch(env, name, "task")
     reset = 0.0
     for _ in range(episodes):
-        begin = time.process_time()
+        before, begin = dict(watch.seconds), time.process_time()
         env.reset()
         reset += time.process_time() - begin
-        watch.seconds.pop("begin", None)
+        watch.seconds = before
         for action in player.actions:
             with watch.part("other"):
                 env.step(action)
@@ -645,8 +645,8 @@ def table(data: dict[str, Any]) -> str:
     )
     lines += [
         "",
-        f"a step of {step['num_envs']} environments, ms of CPU time: {step['total']:.2f} = {parts}; "
-        f"a reset of all {step['reset']:.1f}",
+        f"CPU time of a step of {step['num_envs']} environments: {step['total']:.2f} ms = {parts};",
+        f"of a reset of all: {step['reset']:.1f} ms",
         f"an environment: {made['per_env_ms']:.1f} ms to make, {made['per_env_kib']:.0f} KiB "
         f"(first one {made['first_ms']:.0f} ms; a process without any {made['process_mib']:.0f} "
         "MiB resident, mostly shared libraries)",

@@ -8,37 +8,37 @@ from typing import Any, ClassVar
 import pytest
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
-from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
-from mani_skill.envs.tasks.tabletop.stack_cube import StackCubeEnv
 from mani_skill.utils.structs.pose import Pose
 
 from bench.sim import create, prepare_headless
+from bench.tasks import task_names
+from bench.throughput import stock_class
 
 
 class Kit:
     """What the tests share."""
 
     tasks: ClassVar[dict[str, type[BaseEnv]]] = {
-        "PushCube": PushCubeEnv,
-        "PickCube": PickCubeEnv,
-        "StackCube": StackCubeEnv,
+        name.removesuffix("-v1"): stock_class(name) for name in task_names()
     }
+    robots: ClassVar[dict[str, str]] = {"PushT": "panda_stick"}
     settings: ClassVar[dict[str, Any]] = {
         "obs_mode": "state",
         "control_mode": "pd_joint_delta_pos",
         "reward_mode": "dense",
-        "robot_uids": "panda",
     }
+
+    def _settings(self, task: str, settings: dict[str, Any]) -> dict[str, Any]:
+        return {"robot_uids": self.robots.get(task, "panda"), **self.settings, **settings}
 
     def batched(self, task: str, num_envs: int, **settings: Any) -> BaseEnv:
         """A task on our batched CPU physics."""
-        return create(self.tasks[task], num_envs, **{**self.settings, **settings})
+        return create(self.tasks[task], num_envs, **self._settings(task, settings))
 
     def stock(self, task: str, **settings: Any) -> BaseEnv:
         """The same task on ManiSkill's own CPU physics, which allows one environment."""
         prepare_headless()
-        kwargs = {**self.settings, **settings}
+        kwargs = self._settings(task, settings)
         return self.tasks[task](sim_backend="physx_cpu", render_backend="none", **kwargs)
 
     @staticmethod

@@ -1,0 +1,153 @@
+"""What the throughput verb measures, on parts small enough for a test."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from bench import throughput
+from bench.throughput import Replay, Row, Turn, _Stopwatch
+from policies.errors import UserError
+
+TASK = "PickCube-v1"
+
+
+@pytest.fixture(scope="module")
+def env_cls():
+    return throughput.stock_class(TASK)
+
+
+def test_the_limit_moves_the_robots_that_ours_moved(env_cls):
+    """The replayed substeps lead where the recorded episode led: the same work, nothing else."""
+    replay = Replay(env_cls, 2)
+    robots = [a.get_qpos() for a in replay.env.scene.px._articulations]
+    assert len(replay.targets) == throughput.EPISODE
+    wall, cpu = replay.play()
+    assert 0 < cpu <= wall * 1.5
+    again = [a.get_qpos() for a in replay.env.scene.px._articulations]
+    np.testing.assert_allclose(robots, again, atol=1e-3)
+    starts = []
+    for system, packed in zip(replay.systems, replay.start, strict=True):
+        system.unpack(packed)
+        starts.append(system)
+    first = [a.get_qpos() for a in replay.env.scene.px._articulations]
+    assert np.abs(np.array(first) - np.array(again)).max() > 0.1
+
+
+def test_parts_of_a_step_add_up(env_cls):
+    split = throughput.split_step(env_cls, 4, episodes=1)
+    parts = ("physics", "fetch", "apply", "controller", "task", "other")
+    assert all(split[part] > 0 for part in parts)
+    assert split["total"] == pytest.approx(sum(split[part] for part in parts))
+    assert split["physics"] > split["apply"]
+
+
+def test_a_nested_part_is_not_counted_twice():
+    watch = _Stopwatch()
+
+    def busy(seconds):
+        end = time.process_time() + seconds
+        while time.process_time() < end:
+            pass
+
+    with watch.part("outer"):
+        busy(0.02)
+        with watch.part("inner"):
+            busy(0.06)
+        busy(0.02)
+    busy(0.03)
+    assert watch.seconds["outer"] == pytest.approx(0.04, abs=0.01)
+    assert watch.seconds["inner"] == pytest.approx(0.06, abs=0.01)
+
+
+def rows() -> list[Row]:
+    def row(letter, processes, num_envs, *rates):
+        return Row(
+            letter, letter, processes, num_envs, [Turn(r, 1.0, processes / 2) for r in rates]
+        )
+
+    return [
+        row("a", 1, 1, 240, 250, 260),
+        row("b", 1, 1, 200, 100, 300),
+        row("b", 2, 2, 400, 400, 400),
+        row("c", 1, 4, 900, 900, 900),
+        row("c", 1, 64, 2000, 1800, 1900),
+        row("c", 2, 64, 3000, 3000, 3100),
+        row("d", 1, 64, 3800, 3800, 3000),
+        row("d", 2, 64, 6000, 6000, 6000),
+    ]
+
+
+def test_summary_compares_like_with_like():
+    """Medians of the best of each kind, in the same number of processes."""
+    found = throughput.summarise(rows(), 2)
+    assert found["1"]["num_envs"] == 64
+    assert found["1"]["times_stock"] == pytest.approx(1900 / 200)
+    assert found["1"]["share_of_limit"] == pytest.approx(0.5)
+    assert found["2"]["times_stock"] == pytest.approx(7.5)
+    assert found["2"]["share_of_limit"] == pytest.approx(0.5)
+    assert rows()[0].cpu_rate == pytest.approx(500)
+
+
+def test_table_and_json(env_cls):
+    data = {
+        "settings": {"task": TASK, "controller": "c", "repeats": 3, "episode": 50},
+        "machine": throughput._machine(),
+        "rows": [row.to_json() for row in rows()],
+        "summary": throughput.summarise(rows(), 2),
+        "step": throughput.split_step(env_cls, 2, episodes=1),
+        "creation": throughput.creation(env_cls, 3),
+    }
+    text = throughput.table(data)
+    assert "1,900 (1,800 to 2,000)" in text
+    assert "ours on 2 cores: 3,000 steps/s with 64 environments, 7.5 x stock (b), 50%" in text
+    assert json.loads(throughput.dump(data)) == data
+    assert data["creation"]["per_env_ms"] > 0
+
+
+def test_memory_is_watched():
+    """The numbers of 10,000 steps are a matter of minutes: `symsteer throughput --memory`."""
+    growth = throughput.memory_growth(TASK, num_envs=2, steps=500)
+    assert len(growth["steps"]) == 10
+    assert growth["steps"][-1] == 500
+    assert all(100 < mib < 10_000 for mib in growth["mib"])
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_over_10_000_steps():
+    assert throughput.memory_growth(TASK, num_envs=4)["growth_kib"] < 2**10
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"task": "PickCub-v1"}, "PickCube-v1"),
+        ({"num_envs": ()}, "positive"),
+        ({"num_envs": (0,)}, "positive"),
+        ({"repeats": 0}, "positive"),
+        ({"cores": -1}, "cores is -1"),
+    ],
+)
+def test_bad_input(options, words):
+    with pytest.raises(UserError, match=words):
+        throughput.measure(**options)
+
+
+@pytest.mark.slow
+def test_the_whole_measurement():
+    """All contenders in turns; ours is ahead of stock and behind the limit."""
+    torch.set_num_threads(1)
+    data = throughput.measure(TASK, num_envs=(16,), repeats=2, seconds=0.2, cores=2)
+    kinds = [(row["letter"], row["processes"]) for row in data["rows"]]
+    assert [k for k in kinds if k[0] != "g"] == [
+        *[("a", 1), ("b", 1), ("b", 2)],
+        *[("c", 1), ("d", 1), ("c", 2), ("d", 2)],
+    ]
+    one = data["summary"]["1"]
+    assert one["times_stock_cpu"] > 2
+    assert 0.1 < one["share_of_limit_cpu"] < 1
+    throughput.table(data)
