@@ -56,6 +56,23 @@ class GymEnv(BaseEnv):
         with self._in_batched_branch():
             return super().reset(seed=seed, options=options)
 
+    def step(self, action: Any) -> tuple:
+        """As ManiSkill's; whole numbers are an action too.
+
+        Raises:
+            UserError: if the action is a list.
+        """
+        if isinstance(action, list | tuple):
+            raise UserError(
+                f"an action is a tensor or array of shape {self.action_space.shape}, not a "
+                f"{type(action).__name__}"
+            )
+        if isinstance(action, np.ndarray) and action.dtype.kind in "biu":
+            action = action.astype(np.float32)
+        elif torch.is_tensor(action) and not action.is_floating_point():
+            action = action.float()
+        return super().step(action)
+
     def get_info(self) -> dict:
         """As ManiSkill's."""
         with self._in_batched_branch():
@@ -72,11 +89,6 @@ class GymEnv(BaseEnv):
             return super().render_human()
 
     def _step_action(self, action: Any) -> Any:
-        if isinstance(action, list | tuple):
-            raise UserError(
-                f"an action is a tensor or array of shape {self.action_space.shape}, not a "
-                f"{type(action).__name__}"
-            )
         with self._in_batched_branch():
             return super()._step_action(action)
 
