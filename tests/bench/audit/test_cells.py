@@ -165,7 +165,7 @@ def test_unbroken_tasks(task):
         cell = place(group=group)
         print(text(cell))
         for window in ("step", "chunk"):
-            assert cell.defect("tool", window).relative.high < 0.02
+            assert cell.defect("tool", window).relative.value < 0.02
         assert broken(cell, cell) == set()
 
 
