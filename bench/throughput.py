@@ -44,7 +44,7 @@ CONTROLLER = "pd_ee_delta_pose"
 MIN_STOCK_RATIO, MIN_LIMIT_SHARE = 6.0, 0.55
 """What ours should reach: times stock in as many processes, and share of the physics alone."""
 
-_SETTINGS = {"obs_mode": "state", "control_mode": CONTROLLER}
+_SETTINGS: dict[str, Any] = {"obs_mode": "state", "control_mode": CONTROLLER}
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ def _contenders(
     found[0].actions = found[0].actions[:, 0]  # type: ignore[attr-defined]
     for processes in sorted({1, cores}):
         vector = gym.vector.AsyncVectorEnv([partial(_stock, env_cls)] * processes, context="spawn")
-        pids = [process.pid for process in vector.processes]
+        pids = [process.pid for process in vector.processes if process.pid is not None]
         name = "stock in AsyncVectorEnv"
         found.append(Environments("b", name, vector, processes, dim, pids, numpy=True))
     pool = PhysicsPool(env_cls, cores)
@@ -320,7 +320,7 @@ def _contenders(
             if count < processes:
                 continue
             env = create(env_cls, count, workers=processes, **_SETTINGS)
-            pids = [] if processes == 1 else env._pool.pids  # type: ignore[attr-defined]
+            pids = getattr(env, "worker_pids", [])
             found.append(Environments("c", "ours", env, count, dim, pids))
             found.append(PhysicsAlone(pool, "physics alone", processes, count))
     if torch.cuda.is_available():

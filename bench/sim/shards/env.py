@@ -104,6 +104,11 @@ class ShardedEnv(gym.Env):
         for name, value in {**facts, **(attributes or {})}.items():
             setattr(self, name, value)
 
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process ids of the workers."""
+        return self._pool.pids
+
     # ------------------------------------------------------------------ stepping
     @property
     def elapsed_steps(self) -> torch.Tensor:
@@ -112,7 +117,7 @@ class ShardedEnv(gym.Env):
 
     def step(self, action: Any) -> tuple:
         """One control step of every environment; see ManiSkill's ``BaseEnv.step``."""
-        if action is None or isinstance(action, dict):
+        if action is None or isinstance(action, dict | list | tuple):
             parts = [select(_tensors(action), self.num_envs, rows) for rows in self._rows]
             *result, elapsed = self._ask("step", [(None, part) for part in parts])
         else:
@@ -160,7 +165,7 @@ class ShardedEnv(gym.Env):
         return given
 
     # ------------------------------------------------------------------ resets
-    def reset(self, *, seed: Any = None, options: dict | None = None) -> tuple:
+    def reset(self, seed: Any = None, options: dict | None = None) -> tuple:
         """As one process would: see ``SymmetricTask.reset``.
 
         Args:
@@ -186,6 +191,7 @@ class ShardedEnv(gym.Env):
         seeds = None
         if seed is not None:
             seeds = [int(s) for s in np.atleast_1d(np.asarray(seed))]
+            super().reset(seed=seeds[0])
             if len(seeds) not in (1, len(index)):
                 raise UserError(
                     f"{len(seeds)} seeds were given for {len(index)} environments; give one each"

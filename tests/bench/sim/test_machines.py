@@ -118,6 +118,19 @@ def test_cuda_absent():
         make_env_class(PickCubeEnv, "cuda")(num_envs=2)
 
 
+def test_physx_gpu_library_missing(monkeypatch):
+    """A GPU without PhysX's library, which cannot be downloaded: one sentence, and a way out."""
+
+    def no_network():
+        raise RuntimeError("<urlopen error [Errno -3] Temporary failure in name resolution>")
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("sapien.physx.enable_gpu", no_network)
+    with pytest.raises(UserError, match="PhysX's GPU library.*use sim='cpu'") as error:
+        create(PickCubeEnv, 2, sim="cuda")
+    assert "\n" not in str(error.value)
+
+
 @pytest.mark.gpu
 def test_cuda():
     """ManiSkill's own GPU simulation, where its library is."""

@@ -284,6 +284,8 @@ def test_bad_input(pair):
         two.step(torch.zeros(4, 7))
     with pytest.raises(UserError, match=r"\[environments, steps, action\]"):
         two.step_chunk(torch.zeros(5, 7))
+    with pytest.raises(UserError, match="not a list"):
+        two.step([[0.0] * 7] * 5)
     with pytest.raises(UserError, match="3 seeds were given for 5"):
         two.reset(seed=[1, 2, 3])
     with pytest.raises(UserError, match="env_idx or reconfigure"):
@@ -353,7 +355,7 @@ def test_a_killed_worker_is_reported(when):
     before = open_files()
     env = make(TASK, num_envs=4, workers=2)
     env.reset(seed=1)
-    pids = env._pool.pids
+    pids = env.worker_pids
     if when == "during":
         os.kill(pids[1], signal.SIGSTOP)  # it will not have answered when it dies
         killer = subprocess.Popen(["sh", "-c", f"sleep 0.5; kill -9 {pids[1]}"])
@@ -375,7 +377,7 @@ def test_nothing_is_left_behind():
     """Closed, forgotten or never finished: no process, no descriptor."""
     before = open_files()
     env = make(TASK, num_envs=2, workers=2)
-    pids = env._pool.pids
+    pids = env.worker_pids
     del env
     wait_until_gone(pids)
     with pytest.raises(WorkerError):
@@ -388,7 +390,7 @@ import torch
 from bench.tasks import make
 env = make("{TASK}", num_envs=2, workers=2)
 env.reset(seed=1)
-print(*env._pool.pids, flush=True)
+print(*env.worker_pids, flush=True)
 while True:
     env.step(torch.zeros(2, 7))
 """
