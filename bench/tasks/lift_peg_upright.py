@@ -51,7 +51,9 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
     upright_tolerance = 0.08
     height_tolerance = 0.005
     grip_from_end = 0.02
+    """Where the expert grasps, metres from an end."""
     grip_force = 6.0
+    """How hard it presses with each finger, newtons: closed fingers would hold the peg's tilt."""
 
     def _place_objects(self, rng: Any, count: int) -> None:
         u = rng.uniform(size=3)
@@ -90,8 +92,8 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
     def intent(self, offset: torch.Tensor) -> Intent:
         """Grasp the peg near an end, raise that end about the other one, let go.
 
-        The grip is so loose that the peg turns between the fingers, and it is let go a little
-        early: a peg that leans less than 0.2 rad falls onto its foot.
+        The grip is so loose that the peg turns between the fingers, while its foot stays on the
+        table.
         """
         tcp, peg = self.agent.tcp_pose.p, self.peg.pose
         axis = quaternion_to_matrix(peg.q)[:, :, 0]
@@ -113,7 +115,9 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         flat = axis[:, :2].norm(dim=1)
         bearing = axis[:, :2] / flat[:, None].clamp_min(1e-6)
         tilt = torch.atan2(flat, rise)
-        step = (0.22 * tilt).clamp(0.0, 0.05)
+        radius = 2 * self.peg_half_length - self.grip_from_end
+        step = (radius * tilt).clamp(0.0, 0.05)
+        # Height of the peg's lowest corner: what was lifted off the table goes down again.
         foot = peg.p[:, 2] - self.peg_half_length * rise - self.peg_half_width * flat
         raise_end = Intent(
             move=torch.cat(
@@ -131,5 +135,6 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
     @property
     def _loose(self) -> float:
         """Gripper action at which each finger presses the peg with ``grip_force`` newtons."""
-        target = self.peg_half_width - self.grip_force / 1e3
+        # The finger drives are springs; actions span finger positions of -1 to 4 cm.
+        target = self.peg_half_width - self.grip_force / self.agent.gripper_stiffness
         return CLOSED + (OPEN - CLOSED) * (target + 0.01) / 0.05

@@ -57,7 +57,9 @@ class PushT(SymmetricTask, PushTEnv):
     spawn_extent = 0.24
     half_thickness = 0.02
     lowest_grip = 0.014
+    """Least height of the tool while it drags, metres."""
     max_turn = math.pi / 2
+    """Largest difference of yaw between block and goal at a reset, radians."""
     grip_on_stem = 0.04
     """Where the expert grasps: metres along the stem from the centre of mass."""
     drawing_offset = -0.0047
@@ -143,6 +145,7 @@ class PushT(SymmetricTask, PushTEnv):
         turn = torch.atan2(_cross(stem, goal_stem), (stem * goal_stem).sum(dim=1))
         yaw = yaw_along(self, stem)
         yaw = self.body.reachable_turn(self.agent.robot.get_qpos(), yaw, math.pi, turn)
+        # Fingers that grip the 5 cm of the stem slightly askew stop a little further apart.
         approach, held = grasp_at(self, handle + offset, handle, yaw, 0.053)
         # Where the tool is in the block's frame, there it shall be in the goal's.
         arm = (tcp - tee.p)[:, :2]

@@ -51,7 +51,7 @@ def near_upright():
 
 
 def test_success_is_stocks_where_that_is_well_conditioned(env):
-    """A peg that leans in the x-z plane about its body y axis: stock's Euler angle is its tilt."""
+    """A peg that leans in the x-z plane about its body z axis: stock's Euler angle is its tilt."""
     lean = quaternion_multiply(
         about("y", -math.pi / 2 + uniform(-0.2, 0.2, 3)), about("x", torch.full((COUNT,), 1.5708))
     )
