@@ -126,7 +126,7 @@ def test_physx_gpu_library_missing(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("sapien.physx.enable_gpu", no_network)
-    with pytest.raises(UserError, match="PhysX's GPU library.*use sim='cpu'") as error:
+    with pytest.raises(UserError, match=r"PhysX's GPU library.*use sim='cpu'") as error:
         create(PickCubeEnv, 2, sim="cuda")
     assert "\n" not in str(error.value)
 
