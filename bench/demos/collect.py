@@ -108,9 +108,15 @@ def collect(
         raise UserError(f"demonstrations are written to a file ending in .h5, not {path.name!r}")
     if count < 1:
         raise UserError(f"the number of demonstrations must be at least 1; it is {count}")
+    if not 0 <= seed < 2**32:
+        raise UserError(f"the seed must lie in [0, 2^32); it is {seed}")
     if mode not in MODES:
         raise UserError(f"there is no mode {mode!r}; valid: {', '.join(MODES)}")
     settings = diversity or MODES[mode]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"no folder can be made for {path}: {error.strerror}") from error
     env = make(
         task, num_envs=min(num_envs, 2 * count), embodiment=embodiment, variant=variant, sim=sim
     )
@@ -206,7 +212,6 @@ def _write(
     tried: int,
     variant: str,
 ) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     # Written aside first: an interrupted run leaves no half file under the final name.
     partial = path.with_name(path.name + ".partial")
     episodes = []

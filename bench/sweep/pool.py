@@ -40,11 +40,13 @@ def run_suite(suite: Suite, out: Path, workers: int) -> list[Outcome]:
 
     Raises:
         UserError: if ``workers`` is not positive, or a cell names what does not exist.
+        OSError: if ``out`` cannot be made.
     """
     if workers < 1:
         raise UserError(f"--workers is {workers}; it must be at least 1")
     for config in suite.runs:
         check(config)
+    out.mkdir(parents=True, exist_ok=True)
     outcomes, todo = [], []
     for config in suite.runs:
         folder = out / run_id(config, {})

@@ -111,4 +111,4 @@ def _check_keys(data: dict[str, Any], valid: set[str], source: str, prefix: str 
                 if close
                 else f"valid: {', '.join(sorted(valid))}"
             )
-            raise UserError(f"{source}: unknown key {prefix}{key}; {hint}")
+            raise UserError(f"{source}: there is no key {prefix + key!r}; {hint}")

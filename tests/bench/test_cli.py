@@ -108,6 +108,26 @@ def test_records_that_are_none(monkeypatch, capsys, tmp_path):
     assert "record.json" in sentence(capsys)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["/proc/nowhere/a.h5"], "no folder can be made"),
+        (["a.h5", "--seed", "-1"], "seed"),
+        (["a.txt"], ".h5"),
+        (["a.h5", "--count", "0"], "at least 1"),
+    ],
+)
+def test_mistakes_in_demos(arguments, words, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert symsteer(monkeypatch, "demos", *arguments) == 2
+    assert words in sentence(capsys)
+
+
+def test_a_folder_that_cannot_be_written(monkeypatch, capsys):
+    assert symsteer(monkeypatch, "sweep", "smoke", "--out", "/proc/nowhere") == 2
+    assert "/proc/nowhere" in sentence(capsys)
+
+
 def test_an_unknown_suite(monkeypatch, capsys, tmp_path):
     assert symsteer(monkeypatch, "sweep", "dmeo", "--out", tmp_path) == 2
     assert "demo" in sentence(capsys)

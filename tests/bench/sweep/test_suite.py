@@ -61,7 +61,7 @@ def test_every_suite_that_ships_can_be_read():
         ("[grid]\nseed = []", "at least one value"),
         ("[run]\nenv_steps = 0", "at least 1"),
         ("not toml", "cannot be read as TOML"),
-        ("colour = 'red'", "unknown key colour"),
+        ("colour = 'red'", "there is no key 'colour'"),
     ],
 )
 def test_mistakes_in_a_suite(text, words, tmp_path):
