@@ -475,7 +475,8 @@ def split_step(env_cls: type[BaseEnv], num_envs: int, episodes: int = 2) -> dict
     player.play(1)
     watch, px = _Stopwatch(), env.scene.px
     watch.watch(px, "finish_substeps", "physics")
-    for name in dir(px):
+    # Its class, not what it says to be.
+    for name in dir(type(px)):
         if name.startswith(("gpu_fetch", "fetch_", "gpu_query")):
             watch.watch(px, name, "fetch")
         elif name.startswith(("gpu_apply", "apply_")):
