@@ -41,6 +41,8 @@ class Embodiment:
     control_mode: str = "pd_ee_delta_pose"
     noise_scale: float = 1.0
     """How much action noise demonstrations bear here, relative to the floating gripper."""
+    horizontal_step: float = PlanarPoseControllerConfig.horizontal_step
+    """How far the tool goes in one control step at action 1, metres."""
     drag_gain: float = 1.0
     """What an expert multiplies displacements by while it drags a load over the table."""
 
@@ -58,6 +60,15 @@ class Embodiment:
         Args:
             move: wanted displacement in the world, ``[N, 3]`` metres.
             turn: wanted rotation vector in the world, ``[N, 3]`` radians.
+        """
+        raise NotImplementedError
+
+    def set_bias(self, agent: Any, bias: torch.Tensor) -> None:
+        """Let the actuator drift: add to every horizontal step, behind the controller's bound.
+
+        Args:
+            agent: the robot, whose controller is new.
+            bias: in units of a full step of each environment, ``[N, 2]``.
         """
         raise NotImplementedError
 
@@ -143,6 +154,9 @@ class Floating(Embodiment):
             dim=1,
         )
 
+    def set_bias(self, agent: Any, bias: torch.Tensor) -> None:
+        agent.controller.controllers["root"].bias = self.horizontal_step * bias
+
     def transform_robot(self, state: torch.Tensor, angle: float, reflect: bool) -> torch.Tensor:
         root, q, v = state[:, :13], state[:, 13:21], state[:, 21:29]
         world = planar_matrix(angle, reflect, state)
@@ -201,6 +215,7 @@ class PandaArm(Embodiment):
     # Stock action 1 asks for 0.1 m or 0.1 rad, of which one control step of the non-target
     # controller covers about 40 %.
     step: float = 0.1
+    horizontal_step: float = 0.04
     gain: float = 2.0
     noise_scale: float = 0.6
     # Of joint 7, whose stops are at 2.897 rad.
@@ -228,6 +243,20 @@ class PandaArm(Embodiment):
         move = scale * move
         move = move / move.abs().amax(dim=1, keepdim=True).clamp_min(1.0)
         return torch.cat([move, -scale * turn], dim=1)
+
+    def set_bias(self, agent: Any, bias: torch.Tensor) -> None:
+        # The stock controller bounds what it is given, so the drift has to come in behind that.
+        arm = agent.controller.controllers["arm"]
+        scale, drift = arm._clip_and_scale_action, self.step * bias
+        xy = ACTION_LAYOUT.slice("xy")
+
+        def scale_and_drift(action: torch.Tensor) -> torch.Tensor:
+            step = scale(action)
+            drifted = step.clone()
+            drifted[:, xy] += drift
+            return torch.where((drift != 0).any(dim=1, keepdim=True), drifted, step)
+
+        arm._clip_and_scale_action = scale_and_drift
 
     def reachable_turn(
         self, qpos: torch.Tensor, turn: torch.Tensor, period: float, later: torch.Tensor

@@ -69,6 +69,8 @@ class PlanarPoseController(PDJointPosController):
 
     config: PlanarPoseControllerConfig
     _target_qpos: torch.Tensor
+    bias: torch.Tensor | None = None
+    """Drift of the actuator, added to every bounded horizontal increment, ``[N, 2]`` metres."""
 
     def _initialize_action_space(self) -> None:
         self.single_action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
@@ -94,9 +96,12 @@ class PlanarPoseController(PDJointPosController):
             dim=1,
         )
         low, high = (height - config.root_height for height in config.height_range)
+        step = config.horizontal_step * xy
+        if self.bias is not None:
+            step = step + self.bias
         position = torch.cat(
             [
-                _shorten(position[:, :2] + config.horizontal_step * xy, config.reach),
+                _shorten(position[:, :2] + step, config.reach),
                 (position[:, 2:] + config.vertical_step * z).clamp(low, high),
             ],
             dim=1,

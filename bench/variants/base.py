@@ -157,8 +157,33 @@ def overriding(variants: Iterable[Variant], hook: str) -> list[Variant]:
 def registry() -> dict[str, type[Variant]]:
     """All variants by name."""
     from bench.variants.action_gain import ActionGain
+    from bench.variants.actuator_offset import ActuatorOffset
+    from bench.variants.directional_reward import DirectionalReward
+    from bench.variants.frame_offset import FrameOffset
+    from bench.variants.frame_rotation import FrameRotation
+    from bench.variants.friction_patch import FrictionPatch
+    from bench.variants.gravity_tilt import GravityTilt
+    from bench.variants.observation_noise import ObservationNoise
+    from bench.variants.obstacle import Obstacle
+    from bench.variants.perception_bias import PerceptionBias
+    from bench.variants.spawn_sector import SpawnSector
+    from bench.variants.wind import Wind
 
-    return {variant.name: variant for variant in (ActionGain,)}
+    variants = (
+        GravityTilt,
+        Wind,
+        ActionGain,
+        ActuatorOffset,
+        FrictionPatch,
+        Obstacle,
+        PerceptionBias,
+        FrameOffset,
+        FrameRotation,
+        DirectionalReward,
+        SpawnSector,
+        ObservationNoise,
+    )
+    return {variant.name: variant for variant in variants}
 
 
 def variant_names() -> list[str]:

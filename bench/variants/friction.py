@@ -78,12 +78,3 @@ def _own_material(shape: physx.PhysxCollisionShape) -> tuple[physx.PhysxMaterial
         static_friction=static, dynamic_friction=dynamic, restitution=old.restitution
     )
     return shape.physical_material, static, dynamic
-
-
-def friction_of(body: Actor, num_envs: int) -> torch.Tensor:
-    """Smallest static friction among the shapes of a body, ``[N]``."""
-    values = torch.zeros(num_envs, device=body.device)
-    for scene, part in zip(body._scene_idxs.tolist(), body._bodies, strict=True):
-        shapes = part.collision_shapes
-        values[scene] = min(shape.physical_material.static_friction for shape in shapes)
-    return values

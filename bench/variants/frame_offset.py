@@ -1,0 +1,29 @@
+"""The policy takes another point for the workspace's centre."""
+
+from __future__ import annotations
+
+import torch
+from mani_skill.utils.structs import Pose
+
+from bench.variants.base import Role, Variant
+
+
+class FrameOffset(Variant):
+    """All positions are reported relative to a point 5 cm * strength from the centre along +x.
+
+    A policy that is equivariant about its origin is then equivariant about that point. On a
+    homogeneous table world and observation are as symmetric about it as about the true centre;
+    only where episodes begin is not. Heights, directions and relative vectors are unchanged.
+    Breaks the initial states, everywhere; the mirror image in the x axis survives.
+    """
+
+    name = "frame_offset"
+    breaks = "initial states"
+    moves = frozenset({"resets"})
+
+    def origin(self) -> torch.Tensor:
+        return torch.stack([0.05 * self.amount, torch.zeros_like(self.amount)], dim=1)
+
+    def perceive(self, pose: Pose, role: Role) -> Pose:
+        shift = torch.nn.functional.pad(self.origin(), (0, 1))
+        return Pose.create_from_pq(self.only_active(pose.p - shift, pose.p), pose.q)

@@ -1,0 +1,28 @@
+"""The camera that sees the objects is off."""
+
+from __future__ import annotations
+
+import torch
+from mani_skill.utils.structs import Pose
+
+from bench.variants.base import Role, Variant
+
+
+class PerceptionBias(Variant):
+    """Objects are reported 2 cm * strength too far along +x; tool and goal are seen truly.
+
+    As with a badly calibrated camera. What the observation derives from positions (vectors from
+    the tool to an object, from an object to the goal) is off by the same vector.
+    Breaks the observation, everywhere; the mirror image in the x axis survives.
+    """
+
+    name = "perception_bias"
+    breaks = "observation"
+    moves = frozenset({"observation"})
+
+    def perceive(self, pose: Pose, role: Role) -> Pose:
+        if role != "object":
+            return pose
+        still = torch.zeros_like(self.amount)
+        bias = torch.stack([0.02 * self.amount, still, still], dim=1)
+        return Pose.create_from_pq(self.only_active(pose.p + bias, pose.p), pose.q)
