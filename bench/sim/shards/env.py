@@ -148,6 +148,7 @@ class ShardedEnv(gym.Env):
 
     def _give(self, actions: Any, method: str) -> Field:
         """Lay actions into the shared memory; says what lies there."""
+        self._check_open()
         actions = _tensors(actions if hasattr(actions, "dtype") else np.asarray(actions))
         if not actions.ndim or len(actions) != self.num_envs:
             raise UserError(
@@ -278,7 +279,7 @@ class ShardedEnv(gym.Env):
     # ------------------------------------------------------------------ the rest
     def close(self) -> None:
         """End the workers. What was returned stays valid."""
-        self._closed = self._closed or "it was closed"
+        self._closed = self._closed or "because it was closed"
         self._end()
 
     def __getattr__(self, name: str) -> Any:
@@ -300,10 +301,13 @@ class ShardedEnv(gym.Env):
     def __str__(self) -> str:
         return f"<{self.workers} workers with {self.num_envs} environments of {self._env_cls}>"
 
-    def _ask(self, name: str, requests: Sequence[tuple | None]) -> Any:
-        """Send every worker its request (None: none) and join the answers."""
+    def _check_open(self) -> None:
         if self._closed:
             raise UserError(f"this environment cannot be used any more, {self._closed}")
+
+    def _ask(self, name: str, requests: Sequence[tuple | None]) -> Any:
+        """Send every worker its request (None: none) and join the answers."""
+        self._check_open()
         try:
             return self._pool.ask(name, requests)
         except (UserError, WorkerError):
