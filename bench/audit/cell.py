@@ -275,13 +275,14 @@ def audit(
     try:
         copies = bench.copies()
         resets = bench.resets(settings.resets)
+        undistorted = bench.undistorted().numpy()
         centre = bench.centre
     finally:
         bench.close()
     layout = reference.observation_layout
     seed = settings.seed
     energy, p_value = _reset_defect(resets, layout, seed)
-    observation, fields = _observation_defect(copies, layout, seed)
+    observation, fields = _observation_defect(copies, undistorted, layout, seed)
     return Cell(
         settings=settings,
         base_policy=policy.content_hash()[:12] if policy is not None else None,
@@ -394,7 +395,7 @@ def in_metres(field: Field) -> bool:
 
 
 def _observation_defect(
-    copies: Copies, layout: Layout, seed: int
+    copies: Copies, undistorted: Array, layout: Layout, seed: int
 ) -> tuple[Estimate, tuple[FieldDefect, ...]]:
     keep = _valid(np.ones(len(copies.moving), dtype=bool), copies)
     seen, again = copies.observations.numpy(), copies.observations_again.numpy()
@@ -409,7 +410,7 @@ def _observation_defect(
         floor = gaussian_distance_squared(again[:, :, here], own[:, 0])[keep]
         if seen.shape[2] == 1:
             floor = np.zeros_like(floor)
-        spread = _spread(seen[keep][:, 0, :, here], part, layout)
+        spread = _spread(undistorted[keep][:, here], part)
         defect = bootstrap(root_excess, by_state, floor, seed=seed)
         metres = in_metres(part)
         scale = 1e3 if metres else 1.0
@@ -429,10 +430,10 @@ def _observation_defect(
     return overall, tuple(fields)
 
 
-def _spread(values: Array, part: Field, layout: Layout) -> float:
-    """Root mean square of a field over states and draws, ``[S, K, dim]``: about zero for what
-    rotations turn (the turned states' mean), about the mean for scalars."""
-    centre = 0.0 if part.frequency else values.mean(axis=(0, 1))
+def _spread(values: Array, part: Field) -> float:
+    """Root mean square of a field over states, ``[S, dim]``: about zero for what rotations turn
+    (the turned states' mean), about the mean for scalars."""
+    centre = 0.0 if part.frequency else values.mean(axis=0)
     return float(np.sqrt(((values - centre) ** 2).sum(axis=-1).mean()))
 
 
@@ -440,7 +441,7 @@ def _reset_defect(resets: Resets, layout: Layout, seed: int) -> tuple[Estimate, 
     scaled = []
     for part in layout.fields:
         here = layout.slice(part.name)
-        spread = _spread(resets.original[:, None, here].numpy(), part, layout)
+        spread = _spread(resets.original[:, here].numpy(), part)
         if spread >= LEAST_SPREAD:
             scaled.append([v[:, here].numpy() / spread for v in (resets.original, resets.turned)])
     x, y = (np.concatenate(columns, axis=1) for columns in zip(*scaled, strict=True))

@@ -373,6 +373,10 @@ class Bench:
             found.append(self._observe_unbroken(seen_from(state, self.centre)))
         return torch.cat(found)[:count].double()
 
+    def undistorted(self) -> torch.Tensor:
+        """What the unbroken task shows of the states, ``[S, obs_dim]``."""
+        return self._observe_unbroken(self.visited.state).double()
+
     def _observe_unbroken(self, state: dict[str, Any]) -> torch.Tensor:
         env = self.reference
         total = len(next(iter(state["actors"].values())))

@@ -109,6 +109,9 @@ def test_perception_bias_has_the_size_that_it_must_have(place):
     cell = place("perception_bias:1")
     assert broken(cell, place()) == {"observation"}
     assert cell.worst_field.value.value == pytest.approx(20 * np.sqrt(16 / 7), rel=1e-4)
+    # Against the unbroken spread, so in proportion to the strength.
+    half = place("perception_bias:0.5")
+    assert cell.observation.value == pytest.approx(2 * half.observation.value, rel=1e-3)
     seen = {f.name for f in cell.fields if f.value.value > 1e-2}
     assert seen == {"cube_xy", "tcp_to_cube_xy", "cube_to_goal_xy"}
 
