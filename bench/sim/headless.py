@@ -19,6 +19,9 @@ _NOISE = (
     ".*py3nj.*",
 )
 
+# What ManiSkill logs about objects of its own tasks that get their pose at the first reset.
+_LOGGED_NOISE = "No initial pose set for actor builder"
+
 _VISUAL_METHODS = (
     "add_plane_visual",
     "add_box_visual",
@@ -73,6 +76,7 @@ def prepare_headless() -> bool:
         Whether rendering works.
     """
     silence_import_noise()
+    _silence_logged_noise()
     if rendering_works():
         return True
     _install_stand_ins()
@@ -83,6 +87,13 @@ def silence_import_noise() -> None:
     """Hide the warnings that importing SAPIEN and escnn causes and nobody needs to act on."""
     for message in _NOISE:
         warnings.filterwarnings("ignore", message=message)
+
+
+@lru_cache(maxsize=1)
+def _silence_logged_noise() -> None:
+    from mani_skill import logger
+
+    logger.addFilter(lambda record: not record.getMessage().startswith(_LOGGED_NOISE))
 
 
 @lru_cache(maxsize=1)
