@@ -49,6 +49,9 @@ GRIPPER_FIELDS = (
 
 GRIPPER_LAYOUT = Layout(GRIPPER_FIELDS)
 
+LCG = (6364136223846793005, 1442695040888963407)
+"""Knuth's linear congruential generator modulo 2^64: one episode's key to the next one's."""
+
 
 class SymmetricTask(GymEnv):
     """Mixin; list it before the ManiSkill task class.
@@ -373,7 +376,7 @@ class SymmetricTask(GymEnv):
         if seeded:
             self.episode_key[rows] = keys[rows]
         else:
-            self.episode_key[rows] = self.episode_key[rows] * 6364136223846793005 + 1
+            self.episode_key[rows] = self.episode_key[rows] * LCG[0] + LCG[1]
 
     # ------------------------------------------------------------------- state
 

@@ -1,11 +1,31 @@
-"""Variants: parsing, strengths, and action_gain in the simulation."""
+"""Variants: names and strengths, what strength 0 means, and that every one works everywhere."""
 
+import functools
+
+import gymnasium as gym
 import pytest
 import torch
 
-from bench.tasks import make
-from bench.variants import describe, parse, variant_names
+from bench.tasks import embodiments, make, task_names
+from bench.tasks.experts import Expert
+from bench.variants import describe, evaluated, highest_cost, parse, registry, variant_names
 from policies.errors import UserError
+from tests.bench.variants.scenes import act, scene
+
+NAMES = [
+    "action_gain",
+    "actuator_offset",
+    "directional_reward",
+    "frame_offset",
+    "frame_rotation",
+    "friction_patch",
+    "gravity_tilt",
+    "observation_noise",
+    "obstacle",
+    "perception_bias",
+    "spawn_sector",
+    "wind",
+]
 
 
 @pytest.mark.parametrize(
@@ -13,26 +33,29 @@ from policies.errors import UserError
     [
         ("action_gian:0.5", "did you mean 'action_gain'"),
         ("", "valid: none, action_gain"),
-        ("wind:0.5", "valid: none, action_gain"),
+        ("wined:0.5", "did you mean 'wind'"),
+        ("earthquake:0.5", "valid: none, action_gain, .*, wind"),
         ("action_gain", "needs a strength"),
         ("action_gain:", "no strength can be read"),
         ("action_gain:much", "no strength can be read"),
         ("action_gain:nan", "no strength can be read"),
         ("action_gain:1.5", r"\[0, 1\]"),
         ("action_gain:-0.1", r"\[0, 1\]"),
+        ("wind:0.1+gravity_tilt:7", r"'gravity_tilt' must lie in \[0, 1\]"),
         ("action_gain:0.1+action_gain:0.2", "named twice"),
         ("action_gain:0.1+", "there is no variant ''"),
         ("none+action_gain:0.1", "there is no variant 'none'"),
     ],
 )
 def test_bad_text_is_explained(text, part):
-    with pytest.raises(UserError, match=part) as error:
-        parse(text)
-    assert "\n" not in str(error.value)
+    for read in (parse, evaluated):
+        with pytest.raises(UserError, match=part) as error:
+            read(text)
+        assert "\n" not in str(error.value)
 
 
 def test_parse_and_describe():
-    assert variant_names() == ["action_gain"]
+    assert variant_names() == NAMES
     assert parse("none") == ()
     assert parse("action_gain:0") == ()
     (variant,) = parse("action_gain:0.5")
@@ -41,6 +64,8 @@ def test_parse_and_describe():
     assert describe(()) == "none"
     (variant,) = parse("action_gain", 0.25)
     assert variant.strength == 0.25
+    text = "gravity_tilt:0.3+action_gain:0.5"
+    assert describe(parse(text)) == text
     with pytest.raises(UserError, match="given twice"):
         parse("action_gain:0.5", 0.5)
     with pytest.raises(UserError, match=r"\[0, 1\]"):
@@ -51,46 +76,169 @@ def test_parse_and_describe():
         make("PickCube-v1", num_envs=3, variant="action_gain", strength=[0.5, 0.2])
 
 
-def rollout(**kwargs):
-    env = make("PickCube-v1", num_envs=3, **kwargs)
-    observations = [env.reset(seed=[1, 2, 3])[0].clone()]
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(12):
-        action = 2 * torch.randn(3, 7, generator=generator)
-        observations.append(env.step(action)[0].clone())
+def test_evaluation_leaves_out_what_is_for_training_alone():
+    assert evaluated("none") == "none"
+    assert evaluated("spawn_sector:1") == "none"
+    assert evaluated("wind:0.5+spawn_sector:1+action_gain:0.5") == "wind:0.5+action_gain:0.5"
+
+
+def test_highest_cost():
+    assert highest_cost(parse("wind:1")) == 1
+    assert highest_cost(parse("directional_reward:0.5+wind:1")) == 1.5
+    assert highest_cost(parse("directional_reward", torch.tensor([0.2, 0.75]))) == 1.75
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_variant_says_what_it_is(name):
+    variant = registry()[name]
+    assert variant.breaks
+    assert "strength" in variant.__doc__
+    assert variant.moves
+    assert variant.moves <= {"dynamics", "reward", "observation", "resets"}
+    assert variant.where in ("everywhere", "in a region")
+    assert variant.where in " ".join(variant.__doc__.split())
+
+
+# ------------------------------------------------------------------- strength 0
+
+
+def clone(tree):
+    return {k: clone(v) for k, v in tree.items()} if isinstance(tree, dict) else tree.clone()
+
+
+def flat(tree):
+    return [leaf for v in tree.values() for leaf in flat(v)] if isinstance(tree, dict) else [tree]
+
+
+@functools.cache
+def script(embodiment):
+    """Actions of the expert with some noise: the cube is touched and pushed."""
+    env = make("PushCube-v1", num_envs=3, embodiment=embodiment)
+    env.reset(seed=[1, 2, 3])
+    expert, generator = Expert(env), torch.Generator().manual_seed(0)
+    actions = []
+    for _ in range(14):
+        actions.append(expert.act() + 0.3 * torch.randn(3, 7, generator=generator))
+        env.step(actions[-1])
+    moved = (env.manipulated.linear_velocity.norm(dim=1) > 0.05).any()
     env.close()
-    return torch.stack(observations)
+    assert moved, "the script is meant to have contacts in it"
+    return actions
+
+
+def play(embodiment, **kwargs):
+    """All that an episode, a partial reset and some more steps show: ``[N, ...]`` tensors."""
+    env = make(
+        "PushCube-v1", num_envs=3, embodiment=embodiment, reward_mode="normalized_dense", **kwargs
+    )
+    shown = [env.reset(seed=[1, 2, 3])[0].clone()]
+
+    def step(action):
+        obs, reward, terminated, truncated, info = env.step(action)
+        shown.extend([obs.clone(), reward.clone(), terminated.clone(), truncated.clone()])
+        shown.append(info["success"].clone())
+
+    for action in script(embodiment):
+        step(action)
+    shown.append(env.reset(options={"env_idx": torch.tensor([0, 1])})[0].clone())
+    step(script(embodiment)[0])
+    shown.extend(flat(clone(env.get_state_dict())))
+    env.close()
+    return shown
+
+
+@functools.cache
+def unbroken(embodiment):
+    return play(embodiment)
 
 
 @pytest.mark.parametrize("embodiment", ["floating", "panda"])
-def test_strength_zero_is_the_unbroken_task_to_the_bit(embodiment):
-    plain = rollout(embodiment=embodiment)
-    assert torch.equal(plain, rollout(embodiment=embodiment, variant="action_gain:0"))
-    strengths = torch.tensor([0.0, 0.5, 0.0])
-    mixed = rollout(embodiment=embodiment, variant="action_gain", strength=strengths)
-    assert torch.equal(plain[:, [0, 2]], mixed[:, [0, 2]])
-    assert not torch.equal(plain[:, 1], mixed[:, 1])
+@pytest.mark.parametrize("name", NAMES)
+def test_strength_zero_is_the_unbroken_task_to_the_bit(name, embodiment):
+    """Also beside environments in which the variant acts."""
+    mixed = play(embodiment, variant=name, strength=torch.tensor([0.0, 1.0, 0.0]))
+    for plain, broken in zip(unbroken(embodiment), mixed, strict=True):
+        assert torch.equal(plain[[0, 2]], broken[[0, 2]])
 
 
-def test_action_gain_scales_one_axis():
-    strengths = torch.tensor([0.0, 0.5, 1.0])
-    env = make("PickCube-v1", num_envs=3, variant="action_gain", strength=strengths)
-    for axis, gains in ((0, 1 - 0.6 * strengths), (1, torch.ones(3))):
-        env.reset(seed=[5, 5, 5])
-        before = env.agent.tcp_pose.p.clone()
-        action = torch.zeros(3, 7)
-        # Far beyond the bound: commanding more does not make up for the gain.
-        action[:, axis] = 10.0
-        for _ in range(3):
-            env.step(action)
-        env.step(torch.zeros(3, 7))
-        moved = (env.agent.tcp_pose.p - before)[:, axis]
-        assert torch.allclose(moved, 0.09 * gains, atol=2e-3)
+def test_strength_zero_of_all_is_the_unbroken_task_to_the_bit():
+    everything = play("floating", variant="+".join(f"{name}:0" for name in NAMES))
+    for plain, zero in zip(unbroken("floating"), everything, strict=True):
+        assert torch.equal(plain, zero)
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("obstacle", "friction_patch")])
+def test_strength_one_shows(name):
+    """The two local ones have tests of their own where they act."""
+    mixed = play("floating", variant=name, strength=torch.tensor([0.0, 1.0, 0.0]))
+    pairs = zip(unbroken("floating"), mixed, strict=True)
+    assert not all(torch.equal(plain[1], broken[1]) for plain, broken in pairs)
+
+
+# -------------------------------------------------------------------- together
+
+
+def test_they_compose():
+    """Tilt and gain in one name: each does what it does alone."""
+    env = scene("gravity_tilt:1+action_gain:1+perception_bias:0.5", task="PushCube-v1")
+    before = env.agent.tcp_pose.p.clone()
+    for _ in range(3):
+        env.step(act(env, xy=(1.0, 0.0)))
+    env.step(act(env))
+    moved = (env.agent.tcp_pose.p - before)[:, 0]
+    assert torch.allclose(moved, torch.full((2,), 0.09 * 0.4), atol=2e-3)
+    assert describe(env.variants) == "gravity_tilt:1+action_gain:1+perception_bias:0.5"
+
+
+def test_gym_make_takes_them():
+    env = gym.make(
+        "SymSteer/PickCube-v1", num_envs=2, variant="wind:0.5+frame_rotation:0.2+obstacle:1"
+    )
+    assert describe(env.unwrapped.variants) == "wind:0.5+frame_rotation:0.2+obstacle:1"
+    env.reset(seed=[0, 1])
+    obs, *_ = env.step(env.action_space.sample())
+    assert obs.isfinite().all()
+    env.close()
+    strengths = torch.tensor([0.0, 1.0])
+    env = gym.make("SymSteer/PickCube-v1", num_envs=2, variant="wind", strength=strengths)
+    assert torch.equal(env.unwrapped.variants[0].amount, strengths)
+    env.close()
+    with pytest.raises(UserError, match="valid: none, action_gain"):
+        gym.make("SymSteer/PickCube-v1", variant="earthquake:1")
 
 
 def test_policy_actions_are_not_changed_in_place():
-    env = make("PickCube-v1", num_envs=2, variant="action_gain:1")
-    env.reset(seed=[0, 1])
+    env = scene("action_gain:1+actuator_offset:1")
     action = torch.full((2, 7), 0.5)
     env.step(action)
     assert torch.equal(action, torch.full((2, 7), 0.5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("embodiment", embodiments())
+@pytest.mark.parametrize("task", task_names())
+def test_every_task_takes_every_variant(task, embodiment):
+    for name in NAMES:
+        check_runs(make(task, num_envs=2, embodiment=embodiment, variant=name, strength=MIXED))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("name", NAMES)
+def test_every_variant_runs_on_cuda(name):
+    check_runs(make("PickCube-v1", num_envs=2, sim="cuda", variant=name, strength=MIXED))
+
+
+MIXED = torch.tensor([1.0, 0.4])
+
+
+def check_runs(env):
+    """Two steps, a partial reset, and a state that can be set."""
+    env.reset(seed=[0, 1])
+    for _ in range(2):
+        obs, reward, *_ = env.step(env.body.bound(torch.ones(2, 7, device=env.device)))
+    env.reset(options={"env_idx": torch.tensor([1])})
+    env.set_state_dict(env.get_state_dict())
+    assert obs.isfinite().all()
+    assert reward.isfinite().all()
+    env.close()

@@ -1,0 +1,198 @@
+"""Variants that act on bodies: forces, friction, a post."""
+
+import math
+
+import pytest
+import sapien.physx as physx
+import torch
+
+from bench.tasks import make, task_class, task_names
+from bench.variants.friction_patch import CENTER
+from bench.variants.obstacle import GAP, HALF_WIDTH
+from tests.bench.variants.scenes import CONTROL_STEP, G, act, place, scene
+
+STRENGTHS = torch.tensor([0.0, 0.5, 1.0])
+
+
+def fall(env, steps=3):
+    """Velocity ``[N, 3]`` of the manipulated object after a free fall from rest."""
+    place(env, (0.25, 0.25, 0.5))
+    for _ in range(steps):
+        env.step(act(env))
+    return env.manipulated.linear_velocity
+
+
+def test_tilt_turns_gravity():
+    env = scene("gravity_tilt", STRENGTHS)
+    tilt = math.radians(30) * STRENGTHS
+    direction = torch.stack([tilt.sin(), torch.zeros(3), -tilt.cos()], dim=1)
+    assert torch.allclose(fall(env), 3 * CONTROL_STEP * G * direction, atol=2e-3)
+
+
+def test_tilt_pulls_on_all_objects_and_not_on_the_hand():
+    env = scene("gravity_tilt", STRENGTHS, task="StackCube-v1")
+    state = env.get_state_dict()
+    for i, name in enumerate(("cubeA", "cubeB")):
+        state["actors"][name][:, :3] = torch.tensor([0.25, 0.2 * (1 + i), 0.5])
+    env.set_state_dict(state)
+    tool = env.agent.tcp_pose.p.clone()
+    for _ in range(3):
+        env.step(act(env))
+    for cube in (env.cubeA, env.cubeB):
+        expected = 3 * CONTROL_STEP * G * torch.sin(math.radians(30) * STRENGTHS)
+        assert torch.allclose(cube.linear_velocity[:, 0], expected, atol=2e-3)
+    assert torch.allclose(env.agent.tcp_pose.p, tool, atol=1e-4)
+
+
+def test_arm_feels_no_gravity():
+    """Hence nothing of a tilt either."""
+    env = scene(embodiment="panda")
+    links = [body for link in env.agent.robot.links for body in link._bodies]
+    assert all(body.disable_gravity for body in links)
+
+
+def test_tilt_drags_what_is_let_go():
+    """A cube that slides down the slope: friction has risen, and slows it as it should."""
+    env = scene("gravity_tilt", STRENGTHS)
+    place(env, (0.0, 0.2, env.cube_half_size), (0.4, 0.0, 0.0))
+    env.step(act(env, z=1.0))
+    tilt = math.radians(30) * STRENGTHS
+    friction = 0.3 + 1.5 * tilt.tan()
+    speed = 0.4 + CONTROL_STEP * G * (tilt.sin() - friction * tilt.cos())
+    assert torch.allclose(env.manipulated.linear_velocity[:, 0], speed, atol=0.03)
+
+
+@pytest.mark.parametrize("variant", ["gravity_tilt:1", "wind:1", "wind:1+gravity_tilt:0.5"])
+@pytest.mark.parametrize("task", task_names())
+def test_untouched_objects_stay(task, variant):
+    """Within 1 mm over a whole episode; also a sphere, which does not roll there."""
+    env = make(task, num_envs=4, variant=variant)
+    env.reset(seed=list(range(4)))
+    before = {body.name: body.pose.p.clone() for body in env.moving_bodies}
+    for _ in range(env.max_episode_steps):
+        env.step(act(env, z=1.0))
+    for body in env.moving_bodies:
+        assert (body.pose.p - before[body.name]).norm(dim=1).max() < 1e-3, body.name
+    env.close()
+
+
+def test_sphere_rolls_where_nothing_acts():
+    env = scene("gravity_tilt", STRENGTHS, task="PlaceSphere-v1")
+    place(env, (0.0, 0.25, env.radius), (0.2, 0.0, 0.0))
+    for _ in range(4):
+        env.step(act(env, z=1.0))
+    speed = env.manipulated.linear_velocity[:, 0]
+    assert speed[0] > 0.1
+    assert torch.allclose(speed[1:], torch.zeros(2), atol=1e-2)
+
+
+def test_wind_blows_on_the_manipulated_object_alone():
+    env = scene("wind", STRENGTHS, task="StackCube-v1")
+    other = env.cubeB.pose.p.clone()
+    velocity = fall(env)
+    expected = torch.zeros(3, 3)
+    expected[:, 0] = 0.75 * 0.3 * STRENGTHS * G * 3 * CONTROL_STEP
+    expected[:, 2] = -G * 3 * CONTROL_STEP
+    assert torch.allclose(velocity, expected, atol=2e-3)
+    assert torch.allclose(env.cubeB.pose.p, other, atol=1e-4)
+
+
+def test_wind_bends_the_path_of_a_sliding_cube():
+    env = scene("wind", STRENGTHS)
+    place(env, (0.0, 0.15, env.cube_half_size), (0.0, 0.5, 0.0))
+    for _ in range(5):
+        env.step(act(env, z=1.0))
+    x = env.manipulated.pose.p[:, 0]
+    assert abs(x[0]) < 1e-3
+    assert 5e-3 < x[1] < x[2]
+
+
+def test_rough_patch_stops_what_slides_over_it():
+    """Deceleration is friction times g: inside the region it is higher, outside as ever."""
+    env = scene("friction_patch", STRENGTHS)
+    speed = {}
+    for x in (CENTER[0], -CENTER[0]):
+        place(env, (x, 0.0, env.cube_half_size), (0.0, 0.5, 0.0))
+        env.step(act(env, z=1.0))
+        speed[x] = env.manipulated.linear_velocity[:, 1].clone()
+    lost = 0.5 - speed[CENTER[0]]
+    expected = CONTROL_STEP * G * (0.3 + 0.75 * STRENGTHS)
+    assert torch.allclose(lost, expected.clamp(max=0.5), atol=0.03)
+    assert torch.allclose(speed[-CENTER[0]], speed[CENTER[0]][:1].expand(3), atol=1e-4)
+
+
+def test_patch_and_tilt_add_their_friction():
+    env = scene("friction_patch:1+gravity_tilt:1")
+    shape = env.manipulated._bodies[0].collision_shapes[0]
+    tilt = 1.5 * math.tan(math.radians(30))
+    for x, patch in ((CENTER[0], 1.5), (-CENTER[0], 0.0)):
+        place(env, (x, 0.0, env.cube_half_size))
+        env.step(act(env, z=1.0))
+        assert shape.physical_material.static_friction == pytest.approx(0.3 + tilt + patch)
+        assert shape.physical_material.dynamic_friction == pytest.approx(0.3 + tilt + patch)
+        assert (env.manipulated.pose.p[:, 0] - x).abs().max() < 1e-3
+    table = env.table_scene.table._bodies[0].collision_shapes[0]
+    assert table.physical_material.static_friction == pytest.approx(0.3 + tilt)
+
+
+def test_post_blocks_the_hand():
+    env = scene("obstacle", STRENGTHS)
+    env.reset(seed=[4, 4, 4])
+    face = env.spawn_extent + GAP + HALF_WIDTH * (1 - STRENGTHS)
+    place(env, (-0.2, 0.0, env.cube_half_size))
+    xy = env.action_layout.slice("xy")
+    for _ in range(12):
+        action = act(env, z=-1.0, gripper=-1.0)
+        action[:, xy] = -env.agent.tcp_pose.p[:, :2] / env.body.horizontal_step
+        env.step(env.body.bound(action))
+    for _ in range(14):
+        env.step(act(env, xy=(1.0, 0.0), gripper=-1.0))
+    x = env.agent.tcp_pose.p[:, 0]
+    assert x[0] > face[0] + 0.1
+    assert (x[1:] < face[1:]).all()
+    assert x[2] < x[1]
+
+
+def test_post_is_no_part_of_the_state():
+    plain, env = scene(num_envs=3), scene("obstacle", STRENGTHS)
+    state = env.get_state_dict()
+    assert {k: set(v) for k, v in state.items()} == {
+        k: set(v) for k, v in plain.get_state_dict().items()
+    }
+    env.set_state_dict(plain.get_state_dict())
+    plain.set_state_dict(state)
+    env.set_state_dict(env.transform_state(state, math.pi / 4))
+    posts = [a for a in env.scene.actors.values() if a.name.startswith("obstacle")]
+    assert {a.px_body_type for a in posts} == {"static"}
+    for post in posts:
+        expected = torch.tensor(env.variants[0].position)
+        assert torch.allclose(post.pose.p[:, :2], expected.expand(len(post.pose.p), 2))
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_objects_start_inside_the_spawn_extent(task):
+    """As a whole, in many resets: the post stands outside of it."""
+    env = make(task, num_envs=64)
+    env.reset(seed=list(range(64)))
+    reach = 0.0
+    for actor in env.scene.actors.values():
+        if actor.px_body_type == "static" or actor is env.table_scene.table:
+            continue
+        for body in actor._bodies:
+            for shape in body.collision_shapes:
+                reach = max(reach, _reach(shape, body.entity.pose * shape.local_pose))
+    env.close()
+    extent = task_class(task).spawn_extent
+    assert reach < extent, f"an object of {task} reaches out to {reach:.3f} m"
+    assert extent < 0.3
+
+
+def _reach(shape, pose):
+    """Largest distance of a shape from the vertical axis through the origin."""
+    if isinstance(shape, physx.PhysxCollisionShapeSphere):
+        return math.hypot(*pose.p[:2]) + shape.radius
+    assert isinstance(shape, physx.PhysxCollisionShapeBox)
+    corners = torch.cartesian_prod(*[torch.tensor([-h, h]) for h in shape.half_size.tolist()])
+    matrix = torch.from_numpy(pose.to_transformation_matrix())
+    points = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    return points[:, :2].norm(dim=1).max().item()
