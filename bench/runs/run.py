@@ -102,11 +102,13 @@ def execute(
         UserError: if the input is wrong, or the run is finished already.
     """
     check(config)
-    if workers < 1 or (workers > 1 and config.sim == "cuda"):
+    if not 1 <= workers <= config.num_envs:
         raise UserError(
-            f"--workers is {workers}; it must be at least 1, and 1 with --sim cuda, which "
-            "simulates all environments in one process"
+            f"--workers is {workers}; it must lie between 1 and the number of environments, "
+            f"{config.num_envs}"
         )
+    if workers > 1 and config.sim == "cuda":
+        raise UserError("--workers needs --sim cpu: on CUDA one process simulates all environments")
     files = origin(demonstrations, policy)
     folder = out / run_id(config, files)
     open_run_folder(folder)
