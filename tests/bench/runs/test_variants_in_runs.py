@@ -1,0 +1,34 @@
+"""Runs of the steering loop in variants that change what training or its costs are."""
+
+import pytest
+
+from bench.runs import run as run_module
+from bench.runs.run import execute
+from bench.tasks import make, task_class
+from leaderboard.records import read_record
+from tests.bench.tiny_run import tiny_config
+
+
+def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, monkeypatch):
+    """Evaluation is on the full disc, costs are those of both; the record says so."""
+    _, folder = finished
+    made = []
+
+    def noting(task, **kwargs):
+        made.append(kwargs["variant"])
+        return make(task, **kwargs)
+
+    monkeypatch.setattr(run_module, "make", noting)
+    variant = "spawn_sector:1+directional_reward:0.5"
+    config = tiny_config(variant=variant, env_steps=160)
+    record = read_record(execute(config, folder.parent, progress=False) / "record.json")
+    assert sorted(made) == ["directional_reward:0.5", variant]
+    assert record.config["variant"] == variant
+    assert record.config["evaluation_variant"] == "directional_reward:0.5"
+    low, _ = task_class(config.task).feasible_return(config.sac.gamma, config.policy.execute)
+    assert record.feasible_q.low == pytest.approx(1.5 * low)
+    for evaluation in record.evaluations:
+        for cost, length in zip(
+            evaluation.episodes.return_, evaluation.episodes.episode_len, strict=True
+        ):
+            assert -1.5 * length <= cost <= 0
