@@ -8,7 +8,7 @@ import torch
 from mani_skill.utils.structs import Actor
 
 from bench.variants.base import Variant
-from bench.variants.bodies import masses, stop_rolling
+from bench.variants.bodies import masses, prepare_for_force
 
 MAX_TILT = math.radians(30)
 
@@ -37,8 +37,9 @@ class GravityTilt(Variant):
         return MAX_TILT * self.amount
 
     def load_scene(self) -> None:
-        for body in self.env.moving_bodies:
-            stop_rolling(body, self.active)
+        bodies = self.env.moving_bodies
+        for body in bodies:
+            prepare_for_force(body, self.active, stacks=len(bodies) > 1)
 
     def force(self, body: Actor) -> torch.Tensor:
         g = -float(self.env.sim_config.scene_config.gravity[2])

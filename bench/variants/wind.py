@@ -6,7 +6,7 @@ import torch
 from mani_skill.utils.structs import Actor
 
 from bench.variants.base import Variant
-from bench.variants.bodies import friction_of, masses, stop_rolling
+from bench.variants.bodies import friction_of, masses, prepare_for_force
 
 
 class Wind(Variant):
@@ -29,7 +29,7 @@ class Wind(Variant):
 
     def load_scene(self) -> None:
         body, table, n = self.env.manipulated, self.env.table_scene.table, self.env.num_envs
-        stop_rolling(body, self.active)
+        prepare_for_force(body, self.active, stacks=len(self.env.moving_bodies) > 1)
         g = -float(self.env.sim_config.scene_config.gravity[2])
         friction = ((friction_of(body, n) + friction_of(table, n)) / 2).clamp(max=1)
         push = 0.75 * self.amount * friction * masses(body, n) * g

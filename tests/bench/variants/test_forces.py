@@ -51,6 +51,19 @@ def test_arm_feels_no_gravity():
     assert all(body.disable_gravity for body in links)
 
 
+def test_stacked_cubes_rest_on_a_slope():
+    """ManiSkill's test of rest sees it too; steeper than 27 degrees the stack tips over."""
+    env = scene("gravity_tilt", torch.tensor([0.0, 0.5, 1.0]), task="StackCube-v1")
+    state = env.get_state_dict()
+    for name, height in (("cubeA", 0.06), ("cubeB", 0.02)):
+        state["actors"][name][:] = torch.tensor([0.0, 0.2, height, 1.0] + 9 * [0.0])
+    env.set_state_dict(state)
+    for _ in range(25):
+        info = env.step(act(env, z=1.0))[-1]
+    assert info["is_cubeA_static"][:2].all()
+    assert info["is_cubeA_on_cubeB"].tolist() == [True, True, False]
+
+
 def test_tilt_drags_what_is_let_go():
     """A cube that slides down the slope: friction has risen, and slows it as it should."""
     env = scene("gravity_tilt", STRENGTHS)
