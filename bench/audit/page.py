@@ -1,4 +1,4 @@
-"""The tables of docs/audit.md, from the committed summary of all cells.
+"""The tables of docs/audit.md and of the tasks' pages, from the committed summary of all cells.
 
 python -m bench.audit.page                      # from docs/audit/summary.json
 python -m bench.audit.page OUT/summary.json     # takes a new summary over first
@@ -7,17 +7,31 @@ python -m bench.audit.page OUT/summary.json     # takes a new summary over first
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.audit.report import EXACT, percent_range, summary_json, to_markdown
+from bench.audit.report import (
+    EXACT,
+    SIGNIFICANT,
+    percent,
+    percent_range,
+    summary_json,
+    to_markdown,
+)
 from policies.errors import UserError
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "audit.md"
 SUMMARY = ROOT / "docs" / "audit" / "summary.json"
+TASK_PAGES = ROOT / "docs" / "tasks"
+MARK = "<!-- audit:{} -->\n"
+"""What follows this line of a task's page is generated."""
+GRADES = ((0.01, "near exact"), (0.05, "close"), (0.15, "rough"))
+"""A symmetry's grade by the larger of the tool's defect in a step and the object's in a chunk."""
+
 BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
 
 
@@ -54,7 +68,7 @@ def _overview(rows: Sequence[dict[str, Any]]) -> str:
         cells = [name, str(len(own))]
         cells += [percent_range([r[c] for r in own], 0) for c in ("tool_step", "object_chunk")]
         cells += [percent_range([r[c] for r in own], EXACT) for c in ("cost", "observation")]
-        differ = sum(r["resets_p"] < 0.01 for r in own)
+        differ = sum(r["resets_p"] < SIGNIFICANT for r in own)
         cells += [f"{differ} of {len(own)} differ" if differ else "alike"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
@@ -73,6 +87,43 @@ def generate(page: str, rows: Sequence[dict[str, Any]]) -> str:
     return f"{before}{BEGIN}\n{render(rows)}\n{END}{after}"
 
 
+def grade(row: dict[str, Any]) -> str:
+    """How well the symmetry holds in a cell, in words."""
+    defects = [row[name][0] for name in ("tool_step", "object_chunk") if row[name] is not None]
+    return next((word for limit, word in GRADES if max(defects) < limit), "broken")
+
+
+def generate_task(page: str, task: str, rows: Sequence[dict[str, Any]]) -> str:
+    """A task's page with the audit of its unbroken embodiments behind the mark.
+
+    Raises:
+        UserError: if the page has lost its mark.
+    """
+    before, mark, _ = page.partition(MARK.format(task))
+    if not mark:
+        raise UserError(f"the page of {task} has lost its mark {MARK.format(task).strip()}")
+    lines = [
+        "",
+        "The [audit](../audit.md) of the unbroken task in states that expert and policy visit "
+        "(group C8):",
+        "",
+        "| embodiment | tool, one step | object, chunk of 4 steps | resets | symmetry |",
+        "|---|--:|--:|--:|---|",
+    ]
+    for row in rows:
+        if (row["task"], row["variant"], row["group"]) == (task, "none", "C8"):
+            tool, thing = (percent(row[name]) for name in ("tool_step", "object_chunk"))
+            resets = "differ" if row["resets_p"] < SIGNIFICANT else "alike"
+            lines.append(f"| {row['embodiment']} | {tool} | {thing} | {resets} | {grade(row)} |")
+    return before + mark + "\n".join(lines) + "\n"
+
+
+def task_page(task: str) -> Path:
+    """Where a task's page is: ``docs/tasks/pick-cube.md`` of ``PickCube-v1``."""
+    name = re.sub(r"(?<!^)(?=[A-Z])", "-", task.removesuffix("-v1")).lower()
+    return TASK_PAGES / f"{name}.md"
+
+
 def read_summary(path: Path) -> list[dict[str, Any]]:
     """Rows of a ``summary.json``.
 
@@ -86,13 +137,16 @@ def read_summary(path: Path) -> list[dict[str, Any]]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write docs/audit.md; the exit code."""
+    """Write docs/audit.md and the tasks' pages; the exit code."""
     try:
         rows = [row for path in arguments or [str(SUMMARY)] for row in read_summary(Path(path))]
         if arguments:
             SUMMARY.parent.mkdir(exist_ok=True)
             SUMMARY.write_text(summary_json(rows))
         PAGE.write_text(generate(PAGE.read_text(), rows))
+        for task in dict.fromkeys(row["task"] for row in rows):
+            page = task_page(task)
+            page.write_text(generate_task(page.read_text(), task, rows))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

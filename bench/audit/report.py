@@ -265,6 +265,11 @@ def _cell(interval: list[float] | None, scale: float, unit: str = "", exact: flo
     return f"{value}{unit and ' ' + unit} [{low}, {high}]"
 
 
+def percent(interval: list[float] | None) -> str:
+    """An interval of shares in per cent."""
+    return _cell(interval, 100, "%")
+
+
 def percent_range(intervals: Sequence[list[float] | None], exact: float) -> str:
     """Smallest to largest value in per cent; a plain 0 where all are below ``exact``."""
     values = [i[0] for i in intervals if i is not None]
@@ -351,9 +356,10 @@ def map_figure(cell: Cell) -> Figure:
     figure = Figure(figsize=(9, 4.2), layout="constrained")
     axes = figure.subplots(1, 2)
     side = 1e3 * BIN
-    reach = max([abs(v) for b in cell.map for v in (b.x_mm, b.y_mm)], default=100.0) + side
+    drawn = [b for b in cell.map if b.copies >= MIN_COPIES]
+    reach = max([abs(v) for b in drawn for v in (b.x_mm, b.y_mm)], default=100.0) + side
     for ax, body in zip(axes, ("tool", "object"), strict=True):
-        bins = [b for b in cell.map if b.body == body and b.copies >= MIN_COPIES]
+        bins = [b for b in drawn if b.body == body]
         top = max((b.mm for b in bins), default=0.0) or 1.0
         for b in bins:
             shade = b.mm / top

@@ -115,6 +115,9 @@ def test_the_page_says_what_the_data_say():
     rows = page.read_summary(page.SUMMARY)
     text = page.PAGE.read_text()
     assert text == page.generate(text, rows)
+    for task in {row["task"] for row in rows}:
+        text = page.task_page(task).read_text()
+        assert text == page.generate_task(text, task, rows)
     size = sum(f.stat().st_size for f in page.SUMMARY.parent.iterdir())
     assert size < 300_000
 
@@ -122,3 +125,5 @@ def test_the_page_says_what_the_data_say():
 def test_a_page_without_marks():
     with pytest.raises(UserError, match="marks"):
         page.generate("no marks", [])
+    with pytest.raises(UserError, match="mark"):
+        page.generate_task("no marks", "PickCube-v1", [])
