@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+import weakref
 from functools import cache
 from typing import Any, Literal, cast
 
@@ -22,6 +24,30 @@ from bench.sim.scene import BatchedScene
 from policies.errors import UserError
 
 Simulator = Literal["cpu", "cuda"]
+
+
+MAX_SCENES = 900
+"""PhysX scenes of a process, those of environments before their reconfiguration included. With
+about 1,000 of them the interpreter ends with a fatal error (``_PyGILState_NoteThreadState``)."""
+
+_LIVE_SCENES: weakref.WeakSet[BatchedScene] = weakref.WeakSet()
+
+
+def _make_room(count: int) -> None:
+    """Raise `UserError` unless this process can hold ``count`` more scenes."""
+    if _number_of_scenes() + count > MAX_SCENES:
+        # Environments that were closed hold their scenes until they are collected.
+        gc.collect()
+    if (there := _number_of_scenes()) + count > MAX_SCENES:
+        raise UserError(
+            f"one process holds at most {MAX_SCENES} PhysX scenes: {count} were asked for and "
+            f"{there} are there already (a reset that reconfigures needs each twice); make fewer, "
+            "or spread them over processes with workers"
+        )
+
+
+def _number_of_scenes() -> int:
+    return sum(len(scene.sub_scenes) for scene in _LIVE_SCENES)
 
 
 class _BatchedDevice:
@@ -104,6 +130,7 @@ class BatchedCpuMixin(BaseEnv):
 
     def _setup_scene(self) -> None:
         self._set_scene_config()
+        _make_room(self.num_envs)
         sub_scenes = []
         for _ in range(self.num_envs):
             systems: list[sapien.System] = [physx.PhysxCpuSystem()]
@@ -114,6 +141,7 @@ class BatchedCpuMixin(BaseEnv):
             sub_scenes, sim_config=self.sim_config, device=self.device, backend=self.backend
         )
         self.scene.timestep = 1.0 / self._sim_freq
+        _LIVE_SCENES.add(self.scene)
 
     def _load_agent(self, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(*args, **kwargs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
 from bench.sim import create, make_env_class, patches, rendering_works
+from bench.sim import environment as batched
 from bench.sim.capabilities import probe
 from policies.errors import UserError
 
@@ -108,6 +110,23 @@ def test_bad_settings(monkeypatch, settings, message):
         monkeypatch.setattr(Panda, "_controller_configs", property(with_body_frame))
     with pytest.raises(UserError, match=message):
         create(PickCubeEnv, **{"num_envs": 2, **settings})
+
+
+def test_more_scenes_than_a_process_can_hold(monkeypatch):
+    """Closed environments make room; what does not fit is refused before PhysX ends the process."""
+    gc.collect()
+    before = batched._number_of_scenes()
+    monkeypatch.setattr("bench.sim.environment.MAX_SCENES", before + 12)
+    for _ in range(4):
+        env = create(PickCubeEnv, 5, obs_mode="state")
+        env.reset(seed=0, options={"reconfigure": True})
+        env.close()
+        del env
+    env = create(PickCubeEnv, 7, obs_mode="state")
+    with pytest.raises(UserError, match=r"7 were asked for.*workers"):
+        env.reset(seed=0, options={"reconfigure": True})
+    with pytest.raises(UserError, match="workers"):
+        create(PickCubeEnv, 13, obs_mode="state")
 
 
 def test_cuda_absent():
