@@ -211,7 +211,7 @@ def test_missing_cuda_is_refused(option, tmp_path):
 def test_bad_numbers_of_workers_are_refused(change, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     workers = change.pop("workers")
-    with pytest.raises(UserError, match="--workers (is|needs)"):
+    with pytest.raises(UserError, match=r"--workers (is|needs)"):
         execute(tiny_config(**change), tmp_path, progress=False, workers=workers)
 
 
