@@ -13,11 +13,9 @@ from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from mani_skill import logger
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
-from mani_skill.utils import common
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 from bench.sim import rendering_works
@@ -187,11 +185,6 @@ def _check(task: str, num_envs: Any, options: dict[str, Any]) -> None:
     if not isinstance(variant, str):
         raise UserError(
             f"variant is a text such as 'action_gain:0.5', several joined by '+'; it is {variant!r}"
-        )
-    if variant == "none" and np.any(common.to_numpy(options.get("strength", 0)) != 0):
-        raise UserError(
-            f"strength={options['strength']} was given without a variant; name one, e.g. "
-            "variant='action_gain'"
         )
     body = EMBODIMENTS.get(options.get("embodiment", "floating"))
     if body and options.get("robot_uids", body.robot_uid) != body.robot_uid:

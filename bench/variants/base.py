@@ -202,10 +202,15 @@ def parse(text: str, strength: Strength | None = None) -> tuple[Variant, ...]:
         The variants whose strength is not zero, in the given order.
 
     Raises:
-        UserError: for an unknown or repeated name, a missing or malformed strength, or one out
-            of [0, 1].
+        UserError: for an unknown or repeated name, a missing or malformed strength, one out of
+            [0, 1], or one without a name.
     """
     if text == "none":
+        if strength is not None and bool((torch.as_tensor(strength) != 0).any()):
+            raise UserError(
+                f"strength={strength} was given without a variant; name one, e.g. "
+                "variant='action_gain'"
+            )
         return ()
     parts = text.split("+")
     variants: list[Variant] = []

@@ -66,6 +66,9 @@ def test_parse_and_describe():
     assert variant.strength == 0.25
     text = "gravity_tilt:0.3+action_gain:0.5"
     assert describe(parse(text)) == text
+    with pytest.raises(UserError, match="without a variant"):
+        parse("none", 0.5)
+    assert parse("none", 0.0) == ()
     with pytest.raises(UserError, match="given twice"):
         parse("action_gain:0.5", 0.5)
     with pytest.raises(UserError, match=r"\[0, 1\]"):
