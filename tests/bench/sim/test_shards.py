@@ -386,8 +386,11 @@ def test_nothing_is_left_behind():
 
 
 PROGRAM = f"""
+import signal
 import torch
 from bench.tasks import make
+# A test suite that runs in the background has its children ignore interrupts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 env = make("{TASK}", num_envs=2, workers=2)
 env.reset(seed=1)
 print(*env.worker_pids, flush=True)
@@ -412,15 +415,18 @@ def test_workers_end_with_the_program(end, tmp_path):
         env={**os.environ, "PYTHONPATH": os.getcwd()},
         start_new_session=True,
     )
-    pids = [int(pid) for pid in program.stdout.readline().split()]
-    assert len(pids) == 2
-    time.sleep(0.3)
-    if end == signal.SIGINT:
-        os.killpg(program.pid, end)
-    else:
+    try:
+        pids = [int(pid) for pid in program.stdout.readline().split()]
+        assert len(pids) == 2
+        time.sleep(0.3)
+        if end == signal.SIGINT:
+            os.killpg(program.pid, end)
+        else:
+            program.kill()
+        _, errors = program.communicate(timeout=30)
+        wait_until_gone(pids)
+    finally:
         program.kill()
-    _, errors = program.communicate(timeout=30)
-    wait_until_gone(pids)
     if end == signal.SIGINT:
         assert errors.count("Traceback") == 1
         assert "KeyboardInterrupt" in errors
