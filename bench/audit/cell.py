@@ -29,7 +29,7 @@ from bench.audit.estimates import (
 from bench.audit.measure import Bench, Copies, Resets, check_group
 from bench.audit.states import Visited, visit
 from bench.sim.environment import Simulator
-from bench.tasks import embodiments, make, task_class
+from bench.tasks import check_embodiment, make, task_class
 from bench.tasks.base import SymmetricTask
 from bench.variants import parse
 from policies.base import ChunkPolicy
@@ -79,10 +79,7 @@ class Settings:
                 out of range.
         """
         task_class(self.task)
-        if self.embodiment not in embodiments():
-            raise UserError(
-                f"there is no embodiment {self.embodiment!r}; valid: {', '.join(embodiments())}"
-            )
+        check_embodiment(self.embodiment)
         parse(self.variant)
         check_group(self.group)
         for name, least in (("count", LEAST_STATES), ("chunk", 1), ("resets", 16)):

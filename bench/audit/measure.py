@@ -26,8 +26,8 @@ from policies.errors import UserError
 from policies.geometry import Group
 
 SCENES = 320
-"""Scenes side by side. A process can hold about 1,000 (PhysX takes a thread-local key for each),
-and a rebuild holds the old and the new ones for a moment."""
+"""Scenes side by side: far below ``bench.sim.environment.MAX_SCENES``, since a rebuild holds the
+old and the new ones for a moment."""
 
 DRAWS = 24
 """Observations of a state where the observation is random."""

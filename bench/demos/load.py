@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import torch
 
-from bench.tasks import make, task_class
+from bench.tasks import check_embodiment, make, task_class
 from bench.tasks.embodiments import EMBODIMENTS
 from policies.errors import UserError
 from policies.geometry import Layout
@@ -68,8 +68,7 @@ def load(
     """
     path = Path(h5_path)
     env_class = task_class(task)
-    if embodiment not in EMBODIMENTS:
-        raise UserError(f"there is no embodiment {embodiment!r}; valid: {', '.join(EMBODIMENTS)}")
+    check_embodiment(embodiment)
     description = _read_description(path)
     records = _usable_records(path, description, env_class.task_id, embodiment, count)
     layout = env_class.observation_layout

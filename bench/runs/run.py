@@ -20,7 +20,7 @@ from bench.runs.tensorboard import RunLog
 from bench.steering.diagnostics import OnPolicy, measure
 from bench.steering.evaluation import HELD_OUT_SEED, Rollout, held_out_seeds, rollout
 from bench.steering.latent_env import Clock, LatentNoiseEnv
-from bench.tasks import embodiments, make, task_class
+from bench.tasks import check_embodiment, make, task_class
 from bench.variants import evaluated, highest_cost, parse
 from leaderboard.records import (
     Budget,
@@ -55,10 +55,7 @@ def check(config: RunConfig) -> None:
             range, or a device that this machine lacks.
     """
     task_class(config.task)
-    if config.embodiment not in embodiments():
-        raise UserError(
-            f"there is no embodiment {config.embodiment!r}; valid: {', '.join(embodiments())}"
-        )
+    check_embodiment(config.embodiment)
     parse(config.variant)
     if config.agent not in AGENTS:
         raise UserError(f"there is no agent {config.agent!r}; valid: {', '.join(AGENTS)}")

@@ -34,6 +34,7 @@ from policies.errors import UserError
 
 __all__ = [
     "SymmetricTask",
+    "check_embodiment",
     "embodiments",
     "make",
     "make_batched",
@@ -65,6 +66,12 @@ def task_names() -> list[str]:
 def embodiments() -> list[str]:
     """Names of all embodiments."""
     return list(EMBODIMENTS)
+
+
+def check_embodiment(embodiment: str) -> None:
+    """Raise `UserError` if there is no such embodiment."""
+    if embodiment not in EMBODIMENTS:
+        raise UserError(unknown_name("embodiment", embodiment, embodiments()))
 
 
 def task_class(task: str) -> type[SymmetricTask]:
@@ -115,8 +122,7 @@ def make(
             workers out of range.
     """
     env_class = task_class(task)
-    if embodiment not in EMBODIMENTS:
-        raise UserError(unknown_name("embodiment", embodiment, embodiments()))
+    check_embodiment(embodiment)
     kwargs.update(
         sim=sim,
         render=render,
