@@ -29,10 +29,16 @@ class RunLog:
 
     Namespaces: ``eval/`` held-out episodes, ``train/`` training episodes, ``losses/``, ``time/``
     seconds and rates, ``diag/`` Q and equivariance diagnostics. docs/metrics.md has the formulas.
+
+    Args:
+        folder: the run's folder; the events stand beside its record.
+        config: the resolved configuration.
+        purge_step: for a run that continues: TensorBoard drops what the earlier session wrote at
+            this step and later, since the continued run writes it again.
     """
 
-    def __init__(self, folder: Path, config: Mapping[str, Any]):
-        self.writer = SummaryWriter(str(folder))
+    def __init__(self, folder: Path, config: Mapping[str, Any], purge_step: int | None = None):
+        self.writer = SummaryWriter(str(folder), purge_step=purge_step)
         self.writer.add_custom_scalars(LAYOUT)
         text = json.dumps(config, indent=2).replace("\n", "  \n")
         self.writer.add_text("config", f"```\n{text}\n```")
