@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from leaderboard.errors import RecordError
 from leaderboard.figures import render_figures, to_svg
-from leaderboard.records import write_atomically
-from leaderboard.summary import load_runs, summarize
+from leaderboard.summary import Run, load_runs, summarize
 from leaderboard.tables import relative_link, render_csv, render_page
 
 DEFAULT_RECORDS = Path("leaderboard/results")
@@ -21,30 +22,35 @@ FIGURE_NAME = re.compile(r"(success|q)-[a-z0-9-]+-[0-9a-f]{6}\.svg")
 def generate(records: Sequence[Path] = (DEFAULT_RECORDS,), out: Path = DEFAULT_OUT) -> list[Path]:
     """Write LEADERBOARD.md, leaderboard.csv and figures/ into `out`; returns the files written.
 
-    Everything is rendered before the first file is written, so bad records leave `out` as it was.
-    Figures of an earlier call that no longer belong to a table are removed. Raises RecordError.
+    Everything is rendered, then everything is written under temporary names, before the first file
+    is replaced: bad records, a full disk or a read-only folder leave `out` as it was. Figures of an
+    earlier call that no longer belong to a table are removed. Raises RecordError.
     """
-    out = out.resolve()
-    if out.exists() and not out.is_dir():
-        raise RecordError(f"{out} is a file: name a folder for the leaderboard.")
-    runs = load_runs(records)
+    out = _folder(out)
+    files = render(load_runs(records), out)
+    _write_together({out / name: data for name, data in files.items()})
+    for name in _stale(out, files):
+        (out / name).unlink()
+    return [out / name for name in files]
+
+
+def render(runs: Sequence[Run], out: Path) -> dict[str, bytes]:
+    """Every file of the leaderboard, by its path relative to `out` (with `/`); nothing is written.
+
+    Depends on the records and on where they lie relative to the folder `out`, nothing else.
+    """
     summary = summarize(runs)
-    files: dict[Path, bytes] = {}
+    files: dict[str, bytes] = {}
     shown: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for place, figures in render_figures(summary).items():
         for text, kind, figure in figures:
             name = f"figures/{kind}-{slug(*place)}.svg"
-            files[out / name] = to_svg(figure)
+            files[name] = to_svg(figure)
             shown.setdefault(place, []).append((text, name))
-    links = {run.path: relative_link(run.path, out) for run in runs}
-    files[out / "leaderboard.csv"] = render_csv(summary).encode()
-    files[out / "LEADERBOARD.md"] = render_page(summary, shown, links).encode()
-    for path, data in files.items():
-        write_atomically(path, data)
-    for path in (out / "figures").glob("*.svg"):
-        if path not in files and FIGURE_NAME.fullmatch(path.name):
-            path.unlink()
-    return list(files)
+    links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
+    files["leaderboard.csv"] = render_csv(summary).encode()
+    files["LEADERBOARD.md"] = render_page(summary, shown, links).encode()
+    return files
 
 
 def slug(*texts: str) -> str:
@@ -52,3 +58,45 @@ def slug(*texts: str) -> str:
     words = "-".join(re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") for text in texts)
     digest = hashlib.sha256("\0".join(texts).encode()).hexdigest()
     return f"{words[:60].strip('-') or 'run'}-{digest[:6]}"
+
+
+def _folder(out: Path) -> Path:
+    out = out.resolve()
+    if out.exists() and not out.is_dir():
+        raise RecordError(f"{out} is a file: name a folder for the leaderboard.")
+    return out
+
+
+def _stale(out: Path, files: Mapping[str, bytes]) -> list[str]:
+    """Figures in `out` that carry a name of ours but belong to no table of `files`."""
+    names = (f"figures/{path.name}" for path in (out / "figures").glob("*.svg"))
+    return sorted(n for n in names if n not in files and FIGURE_NAME.fullmatch(Path(n).name))
+
+
+def _write_together(files: Mapping[Path, bytes]) -> None:
+    """Write all files or, as far as a file system can promise it, none.
+
+    Raises:
+        RecordError: when a folder cannot be written or the disk is full; nothing has changed then
+            (only a failing rename, after all data have reached the disk, can leave a mixture).
+    """
+    staged: list[tuple[Path, Path]] = []
+    path = Path()
+    try:
+        for path, data in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+            staged.append((temporary, path))
+            with open(temporary, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        for temporary, path in staged:
+            os.replace(temporary, path)
+    except OSError as error:
+        for temporary, _ in staged:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+        raise RecordError(
+            f"{path} cannot be written: {error.strerror}; free space or choose another folder."
+        ) from error
