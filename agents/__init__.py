@@ -1,17 +1,25 @@
-"""Steering agents: SAC in the latent noise of a frozen policy, and the references it must beat."""
+"""Steering agents: SAC in the latent noise of a frozen policy, and the references it must beat.
+
+An agent is a class with a ``name`` in any module of this package: a new one needs one new file and
+nothing else (docs/submit.md).
+"""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import functools
+import importlib
+import inspect
+import pkgutil
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias, cast
 
 import torch
 
-from agents.approximate import ApproximateAgent
-from agents.equivariant import EquivariantAgent
-from agents.references import BaseAgent, ZeroAgent
+from agents.references import BaseAgent
 from agents.replay import Batch, ReplayBuffer
 from agents.sac import Normalize, SacAgent, SacConfig
-from agents.standard import MatchedStandardAgent, StandardAgent
 from policies.errors import UserError
 from policies.geometry import Layout
 
@@ -23,19 +31,22 @@ __all__ = [
     "SacConfig",
     "SteeringAgent",
     "make_agent",
+    "registry",
 ]
 
-AGENTS: dict[str, type[SacAgent] | type[BaseAgent]] = {
-    agent.name: agent
-    for agent in (
-        StandardAgent,
-        MatchedStandardAgent,
-        EquivariantAgent,
-        ApproximateAgent,
-        BaseAgent,
-        ZeroAgent,
-    )
-}
+AgentClass: TypeAlias = type[SacAgent] | type[BaseAgent]
+
+AGENTS: Mapping[str, AgentClass]
+"""What :func:`registry` returns; looked up on first use, so that a damaged file in this package is
+reported by the command that needs the agents."""
+
+COMPARED = ("standard", "standard-matched", "equivariant", "approximate")
+"""The agents of the paper's question, listed first and in this order."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
+"""Names that can be part of a run's folder and record."""
+
+PARTS = ("learns", "act", "update", "state_dict", "load_state_dict", "parameter_counts")
 
 
 class SteeringAgent(Protocol):
@@ -61,6 +72,85 @@ class SteeringAgent(Protocol):
         ...
 
 
+@functools.cache
+def registry() -> Mapping[str, AgentClass]:
+    """All agents by name: `COMPARED`, other learners by name, then the references.
+
+    An agent is a class that a module of this package defines and that has a ``name``, its own or
+    an inherited one; classes whose own name starts with an underscore are none.
+
+    Raises:
+        UserError: if a module cannot be imported, two agents have one name, or an agent's name
+            cannot be part of a run's folder, or it lacks a part of :class:`SteeringAgent`.
+    """
+    found: dict[str, AgentClass] = {}
+    for agent in _classes():
+        where = f"{agent.__module__.replace('.', '/')}.py: {agent.__name__}"
+        if not NAME.fullmatch(agent.name):
+            raise UserError(
+                f"{where} has the name {agent.name!r}; use at most 60 letters, digits, dots, "
+                "dashes and underscores, as the name becomes part of file names"
+            )
+        if missing := [part for part in PARTS if not hasattr(agent, part)]:
+            raise UserError(
+                f"{where} lacks {', '.join(missing)}; inherit from agents.sac.SacAgent, or start "
+                "the class's name with an underscore if it is no agent"
+            )
+        if agent.name in found:
+            other = found[agent.name]
+            raise UserError(
+                f"{where} and {other.__module__.replace('.', '/')}.py: {other.__name__} are both "
+                f"called {agent.name!r}; give each agent a name of its own"
+            )
+        found[agent.name] = agent
+
+    def place(name: str) -> tuple[int, str]:
+        if name in COMPARED:
+            return COMPARED.index(name), ""
+        # References keep the order of their file, from the simplest on.
+        return (len(COMPARED), name) if found[name].learns else (len(COMPARED) + 1, "")
+
+    return {name: found[name] for name in sorted(found, key=place)}
+
+
+def _classes() -> Iterator[AgentClass]:
+    for module in pkgutil.iter_modules(__path__, f"{__name__}."):
+        try:
+            members = vars(importlib.import_module(module.name))
+        # Whatever an agent's file may raise while it is read.
+        except Exception as error:
+            raise UserError(
+                f"{module.name.replace('.', '/')}.py cannot be imported "
+                f"({type(error).__name__}: {error}{_line(error)}); mend or remove it"
+            ) from error
+        for member in list(members.values()):
+            if (
+                inspect.isclass(member)
+                and member.__module__ == module.name
+                and not member.__name__.startswith("_")
+                and isinstance(getattr(member, "name", None), str)
+            ):
+                yield cast(AgentClass, member)
+
+
+def _line(error: Exception) -> str:
+    """Where the innermost file of this package failed."""
+    lines = []
+    trace = error.__traceback__
+    while trace:
+        path = Path(trace.tb_frame.f_code.co_filename)
+        if str(path.parent) in __path__ and path != Path(__file__):
+            lines.append(f", line {trace.tb_lineno}")
+        trace = trace.tb_next
+    return lines[-1] if lines else ""
+
+
+def __getattr__(name: str) -> Any:
+    if name == "AGENTS":
+        return registry()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
 def make_agent(
     name: str,
     obs_layout: Layout,
@@ -77,8 +167,9 @@ def make_agent(
     Raises:
         UserError: if there is no agent of that name.
     """
-    if name not in AGENTS:
-        raise UserError(f"there is no agent {name!r}; choose one of {', '.join(AGENTS)}")
-    return AGENTS[name](
+    agents = registry()
+    if name not in agents:
+        raise UserError(f"there is no agent {name!r}; choose one of {', '.join(agents)}")
+    return agents[name](
         obs_layout, act_layout, horizon, config or SacConfig(), device, seed, normalize_obs, dtype
     )
