@@ -45,11 +45,18 @@ MAX_BYTES = 64 * 2**20
 
 MAX_TEXT = 2000
 
+HELD_OUT_SEED = 1_000_000
+"""Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
+and run. Training and steerability draw their seeds below it, demonstrations at random from 2^31."""
+
 DIVERGED_SHARE = 0.05
 DIVERGED_EVALUATIONS = 3
 
 Q_VALUES = ("q_mean", "q_min", "q_max", "q_abs_max")
 """Diagnostics that are Q-values themselves: their presence shows a critic."""
+
+CODE = tuple(f"{folder}/*.py" for folder in ("agents", "bench", "leaderboard", "policies"))
+"""What git must know for a commit to say which code has run (git's patterns)."""
 
 PACKAGES = ("torch", "mani-skill", "sapien", "escnn", "gymnasium", "numpy")
 
@@ -214,7 +221,10 @@ class Cell(BaseModel):
 
 
 class Provenance(_Block):
-    """Where the numbers come from. `commit` and `dirty` are null outside a git checkout."""
+    """Where the numbers come from. `commit` and `dirty` are null outside a git checkout.
+
+    `dirty`: whether tracked files differ from the commit, or code lies there that git does not know.
+    """
 
     commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
     dirty: bool | None
@@ -241,9 +251,11 @@ class Provenance(_Block):
                 continue
         commit = _git(root, "rev-parse", "HEAD")
         changes = _git(root, "status", "--porcelain", "--untracked-files=no")
+        # A file that git does not know runs as well: a new agent's, for one.
+        unknown = _git(root, "ls-files", "--others", "--exclude-standard", *CODE)
         return cls(
             commit=commit,
-            dirty=bool(changes) if commit and changes is not None else None,
+            dirty=None if None in (commit, changes, unknown) else bool(changes or unknown),
             packages=versions,
             python=platform.python_version(),
             platform=f"{platform.system()} {platform.machine()}",

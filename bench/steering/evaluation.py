@@ -9,13 +9,10 @@ from dataclasses import dataclass
 import torch
 
 from bench.steering.latent_env import LatentNoiseEnv
+from leaderboard.records import HELD_OUT_SEED
 from policies.base import ChunkPolicy
 from policies.errors import UserError
 from policies.steerability import DESIRED_ACTION_STD, action_spread
-
-HELD_OUT_SEED = 1_000_000
-"""Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
-and run. Training and steerability draw their seeds below it, demonstrations at random from 2^31."""
 
 
 def held_out_seeds(count: int) -> list[int]:
