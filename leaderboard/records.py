@@ -223,7 +223,7 @@ class Cell(BaseModel):
 class Provenance(_Block):
     """Where the numbers come from. `commit` and `dirty` are null outside a git checkout.
 
-    `dirty`: whether tracked files differ from the commit, or code lies there that git does not know.
+    `dirty`: whether tracked files differ from the commit, or git does not know some of the code.
     """
 
     commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
