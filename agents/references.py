@@ -1,4 +1,4 @@
-"""What every learner has to beat: the base policy's own noise, and no noise at all."""
+"""What every learner has to beat: the base policy's own noise, none, and the best constant one."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ class BaseAgent:
 
     name: ClassVar[str] = "base"
     learns: ClassVar[bool] = False
+    searches: ClassVar[bool] = False
+    """Whether the run has to search something before the agent can act."""
 
     def __init__(
         self,
@@ -43,6 +45,10 @@ class BaseAgent:
 
     def update(self, batch: Batch) -> dict[str, torch.Tensor]:
         """Nothing to learn."""
+        return {}
+
+    def scalars(self) -> dict[str, float | None]:
+        """What an evaluation reports of the agent itself."""
         return {}
 
     def parameter_counts(self) -> dict[str, int]:
@@ -83,3 +89,54 @@ class ZeroAgent(BaseAgent):
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Zeros ``[B, Tp, Da]``."""
         return torch.zeros(self._shape(obs), device=self.device, dtype=self.dtype)
+
+
+class GoldenTicketAgent(BaseAgent):
+    """One constant noise for all states, found by search on training episodes.
+
+    After arXiv 2603.15757; ``bench/steering/search.py`` searches. Until then the noise is 0.
+    """
+
+    name = "golden-ticket"
+    searches = True
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.ticket = torch.zeros(
+            self.horizon, self.act_layout.dim, device=self.device, dtype=self.dtype
+        )
+        self.searched: dict[str, float | None] = {}
+
+    def candidates(self, count: int) -> torch.Tensor:
+        """Noise ``[count, Tp, Da]`` to search in: zero first, for it is free, then N(0, I)."""
+        drawn = torch.randn(
+            count,
+            *self.ticket.shape,
+            generator=self.generator,
+            device=self.device,
+            dtype=self.dtype,
+        )
+        drawn[0] = 0
+        return drawn
+
+    def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
+        """The ticket for every observation, ``[B, Tp, Da]``."""
+        return self.ticket.expand(self._shape(obs)).clone()
+
+    def scalars(self) -> dict[str, float | None]:
+        """The ticket's root mean square (of N(0, I): about 1), and what the search said of it."""
+        return {"ticket_rms": self.ticket.square().mean().sqrt().item(), **self.searched}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The generator, the ticket and the search's numbers."""
+        return {**super().state_dict(), "ticket": self.ticket.clone(), "searched": self.searched}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue with the ticket.
+
+        Raises:
+            UserError: if the checkpoint is of another agent or layout.
+        """
+        super().load_state_dict(state)
+        self.ticket = state["ticket"].to(self.ticket)
+        self.searched = dict(state["searched"])

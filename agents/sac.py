@@ -125,6 +125,7 @@ class SacAgent:
 
     name: ClassVar[str]
     learns: ClassVar[bool] = True
+    searches: ClassVar[bool] = False
 
     def __init__(
         self,

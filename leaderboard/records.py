@@ -19,7 +19,7 @@ import os
 import platform
 import re
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -39,7 +39,7 @@ from pydantic import (
 
 from leaderboard.errors import RecordError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MAX_BYTES = 64 * 2**20
 """A record of this project has some ten to a few hundred kilobytes; larger files are not ours."""
 
@@ -277,13 +277,18 @@ class Parameters(_Block):
 
 
 class WallClock(_Block):
-    """Seconds spent; `total` also holds what the four named parts do not."""
+    """Seconds spent; `total` also holds what the four named parts do not.
+
+    `resumed` counts how often the run was continued from a checkpoint. What an interrupted process
+    did after its last checkpoint was done again and is not part of the seconds.
+    """
 
     simulate: Seconds = 0.0
     decode: Seconds = 0.0
     update: Seconds = 0.0
     evaluate: Seconds = 0.0
     total: Seconds = 0.0
+    resumed: Count = 0
 
 
 class Budget(_Block):
@@ -392,14 +397,28 @@ class Training(_Measured):
         return self
 
 
+def _from_1(data: dict[str, Any]) -> dict[str, Any]:
+    """Version 2 added `continued` and `wall_clock.resumed`: a run of version 1 never was."""
+    for name, block in (("continued", data), ("resumed", data.get("wall_clock"))):
+        if isinstance(block, dict) and name in block:
+            raise ValueError(f"{name} does not belong to schema_version 1")
+    return {**data, "schema_version": 2}
+
+
+MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {1: _from_1}
+"""From each older version of the schema to the next one; applied when a record is read."""
+
+
 class RunRecord(_Block):
     """Everything the leaderboard may know about one run."""
 
-    schema_version: Literal[1] = 1
+    schema_version: Literal[2] = 2
     run_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+=:,@-]{0,199}$")]
     config: dict[str, JsonValue]
     config_hash: str = ""
     provenance: Provenance
+    continued: list[Provenance] = Field(default_factory=list)
+    """Where the run was continued, as far as that differs from where it began."""
     seeds: dict[Name, int]
     started: Moment
     ended: Moment | None = None
@@ -593,15 +612,17 @@ def read_record(path: Path | str) -> RunRecord:
     if not isinstance(data, dict) or "schema_version" not in data:
         raise RecordError(f"{path} is JSON but has no schema_version: not a run record; remove it.")
     version = data["schema_version"]
-    if type(version) is not int or version != SCHEMA_VERSION:
+    if type(version) is not int or not 1 <= version <= SCHEMA_VERSION:
         raise RecordError(
             f"{path} has schema_version {str(version)[:20]!r}, "
-            f"this program reads {SCHEMA_VERSION}: "
+            f"this program reads 1 to {SCHEMA_VERSION}: "
             "use the version of symsteer that wrote it or run the cell again."
         )
     if "config_hash" not in data:
         raise RecordError(f"{path} is not a valid record: config_hash is missing; run it again.")
     try:
+        for old in range(version, SCHEMA_VERSION):
+            data = MIGRATIONS[old](data)
         return _validated(data)
     except (ValidationError, ValueError) as error:
         raise RecordError(

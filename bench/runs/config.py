@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import hashlib
 import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from agents.sac import SacConfig
 from policies.base import PolicyConfig
@@ -69,13 +74,16 @@ class RunConfig:
     variant: str = "none"
     """How the symmetry is broken: `none`, `action_gain:0.5`, or several joined with `+`."""
     agent: str = "equivariant"
-    """standard, standard-matched, equivariant, approximate, base or zero."""
+    """Agent; `symsteer list` names them."""
     seed: int = 0
     """Seed of the run: networks, exploration, training episodes."""
     env_steps: int = 50_000
     """Budget in control steps, summed over the parallel environments."""
     num_envs: int = 64
     """Parallel training environments."""
+    checkpoint_every: int = 250
+    """Control steps of each environment between two checkpoints. There all environments begin new
+    episodes in fresh scenes, for PhysX remembers contacts that no checkpoint can hold."""
     sim: Literal["cpu", "cuda"] = "cpu"
     """Where physics runs."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -88,7 +96,7 @@ class RunConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
-        for name in ("env_steps", "num_envs"):
+        for name in ("env_steps", "num_envs", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} is {getattr(self, name)}; it must be at least 1")
         if self.seed < 0:
@@ -102,6 +110,78 @@ class RunConfig:
     def to_json(self) -> dict[str, Any]:
         """Nested plain data."""
         return dataclasses.asdict(self)
+
+
+FIRST_TRAINING_SEED = 2**22
+"""Episodes of evaluation, diagnostics and steerability have smaller seeds."""
+
+
+def training_seeds(run_seed: int, start: int, count: int) -> list[int]:
+    """Seeds of ``count`` training episodes, for the ``start``-th fresh start of a run."""
+    words = np.random.SeedSequence((run_seed, start)).generate_state(count, np.uint64)
+    span = 2**31 - FIRST_TRAINING_SEED
+    return [FIRST_TRAINING_SEED + int(word % span) for word in words]
+
+
+def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
+    """A run's configuration from nested plain data; what is left out keeps its default.
+
+    Args:
+        data: as :meth:`RunConfig.to_json` returns it, or a part of that.
+        source: where the data come from, for messages.
+
+    Raises:
+        UserError: on an unknown key (with the nearest valid one) or a value of a wrong type.
+    """
+    defaults = RunConfig().to_json()
+    _check_nested_keys(data, defaults, source, "")
+    try:
+        # As JSON, in which strictness still takes 1 for 1.0, but "1" or true for no number.
+        text = json.dumps(_merge(defaults, data), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{source}: a value is neither a number nor text: {error}") from error
+    try:
+        return TypeAdapter(RunConfig).validate_json(text, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        problem = first["msg"].removeprefix("Value error, ")
+        given = "" if isinstance(first["input"], dict) else f" (got {first['input']!r})"
+        raise UserError(f"{source}: {key}{': ' * bool(key)}{problem}{given}") from error
+
+
+def check_keys(data: Iterable[str], valid: Iterable[str], source: str, prefix: str = "") -> None:
+    """Refuse keys that are not valid.
+
+    Raises:
+        UserError: naming the nearest valid key.
+    """
+    valid = sorted(valid)
+    for key in data:
+        if key not in valid:
+            close = difflib.get_close_matches(key, valid, n=1)
+            hint = f"did you mean {prefix}{close[0]}?" if close else f"valid: {', '.join(valid)}"
+            raise UserError(f"{source}: there is no key {prefix + key!r}; {hint}")
+
+
+def _merge(defaults: dict[str, Any], data: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        key: _merge(value, data[key])
+        if key in data and isinstance(value, dict)
+        else data.get(key, value)
+        for key, value in defaults.items()
+    }
+
+
+def _check_nested_keys(
+    data: Mapping[str, Any], defaults: dict[str, Any], source: str, prefix: str
+) -> None:
+    check_keys(data, defaults, source, prefix)
+    for key, value in data.items():
+        if isinstance(defaults[key], dict):
+            if not isinstance(value, dict):
+                raise UserError(f"{source}: {prefix}{key} must be a table, not {value!r}")
+            _check_nested_keys(value, defaults[key], source, f"{prefix}{key}.")
 
 
 def content_key(*parts: Any) -> str:

@@ -1,18 +1,41 @@
-"""The folder of a run: config.json, record.json, checkpoint.pt, TensorBoard events."""
+"""The folder of a run: what lies in it, who works on it, how far it is.
+
+config.json, record.json, policy.safetensors (the base policy that is steered), checkpoint.pt,
+progress.json, the TensorBoard events, and .lock, held by the process that works on the run.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import os
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from filelock import FileLock, Timeout
 
 from bench.runs.config import RunConfig, content_key
 from leaderboard.errors import RecordError
 from leaderboard.records import read_record, write_atomically
 from policies.errors import UserError
+
+State = Literal["missing", "running", "interrupted", "failed", "finished"]
+
+CONFIG, RECORD, CHECKPOINT = "config.json", "record.json", "checkpoint.pt"
+PROGRESS, LOCK = "progress.json", ".lock"
+
+CHECKPOINT_FORMAT = 1
+
+HEARTBEAT_SECONDS = 2.0
+
+
+class RunBusyError(UserError):
+    """Another process is working on the run."""
 
 
 def run_id(config: RunConfig, origin: dict[str, Any]) -> str:
@@ -30,34 +53,69 @@ def run_id(config: RunConfig, origin: dict[str, Any]) -> str:
 def is_finished(folder: Path) -> bool:
     """Whether the folder holds the record of a finished run."""
     try:
-        return read_record(folder / "record.json").status == "finished"
-    except (RecordError, FileNotFoundError):
+        return read_record(folder / RECORD).status == "finished"
+    except RecordError:
         return False
 
 
-def open_run_folder(folder: Path) -> None:
-    """Create the folder of a new run; what an unfinished run left there is moved aside.
+def state_of(folder: Path) -> State:
+    """What has become of a run.
+
+    ``running`` means that a process holds the run now. One that was killed leaves a record which
+    still says so; without the process the run is ``interrupted``, and can be continued.
+    """
+    if is_finished(folder):
+        return "finished"
+    if not (folder / CONFIG).is_file():
+        return "missing"
+    if _is_held(folder):
+        return "running"
+    try:
+        return "failed" if read_record(folder / RECORD).status == "failed" else "interrupted"
+    except RecordError:
+        return "interrupted"
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Create the folder of a run if need be, and keep other processes off it.
+
+    The lock goes with the process, however that ends.
 
     Raises:
         UserError: if the run is finished already, or the folder cannot be written.
+        RunBusyError: if another process is working on the run.
     """
-    if is_finished(folder):
-        raise UserError(
-            f"the run {folder.name} is finished already in {folder.parent}; "
-            "choose another --out or --seed, or delete its folder to run it again"
-        )
     try:
-        if folder.exists():
-            number = 1
-            while (aside := folder.with_name(f"{folder.name}.unfinished-{number}")).exists():
-                number += 1
-            folder.rename(aside)
-        folder.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / LOCK, timeout=0)
+        lock.acquire()
+    except Timeout as error:
+        raise RunBusyError(
+            f"another process is working on the run {folder.name}; wait for it or stop it"
+        ) from error
     except OSError as error:
         raise UserError(
             f"cannot write to {folder.parent}: {error.strerror}; "
             "choose a writable folder with --out"
         ) from error
+    try:
+        if is_finished(folder):
+            raise UserError(
+                f"the run {folder.name} is finished already in {folder.parent}; "
+                "choose another --out or --seed, or delete its folder to run it again"
+            )
+        yield
+    finally:
+        lock.release()
+
+
+def discard_empty(folder: Path) -> None:
+    """Remove the folder of a run that has produced nothing yet."""
+    if not {path.name for path in folder.iterdir()} - {CONFIG, PROGRESS, LOCK}:
+        for path in folder.iterdir():
+            path.unlink()
+        folder.rmdir()
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -65,8 +123,118 @@ def write_json(path: Path, data: Any) -> None:
     write_atomically(path, (json.dumps(data, indent=2, allow_nan=False) + "\n").encode())
 
 
-def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint of tensors and plain data atomically (loads with weights_only)."""
+def read_config(folder: Path) -> dict[str, Any]:
+    """The resolved configuration of a run.
+
+    Raises:
+        UserError: if the folder is no run's, or its configuration is damaged.
+    """
+    path = folder / CONFIG
+    try:
+        data = json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{folder} is not the folder of a run: it has no {CONFIG}; name a folder that "
+            "`symsteer run` or `symsteer sweep` wrote"
+        ) from error
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise UserError(
+            f"{path} cannot be read ({error}); restore it, or start the run again"
+        ) from error
+    if not isinstance(data, dict):
+        raise UserError(f"{path} is not the configuration of a run; restore it")
+    return data
+
+
+def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint of tensors and plain data atomically: the old one stays until then."""
     buffer = io.BytesIO()
-    torch.save(state, buffer)
-    write_atomically(path, buffer.getvalue())
+    torch.save({"format": CHECKPOINT_FORMAT, "run_id": folder.name, **state}, buffer)
+    write_atomically(folder / CHECKPOINT, buffer.getvalue())
+
+
+def load_checkpoint(folder: Path) -> dict[str, Any] | None:
+    """The last checkpoint of a run (``weights_only``), or None before the first one.
+
+    Raises:
+        UserError: if the file is damaged or of another run.
+    """
+    path = folder / CHECKPOINT
+    try:
+        state = torch.load(io.BytesIO(path.read_bytes()), weights_only=True)
+    except FileNotFoundError:
+        return None
+    # A damaged archive fails in many ways: zip, pickle, key and runtime errors.
+    except Exception as error:
+        raise UserError(
+            f"{path} cannot be read as a checkpoint; delete it to start the run from the beginning"
+        ) from error
+    if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
+        raise UserError(
+            f"{path} is not a checkpoint that this version reads; delete it to start the run "
+            "from the beginning"
+        )
+    if state.get("run_id") != folder.name:
+        raise UserError(
+            f"{path} is of another run ({str(state.get('run_id'))[:120]}); put it back, or delete "
+            "it to start the run from the beginning"
+        )
+    return state
+
+
+class Heartbeat:
+    """progress.json: how far a running run is, for `symsteer status` and the sweep's display.
+
+    Args:
+        folder: of the run.
+        budget: control steps that the run may use.
+        env_steps: control steps that it has used already, if it continues.
+    """
+
+    def __init__(self, folder: Path, budget: int, env_steps: int = 0):
+        self._path, self._budget, self._first = folder / PROGRESS, budget, env_steps
+        self._start = time.monotonic()
+        self._last = -float("inf")
+        self._phase = ""
+
+    def beat(self, phase: str, env_steps: int, success: float | None = None) -> None:
+        """Write now and then; a change of phase is written at once."""
+        now = time.monotonic()
+        if phase == self._phase and now - self._last < HEARTBEAT_SECONDS:
+            return
+        self._last, self._phase = now, phase
+        rate = (env_steps - self._first) / max(now - self._start, 1e-9)
+        data = {
+            "phase": phase,
+            "env_steps": env_steps,
+            "budget": self._budget,
+            "success": success,
+            "steps_per_second": rate,
+            "seconds_left": (self._budget - env_steps) / rate if rate > 0 else None,
+            "updated": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        # A display is not worth a run: a full disk is reported where results are written.
+        with contextlib.suppress(OSError):
+            temporary = self._path.with_name(f".{self._path.name}.tmp")
+            temporary.write_text(json.dumps(data))
+            os.replace(temporary, self._path)
+
+
+def read_progress(folder: Path) -> dict[str, Any] | None:
+    """What :class:`Heartbeat` wrote last; None if there is nothing legible."""
+    try:
+        data = json.loads((folder / PROGRESS).read_text())
+    except (OSError, ValueError):
+        return None
+    return data if isinstance(data, dict) and "env_steps" in data else None
+
+
+def _is_held(folder: Path) -> bool:
+    lock = FileLock(folder / LOCK, timeout=0)
+    try:
+        with lock:
+            return False
+    except Timeout:
+        return True
+    except OSError:  # a folder that cannot be written is nobody's
+        return False

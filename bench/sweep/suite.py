@@ -1,22 +1,22 @@
-"""A suite: a grid of runs described in TOML.
+"""A suite: grids of runs described in TOML.
 
-``[grid]`` lists values of top-level keys of :class:`bench.runs.config.RunConfig` whose product is
-taken, in the order written; ``[run]`` sets everything that the runs share, nested as the
-configuration is.
+``[grid]`` lists values of keys of :class:`bench.runs.config.RunConfig`, nested ones with a dot
+(``"demonstrations.count"``); their product is taken in the order written. ``strength`` lists
+strengths for the variants that are named without one. Several grids are written ``[[grid]]`` each.
+``[run]`` sets everything that the runs share, nested as the configuration is.
 """
 
 from __future__ import annotations
 
-import difflib
+import copy
 import itertools
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
-from bench.runs.config import RunConfig
+from bench.runs.config import RunConfig, build_config, check_keys
 from policies.errors import UserError
 
 SUITES = Path(__file__).parent.parent / "suites"
@@ -54,61 +54,54 @@ def load_suite(name_or_path: str) -> Suite:
         ) from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UserError(f"the suite {path.name} cannot be read as TOML: {error}") from error
-    _check_keys(data, {"description", "grid", "run"}, path.name)
-    grid = data.get("grid", {})
+    check_keys(data, {"description", "grid", "run"}, path.name)
+    shared, description = data.get("run", {}), data.get("description", "")
+    if not isinstance(shared, dict):
+        raise UserError(f"{path.name}: run must be a table, [run]")
+    if not isinstance(description, str):
+        raise UserError(f"{path.name}: description must be a text in quotes")
+    grids = data.get("grid", {})
+    runs: dict[RunConfig, None] = {}
+    for grid in grids if isinstance(grids, list) else [grids]:
+        for cell in _cells(grid, path.name):
+            config = build_config(_merge(shared, cell, path.name), path.name)
+            runs[config] = None
+    return Suite(path.stem, description, tuple(runs))
+
+
+def _cells(grid: Any, source: str) -> Iterator[dict[str, Any]]:
+    """Every combination of a grid's values, strengths joined to their variants."""
+    if not isinstance(grid, dict):
+        raise UserError(f"{source}: grid must be a table, [grid], or several, each [[grid]]")
     for key, values in grid.items():
         if not isinstance(values, list) or not values:
-            raise UserError(f"{path.name}: grid.{key} must be a list with at least one value")
-    runs = []
-    for values in itertools.product(*grid.values()):
-        cell = dict(zip(grid, values, strict=True))
-        runs.append(build_config({**data.get("run", {}), **cell}, path.name))
-    return Suite(path.stem, data.get("description", ""), tuple(runs))
+            raise UserError(f"{source}: grid.{key} must be a list with at least one value")
+    for chosen in itertools.product(*grid.values()):
+        cell = dict(zip(grid, chosen, strict=True))
+        if "strength" in cell:
+            cell["variant"] = _with_strength(cell.get("variant"), cell.pop("strength"), source)
+        yield cell
 
 
-def build_config(data: dict[str, Any], source: str) -> RunConfig:
-    """A run's configuration from nested plain data; what is left out keeps its default.
-
-    Raises:
-        UserError: on an unknown key (with the nearest valid one) or a value of a wrong type.
-    """
-    defaults = RunConfig().to_json()
-    _check_nested_keys(data, defaults, source, "")
-    try:
-        return TypeAdapter(RunConfig).validate_python(_merge(defaults, data))
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise UserError(f"{source}: {key}: {first['msg']} (got {first['input']!r})") from error
+def _with_strength(variant: Any, strength: Any, source: str) -> str:
+    if not isinstance(variant, str):
+        raise UserError(f"{source}: grid.strength needs grid.variant, a list of names")
+    if isinstance(strength, bool) or not isinstance(strength, int | float):
+        raise UserError(f"{source}: grid.strength must list numbers in [0, 1], not {strength!r}")
+    if variant == "none" or ":" in variant:
+        return variant
+    return "+".join(f"{name}:{strength:g}" for name in variant.split("+"))
 
 
-def _merge(defaults: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: _merge(value, data[key])
-        if key in data and isinstance(value, dict)
-        else data.get(key, value)
-        for key, value in defaults.items()
-    }
-
-
-def _check_nested_keys(
-    data: dict[str, Any], defaults: dict[str, Any], source: str, prefix: str
-) -> None:
-    _check_keys(data, set(defaults), source, prefix)
-    for key, value in data.items():
-        if isinstance(defaults[key], dict):
-            if not isinstance(value, dict):
-                raise UserError(f"{source}: {prefix}{key} must be a table, not {value!r}")
-            _check_nested_keys(value, defaults[key], source, f"{prefix}{key}.")
-
-
-def _check_keys(data: dict[str, Any], valid: set[str], source: str, prefix: str = "") -> None:
-    for key in data:
-        if key not in valid:
-            close = difflib.get_close_matches(key, valid, n=1)
-            hint = (
-                f"did you mean {prefix}{close[0]}?"
-                if close
-                else f"valid: {', '.join(sorted(valid))}"
-            )
-            raise UserError(f"{source}: there is no key {prefix + key!r}; {hint}")
+def _merge(shared: dict[str, Any], cell: dict[str, Any], source: str) -> dict[str, Any]:
+    """The shared settings with a cell's values in their places."""
+    merged = copy.deepcopy(shared)
+    for key, value in cell.items():
+        place = merged
+        *path, last = key.split(".")
+        for part in path:
+            place = place.setdefault(part, {})
+            if not isinstance(place, dict):
+                raise UserError(f"{source}: run.{part} must be a table, so that {key} has a place")
+        place[last] = value
+    return merged

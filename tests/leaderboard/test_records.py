@@ -260,7 +260,8 @@ def change(data: dict[str, Any], where: str, value: Any) -> None:
 
 
 EDITS: list[tuple[str, Any, str]] = [
-    ("schema_version", 2, "schema_version"),
+    ("schema_version", 3, "schema_version"),
+    ("schema_version", 0, "schema_version"),
     ("schema_version", "1", "schema_version"),
     ("schema_version", True, "schema_version"),
     ("run_id", "../../etc/passwd", "run_id"),

@@ -3,8 +3,9 @@
 import pytest
 
 from agents.sac import SacConfig
+from bench.runs.config import build_config
 from bench.sweep import pool
-from bench.sweep.suite import Suite, build_config, load_suite, suite_names
+from bench.sweep.suite import Suite, load_suite, suite_names
 from leaderboard.records import read_record
 from policies.errors import UserError
 from tests.bench.tiny_run import tiny_config
