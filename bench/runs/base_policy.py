@@ -58,8 +58,7 @@ def prepare_base(
     if demonstrations is None:
         demonstrations = demonstration_file(config, out, progress)
     demos = load(demonstrations, config.task, config.embodiment, config.demonstrations.count)
-    key = content_key(demos.content_hash, config.policy.to_json(), config.policy_seed)
-    folder = out / "base" / f"{config.task}-{config.embodiment}-{config.policy.name}-{key}"
+    folder = _policy_folder(config, out, demos)
     if policy_path(folder).is_file():
         return load_policy(folder, *layouts).to(config.device)
     base = _train(config, demos, progress)
@@ -74,13 +73,32 @@ def prepare_base(
     return base.to(config.device)
 
 
-def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> Path:
-    """The scripted expert's demonstrations of the unbroken task, collected if need be."""
+def find_base(config: RunConfig, out: Path) -> Path | None:
+    """The folder of a run's trained base policy; None if it is yet to be built."""
+    path = demonstration_path(config, out)
+    if not path.is_file():
+        return None
+    try:
+        demos = load(path, config.task, config.embodiment, config.demonstrations.count)
+    except UserError:  # whoever builds the policy says what is wrong with the file
+        return None
+    folder = _policy_folder(config, out, demos)
+    return folder if policy_path(folder).is_file() else None
+
+
+def demonstration_path(config: RunConfig, out: Path) -> Path:
+    """Where the scripted expert's demonstrations for a run lie, or will."""
     wanted = config.demonstrations
     # The mode's own settings are part of the name: a change of theirs must not find old files.
     key = content_key(dataclasses.asdict(MODES[wanted.mode]))
     name = f"{config.task}-{config.embodiment}-{wanted.mode}-{wanted.count}-s{wanted.seed}-{key}.h5"
-    path = out / "base" / name
+    return out / "base" / name
+
+
+def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> Path:
+    """The scripted expert's demonstrations of the unbroken task, collected if need be."""
+    wanted = config.demonstrations
+    path = demonstration_path(config, out)
     if path.is_file():
         return path
     try:
@@ -123,6 +141,11 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
         parameters=policy.parameter_count(),
         warning=report["warning"],
     )
+
+
+def _policy_folder(config: RunConfig, out: Path, demos: Demonstrations) -> Path:
+    key = content_key(demos.content_hash, config.policy.to_json(), config.policy_seed)
+    return out / "base" / f"{config.task}-{config.embodiment}-{config.policy.name}-{key}"
 
 
 def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPolicy:
