@@ -52,11 +52,78 @@ def run(
     """
     from bench.runs.run import execute
 
-    folder = execute(config, out, demos, base_policy, progress=not quiet, workers=workers)
+    _tell(execute(config, out, demos, base_policy, progress=not quiet, workers=workers))
+    return 0
+
+
+@app.command
+def resume(folder: Path, /, workers: int = 1, quiet: bool = False) -> int:
+    """Continue a run that was stopped, from its last checkpoint; the record comes out the same.
+
+    Args:
+        folder: The run's folder (it holds config.json).
+        workers: Processes that share the simulation; the record is the same but for the clock.
+        quiet: No progress bars.
+    """
+    from bench.runs.run import resume
+
+    _tell(resume(folder, progress=not quiet, workers=workers))
+    return 0
+
+
+@app.command
+def evaluate(
+    folder: Path,
+    /,
+    variant: str | None = None,
+    episodes: int | None = None,
+    workers: int = 1,
+    json: bool = False,
+) -> int:
+    """Play held-out episodes with the last checkpoint of a run, in its world or in another one.
+
+    With the run's own variant and number of episodes this says whether they come out as recorded.
+
+    Args:
+        folder: The run's folder; nothing in it changes.
+        variant: How the world is broken, such as action_gain:0.5, or none; default: as in the run.
+        episodes: Number of held-out episodes; default: as many as the record's final ones.
+        workers: Processes that share the simulation.
+        json: Print every episode and diagnostic as JSON, and nothing else.
+    """
+    from json import dumps
+
+    from scipy.stats import binomtest
+
+    from bench.runs.run import evaluate
+
+    found = evaluate(folder, variant, episodes, workers)
+    if json:
+        print(dumps(found.to_json()))
+        return 0
+    columns = found.evaluation.episodes
+    count, successes = len(columns.seed), sum(columns.success_once)
+    sure = binomtest(successes, count).proportion_ci(method="wilson")
+    print(f"run           {found.run_id}, checkpoint at {found.evaluation.env_steps} steps")
+    print(f"variant       {found.variant}")
+    print(
+        f"success_once  {successes / count:.2f} [{sure.low:.2f}, {sure.high:.2f}] "
+        f"({successes} of {count} held-out episodes; 95 % Wilson interval)"
+    )
+    print(f"at the end    {sum(columns.success_at_end) / count:.2f}")
+    print(f"mean length   {sum(columns.episode_len) / count:.1f} steps")
+    if found.recorded is not None:
+        same = "the same episodes as in" if found.recorded else "NOT the episodes of"
+        print(f"record        {same} the final evaluation")
+    return 0 if found.recorded is not False else 1
+
+
+def _tell(folder: Path) -> None:
+    """Where the results of a finished run are."""
+    out = folder.parent
     print(f"record:      {folder / 'record.json'}")
     print(f"TensorBoard: tensorboard --logdir {out}")
     print(f"leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
-    return 0
 
 
 @app.command
@@ -395,17 +462,19 @@ def main() -> int:
     try:
         return app.cli(prog="symsteer", description=ABOUT, sort_subcommands=False)
     except (UserError, RecordError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return _complain(error, f"error: {error}", 2)
     except WorkerLostError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+        return _complain(error, f"error: {error}", 1)
     except OSError as error:
         # A path that cannot be read or written; without one it is a fault of ours.
         if error.filename is None:
             raise
-        print(f"error: {error.filename}: {error.strerror}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
+        return _complain(error, f"error: {error.filename}: {error.strerror}", 2)
+    except KeyboardInterrupt as error:
+        return _complain(error, "interrupted", 130)
+
+
+def _complain(error: BaseException, text: str, code: int) -> int:
+    """One sentence on stderr, and how to go on where that is known; returns the exit code."""
+    print(text, *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
+    return code

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from bench.runs.folder import (
 from bench.runs.loop import Loop, feasible_return, new_agent
 from bench.tasks import check_embodiment, task_class
 from bench.variants import evaluated, parse
-from leaderboard.records import Episodes, read_record
+from leaderboard.records import Episodes, Evaluation, read_record
 from policies.base import ChunkPolicy, load_policy, policy_path, save_policy
 from policies.errors import UserError
 from policies.geometry import Group
@@ -124,25 +125,23 @@ class Evaluated:
     Attributes:
         run_id: of the run.
         variant: how the world was broken in these episodes.
-        env_steps: control steps that the agent had learned from.
-        episodes: columns as in a record.
-        diagnostics: as in a record.
+        evaluation: as in a record.
         recorded: whether the record's final evaluation has the same episodes; None where it is of
             another variant or number of episodes.
     """
 
     run_id: str
     variant: str
-    env_steps: int
-    episodes: Episodes
-    diagnostics: dict[str, float | None]
+    evaluation: Evaluation
     recorded: bool | None
 
     def to_json(self) -> dict[str, Any]:
         """Plain data."""
         return {
-            **dataclasses.asdict(dataclasses.replace(self, episodes=None)),  # type: ignore[arg-type]
-            "episodes": self.episodes.model_dump(mode="json", by_alias=True),
+            "run_id": self.run_id,
+            "variant": self.variant,
+            "recorded": self.recorded,
+            **self.evaluation.model_dump(mode="json", by_alias=True),
         }
 
 
@@ -183,20 +182,27 @@ def evaluate(
     evaluator = Evaluator(
         config, base, feasible_return(config, base), agent.learns, variant or own, workers
     )
+    begin = time.perf_counter()
     try:
         columns, diagnostics = evaluator.measure(agent, count)
     finally:
         evaluator.close()
-    played = Episodes.model_validate(columns)
+    evaluation = Evaluation(
+        env_steps=state["env_steps"],
+        decisions=state["decisions"],
+        updates=state["updates"],
+        wall_clock=time.perf_counter() - begin,
+        final=state["final"],
+        episodes=Episodes.model_validate(columns),
+        diagnostics=diagnostics,
+    )
     final = read_record(folder / RECORD).final if is_finished(folder) else None
     comparable = final and (variant or own) == own and len(final.episodes.seed) == count
     return Evaluated(
         run_id=folder.name,
         variant=variant or own,
-        env_steps=state["env_steps"],
-        episodes=played,
-        diagnostics=diagnostics,
-        recorded=played == final.episodes if final and comparable else None,
+        evaluation=evaluation,
+        recorded=evaluation.episodes == final.episodes if final and comparable else None,
     )
 
 
@@ -240,6 +246,7 @@ def _play(
             loop.play()
         except BaseException as error:
             loop.stop(error)
+            error.add_note(f"continue the run with: symsteer resume {folder}")
             raise
     return folder
 

@@ -12,9 +12,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.runs.folder import state_of
-from bench.runs.run import execute, resume
+from bench.runs.folder import RunBusyError, claimed, load_checkpoint, read_progress, state_of
+from bench.runs.run import evaluate, execute, resume
 from leaderboard.records import read_record
+from policies.errors import UserError
 from tests.bench.tiny_run import tiny_config
 
 # Fresh processes that have their imports done: a kill then falls into the run, not into these.
@@ -110,3 +111,81 @@ def test_killed_at_twenty_random_moments(undisturbed, begun):
     # Some fall before the first checkpoint, some behind it.
     assert 5 <= sum(resumed) <= 20
     print(f"{sum(resumed)} of 20 continued from a checkpoint, the others from the beginning")
+
+
+def test_evaluating_again_gives_the_recorded_episodes(undisturbed):
+    before = {path.name: path.stat().st_mtime_ns for path in undisturbed.iterdir()}
+    found = evaluate(undisturbed)
+    record = read_record(undisturbed / "record.json")
+    assert found.recorded is True
+    assert found.evaluation.episodes == record.final.episodes
+    assert found.evaluation.diagnostics == record.final.diagnostics
+    assert {path.name: path.stat().st_mtime_ns for path in undisturbed.iterdir()} == before
+
+
+def test_evaluating_in_another_world(undisturbed):
+    found = evaluate(undisturbed, variant="action_gain:1", episodes=4)
+    assert found.variant == "action_gain:1"
+    assert (
+        found.evaluation.episodes.seed
+        == read_record(undisturbed / "record.json").final.episodes.seed[:4]
+    )
+    assert found.recorded is None
+    assert json.loads(json.dumps(found.to_json()))["episodes"]["episode_len"] == [50] * 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"variant": "action_gian:1"}, "action_gain"),
+        ({"episodes": 0}, "--episodes is 0"),
+        ({"workers": 0}, "--workers is 0"),
+    ],
+)
+def test_mistakes_in_evaluating_again(arguments, words, undisturbed):
+    with pytest.raises(UserError, match=words):
+        evaluate(undisturbed, **arguments)
+
+
+def test_a_run_is_worked_on_by_one_process(undisturbed, begun):
+    with claimed(begun):
+        assert state_of(begun) == "running"
+        with pytest.raises(RunBusyError, match="another process"):
+            resume(begun, progress=False)
+    assert state_of(begun) == "interrupted"
+
+
+def test_what_cannot_be_continued(undisturbed, begun, tmp_path):
+    with pytest.raises(UserError, match="finished already"):
+        resume(undisturbed, progress=False)
+    with pytest.raises(UserError, match=r"no config\.json"):
+        resume(tmp_path / "nothing", progress=False)
+    with pytest.raises(UserError, match="no checkpoint yet"):
+        evaluate(begun)
+    renamed = begun.rename(tmp_path / "renamed")
+    with pytest.raises(UserError, match="does not belong"):
+        resume(renamed, progress=False)
+
+
+def test_a_damaged_or_foreign_checkpoint_is_refused_and_kept(undisturbed, begun):
+    shutil.copy(undisturbed / "policy.safetensors", begun)
+    whole = (undisturbed / "checkpoint.pt").read_bytes()
+    state = torch.load(undisturbed / "checkpoint.pt", weights_only=True)
+    for words, change in (("another run", {"run_id": "else"}), ("version", {"format": 99})):
+        torch.save({**state, **change}, begun / "checkpoint.pt")
+        with pytest.raises(UserError, match=words):
+            resume(begun, progress=False)
+    (begun / "checkpoint.pt").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UserError, match="delete it"):
+        resume(begun, progress=False)
+    assert (begun / "checkpoint.pt").stat().st_size == len(whole) // 2
+
+
+def test_a_checkpoint_holds_plain_data_and_goes_without_the_replay_at_the_end(undisturbed):
+    state = load_checkpoint(undisturbed)
+    assert state["final"]
+    assert state["replay"] is None
+    assert state["env_steps"] == read_record(undisturbed / "record.json").budget.env_steps
+    progress = read_progress(undisturbed)
+    assert progress["phase"] == "evaluation"
+    assert progress["budget"] == CONFIG.env_steps
