@@ -1,186 +1,38 @@
-"""The page: LEADERBOARD.md and leaderboard.csv from a summary.
-
-Text that comes from a record is only ever shown inside code spans, stripped of what could end one
-(`code`), so that no record can inject markup, and is never used as a path or a link.
-"""
+"""The tables of one task, embodiment and variant, and leaderboard.csv."""
 
 from __future__ import annotations
 
 import csv
 import io
-import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from urllib.parse import quote
 
-from leaderboard.records import DIVERGED_EVALUATIONS, DIVERGED_SHARE
-from leaderboard.statistics import Interval
-from leaderboard.summary import ARM, MIN_SEEDS, THRESHOLD, Key, Row, Run, Summary, Table
-
-NOTHING = "\u2013"
-MINUS = "\u2212"
-MARKS = {1: " \u25b2", 0: "", -1: " \u25bc"}
-
-READING = f"""\
-Each agent steers a frozen diffusion policy by choosing the noise that it starts from. `base` draws
-that noise at random and `zero` sets it to 0: they do not learn, and every other row should beat
-them. All agents of a table share the task, the demonstrations, the budget and the held-out episodes
-that score them; the number is always the last checkpoint's, never the best one's.
-
-- **Success** is `success_once` over the held-out episodes: the interquartile mean (IQM) over seeds
-  and its 95 % interval, from a bootstrap over seeds and over the episodes of each. With fewer than
-  4 seeds the IQM is the plain mean; with one seed the interval covers its episodes only.
-- **Against base** is the mean difference to the base policy on the same episodes and seeds, with
-  its 95 % interval. ▲ or ▼ marks an interval that excludes 0; without a mark, the data do not
-  decide.
-- **AUC** is the area under the success curve as a share of the budget: how good the agent was on
-  average while it learned. **Steps** is the median number of environment steps until the success
-  reaches {100 * THRESHOLD:.0f} % of the best learning agent's final one, and how many seeds got
-  there. **Dip** is the deepest fall below the base policy at any evaluation of any seed.
-- **Diverged** († at a glance) counts the seeds whose Q-values left the range of returns that the
-  reward allows (more than {100 * DIVERGED_SHARE:.0f} % of the states at {DIVERGED_EVALUATIONS}
-  evaluations in a row, once learning has begun) or were not finite.
-- Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
-  **Runs** and never dropped in silence.
-"""
-
-CAPTION = (
-    "Thick lines are the IQM (success) or the mean (Q) over seeds, bands the 95 % interval of the "
-    "IQM, thin lines single seeds, dotted ones with a cross unfinished runs. The green area holds "
-    "the returns that the reward allows."
+from leaderboard.summary import ARM, THRESHOLD, Key, Row, Summary, Table
+from leaderboard.text import (
+    MARKS,
+    NOTHING,
+    SPACE,
+    code,
+    compact,
+    count,
+    difference,
+    grid,
+    number,
+    stacked,
 )
 
-
-def code(text: str, limit: int = 300) -> str:
-    """Show text from a record as a code span that it cannot leave, on one line, in a table cell."""
-    allowed = "".join(c if c.isprintable() else " " for c in text)
-    for bad, good in (("`", "'"), ("|", "¦"), ("\\", "/")):
-        allowed = allowed.replace(bad, good)
-    allowed = " ".join(allowed.split())
-    if len(allowed) > limit:
-        allowed = allowed[: limit - 1] + "…"
-    return f"`{allowed}`" if allowed else NOTHING
+Links = Mapping[Path, str | None]
+"""Address of each record relative to the page, None to show none."""
 
 
-def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
-    """A number for reading: fixed digits, a true minus sign, a dash where there is none."""
-    if value is None:
-        return NOTHING
-    text = f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
-    if float(text) == 0:
-        text = f"{0:.{digits}f}"
-    return text.replace("-", MINUS)
-
-
-def compact(value: float | None) -> str:
-    """Two or three significant digits for quantities of any size, such as Q-values and errors."""
-    if value is None:
-        return NOTHING
-    if value == 0:
-        text = "0"
-    elif 1e3 <= abs(value) < 1e5:
-        text = f"{value:.0f}"
-    elif 1e-3 <= abs(value) < 1e3:
-        text = f"{value:.3g}"
-    else:
-        mantissa, exponent = f"{value:.1e}".split("e")
-        text = f"{mantissa}e{int(exponent)}"
-    return text.replace("-", MINUS)
-
-
-def count(value: float | None) -> str:
-    """A count in thousands or millions."""
-    if value is None:
-        return NOTHING
-    for unit, size in (("M", 1e6), ("k", 1e3)):
-        if value >= size:
-            return f"{value / size:.3g} {unit}".replace(" ", "\u00a0")
-    return f"{value:.0f}"
-
-
-def interval(value: Interval | None, sign: bool = False) -> str:
-    """`0.71 [0.66, 0.77]` on one line."""
-    if value is None:
-        return NOTHING
-    low, high = number(value.low, sign=sign), number(value.high, sign=sign)
-    return f"{number(value.value, sign=sign)} [{low}, {high}]".replace(" ", "\u00a0")
-
-
-def render_page(
-    summary: Summary,
-    figures: Mapping[tuple[str, str], Sequence[tuple[str, str]]],
-    links: Mapping[Path, str | None],
-) -> str:
-    """The markdown page.
-
-    `figures[task, embodiment]` lists (description, relative path); `links[path of a record]` is
-    its address relative to the page, None to show none.
-    """
-    parts = [
-        "# Leaderboard",
-        "This page is generated from run records by `symsteer report`; do not edit it.",
-        "## How to read it",
-        READING.strip(),
-    ]
-    if notice := _seed_notice(summary):
-        parts.append(notice)
-    parts += ["## At a glance", _overview(summary)]
-    place = None
-    for table in summary.tables:
-        key = table.key
-        if (key.task, key.embodiment) != place:
-            place = key.task, key.embodiment
-            parts.append(f"## {code(key.task)}, {code(key.embodiment)}")
-            if place in figures:
-                parts += [f"![{text}]({quote(path)})" for text, path in figures[place]]
-                parts.append(CAPTION)
-        parts += _section(table)
-    parts += ["## Provenance", *_provenance(summary, links)]
-    return "\n\n".join(parts) + "\n"
-
-
-def _seed_notice(summary: Summary) -> str:
-    learning = [row for table in summary.tables for row in table.rows if not row.is_reference]
-    few = [row for row in learning if len(row.finished) < MIN_SEEDS]
-    if not few:
-        return ""
-    which = "No agent here has" if len(few) == len(learning) else "Not every agent here has"
-    return (
-        f"> **Not ranked.** {which} the {MIN_SEEDS} finished seeds that a ranking needs. Agents "
-        "with fewer are shown in a fixed order; read the intervals, and treat differences between "
-        "agents as leads, not as results."
-    )
-
-
-def _overview(summary: Summary) -> str:
-    header = ["Task", *(code(agent) for agent in summary.agents)]
-    rows = []
-    for table in summary.tables:
-        cells = []
-        for agent in summary.agents:
-            rows_of = [row for row in table.rows if row.agent == agent]
-            cells.append("<br>".join(_glance(row) for row in rows_of) or NOTHING)
-        rows.append([_cell_name(table, summary), *cells])
-    return _grid(header, rows, left=1)
-
-
-def _glance(row: Row) -> str:
-    if row.success is None:
-        return _status(row)
-    mark = MARKS[row.difference.sign] if row.difference else ""
-    dagger = " \u2020" if any(row.diverged) else ""
-    value, bounds = interval(row.success).split("\u00a0", 1)
-    return f"{value}{mark}{dagger}".replace(" ", "\u00a0") + f"<br>{bounds}"
-
-
-def _broken_by(key: Key) -> str:
+def broken_by(key: Key) -> str:
     return " and ".join(part if part == ARM else code(part) for part in key.broken_by)
 
 
-def _cell_name(table: Table, summary: Summary) -> str:
+def cell_name(table: Table, summary: Summary) -> str:
     """Task, embodiment and variant, and of the rest of the key what tells the tables apart."""
     key = table.key
-    name = f"{code(key.task)} {code(key.embodiment)} {_broken_by(key) or 'unbroken'}"
+    name = f"{code(key.task)} {code(key.embodiment)} {broken_by(key) or 'unbroken'}"
     keys = [other.key for other in summary.tables]
     if len({other.base + other.group for other in keys}) > 1:
         name += f" {code((key.base + ' ' + key.group).strip())}"
@@ -191,33 +43,56 @@ def _cell_name(table: Table, summary: Summary) -> str:
     return name
 
 
-def _section(table: Table) -> list[str]:
+def section(table: Table, links: Links) -> list[str]:
+    """Heading, both tables and notes of one table, as blocks of markdown."""
     key = table.key
-    broken = _broken_by(key)
+    broken = broken_by(key)
     heading = f"Broken by {broken}" if broken else "Unbroken symmetry"
     parts = [f"### {heading}", _base_line(table)]
-    header = ["Agent", "Success (IQM)", "Against base", "AUC", "Steps", "Dip", "Episodes", "Runs"]
+    header = [
+        "Agent",
+        "Success (final window)",
+        "Last checkpoint",
+        "Against base",
+        "AUC",
+        f"Steps to {100 * THRESHOLD:.0f}\u00a0%",
+        "Dip",
+        "Seeds \u00d7 episodes",
+        "Status",
+    ]
     if table.is_ranked:
         header.insert(0, "Rank")
     rows = []
-    for row in table.rows:
+    for row in sorted(table.rows, key=_place):
         cells = [
             code(row.label),
-            interval(row.success),
-            interval(row.difference, sign=True)
-            + (MARKS[row.difference.sign] if row.difference else ""),
+            stacked(row.success),
+            number(row.last.value if row.last else None),
+            stacked(row.difference, True, MARKS[row.difference.sign] if row.difference else ""),
             number(row.area),
             _steps(row, key.env_steps),
             number(row.dip),
-            _episodes(row),
-            _status(row),
+            _episodes(row, links),
+            status(row),
         ]
-        rows.append([str(row.rank or NOTHING), *cells] if table.is_ranked else cells)
-    parts.append(_grid(header, rows, left=2 if table.is_ranked else 1))
-    parts += _diagnostics(table)
+        rows.append([_rank(row, table), *cells] if table.is_ranked else cells)
+    parts.append(grid(header, rows, left=2 if table.is_ranked else 1))
+    parts += [*_against_best(table), *_diagnostics(table)]
     if notes := _notes(table):
         parts.append("\n".join(f"- {note}" for note in notes))
     return parts
+
+
+def _place(row: Row) -> tuple[bool, float]:
+    """References first, then by rank; otherwise the order stays as it is."""
+    return not row.is_reference, row.rank or float("inf")
+
+
+def _rank(row: Row, table: Table) -> str:
+    if row.rank is None:
+        return NOTHING
+    tied = sum(other.rank == row.rank for other in table.rows) > 1
+    return f"{row.rank}{'=' if tied else ''}"
 
 
 def _base_line(table: Table) -> str:
@@ -243,71 +118,104 @@ def _base_line(table: Table) -> str:
         f"noise {over('action_std')}, initial states solved in {draws} draws {over('solvable')}."
     )
     if table.threshold is not None:
-        text.append(f"Steps count to a success of {number(table.threshold)}.")
+        base = table.row_of("base")
+        there = base and base.success and base.success.value >= table.threshold
+        already = ", where the base policy already is" if there else ""
+        text.append(f"Steps count to a success of {number(table.threshold)}{already}.")
     return " ".join(text)
 
 
 def _steps(row: Row, budget: int) -> str:
+    if row.search_steps:
+        return f"search {count(row.search_steps)}".replace(" ", SPACE)
     if not row.threshold_steps:
         return NOTHING
     reached = sum(steps is not None for steps in row.threshold_steps)
     median = row.median_threshold_steps
     text = f"> {count(budget)}" if median is None else count(median)
-    return f"{text} ({reached}/{len(row.threshold_steps)})".replace(" ", "\u00a0")
+    return f"{text} ({reached}/{len(row.threshold_steps)})".replace(" ", SPACE)
 
 
-def _episodes(row: Row) -> str:
+def _episodes(row: Row, links: Links) -> str:
+    """How many finished seeds and episodes; below it every run's seed as a link to its record."""
+    seeds = []
+    for run in row.runs:
+        target = links.get(run.path)
+        seeds.append(f"[{run.seed}]({target})" if target else str(run.seed))
+    listed = f"<br>{' '.join(seeds)}" if seeds else ""
     counts = row.episodes
     if not counts:
-        return NOTHING
+        return NOTHING + listed
     size = str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
-    return f"{len(counts)} \u00d7 {size}".replace(" ", "\u00a0")
+    return f"{len(counts)} \u00d7 {size}".replace(" ", SPACE) + listed
 
 
-def _status(row: Row) -> str:
+def status(row: Row) -> str:
     parts = []
     for status in ("finished", "running", "interrupted", "failed"):
         if number_of := sum(run.record.status == status for run in row.runs):
             parts.append(f"{number_of} {status}")
     if row.missing:
         parts.append(f"{row.missing} missing")
-    return ", ".join(parts).replace(" ", "\u00a0").replace(",\u00a0", ", ")
+    return ", ".join(parts).replace(" ", SPACE).replace(f",{SPACE}", ", ")
+
+
+def _against_best(table: Table) -> list[str]:
+    best = table.best_reference
+    if best is None or best.success is None:
+        return []
+    against = [
+        f"{code(row.label)} {difference(row.against_best)}"
+        for row in sorted(table.learners, key=_place)
+        if row.against_best
+    ]
+    text = f"Best reference: {code(best.label)}, {number(best.success.value)}."
+    return [text + (f" Against it: {'; '.join(against)}." if against else "")]
 
 
 def _diagnostics(table: Table) -> list[str]:
     rows = [row for row in table.rows if row.runs and not row.is_reference]
     if not rows:
         return []
-    feasible = table.feasible
-    bounds = f" (feasible Q: {compact(feasible[0])} to {compact(feasible[1])})" if feasible else ""
     header = [
         "Agent",
-        "Diverged",
-        "Largest \\|Q\\|",
+        "Q diverged",
         "Q bias",
+        _largest_header(table),
         "Orbit variance",
         "Equivariance error: actor, critic",
         "Parameters: actor, critic (width)",
         "Minutes a run",
+        "Device",
     ]
     body = []
-    for row in rows:
+    for row in sorted(rows, key=_place):
         diverged = row.diverged
         errors = [row.over_runs("equivariance_actor"), row.over_runs("equivariance_critic")]
         minutes = [run.record.wall_clock.total / 60 for run in row.finished]
+        devices = sorted({p.device for run in row.runs for p in run.provenances})
         body.append(
             [
                 code(row.label),
                 f"{sum(diverged)}/{len(diverged)}" if diverged else NOTHING,
-                compact(row.largest("q_abs_max")),
                 compact(row.over_runs("q_bias")),
+                compact(row.largest("q_abs_max")),
                 compact(row.over_runs("orbit_variance")),
                 ", ".join(map(compact, errors)) if any(e is not None for e in errors) else NOTHING,
                 _parameters(row),
                 number(sum(minutes) / len(minutes), 1) if minutes else NOTHING,
+                ", ".join(map(code, devices)),
             ]
         )
-    return [f"Q-values, symmetry and cost{bounds}:", _grid(header, body, left=1)]
+    return ["Q-values, symmetry and cost:", grid(header, body, left=1)]
+
+
+def _largest_header(table: Table) -> str:
+    """The feasible bound stands in the header, so that every row can be read against it."""
+    text = "Largest \\|Q\\|"
+    if table.feasible:
+        text += f" (feasible Q: {compact(table.feasible[0])} to {compact(table.feasible[1])})"
+    return text
 
 
 def _parameters(row: Row) -> str:
@@ -319,7 +227,7 @@ def _parameters(row: Row) -> str:
     texts = []
     for actor, critic, width in sorted(sizes, key=str):
         text = f"{count(actor)}, {count(critic)}" + (f" ({width})" if width else "")
-        texts.append(text.replace(" ", "\u00a0"))
+        texts.append(text.replace(" ", SPACE))
     return "; ".join(texts)
 
 
@@ -344,100 +252,6 @@ def _notes(table: Table) -> list[str]:
         split = ", ".join(code(row.label) for row in table.rows if row.label != row.agent)
         notes.append(f"Same agent with different settings, in rows of their own: {split}")
     return notes
-
-
-def _provenance(summary: Summary, links: Mapping[Path, str | None]) -> list[str]:
-    runs = summary.runs
-    records = [run.record for run in runs]
-    started = min(record.started for record in records)
-    ended = max(record.ended or record.started for record in records)
-    hours = sum(record.wall_clock.total for record in records) / 3600
-    parts = [
-        "Regenerate with `symsteer report`, or `python -m leaderboard RECORDS --out FOLDER`: the "
-        "same records give the same bytes. Each record holds the whole configuration and every "
-        "evaluation episode with its seed.",
-        "\n".join(
-            [
-                f"- Runs: {len(records)}, {number(hours, 1)} hours in all, "
-                f"{started:%Y-%m-%d} to {ended:%Y-%m-%d} (UTC)",
-                f"- Commits: {_values(_commit(run) for run in runs)}",
-                f"- Devices: {_values(r.provenance.device for r in records)}; platforms: "
-                f"{_values(r.provenance.platform for r in records)}; Python: "
-                f"{_values(r.provenance.python for r in records)}; torch threads: "
-                f"{_values(str(r.provenance.torch_threads) for r in records)}",
-                "- Packages: "
-                + _values(
-                    f"{name} {version}"
-                    for record in records
-                    for name, version in record.provenance.packages.items()
-                ),
-            ]
-        ),
-    ]
-    rows = []
-    for table in summary.tables:
-        for row in table.rows:
-            for run in row.runs:
-                rows.append(
-                    [
-                        _cell_name(table, summary),
-                        code(row.label),
-                        str(run.seed),
-                        run.record.status,
-                        _commit_cell(run),
-                        code(run.record.config_hash[:12]),
-                        _link(run, links),
-                    ]
-                )
-    header = ["Task", "Agent", "Seed", "Status", "Commit", "Config", "Record"]
-    grid = _grid(header, rows, left=2)
-    parts.append(f"<details>\n<summary>All records</summary>\n\n{grid}\n\n</details>")
-    if summary.set_aside:
-        aside = ", ".join(_link(run, links) for run in summary.set_aside)
-        parts.append(
-            "Set aside, because a finished or newer record of the same configuration and seed "
-            f"exists: {aside}."
-        )
-    return parts
-
-
-def _commit(run: Run) -> str:
-    provenance = run.record.provenance
-    if provenance.commit is None:
-        return "outside git"
-    return provenance.commit[:12] + (" with local changes" if provenance.dirty else "")
-
-
-def _commit_cell(run: Run) -> str:
-    provenance = run.record.provenance
-    if provenance.commit is None:
-        return NOTHING
-    return code(provenance.commit[:12] + ("+" if provenance.dirty else ""))
-
-
-def _values(texts: Iterable[str]) -> str:
-    return ", ".join(code(text) for text in sorted(set(texts))) or NOTHING
-
-
-def _link(run: Run, links: Mapping[Path, str | None]) -> str:
-    # run_id is validated to letters, digits and ._+=:,@- so that it is safe as a link's text.
-    target = links.get(run.path)
-    name = code(run.record.run_id)
-    return f"[{name}]({target})" if target else name
-
-
-def relative_link(path: Path, folder: Path) -> str | None:
-    """URL of `path` relative to `folder`; None where it would spell out folders of this machine."""
-    relative = Path(os.path.relpath(path, folder))
-    if relative.is_absolute() or relative.parts[:3] == ("..", "..", ".."):
-        return None
-    return quote(relative.as_posix())
-
-
-def _grid(header: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    """A markdown table; the first `left` columns are left-aligned, the others right-aligned."""
-    rule = [":--" if index < left else "--:" for index in range(len(header))]
-    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows))
 
 
 CSV_DIAGNOSTICS = (
@@ -465,7 +279,7 @@ def render_csv(summary: Summary) -> str:
 
 
 def _csv_row(table: Table, row: Row) -> dict[str, object]:
-    key, success, difference = table.key, row.success, row.difference
+    key, success, base, best = table.key, row.success, row.difference, row.against_best
     statuses = [run.record.status for run in row.runs]
     sizes = row.runs[0].record.parameters if row.runs else None
     wall = [run.record.wall_clock.total for run in row.finished]
@@ -489,13 +303,20 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
         "success_iqm": success and success.value,
         "success_low": success and success.low,
         "success_high": success and success.high,
-        "final_window": row.window,
-        "difference": difference and difference.value,
-        "difference_low": difference and difference.low,
-        "difference_high": difference and difference.high,
+        "last_checkpoint": row.last and row.last.value,
+        "last_checkpoint_low": row.last and row.last.low,
+        "last_checkpoint_high": row.last and row.last.high,
+        "against_base": base and base.value,
+        "against_base_low": base and base.low,
+        "against_base_high": base and base.high,
+        "best_reference": table.best_reference and table.best_reference.label,
+        "against_best": best and best.value,
+        "against_best_low": best and best.low,
+        "against_best_high": best and best.high,
         "auc": row.area,
         "threshold": table.threshold,
         "threshold_steps": row.median_threshold_steps,
+        "search_steps": row.search_steps,
         "threshold_seeds": sum(s is not None for s in row.threshold_steps),
         "dip": row.dip,
         "diverged": sum(row.diverged),
@@ -508,6 +329,7 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
         "parameters_critic": sizes and sizes.critic,
         "width": sizes and sizes.width,
         "wall_clock_s": sum(wall) / len(wall) if wall else None,
+        "devices": "; ".join(sorted({p.device for run in row.runs for p in run.provenances})),
     }
 
 

@@ -12,9 +12,20 @@ import pytest
 from record_factory import START, make_curve, make_evaluation, make_record
 
 from leaderboard.errors import RecordError
-from leaderboard.records import RunRecord, config_hash, write_record
-from leaderboard.summary import Row, Run, Summary, base_success, load_runs, recipe_of, summarize
-from leaderboard.tables import render_page
+from leaderboard.findings import analyse
+from leaderboard.page import render_page
+from leaderboard.records import Evaluation, RunRecord, config_hash, write_record
+from leaderboard.summary import (
+    Row,
+    Run,
+    Summary,
+    area_pairs,
+    load_runs,
+    recipe_of,
+    reference_success,
+    success_pairs,
+    summarize,
+)
 
 
 def run(record: RunRecord, name: str = "") -> Run:
@@ -37,10 +48,12 @@ def row(summary: Summary, agent: str, table: int = 0) -> Row:
 
 def test_rows_come_in_the_fixed_order() -> None:
     agents = ["mine", "approximate", "zero", "equivariant", "standard", "base", "standard-matched"]
+    agents.append("golden-ticket")
     summary = summarize([of(0.5, agent=agent) for agent in agents])
     assert summary.agents == [
         "base",
         "zero",
+        "golden-ticket",
         "standard",
         "standard-matched",
         "equivariant",
@@ -83,7 +96,8 @@ def test_an_arm_breaks_the_symmetry_by_itself() -> None:
         ("arm kinematics",),
         ("arm kinematics", "action_gain:0.5"),
     ]
-    page = render_page(summarize(runs), {}, {run.path: None for run in runs})
+    summary = summarize(runs)
+    page = render_page(summary, analyse(summary, {}), {}, {run.path: None for run in runs})
     assert "### Broken by arm kinematics and `action_gain:0.5`" in page
     assert page.count("### Unbroken symmetry") == 1
 
@@ -126,7 +140,7 @@ def test_the_difference_to_base_is_paired_by_policy_seed_and_episode() -> None:
 def test_runs_on_another_base_policy_are_not_compared_with_it() -> None:
     other = make_record(agent="base")
     other.base_policy.content_hash = "f" * 64
-    assert base_success(of(0.5), [run(other)]) == {}
+    assert reference_success(of(0.5), [run(other)]) == {}
     summary = summarize([run(other), of(0.5)])
     assert row(summary, "standard").difference is None
 
@@ -157,24 +171,99 @@ def test_unfinished_and_missing_runs_are_kept_and_not_counted() -> None:
     assert row(summary, "standard", 1).missing == 1
 
 
-def test_curves_give_area_threshold_dip_and_window() -> None:
+def test_curves_give_area_threshold_and_dip() -> None:
     generator = np.random.default_rng(0)
     base = [run(make_record([make_evaluation(outcomes(0.5, 3))], agent="base"))]
     rates = [0.5, 0.05, 0.95, 0.95, 0.95, 0.95]
     curve = make_curve(generator, rates)
     summary = summarize([*base, run(make_record(curve))])
     standard, table = row(summary, "standard"), summary.tables[0]
-    final = curve[-1].success_once
-    assert table.threshold == pytest.approx(0.8 * final)
+    heights = [evaluation.success_once for evaluation in curve]
+    assert table.threshold == pytest.approx(0.8 * np.mean(heights[-2:]))
     assert standard.threshold_steps == [20_000]
-    expected = curve[1].success_once - np.mean(outcomes(0.5, 3))
+    expected = heights[1] - np.mean(outcomes(0.5, 3))
     assert standard.dip == pytest.approx(expected)
     assert expected < -0.3
-    heights = [evaluation.success_once for evaluation in curve]
     assert standard.area == pytest.approx((sum(heights) - (heights[0] + heights[-1]) / 2) / 5)
-    assert standard.window == pytest.approx(np.mean(heights[-2:]))
     assert row(summary, "base").threshold_steps == []
     assert row(summary, "base").dip is None
+
+
+def points(*points: tuple[int, list[int]]) -> list[Evaluation]:
+    """A curve from (steps, outcomes of the episodes)."""
+    return [
+        make_evaluation(episodes, steps, steps == points[-1][0], first_seed=100)
+        for steps, episodes in points
+    ]
+
+
+def test_the_final_window_pools_the_last_fifth_of_the_budget() -> None:
+    curve = points((0, [0, 0]), (39_999, [0, 0]), (40_000, [1, 0]), (50_000, [1, 1, 0, 1]))
+    learner = run(make_record(curve))
+    assert learner.window == {
+        (40_000, 100): 1.0,
+        (40_000, 101): 0.0,
+        (50_000, 100): 1.0,
+        (50_000, 101): 1.0,
+        (50_000, 102): 0.0,
+        (50_000, 103): 1.0,
+    }
+    standard = row(summarize([learner]), "standard")
+    assert standard.success is not None
+    assert standard.last is not None
+    assert standard.success.value == learner.success == pytest.approx(4 / 6)
+    assert standard.last.value == pytest.approx(3 / 4)
+    assert standard.episodes == [6]
+    assert run(make_record(curve, "interrupted")).window == {}
+
+
+def test_a_reference_is_measured_where_its_search_ended() -> None:
+    ticket = make_record(points((12_800, [1, 1, 0])), agent="golden-ticket")
+    ticket.budget.env_steps = 12_800
+    found = row(summarize([run(ticket)]), "golden-ticket")
+    assert found.success is not None
+    assert found.success.value == pytest.approx(2 / 3)
+    assert (found.search_steps, found.area, found.rank) == (12_800, None, None)
+    zero = make_record(points((0, [1, 0, 0])), agent="zero")
+    zero.budget.env_steps = 0
+    found = row(summarize([run(zero)]), "zero")
+    assert found.search_steps is None
+    assert found.area == pytest.approx(1 / 3)
+
+
+def test_learners_are_paired_by_step_and_episode_references_by_episode() -> None:
+    first = make_record(points((40_000, [1, 0]), (50_000, [1, 1])), agent="equivariant")
+    second = make_record(points((40_000, [0, 0]), (50_000, [0, 1, 1])), agent="standard")
+    base = make_record(points((0, [1, 0, 0])), agent="base")
+    rows = {r.agent: r for r in summarize(list(map(run, (first, second, base)))).tables[0].rows}
+    learners = success_pairs(rows["equivariant"], rows["standard"])[0]
+    assert sorted(learners.blocks[0]) == [0, 0, 1, 1]
+    against = success_pairs(rows["equivariant"], rows["base"])[0]
+    assert sorted(against.blocks[0]) == [0, 0, 0, 1]
+    reverse = success_pairs(rows["base"], rows["equivariant"])[0]
+    assert sorted(reverse.blocks[0]) == [-1, 0, 0, 0]
+    area = area_pairs(rows["equivariant"], rows["standard"], 50_000)[0]
+    # The first value is held back to 0: 0.5 for 40,000 steps, then to 0.5 (the last one counts the
+    # two common episodes alone).
+    assert area.value == pytest.approx(0.5)
+    assert [block.size for block in area.blocks] == [2, 2]
+    other = make_record(points((30_000, [1, 0]), (49_000, [1, 1])), agent="approximate")
+    approximate = row(summarize([run(other), run(second)]), "approximate")
+    assert success_pairs(approximate, rows["standard"]) == {}
+
+
+def test_learners_are_compared_with_the_best_reference() -> None:
+    runs = [of(rate, agent=agent) for agent, rate in (("base", 0.3), ("zero", 0.6))]
+    summary = summarize([*runs, of(0.95), of(0.61, agent="equivariant")])
+    best = summary.tables[0].best_reference
+    assert best is not None
+    assert best.agent == "zero"
+    against = {r.agent: r.against_best for r in summary.tables[0].rows}
+    assert against["base"] is against["zero"] is None
+    standard, equivariant = against["standard"], against["equivariant"]
+    assert standard is not None
+    assert equivariant is not None
+    assert (standard.sign, equivariant.sign) == (1, 0)
 
 
 def five(agent: str, rate: float, seeds: int = 5) -> list[Run]:

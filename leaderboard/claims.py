@@ -1,0 +1,275 @@
+"""The claims of arXiv 2512.11345, each with a test, an effect, an interval and a verdict.
+
+A verdict follows a fixed rule: the 95 % interval of the effect lies wholly on the side that the
+claim predicts (supported), wholly on the other one (contradicted), or neither (undecided). A test
+that lacks data is undecided with the reason, never left out.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from leaderboard.defects import (
+    MIN_CELLS,
+    Audit,
+    DefectMap,
+    Panel,
+    advantage,
+    defect_of,
+)
+from leaderboard.statistics import (
+    RESAMPLES,
+    Interval,
+    Sample,
+    bootstrap_draws,
+    censored_median,
+    newcombe,
+    percentile,
+    stratified_bootstrap,
+)
+from leaderboard.summary import MIN_SEEDS, Key, Summary, Table
+
+NEARLY_SYMMETRIC = 0.05
+"""Cells with an audited defect up to this are where the paper expects symmetry to help."""
+
+STRONGLY_BROKEN = 0.25
+"""Cells with an audited defect from this on are where the paper expects strictness to hurt."""
+
+SLOPE_UNIT = 0.1
+"""Slopes are given for this much more defect."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One test. `predicted` is the sign of the effect that the claim expects."""
+
+    name: str
+    test: str
+    predicted: int
+    effect: Interval | None = None
+    cells: int = 0
+    seeds: int = 0
+    """Paired runs over all cells."""
+    reason: str = ""
+    """Why the test cannot decide, whatever its interval says."""
+    beside: str = ""
+    """Another view of the same question, without a test."""
+
+    @property
+    def verdict(self) -> str:
+        if self.reason or self.effect is None or self.effect.sign == 0:
+            return "undecided"
+        return "supported" if self.effect.sign == self.predicted else "contradicted"
+
+
+T = TypeVar("T")
+Cells = list[tuple[Table, dict[int, T]]]
+"""Tables with what each run seed contributes."""
+
+
+def claims(summary: Summary, audit: Audit, found: DefectMap) -> list[Claim]:
+    """All tests, in the order of the paper's claims."""
+    symmetric = [t for t in summary.tables if _below(t, audit)]
+    return [
+        *(_sample_efficiency(symmetric, rival) for rival in ("standard", "standard-matched")),
+        _divergence(summary.tables),
+        _fewest_demonstrations(symmetric),
+        _fewer_demonstrations(symmetric),
+        *(_falls(found.panels["equivariant", measure]) for measure in ("auc", "success")),
+        _approximate_beyond(summary.tables, audit),
+    ]
+
+
+def _below(table: Table, audit: Audit) -> bool:
+    defect = defect_of(table.key, audit)
+    return defect is not None and defect.value <= NEARLY_SYMMETRIC
+
+
+def _enough(cells: Cells[T], wanted: str) -> tuple[Cells[T], str]:
+    """The cells with enough seeds; if there are none, all of them and why they cannot decide."""
+    cells = [(table, samples) for table, samples in cells if samples]
+    if not cells:
+        return [], f"no runs of {wanted} to pair"
+    enough = [(table, samples) for table, samples in cells if len(samples) >= MIN_SEEDS]
+    if enough:
+        return enough, ""
+    most = max(len(samples) for _, samples in cells)
+    return cells, f"at most {most} paired seeds in a cell, {MIN_SEEDS} are needed"
+
+
+def _paired(
+    name: str, test: str, tables: Sequence[Table], first: str, second: str, measure: str, where: str
+) -> tuple[Claim, Cells[Sample]]:
+    """Mean over cells of a paired difference, predicted to be positive."""
+    found = [(table, advantage(table, first, second, measure)) for table in tables]
+    cells, reason = _enough(found, f"`{first}` and `{second}`{where}")
+    if not cells:
+        return Claim(name, test, 1, reason=reason), cells
+    effect = stratified_bootstrap([list(samples.values()) for _, samples in cells])
+    seeds = sum(len(samples) for _, samples in cells)
+    return Claim(name, test, 1, effect, len(cells), seeds, reason), cells
+
+
+def _sample_efficiency(tables: Sequence[Table], rival: str) -> Claim:
+    claim, cells = _paired(
+        "Sample efficiency: symmetric agents learn faster",
+        f"area under the curve, `equivariant` minus `{rival}`, defect up to {NEARLY_SYMMETRIC:g}",
+        tables,
+        "equivariant",
+        rival,
+        "auc",
+        f" where the audited defect is at most {NEARLY_SYMMETRIC:g}",
+    )
+    if not cells:
+        return claim
+    steps = [_threshold_steps([t for t, _ in cells], agent) for agent in ("equivariant", rival)]
+    return replace(claim, beside=f"steps: {steps[0]} against {steps[1]} of the budget")
+
+
+def _threshold_steps(tables: Sequence[Table], agent: str) -> str:
+    """Median share of the budget until the threshold over all runs, and how many got there."""
+    shares = [
+        None if steps is None else round(100 * steps / table.key.env_steps)
+        for table in tables
+        if (row := table.row_of(agent))
+        for steps in row.threshold_steps
+    ]
+    reached = sum(share is not None for share in shares)
+    median = censored_median(shares)
+    text = "> 100 %" if median is None else f"{median:.0f} %"
+    return f"{text} ({reached}/{len(shares)})"
+
+
+def _divergence(tables: Sequence[Table]) -> Claim:
+    name = "Value divergence: symmetry prevents it"
+    test = "share of seeds whose Q diverged, `standard` minus `equivariant`, all cells"
+
+    def verdicts(table: Table, agent: str) -> dict[int, bool]:
+        # A run that broke off because its Q was not finite counts, so rows without any finished
+        # run do too.
+        rows = [row for row in table.rows if row.agent == agent]
+        found = [{r.seed: r.diverged for r in row.runs if r.diverged is not None} for row in rows]
+        return max(found, key=len, default={})
+
+    found: Cells[tuple[bool, bool]] = []
+    for table in tables:
+        one, other = verdicts(table, "standard"), verdicts(table, "equivariant")
+        seeds_of = sorted(one.keys() & other.keys())
+        found.append((table, {seed: (one[seed], other[seed]) for seed in seeds_of}))
+    cells, reason = _enough(found, "`standard` and `equivariant` with a critic")
+    if not cells:
+        return Claim(name, test, 1, reason=reason)
+    both = [pair for _, pairs in cells for pair in pairs.values()]
+    counts, seeds = [sum(pair[i] for pair in both) for i in (0, 1)], len(both)
+    effect = newcombe((counts[0], seeds), (counts[1], seeds))
+    beside = f"{counts[0]}/{seeds} against {counts[1]}/{seeds} diverged"
+    return Claim(name, test, 1, effect, len(cells), seeds, reason, beside)
+
+
+FEW = "Few demonstrations: symmetry helps most there"
+
+
+def _by_demonstrations(tables: Sequence[Table]) -> list[list[Table]]:
+    """Tables that differ in the number of demonstrations alone, fewest first; families of two."""
+    families: dict[tuple[object, ...], list[Table]] = defaultdict(list)
+    for table in sorted(tables, key=lambda table: table.key):
+        families[_family(table.key)].append(table)
+    return [
+        sorted(family, key=lambda table: table.key.demonstrations)
+        for family in families.values()
+        if len({table.key.demonstrations for table in family}) > 1
+    ]
+
+
+def _family(key: Key) -> tuple[object, ...]:
+    return (key.task, key.embodiment, key.breaking, key.base, key.group, key.mode, key.env_steps)
+
+
+def _one_number(tables: Sequence[Table]) -> str:
+    numbers = sorted({table.key.demonstrations for table in tables})
+    if not numbers:
+        return f"no cell has an audited defect of at most {NEARLY_SYMMETRIC:g}"
+    have = f"all have {numbers[0]}" if len(numbers) == 1 else f"there are {numbers}"
+    return f"no cell was run with more than one number of demonstrations ({have})"
+
+
+def _fewest_demonstrations(tables: Sequence[Table]) -> Claim:
+    test = (
+        "success, `equivariant` minus `standard`, at the smallest number of demonstrations, "
+        f"defect up to {NEARLY_SYMMETRIC:g}"
+    )
+    families = _by_demonstrations(tables)
+    if not families:
+        return Claim(FEW, test, 1, reason=_one_number(tables))
+    fewest = [family[0] for family in families]
+    where = " at the smallest number of demonstrations"
+    return _paired(FEW, test, fewest, "equivariant", "standard", "success", where)[0]
+
+
+def _fewer_demonstrations(tables: Sequence[Table]) -> Claim:
+    test = "the same, at the smallest minus at the largest number of demonstrations"
+    families = _by_demonstrations(tables)
+    if not families:
+        return Claim(FEW, test, 1, reason=_one_number(tables))
+
+    def samples(table: Table) -> dict[int, Sample]:
+        return advantage(table, "equivariant", "standard", "success")
+
+    ends = [(samples(family[0]), samples(family[-1])) for family in families]
+    ends = [(few, many) for few, many in ends if few and many]
+    if not ends:
+        return Claim(FEW, test, 1, reason="no runs of `equivariant` and `standard` at both ends")
+    enough = [(few, many) for few, many in ends if min(len(few), len(many)) >= MIN_SEEDS]
+    reason = "" if enough else f"fewer than {MIN_SEEDS} paired seeds at one of the ends"
+    generator = np.random.default_rng(0)
+    values, draws = [], np.zeros(RESAMPLES)
+    for few, many in enough or ends:
+        value = [np.mean([s.value for s in side.values()]) for side in (few, many)]
+        drawn = [bootstrap_draws(list(side.values()), generator) for side in (few, many)]
+        values.append(value[0] - value[1])
+        draws += (drawn[0] - drawn[1]) / len(enough or ends)
+    seeds = sum(len(few) for few, _ in enough or ends)
+    effect = percentile(float(np.mean(values)), draws)
+    return Claim(FEW, test, 1, effect, len(enough or ends), seeds, reason)
+
+
+LIMITS = "Limits under breaking: the advantage of strictness falls with the defect"
+
+
+def _falls(panel: Panel) -> Claim:
+    what = {"auc": "area under the curve", "success": "success"}[panel.measure]
+    test = f"slope of the advantage in {what} (the map's line), per {SLOPE_UNIT:g} of defect"
+    if panel.line is None:
+        found = len({p.defect.value for p in panel.points if p.counts})
+        reason = (
+            f"{found} audited cells with {MIN_SEEDS} paired seeds and a defect of their own, "
+            f"{MIN_CELLS} are needed"
+        )
+        return Claim(LIMITS, test, -1, reason=reason)
+    slope = panel.line.slope
+    scaled = Interval(*(SLOPE_UNIT * value for value in (slope.value, slope.low, slope.high)))
+    counted = [point for point in panel.points if point.counts]
+    seeds = sum(len(point.samples) for point in counted)
+    return Claim(LIMITS, test, -1, scaled, len(counted), seeds)
+
+
+def _approximate_beyond(tables: Sequence[Table], audit: Audit) -> Claim:
+    broken = [
+        table
+        for table in tables
+        if (defect := defect_of(table.key, audit)) and defect.value >= STRONGLY_BROKEN
+    ]
+    return _paired(
+        "Limits under breaking: approximate equivariance holds up where strictness does not",
+        f"success, `approximate` minus `equivariant`, defect from {STRONGLY_BROKEN:g} on",
+        broken,
+        "approximate",
+        "equivariant",
+        "success",
+        f" where the audited defect is at least {STRONGLY_BROKEN:g}",
+    )[0]

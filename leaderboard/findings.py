@@ -1,0 +1,25 @@
+"""Everything that is computed over all tables together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from leaderboard.claims import Claim, claims
+from leaderboard.comparisons import Comparisons, compare_agents
+from leaderboard.defects import Audit, DefectMap, defect_map
+from leaderboard.summary import Summary
+
+
+@dataclass(frozen=True)
+class Findings:
+    """The map against the audited defect, comparisons of agents, and the paper's claims."""
+
+    map: DefectMap
+    comparisons: Comparisons
+    claims: list[Claim]
+
+
+def analyse(summary: Summary, audit: Audit) -> Findings:
+    """Compute all findings; pure and seeded."""
+    found = defect_map(summary, audit)
+    return Findings(found, compare_agents(summary), claims(summary, audit, found))

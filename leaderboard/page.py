@@ -1,0 +1,409 @@
+"""LEADERBOARD.md: how to read it, the overview, claims, map and comparisons, tables, provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from leaderboard.claims import NEARLY_SYMMETRIC, STRONGLY_BROKEN, Claim
+from leaderboard.comparisons import Comparisons
+from leaderboard.defects import (
+    BASELINE,
+    COMPARED,
+    COMPONENTS,
+    MEASURES,
+    MIN_CELLS,
+    Crossing,
+    DefectMap,
+    Line,
+    Panel,
+    audit_commands,
+)
+from leaderboard.findings import Findings
+from leaderboard.records import DIVERGED_EVALUATIONS, DIVERGED_SHARE, Provenance
+from leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
+from leaderboard.tables import Links, cell_name, section, status
+from leaderboard.text import (
+    MARKS,
+    NOTHING,
+    SPACE,
+    code,
+    difference,
+    grid,
+    image,
+    interval,
+    number,
+    stacked,
+)
+
+Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
+"""By place, (task, embodiment) or () for all of them, then by kind: description and address."""
+
+READING = f"""\
+Each agent steers a frozen diffusion policy by choosing the noise that it starts from. Three
+references do not learn: `base` draws the noise at random, `zero` sets it to 0, `golden-ticket` is
+the best constant noise that a search has found. They are never ranked, and a learner is worth its
+steps where it beats the best of them. All agents of a table share the task, the demonstrations,
+the budget and the held-out episodes that score them.
+
+- **Success** is `success_once` in the final window: all held-out evaluations in the last fifth of
+  the budget, their episodes pooled (a reference is evaluated once). Shown are the interquartile
+  mean (IQM) over seeds and its 95 % interval, from a bootstrap over seeds and over the episodes of
+  each. With fewer than 4 seeds the IQM is the plain mean; with one seed the interval covers its
+  episodes only. **Last checkpoint** is the same of the final evaluation alone. No number is ever
+  the best of several evaluations.
+- **Against base** is the mean difference to the base policy on the same episodes and seeds, with
+  its 95 % interval. ▲ or ▼ marks an interval that excludes 0; without a mark, the data do not
+  decide.
+- **Rank** is 1 + the number of agents that are clearly better, by the same paired differences; "="
+  marks a tie. It takes {MIN_SEEDS} finished seeds; agents with fewer are shown without a rank.
+- **AUC** is the area under the success curve as a share of the budget's maximum: how good the
+  agent was on average while it learned. **Steps** is the median number of environment steps until
+  the success reaches {100 * THRESHOLD:.0f} % of the best learning agent's, and how many seeds got
+  there; `>` means that the median seed did not within the budget. **Dip** is the deepest fall
+  below the base policy at any evaluation of any seed.
+- **Q diverged** († at a glance) counts the seeds whose Q-values left the range of returns that the
+  reward allows (more than {100 * DIVERGED_SHARE:.0f} % of the states at {DIVERGED_EVALUATIONS}
+  evaluations in a row, once learning has begun) or were not finite.
+- Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
+  **Status**. Below the count of seeds and episodes stand the seeds; they lead to the records.
+"""
+
+CURVES = (
+    "Thick lines are the IQM (success) or the mean (Q) over seeds, bands the 95 % interval of the "
+    "IQM, thin lines single seeds, dotted ones with a cross unfinished runs; references are "
+    "horizontal, from the step on at which their search ended. The green area holds the returns "
+    "that the reward allows."
+)
+
+CLAIMS = f"""\
+The paper is arXiv 2512.11345. A claim is *supported* where the 95 % interval of the effect lies on
+the side of 0 that the claim predicts, *contradicted* where it lies on the other side, and
+otherwise *undecided*. Differences are paired by seed and episode, and averaged over cells; only
+cells with {MIN_SEEDS} paired seeds count, and at least one is needed. Nothing is corrected for the
+number of tests: of tests without any effect, one in twenty would still exclude 0. *Defect* is the
+audited one (next section): cells up to {NEARLY_SYMMETRIC:g} count as symmetric, from
+{STRONGLY_BROKEN:g} on as strongly broken.
+"""
+
+MAP = f"""\
+Each point is a cell: the advantage over `{BASELINE}`, paired by seed, against the *audited
+defect*, which is measured in simulation and not read off a dial: the largest of the defects of
+dynamics (share of a step's own displacement), reward and observation. Bars are 95 % intervals;
+hollow points have fewer than {MIN_SEEDS} paired seeds and do not enter the line, which needs
+{MIN_CELLS} cells. The line's band, slope and crossing come from drawing seeds and episodes within
+the cells, defects within their intervals, and the scatter of the cells about the line that these
+do not explain.
+"""
+
+PROFILES = (
+    "Performance profiles: the share of runs that close at least the given share of the gap "
+    "between the frozen base (0, on the same episodes) and certain success (1), in the final "
+    "window. Higher is better; left of 0, steering does harm. Bands are 95 %, from drawing runs "
+    "within each cell."
+)
+IMPROVEMENT = (
+    "Probability of improvement: how likely a run of X beats a run of Y in the same cell (ties "
+    "count half), mean over cells, with 95 % intervals from drawing runs within each cell. "
+    "Where every run of one beats every run of the other, the interval has no width: with few runs "
+    "that claims too much."
+)
+
+
+def render_page(summary: Summary, findings: Findings, figures: Figures, links: Links) -> str:
+    """The whole page as markdown."""
+    overall = figures.get((), {})
+    parts = [
+        "# Leaderboard",
+        "This page is generated from run records by `symsteer report`; do not edit it.",
+        "## How to read it",
+        READING.strip(),
+    ]
+    if notice := _seed_notice(summary):
+        parts.append(notice)
+    parts += ["## At a glance", _overview(summary)]
+    if beaten := _beaten(summary):
+        parts.append(beaten)
+    parts += ["## The paper's claims", CLAIMS.strip(), _claims(findings.claims)]
+    parts += ["## Where symmetry stops paying", *_map(summary, findings.map, overall)]
+    if findings.comparisons.cells:
+        parts += ["## All cells together", *_comparisons(findings.comparisons, overall)]
+    place = None
+    for table in summary.tables:
+        key = table.key
+        if (key.task, key.embodiment) != place:
+            place = key.task, key.embodiment
+            parts.append(f"## {code(key.task)}, {code(key.embodiment)}")
+            if drawn := figures.get(place):
+                parts += [image(*figure) for figure in drawn.values()]
+                parts.append(CURVES)
+        parts += section(table, links)
+    parts += ["## Provenance", *_provenance(summary, links)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _seed_notice(summary: Summary) -> str:
+    learning = [row for table in summary.tables for row in table.rows if not row.is_reference]
+    few = [row for row in learning if len(row.finished) < MIN_SEEDS]
+    if not few:
+        return ""
+    which = "No agent here has" if len(few) == len(learning) else "Not every agent here has"
+    return (
+        f"> **Not ranked.** {which} the {MIN_SEEDS} finished seeds that a ranking needs. Agents "
+        "with fewer are shown in a fixed order; read the intervals, and treat differences between "
+        "agents as leads, not as results."
+    )
+
+
+def _overview(summary: Summary) -> str:
+    header = ["Task", *(code(agent) for agent in summary.agents)]
+    rows = []
+    for table in summary.tables:
+        cells = []
+        for agent in summary.agents:
+            rows_of = [row for row in table.rows if row.agent == agent]
+            cells.append("<br>".join(_glance(row) for row in rows_of) or NOTHING)
+        rows.append([cell_name(table, summary), *cells])
+    return grid(header, rows, left=1)
+
+
+def _glance(row: Row) -> str:
+    if row.success is None:
+        return status(row)
+    mark = MARKS[row.difference.sign] if row.difference else ""
+    dagger = " \u2020" if any(row.diverged) else ""
+    return stacked(row.success, marks=f"{mark}{dagger}")
+
+
+def _beaten(summary: Summary) -> str:
+    """For every learner, in how many cells it clearly beats the best reference."""
+    texts = []
+    for agent in summary.agents:
+        rows = [t.row_of(agent) for t in summary.tables if t.best_reference]
+        signs = [row.against_best.sign for row in rows if row and row.against_best]
+        if signs:
+            above, below = signs.count(1), signs.count(-1)
+            text = f"{code(agent)} clearly above in {above}, clearly below in {below}"
+            texts.append(f"{text} of {len(signs)}")
+    if not texts:
+        return ""
+    return f"Against the best reference of each cell, the frozen policy alone: {'; '.join(texts)}."
+
+
+def _claims(found: Sequence[Claim]) -> str:
+    rows = []
+    for claim in found:
+        effect = interval(claim.effect, sign=True, digits=3)
+        if claim.beside:
+            effect += f"<br>{claim.beside}"
+        verdict = f"**{claim.verdict}**"
+        if claim.reason:
+            verdict += f": {claim.reason}"
+        elif claim.verdict == "undecided":
+            verdict += ": the interval holds 0"
+        seeds = f"{claim.cells}, {claim.seeds}" if claim.cells else NOTHING
+        rows.append([claim.name, claim.test, effect, seeds, verdict])
+    header = ["Claim", "Test", "Effect, 95 % interval", "Cells, paired seeds", "Verdict"]
+    return grid(header, rows, left=5)
+
+
+def _map(summary: Summary, found: DefectMap, figures: Mapping[str, tuple[str, str]]) -> list[str]:
+    parts = [MAP.strip()]
+    if "map" in figures:
+        parts += [image(*figures["map"]), _lines(found), _map_numbers(summary, found)]
+    else:
+        parts.append("There is no map yet: no audited cell has paired runs of these agents.")
+    if found.unaudited:
+        names = {t.key: cell_name(t, summary) for t in summary.tables}
+        listed = ", ".join(dict.fromkeys(names[key] for key in found.unaudited))
+        text = f"Not audited, so not in the map: {listed}."
+        if commands := audit_commands(found.unaudited):
+            measured = ", ".join(code(command, 1000) for command in commands)
+            text += (
+                f" To measure them: {measured}; then "
+                "`python -m bench.audit.page docs/audit/summary.json runs/audit/summary.json`."
+            )
+        parts.append(text)
+    return parts
+
+
+def _lines(found: DefectMap) -> str:
+    rows = []
+    for agent in COMPARED:
+        for measure in MEASURES:
+            panel = found.panels[agent, measure]
+            counted = sum(point.counts for point in panel.points)
+            slope = NOTHING
+            if panel.line:
+                s = panel.line.slope
+                slope = f"{number(s.value, sign=True)} [{number(s.low, sign=True)}, "
+                slope = f"{slope}{number(s.high, sign=True)}]".replace(" ", SPACE)
+            rows.append(
+                [
+                    code(agent),
+                    {"auc": "AUC", "success": "success"}[measure],
+                    f"{counted} of {len(panel.points)}",
+                    slope,
+                    crossing_text(panel),
+                ]
+            )
+    header = [
+        "Agent",
+        "Advantage in",
+        "Cells in the line",
+        "Slope (per 1 of defect)",
+        "The line falls through 0 at a defect of",
+    ]
+    return grid(header, rows, left=5)
+
+
+def crossing_text(panel: Panel) -> str:
+    """Where the advantage ends, or in words why there is no such place."""
+    line = panel.line
+    if line is None:
+        return f"no line: fewer than {MIN_CELLS} different defects with {MIN_SEEDS} paired seeds"
+    crossing = line.crossing
+    if crossing.value is not None:
+        low = number(crossing.low) if np.isfinite(crossing.low) else "below all audited"
+        high = number(crossing.high) if np.isfinite(crossing.high) else "beyond all audited"
+        return f"{number(crossing.value)} [{low}, {high}]"
+    return f"none: {_no_crossing(line)}{_excluded(crossing)}"
+
+
+def _no_crossing(line: Line) -> str:
+    low, high = line.span
+    ends = [line.intercept + line.slope.value * x for x in line.span]
+    where = f"from {number(low)} to {number(high)}"
+    if min(ends) > 0:
+        return f"the line stays above 0 {where}"
+    return f"the line {'rises through' if max(ends) > 0 else 'stays below'} 0 {where}"
+
+
+def _excluded(crossing: Crossing) -> str:
+    """What the interval says about a crossing inside the audited range."""
+    if crossing.low == crossing.high:
+        return "; at 95 % there is none in this range"
+    if np.isfinite(crossing.low):
+        return f"; at 95 % it does not lie below {number(crossing.low)}"
+    if np.isfinite(crossing.high):
+        return f"; at 95 % it does not lie beyond {number(crossing.high)}"
+    return "; the data leave open where"
+
+
+def _map_numbers(summary: Summary, found: DefectMap) -> str:
+    cells: dict[int, dict[tuple[str, str], str]] = {}
+    tables, defects = {}, {}
+    for which, panel in found.panels.items():
+        for point in panel.points:
+            place = id(point.table)
+            tables[place], defects[place] = point.table, point.defect
+            cells.setdefault(place, {})[which] = (
+                f"{difference(point.advantage)} ({len(point.samples)})"
+            )
+    rows = []
+    for place in sorted(cells, key=lambda p: (defects[p].value, tables[p].key)):
+        defect = defects[place]
+        rows.append(
+            [
+                cell_name(tables[place], summary),
+                f"{interval(defect.interval, digits=3)} {COMPONENTS[defect.component]}",
+                *(cells[place].get(which, NOTHING) for which in found.panels),
+            ]
+        )
+    header = ["Cell", "Audited defect"]
+    for agent, measure in found.panels:
+        header.append(f"{code(agent)}, {'AUC' if measure == 'auc' else measure} (seeds)")
+    table = grid(header, rows, left=1)
+    return f"<details>\n<summary>The map's numbers</summary>\n\n{table}\n\n</details>"
+
+
+def _comparisons(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> list[str]:
+    parts = []
+    if "profiles" in figures:
+        parts += [image(*figures["profiles"]), PROFILES]
+    if "improvement" in figures:
+        parts += [image(*figures["improvement"]), IMPROVEMENT]
+    groups = [group for group, pairs in found.improvements.items() if pairs]
+    pairs: dict[tuple[str, str], dict[str, str]] = {}
+    for group in groups:
+        for pair in found.improvements[group]:
+            text = f"{interval(pair.probability)} ({pair.cells}; {pair.runs[0]}, {pair.runs[1]})"
+            pairs.setdefault((pair.first, pair.second), {})[group] = text
+    if pairs:
+        rows = [
+            [f"{code(first)} > {code(second)}", *(texts.get(group, NOTHING) for group in groups)]
+            for (first, second), texts in pairs.items()
+        ]
+        header = ["P(X > Y)", *(f"{group} (cells; runs of X, of Y)" for group in groups)]
+        parts.append(grid(header, rows, left=1))
+    return parts
+
+
+def _provenance(summary: Summary, links: Links) -> list[str]:
+    runs = summary.runs
+    records = [run.record for run in runs]
+    places = [place for run in runs for place in run.provenances]
+    started = min(record.started for record in records)
+    ended = max(record.ended or record.started for record in records)
+    hours = sum(record.wall_clock.total for record in records) / 3600
+    resumed = sum(record.wall_clock.resumed > 0 for record in records)
+    packages = (f"{name} {version}" for p in places for name, version in p.packages.items())
+    facts = [
+        f"Runs: {len(records)}, {number(hours, 1)} hours in all, {started:%Y-%m-%d} to "
+        f"{ended:%Y-%m-%d} (UTC)"
+        + (f"; {resumed} of them continued after an interruption" if resumed else ""),
+        f"Commits: {_values(_commit(place) for place in places)}",
+        f"Devices: {_values(p.device for p in places)}; platforms: "
+        f"{_values(p.platform for p in places)}; Python: {_values(p.python for p in places)}; "
+        f"torch threads: {_values(str(p.torch_threads) for p in places)}",
+        f"Packages: {_values(packages)}",
+    ]
+    parts = [
+        "Regenerate with `symsteer report`, or `python -m leaderboard RECORDS --out FOLDER`: the "
+        "same records give the same bytes. Each record holds the whole configuration and every "
+        "evaluation episode with its seed.",
+        "\n".join(f"- {fact}" for fact in facts),
+    ]
+    rows = [
+        [
+            cell_name(table, summary),
+            code(row.label),
+            str(run.seed),
+            run.record.status,
+            _values(_commit(place, short=True) for place in run.provenances),
+            code(run.record.config_hash[:12]),
+            _link(run, links),
+        ]
+        for table in summary.tables
+        for row in table.rows
+        for run in row.runs
+    ]
+    header = ["Task", "Agent", "Seed", "Status", "Commit", "Config", "Record"]
+    every = grid(header, rows, left=2)
+    parts.append(f"<details>\n<summary>All records</summary>\n\n{every}\n\n</details>")
+    if summary.set_aside:
+        aside = ", ".join(_link(run, links) for run in summary.set_aside)
+        parts.append(
+            "Set aside, because a finished or newer record of the same configuration and seed "
+            f"exists: {aside}."
+        )
+    return parts
+
+
+def _commit(place: Provenance, short: bool = False) -> str:
+    if place.commit is None:
+        return "outside git"
+    dirty = "+" if short else " with local changes"
+    return place.commit[:12] + (dirty if place.dirty else "")
+
+
+def _values(texts: Iterable[str]) -> str:
+    return ", ".join(code(text) for text in sorted(set(texts))) or NOTHING
+
+
+def _link(run: Run, links: Links) -> str:
+    # run_id is validated to letters, digits and ._+=:,@- so that it is safe as a link's text.
+    target = links.get(run.path)
+    name = code(run.record.run_id)
+    return f"[{name}]({target})" if target else name

@@ -1,0 +1,107 @@
+"""How the page writes texts, numbers, intervals, links and tables.
+
+Text that comes from a record is only ever shown inside code spans, stripped of what could end one
+(`code`), so that no record can inject markup, and is never used as a path or a link.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from leaderboard.statistics import Interval
+
+NOTHING = "\u2013"
+MINUS = "\u2212"
+SPACE = "\u00a0"
+"""A space at which no line is broken."""
+MARKS = {1: " \u25b2", 0: "", -1: " \u25bc"}
+
+
+def code(text: str, limit: int = 300) -> str:
+    """Show text from a record as a code span that it cannot leave, on one line, in a table cell."""
+    allowed = "".join(c if c.isprintable() else " " for c in text)
+    for bad, good in (("`", "'"), ("|", "¦"), ("\\", "/")):
+        allowed = allowed.replace(bad, good)
+    allowed = " ".join(allowed.split())
+    if len(allowed) > limit:
+        allowed = allowed[: limit - 1] + "…"
+    return f"`{allowed}`" if allowed else NOTHING
+
+
+def number(value: float | None, digits: int = 2, sign: bool = False) -> str:
+    """A number for reading: fixed digits, a true minus sign, a dash where there is none."""
+    if value is None:
+        return NOTHING
+    text = f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
+    if float(text) == 0:
+        text = f"{0:.{digits}f}"
+    return text.replace("-", MINUS)
+
+
+def compact(value: float | None) -> str:
+    """Two or three significant digits for quantities of any size, such as Q-values and errors."""
+    if value is None:
+        return NOTHING
+    if value == 0:
+        text = "0"
+    elif 1e3 <= abs(value) < 1e5:
+        text = f"{value:.0f}"
+    elif 1e-3 <= abs(value) < 1e3:
+        text = f"{value:.3g}"
+    else:
+        mantissa, exponent = f"{value:.1e}".split("e")
+        text = f"{mantissa}e{int(exponent)}"
+    return text.replace("-", MINUS)
+
+
+def count(value: float | None) -> str:
+    """A count in thousands or millions."""
+    if value is None:
+        return NOTHING
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if value >= size:
+            return f"{value / size:.3g} {unit}".replace(" ", SPACE)
+    return f"{value:.0f}"
+
+
+def interval(value: Interval | None, sign: bool = False, digits: int = 2) -> str:
+    """`0.71 [0.66, 0.77]` on one line."""
+    if value is None:
+        return NOTHING
+    middle, low, high = (number(v, digits, sign) for v in (value.value, value.low, value.high))
+    return f"{middle} [{low}, {high}]".replace(" ", SPACE)
+
+
+def difference(value: Interval | None) -> str:
+    """`+0.12 [+0.05, +0.20] ▲`: the mark says that the interval excludes 0, and on which side."""
+    return interval(value, sign=True) + (MARKS[value.sign].replace(" ", SPACE) if value else "")
+
+
+def stacked(value: Interval | None, sign: bool = False, marks: str = "") -> str:
+    """An interval on two lines, for tables with many columns: value and marks above its ends."""
+    if value is None:
+        return NOTHING
+    middle, ends = interval(value, sign).split(SPACE, 1)
+    return f"{middle}{marks}".replace(" ", SPACE) + f"<br>{ends}"
+
+
+def relative_link(path: Path, folder: Path) -> str | None:
+    """URL of `path` relative to `folder`; None where it would spell out folders of this machine."""
+    relative = Path(os.path.relpath(path, folder))
+    if relative.is_absolute() or relative.parts[:3] == ("..", "..", ".."):
+        return None
+    return quote(relative.as_posix())
+
+
+def image(text: str, path: str) -> str:
+    """A figure of the page; `text` and `path` are our own."""
+    return f"![{text}]({quote(path)})"
+
+
+def grid(header: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
+    """A markdown table; the first `left` columns are left-aligned, the others right-aligned."""
+    rule = [":--" if index < left else "--:" for index in range(len(header))]
+    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows))
