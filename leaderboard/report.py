@@ -3,64 +3,69 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import re
+import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from leaderboard.defects import Audit, read_audit
 from leaderboard.errors import RecordError
 from leaderboard.figures import render_figures, to_svg
-from leaderboard.findings import analyse
-from leaderboard.page import render_page
 from leaderboard.summary import Run, load_runs, summarize
-from leaderboard.tables import render_csv
-from leaderboard.text import relative_link
+from leaderboard.tables import relative_link, render_csv, render_page
+from leaderboard.verification import Verification, differences
 
-DEFAULT_RECORDS = Path("leaderboard/results")
-DEFAULT_OUT = Path("leaderboard")
-FIGURE_NAME = re.compile(r"(map|profiles|improvement|(success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
+DEFAULT_OUT = Path(__file__).resolve().parent
+DEFAULT_RECORDS = DEFAULT_OUT / "results"
+FIGURE_NAME = re.compile(r"(success|q)-[a-z0-9-]+-[0-9a-f]{6}\.svg")
 
 
-def generate(
-    records: Sequence[Path] = (DEFAULT_RECORDS,),
-    out: Path = DEFAULT_OUT,
-    audit: Path | None = None,
-) -> list[Path]:
+def generate(records: Sequence[Path] = (DEFAULT_RECORDS,), out: Path = DEFAULT_OUT) -> list[Path]:
     """Write LEADERBOARD.md, leaderboard.csv and figures/ into `out`; returns the files written.
-
-    `audit` is the summary of an audit, the committed one by default (`read_audit`).
 
     Everything is rendered, then everything is written under temporary names, before the first file
     is replaced: bad records, a full disk or a read-only folder leave `out` as it was. Figures of an
     earlier call that no longer belong to a table are removed. Raises RecordError.
     """
     out = _folder(out)
-    files = render(load_runs(records), out, read_audit(audit))
-    _write_together({out / name: data for name, data in files.items()})
-    for name in _stale(out, files):
-        (out / name).unlink()
+    files = render(load_runs(records), out)
+    _replace_together(
+        {out / name: data for name, data in files.items()},
+        [out / name for name in _stale(out, files)],
+    )
     return [out / name for name in files]
 
 
-def render(runs: Sequence[Run], out: Path, audit: Audit) -> dict[str, bytes]:
+def verify(records: Sequence[Path] = (DEFAULT_RECORDS,), out: Path = DEFAULT_OUT) -> Verification:
+    """Compare the files in `out` with what `generate` would write; changes nothing.
+
+    Raises RecordError.
+    """
+    out = _folder(out)
+    runs = load_runs(records)
+    files = render(runs, out)
+    found = differences(files, _stale(out, files), out)
+    return Verification(len(runs), len(files), found)
+
+
+def render(runs: Sequence[Run], out: Path) -> dict[str, bytes]:
     """Every file of the leaderboard, by its path relative to `out` (with `/`); nothing is written.
 
-    Depends on the records, the audit, and where the records lie relative to `out`, nothing else.
+    Depends on the records and on where they lie relative to the folder `out`, nothing else.
     """
     summary = summarize(runs)
-    findings = analyse(summary, audit)
     files: dict[str, bytes] = {}
-    shown: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
-    for drawing in render_figures(summary, findings):
-        stem = "-".join([drawing.kind, *([slug(*drawing.place)] if drawing.place else [])])
-        name = f"figures/{stem}.svg"
-        files[name] = to_svg(drawing.figure)
-        shown.setdefault(drawing.place, {})[drawing.kind] = (drawing.text, name)
+    shown: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for place, figures in render_figures(summary).items():
+        for text, kind, figure in figures:
+            name = f"figures/{kind}-{slug(*place)}.svg"
+            files[name] = to_svg(figure)
+            shown.setdefault(place, []).append((text, name))
     links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
     files["leaderboard.csv"] = render_csv(summary).encode()
-    files["LEADERBOARD.md"] = render_page(summary, findings, shown, links).encode()
+    files["LEADERBOARD.md"] = render_page(summary, shown, links).encode()
     return files
 
 
@@ -72,10 +77,17 @@ def slug(*texts: str) -> str:
 
 
 def _folder(out: Path) -> Path:
-    out = out.resolve()
-    if out.exists() and not out.is_dir():
-        raise RecordError(f"{out} is a file: name a folder for the leaderboard.")
-    return out
+    out = Path(os.path.realpath(out))
+    try:
+        if stat.S_ISDIR(out.stat().st_mode):
+            return out
+    except FileNotFoundError:
+        return out
+    except OSError as error:
+        raise RecordError(
+            f"{out} cannot be used: {error.strerror}; name another folder."
+        ) from error
+    raise RecordError(f"{out} is a file: name a folder for the leaderboard.")
 
 
 def _stale(out: Path, files: Mapping[str, bytes]) -> list[str]:
@@ -84,18 +96,23 @@ def _stale(out: Path, files: Mapping[str, bytes]) -> list[str]:
     return sorted(n for n in names if n not in files and FIGURE_NAME.fullmatch(Path(n).name))
 
 
-def _write_together(files: Mapping[Path, bytes]) -> None:
-    """Write all files or, as far as a file system can promise it, none.
+def _replace_together(files: Mapping[Path, bytes], stale: Sequence[Path]) -> None:
+    """Write all `files` and remove the `stale` ones or, as far as one can promise it, do nothing.
 
     Raises:
-        RecordError: when a folder cannot be written or the disk is full; nothing has changed then
-            (only a failing rename, after all data have reached the disk, can leave a mixture).
+        RecordError: when a folder cannot be written, leads elsewhere, or the disk is full; nothing
+            has changed then (only a failing rename, after all data have reached the disk, can
+            leave a mixture, which `verify` tells).
     """
     staged: list[tuple[Path, Path]] = []
     path = Path()
     try:
         for path, data in files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
+            if path.parent.resolve() != path.parent:
+                raise RecordError(f"{path.parent} is a link: make it a folder, or remove it.")
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
             temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
             staged.append((temporary, path))
             with open(temporary, "wb") as file:
@@ -104,10 +121,13 @@ def _write_together(files: Mapping[Path, bytes]) -> None:
                 os.fsync(file.fileno())
         for temporary, path in staged:
             os.replace(temporary, path)
+        for path in stale:
+            path.unlink()
     except OSError as error:
-        for temporary, _ in staged:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
         raise RecordError(
             f"{path} cannot be written: {error.strerror}; free space or choose another folder."
         ) from error
+    finally:
+        for temporary, _ in staged:
+            with contextlib.suppress(OSError):
+                temporary.unlink()

@@ -1,0 +1,280 @@
+"""Whether a record may join the leaderboard: every rule of docs/submit.md, one function each.
+
+A problem keeps a record out; a note says how it would be shown. Both are one sentence with what to
+do about it.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import subprocess
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from leaderboard.errors import RecordError
+from leaderboard.paths import record_files
+from leaderboard.records import (
+    HELD_OUT_SEED,
+    RunRecord,
+    canonical_json,
+    portable,
+    read_record,
+)
+from leaderboard.summary import MIN_SEEDS, REFERENCES, Key, recipe_of
+
+MIN_EPISODES = 100
+"""Held-out episodes of an admissible record's final evaluation."""
+
+RowKey = tuple[Key, str, str]
+"""Table, agent, recipe: what the runs of one row have in common."""
+
+
+@dataclass
+class Verdict:
+    """What is to be said of one record file."""
+
+    path: Path
+    problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def is_admissible(self) -> bool:
+        return not self.problems
+
+
+def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
+    """Judge the records that `paths` name, among those in the folder `committed`.
+
+    Args:
+        paths: files or folders, as in `record_files`; they may lie in `committed` themselves.
+        committed: the folder of the committed records; none are known if it does not exist.
+
+    Raises:
+        RecordError: for a path that cannot be read, or a damaged record among the committed ones.
+    """
+    files = record_files(paths)
+    known = _Known()
+    if committed.is_dir() and any(committed.rglob("*.json")):
+        for file in record_files([committed]):
+            if file not in files:
+                known.add(file, read_record(file), committed=True)
+    verdicts, records = [], {}
+    for file in files:
+        verdicts.append(verdict := Verdict(file))
+        try:
+            records[file] = record = read_record(file)
+        except RecordError as error:
+            verdict.problems.append(str(error))
+            continue
+        for rule in RULES:
+            verdict.problems += rule(file, record)
+        verdict.problems += known.duplicates(record)
+        known.add(file, record)
+    for verdict in verdicts:
+        if verdict.path in records:
+            verdict.notes += known.notes(records[verdict.path])
+    return verdicts
+
+
+# The rules that look at one record alone: (file, record) -> problems.
+
+
+def named_after_its_run(file: Path, record: RunRecord) -> Iterator[str]:
+    """The file is called RUN_ID.json."""
+    if file.name != f"{record.run_id}.json":
+        yield f"the file must be named after its run: rename it to {record.run_id}.json."
+
+
+def finished(file: Path, record: RunRecord) -> Iterator[str]:
+    """The run came to its end."""
+    if record.status != "finished":
+        yield (
+            f"the run is {record.status}, not finished: continue it with `symsteer resume "
+            "RUN_FOLDER` and take the record from there."
+        )
+
+
+def reproducible(file: Path, record: RunRecord) -> Iterator[str]:
+    """Every session of the run used code of a known commit without local changes."""
+    sessions = [("", record.provenance)]
+    sessions += [(f"session {n} of ", p) for n, p in enumerate(record.continued, 2)]
+    for session, provenance in sessions:
+        if provenance.commit is None:
+            yield (
+                f"{session}the run names no commit, so nobody knows its code: run it again in a "
+                "git clone of the repository."
+            )
+        elif provenance.dirty is not False:
+            yield (
+                f"{session}the run used code that is not in commit {provenance.commit[:12]}: "
+                "commit all changes and new files, then run it again."
+            )
+
+
+def scored_on_held_out_episodes(file: Path, record: RunRecord) -> Iterator[str]:
+    """Evaluations use the first of the held-out seeds, the final one at least 100."""
+    for evaluation in record.evaluations:
+        seeds = evaluation.episodes.seed
+        if seeds != list(range(HELD_OUT_SEED, HELD_OUT_SEED + len(seeds))):
+            yield (
+                f"the evaluation at step {evaluation.env_steps} is not on the held-out seeds "
+                f"{HELD_OUT_SEED}, {HELD_OUT_SEED + 1}, ... in order: evaluate with `symsteer run`."
+            )
+            break
+    if record.final and len(record.final.episodes.seed) < MIN_EPISODES:
+        yield (
+            f"the final evaluation has {len(record.final.episodes.seed)} episodes, fewer than "
+            f"{MIN_EPISODES}: run it again with --evaluation.final-episodes {MIN_EPISODES}."
+        )
+
+
+def budget_used_up(file: Path, record: RunRecord) -> Iterator[str]:
+    """A learner was scored at the end of its budget, a reference after what it searched."""
+    final, budget = record.final, record.cell.env_steps
+    if final is None:
+        return
+    if final.env_steps != record.budget.env_steps:
+        yield (
+            f"the final evaluation stands at step {final.env_steps}, but the run used "
+            f"{record.budget.env_steps}: run it again."
+        )
+    elif _learns(record) and final.env_steps < budget:
+        yield (
+            f"the run ended after {final.env_steps} of the {budget} environment steps of its "
+            "budget: run it again to the end, or with --env-steps as large as what it uses."
+        )
+
+
+def names_no_machine(file: Path, record: RunRecord) -> Iterator[str]:
+    """No text of the file holds an absolute path."""
+    for text in _texts(json.loads(file.read_bytes())):
+        if portable(text) != text:
+            yield (
+                f"the text {text[:60]!r} holds a path of the machine: leave it out where the run "
+                "is configured, and run it again."
+            )
+            return
+
+
+RULES: tuple[Callable[[Path, RunRecord], Iterator[str]], ...] = (
+    named_after_its_run,
+    finished,
+    reproducible,
+    scored_on_held_out_episodes,
+    budget_used_up,
+    names_no_machine,
+)
+
+
+class _Known:
+    """The records that one record is held against: the committed ones and those before it."""
+
+    def __init__(self) -> None:
+        self._runs: dict[tuple[RowKey, int], tuple[Path, RunRecord]] = {}
+        self._outcomes: dict[str, Path] = {}
+        self._seeds: dict[RowKey, set[int]] = defaultdict(set)
+        self._committed: dict[Key, set[str]] = defaultdict(set)
+        self._references: dict[tuple[Key, str], set[str]] = defaultdict(set)
+
+    def add(self, file: Path, record: RunRecord, committed: bool = False) -> None:
+        row = _row(record)
+        self._runs.setdefault((row, record.cell.seed), (file, record))
+        if outcome := _outcome(record):
+            self._outcomes.setdefault(outcome, file)
+        if committed:
+            self._committed[row[0]].add(record.base_policy.content_hash)
+        if record.status == "finished":
+            self._seeds[row].add(record.cell.seed)
+            policy = record.base_policy.content_hash
+            self._references[row[0], policy].add(record.cell.agent)
+
+    def duplicates(self, record: RunRecord) -> Iterator[str]:
+        twin = self._runs.get((_row(record), record.cell.seed))
+        outcome = _outcome(record)
+        if twin and twin[1] == record:
+            yield f"it is a copy of {twin[0]}: remove one of the two."
+        elif twin:
+            yield (
+                f"{twin[0]} holds the same configuration and seed already: remove one of the two "
+                "(to replace a committed record, say why in the pull request)."
+            )
+        elif outcome in self._outcomes:
+            yield (
+                f"its evaluations equal those of {self._outcomes[outcome]} to the last digit: a "
+                "copy, or a setting that changes nothing; keep one of the two."
+            )
+
+    def notes(self, record: RunRecord) -> Iterator[str]:
+        row = _row(record)
+        number = len(self._seeds[row])
+        if record.cell.agent not in REFERENCES and number < MIN_SEEDS:
+            yield (
+                f"shown, not ranked: its row has {number} of the {MIN_SEEDS} finished seeds that a "
+                "ranking needs."
+            )
+        policy, committed = record.base_policy.content_hash, self._committed[row[0]]
+        if committed and policy not in committed:
+            present = self._references[row[0], policy]
+            lacking = [name for name in REFERENCES if name not in present]
+            wanted = f"; submit {', '.join(lacking)} on it as well" if lacking else ""
+            yield (
+                f"its base policy {policy[:12]} is not that of the committed runs of its table: it "
+                f"is compared only with runs on the same policy{wanted}."
+            )
+        commit = record.provenance.commit
+        if commit is not None and _is_missing(commit):
+            yield (
+                f"its commit {commit[:12]} is not in this clone: push it with the pull request, so "
+                "that others can run the same code."
+            )
+
+
+def _row(record: RunRecord) -> RowKey:
+    return Key.of(record), record.cell.agent, recipe_of(record.config)
+
+
+def _learns(record: RunRecord) -> bool:
+    return record.parameters.total > 0 or record.budget.updates > 0 or record.has_critic
+
+
+def _outcome(record: RunRecord) -> str | None:
+    """A hash of all that a learner's evaluations measured; None where chance alone could agree."""
+    if not record.has_critic:
+        return None
+    data = [evaluation.model_dump(mode="json") for evaluation in record.evaluations]
+    measured = [[evaluation["episodes"], evaluation["diagnostics"]] for evaluation in data]
+    return hashlib.sha256(canonical_json(measured).encode()).hexdigest()
+
+
+def _texts(data: Any) -> Iterator[str]:
+    """Every text in plain data, keys included."""
+    if isinstance(data, str):
+        yield data
+    elif isinstance(data, dict):
+        for key, value in data.items():
+            yield key
+            yield from _texts(value)
+    elif isinstance(data, list):
+        for value in data:
+            yield from _texts(value)
+
+
+@functools.cache
+def _is_missing(commit: str) -> bool:
+    """Whether this is a whole git clone without that commit."""
+
+    def git(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=20)
+
+    try:
+        if git("rev-parse", "--is-shallow-repository").stdout.strip() != "false":
+            return False
+        return git("cat-file", "-e", f"{commit}^{{commit}}").returncode != 0
+    except (OSError, subprocess.SubprocessError):
+        return False

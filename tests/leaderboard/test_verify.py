@@ -1,0 +1,180 @@
+"""`--verify`: every byte of the leaderboard comes from its records, on any machine."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from record_factory import make_curve, make_evaluation, make_record
+
+from leaderboard.__main__ import main
+from leaderboard.records import write_record
+from leaderboard.report import DEFAULT_OUT, DEFAULT_RECORDS, generate, slug
+from leaderboard.verification import differences, other_versions
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("verify")
+    generator = np.random.default_rng(0)
+    for variant in ("none", "action_gain:0.5"):
+        for seed in range(2):
+            for agent in ("base", "standard", "equivariant"):
+                learns = agent != "base"
+                curve = make_curve(generator, [0.35, 0.5, 0.65]) if learns else None
+                record = make_record(
+                    curve or [make_evaluation(generator.random(100) < 0.35)],
+                    agent=agent,
+                    seed=seed,
+                    variant=variant,
+                )
+                write_record(record, folder / "records" / f"{record.run_id}.json")
+    generate([folder / "records"], folder / "board")
+    return folder
+
+
+@pytest.fixture
+def board(written: Path, tmp_path: Path) -> Path:
+    """A copy of the leaderboard beside its records, to be damaged."""
+    for path in sorted(written.rglob("*")):
+        copy = tmp_path / path.relative_to(written)
+        if path.is_dir():
+            copy.mkdir()
+        else:
+            copy.write_bytes(path.read_bytes())
+    return tmp_path / "board"
+
+
+def snapshot(folder: Path) -> dict[str, bytes | None]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def call(board: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, list[str], str]:
+    """Exit code, lines of stdout, stderr; and nothing may have changed on disk."""
+    before = snapshot(board.parent)
+    code = main(["--verify", str(board.parent / "records"), "--out", str(board)])
+    assert snapshot(board.parent) == before
+    shown = capsys.readouterr()
+    return code, shown.out.splitlines(), shown.err
+
+
+def test_what_was_generated_agrees(board: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (board / "figures" / "mine.svg").write_text("not ours")
+    (board / "NOTES.md").write_text("not ours")
+    code, lines, error = call(board, capsys)
+    assert (code, error) == (0, "")
+    assert len(lines) == 1
+    files = len(snapshot(board)) - 3
+    assert f"12 records and {files} files of the leaderboard agree" in lines[0]
+
+
+def test_each_file_that_differs_has_its_line(
+    board: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page, table = board / "LEADERBOARD.md", board / "leaderboard.csv"
+    page.write_text(page.read_text().replace("At a glance", "At a glimpse", 1))
+    # The line ends that a careless checkout makes.
+    table.write_bytes(table.read_bytes().replace(b"\n", b"\r\n"))
+    first, second, *_ = sorted((board / "figures").iterdir())
+    first.unlink()
+    second.write_bytes(second.read_bytes() + b"\n")
+    stale = board / "figures" / f"q-{slug('OldTask-v1', 'floating')}.svg"
+    stale.write_text("")
+    code, lines, error = call(board, capsys)
+    assert code == 1
+    assert error.startswith("error: 5 files")
+    assert error.count("\n") == 1
+    assert len(lines) == 5
+    shown = dict(line.split(": ", 1) for line in lines)
+    number = page.read_text().splitlines().index("## At a glimpse") + 1
+    assert re.fullmatch(
+        rf"differs from line {number}, column \d+ on: 'impse', but the records give 'ance'",
+        shown[str(page)],
+    )
+    assert "'\\r'" in shown[str(table)]
+    assert shown[str(first)] == "missing"
+    assert "'\\n', but the records give the file ends" in shown[str(second)]
+    assert shown[str(stale)] == "no record gives this file"
+
+
+def test_a_number_changed_in_a_record_is_found(
+    board: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = next(iter(sorted((board.parent / "records").glob("*equivariant-0.json"))))
+    text = record.read_text()
+    position = text.index("0", text.rindex('"success_once":['))
+    record.write_text(text[:position] + "1" + text[position + 1 :])
+    code, lines, _ = call(board, capsys)
+    assert code == 1
+    assert {Path(line.split(": ")[0]).name for line in lines} >= {
+        "LEADERBOARD.md",
+        "leaderboard.csv",
+    }
+
+
+def test_a_missing_record_or_folder_is_found(
+    board: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    next((board.parent / "records").iterdir()).unlink()
+    assert call(board, capsys)[0] == 1
+    code, lines, _ = call(board.parent / "elsewhere", capsys)
+    assert code == 1
+    assert all(line.endswith(": missing") for line in lines)
+
+
+def test_another_kind_of_machine_gives_the_same_bytes(written: Path, tmp_path: Path) -> None:
+    """Another folder, home, style, time zone, hash seed, instruction set and number of threads."""
+    (tmp_path / "matplotlibrc").write_text("font.size: 20\nlines.linewidth: 5\npath.sketch: 1,2,3")
+    environment = os.environ | {
+        "PYTHONHASHSEED": "7",
+        "HOME": str(tmp_path),
+        "MPLCONFIGDIR": str(tmp_path),
+        "LC_ALL": "C",
+        "TZ": "Asia/Tokyo",
+        "OMP_NUM_THREADS": "2",
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3",
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA",
+        "PYTHONPATH": str(REPOSITORY),
+    }
+    command = [sys.executable, "-m", "leaderboard", str(written / "records"), "--verify"]
+    result = subprocess.run(
+        [*command, "--out", str(written / "board")],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert (result.returncode, result.stdout.count("\n")) == (0, 1), result.stdout + result.stderr
+
+
+def test_the_defaults_do_not_depend_on_the_folder_one_is_in() -> None:
+    assert DEFAULT_OUT == REPOSITORY / "leaderboard"
+    assert DEFAULT_RECORDS == REPOSITORY / "leaderboard" / "results"
+
+
+def test_pinned_versions_are_those_that_run() -> None:
+    """In the environment of `make setup`; elsewhere `--verify` names what differs."""
+    assert other_versions() == []
+
+
+def test_differences_are_short_and_printable(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"\x1b[2J" + b"x" * 10**6)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "c").symlink_to(tmp_path / "c")
+    lines = differences({"a": b"y", "b": b"", "c": b"", "d/e": b""}, [], tmp_path)
+    assert [line.split(": ")[0] for line in lines] == [
+        str(tmp_path / name) for name in ("a", "b", "c", "d/e")
+    ]
+    assert all(line.isprintable() and len(line) < len(str(tmp_path)) + 140 for line in lines)
+    assert "Is a directory" in lines[1]
