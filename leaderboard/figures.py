@@ -1,4 +1,4 @@
-"""The figures: learning curves and Q-values, one panel per variant, as deterministic SVG.
+"""The figures as deterministic SVG: the map, profiles, comparisons; learning curves and Q-values.
 
 Colours are Okabe and Ito's, told apart with colour blindness; agents differ by marker as well. Text
 is drawn as outlines of matplotlib's own font, so that a figure looks the same everywhere and has
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+from leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
+from leaderboard.defects import BASELINE, COMPARED, MEASURES, DefectMap, Line, Panel
+from leaderboard.findings import Findings
 from leaderboard.statistics import iqm, success_interval
-from leaderboard.summary import MIN_SEEDS, Row, Run, Summary, Table
+from leaderboard.summary import MIN_SEEDS, REFERENCES, Row, Run, Summary, Table
 
 Style = tuple[str, str, Any]
 """Color, marker and line style of an agent."""
@@ -28,6 +32,7 @@ Style = tuple[str, str, Any]
 STYLES: dict[str, Style] = {
     "base": ("#555555", "", (0, (5, 2))),
     "zero": ("#555555", "", (0, (1, 1.5))),
+    "golden-ticket": ("#A8860B", "", (0, (5, 1.5, 1, 1.5))),
     "standard": ("#D55E00", "s", "-"),
     "standard-matched": ("#E69F00", "D", "-"),
     "equivariant": ("#0072B2", "o", "-"),
@@ -35,6 +40,9 @@ STYLES: dict[str, Style] = {
 }
 OTHERS: tuple[Style, ...] = (("#CC79A7", "v", "-"), ("#56B4E9", "P", "-"), ("#000000", "X", "-"))
 FEASIBLE, FEASIBLE_EDGE, FEASIBLE_TEXT = "#DDE7D0", "#7A9A50", "#4F6B2A"
+PLACE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*")
+"""Markers of the map, one for each task and embodiment."""
+
 COLUMNS = 3
 MAX_MARKERS = 15
 BAND_RESAMPLES = 1000
@@ -59,19 +67,40 @@ SHEETS: Any = ["default", RC]
 """Starts from matplotlib's own defaults: a matplotlibrc of the user's would change the bytes."""
 
 
-def render_figures(summary: Summary) -> dict[tuple[str, str], list[tuple[str, str, Figure]]]:
-    """Figures of each (task, embodiment): description, kind (`success` or `q`), figure."""
+@dataclass(frozen=True)
+class Drawing:
+    """A figure, what it shows, and where it belongs: (task, embodiment), or () for all of them."""
+
+    kind: str
+    place: tuple[str, ...]
+    text: str
+    figure: Figure
+
+
+def render_figures(summary: Summary, findings: Findings) -> list[Drawing]:
+    """All figures in the order of the page; those without anything to show are left out."""
+    drawings = []
     places: dict[tuple[str, str], list[Table]] = {}
     for table in summary.tables:
         if table.runs:
             places.setdefault((table.key.task, table.key.embodiment), []).append(table)
-    figures: dict[tuple[str, str], list[tuple[str, str, Figure]]] = {}
     with mpl_style.context(SHEETS):
+        if findings.map.has_points:
+            text = "Advantage of symmetry against the audited defect"
+            drawings.append(Drawing("map", (), text, advantage_map(findings.map)))
+        if any(findings.comparisons.profiles.values()):
+            figure = performance_profiles(findings.comparisons)
+            drawings.append(Drawing("profiles", (), "Performance profiles", figure))
+        if any(findings.comparisons.improvements.values()):
+            figure = improvement_chart(findings.comparisons)
+            drawings.append(Drawing("improvement", (), "Probability of improvement", figure))
         for place, tables in places.items():
-            figures[place] = [("Learning curves", "success", learning_curves(tables))]
+            text = "Learning curves"
+            drawings.append(Drawing("success", place, text, learning_curves(tables)))
             if any(run.record.has_critic for table in tables for run in table.runs):
-                figures[place].append(("Q-values and their feasible band", "q", q_values(tables)))
-    return figures
+                text = "Q-values and their feasible band"
+                drawings.append(Drawing("q", place, text, q_values(tables)))
+    return drawings
 
 
 def to_svg(figure: Figure) -> bytes:
@@ -95,7 +124,7 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
         for row in table.rows:
             if not row.runs:
                 continue
-            style = _style(row)
+            style = _style(row.agent)
             color, marker, line = style
             _draw_success(ax, row, style, table.key.env_steps)
             handles.setdefault(
@@ -127,7 +156,10 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
     ]
     low, high = [band.low for band in bands], [band.high for band in bands]
     if len(steps) == 1 and row.is_reference:
-        ax.axhline(bands[0].value, color=color, linestyle=line, linewidth=1.4, zorder=1.5)
+        # From where the search ended; those that search nothing are there from the start.
+        start = min(row.search_steps or 0, budget)
+        value = bands[0].value
+        ax.hlines(value, start, budget, color=color, linestyle=line, linewidth=1.4, zorder=1.5)
         if row.agent == "base":
             ax.axhspan(low[0], high[0], color=color, alpha=0.10, linewidth=0)
         return
@@ -161,7 +193,7 @@ def q_values(tables: Sequence[Table]) -> Figure:
             runs = [run for run in row.runs if run.record.has_critic]
             if not runs:
                 continue
-            color, marker, line = _style(row)
+            color, marker, line = _style(row.agent)
             for run in runs:
                 steps, values = _series(run, "q_mean")
                 ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
@@ -231,6 +263,153 @@ def _feasible_band(ax: Axes, low: float, high: float, values: Sequence[float]) -
     ax.set_ylim(bottom - margin, top + margin)
 
 
+def advantage_map(found: DefectMap) -> Figure:
+    """Advantage over the standard agent against the audited defect: agents by measures.
+
+    Bars are 95 % intervals; hollow points have too few seeds for the line. The line is drawn with
+    its band over the audited range, the diamond is where it falls through zero, with its interval.
+    """
+    figure = Figure(figsize=(9.0, 6.9), layout="constrained")
+    grid = figure.subplots(len(COMPARED), len(MEASURES), sharex=True, sharey=True, squeeze=False)
+    points = [point for panel in found.panels.values() for point in panel.points]
+    places = sorted({(p.table.key.task, p.table.key.embodiment) for p in points})
+    markers = {p: PLACE_MARKERS[i % len(PLACE_MARKERS)] for i, p in enumerate(places)}
+    right = 1.04 * max(point.defect.interval.high for point in points)
+    names = {"auc": "area under the curve", "success": "final success"}
+    for row, agent in enumerate(COMPARED):
+        for column, measure in enumerate(MEASURES):
+            ax = grid[row, column]
+            _draw_panel(ax, found.panels[agent, measure], markers, right)
+            ax.set_title(f"{agent}, {names[measure]}")
+            if row == len(COMPARED) - 1:
+                ax.set_xlabel("audited defect")
+            if column == 0:
+                ax.set_ylabel(f"advantage over {BASELINE}")
+    handles = {
+        _ascii(", ".join(place)): Line2D(
+            [], [], color="#555555", marker=marker, linestyle="none", markersize=5
+        )
+        for place, marker in markers.items()
+    }
+    diamond = Line2D([], [], color="black", marker="d", linestyle="-", markersize=7)
+    _legend(figure, {**handles, "falls through 0, 95 %": diamond}, columns=4)
+    return figure
+
+
+def _draw_panel(
+    ax: Axes, panel: Panel, markers: Mapping[tuple[str, str], str], right: float
+) -> None:
+    color = STYLES[panel.agent][0]
+    ax.set_xlim(-0.02 * right, right)
+    ax.axhline(0, color="#333333", linewidth=0.9, zorder=1)
+    for point in panel.points:
+        defect, gain = point.defect.interval, point.advantage
+        ax.errorbar(
+            defect.value,
+            gain.value,
+            xerr=[[defect.value - defect.low], [defect.high - defect.value]],
+            yerr=[[gain.value - gain.low], [gain.high - gain.value]],
+            color=color,
+            elinewidth=0.8,
+            alpha=0.85,
+            marker=markers[point.table.key.task, point.table.key.embodiment],
+            markersize=6,
+            markerfacecolor=color if point.counts else "white",
+        )
+    if not panel.points:
+        ax.text(0.5, 0.5, "no paired runs", transform=ax.transAxes, ha="center", color="#777777")
+    if panel.line:
+        _draw_line(ax, panel.line, color, right)
+
+
+def _draw_line(ax: Axes, line: Line, color: str, right: float) -> None:
+    ax.fill_between(line.grid, line.low, line.high, color=color, alpha=0.13, linewidth=0)
+    heights = line.intercept + line.slope.value * line.grid
+    ax.plot(line.grid, heights, color=color, linewidth=1.8)
+    crossing = line.crossing
+    if crossing.value is None:
+        return
+    ends = max(crossing.low, 0.0), min(crossing.high, right)
+    ax.plot(ends, [0, 0], color="black", linewidth=2.2, solid_capstyle="butt", zorder=4)
+    for end, bound, marker in ((ends[0], crossing.low, "<"), (ends[1], crossing.high, ">")):
+        shape = "|" if np.isfinite(bound) else marker
+        ax.plot(end, 0, marker=shape, color="black", markersize=7, clip_on=False, zorder=4)
+    ax.plot(crossing.value, 0, marker="d", color="black", markersize=8, zorder=5)
+
+
+def performance_profiles(found: Comparisons) -> Figure:
+    """Share of runs that close at least a share of the gap to certain success, with 95 % bands."""
+    groups = [group for group, profiles in found.profiles.items() if profiles]
+    figure, axes = _side_by_side(groups, found.cells, 3.3, sharey=True)
+    handles: dict[str, Line2D | Patch] = {}
+    for ax, group in zip(axes, groups, strict=True):
+        ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
+        for profile in found.profiles[group]:
+            color, _, line = _style(profile.agent)
+            if profile.agent not in REFERENCES:
+                band: dict[str, Any] = {"color": color, "alpha": 0.13, "linewidth": 0}
+                ax.fill_between(THRESHOLDS, profile.low, profile.high, **band)
+            ax.plot(THRESHOLDS, profile.share, color=color, linestyle=line, linewidth=1.7)
+            if profile.cells < found.cells[group]:
+                ax.plot([], [], " ", label=f"{_ascii(profile.agent)}: {_coverage(profile.cells)}")
+            handles.setdefault(
+                _ascii(profile.agent), Line2D([], [], color=color, linestyle=line, linewidth=1.7)
+            )
+        if ax.get_legend_handles_labels()[1]:
+            ax.legend(loc="lower left", fontsize=7.5, frameon=False, handlelength=0)
+        ax.set_xlim(_start(found.profiles[group]), THRESHOLDS[-1])
+        ax.set_ylim(-0.02, 1.02)
+        ax.set_xlabel("share of the gap from the base to certain success")
+    axes[0].set_ylabel("share of runs at or above")
+    _legend(figure, handles)
+    return figure
+
+
+def _start(profiles: Sequence[Profile]) -> float:
+    """Left end of the axis: where the first run falls out, but at most a little left of 0."""
+    all_in = np.min([profile.share for profile in profiles], axis=0) == 1
+    return float(min(THRESHOLDS[all_in].max(initial=THRESHOLDS[0]), 0.0) - 0.03)
+
+
+def _coverage(cells: int) -> str:
+    return f"{cells} cell{'s' if cells > 1 else ''} only"
+
+
+def improvement_chart(found: Comparisons) -> Figure:
+    """P(X > Y) of every pair of learning agents with its 95 % interval; 0.5 is no difference."""
+    groups = [group for group, pairs in found.improvements.items() if pairs]
+    rows = list(dict.fromkeys((p.first, p.second) for g in groups for p in found.improvements[g]))
+    figure, axes = _side_by_side(groups, found.cells, 1.1 + 0.3 * len(rows), sharey=True)
+    for ax, group in zip(axes, groups, strict=True):
+        ax.axvline(0.5, color="#333333", linewidth=0.9, zorder=1)
+        for pair in found.improvements[group]:
+            height, p = rows.index((pair.first, pair.second)), pair.probability
+            color = _style(pair.first)[0]
+            bar: dict[str, Any] = {"linewidth": 6, "alpha": 0.35, "solid_capstyle": "butt"}
+            ax.plot([p.low, p.high], [height] * 2, color=color, **bar)
+            ax.plot(p.value, height, "o", color=color, markersize=5, clip_on=False)
+            if pair.cells < found.cells[group]:
+                beside: dict[str, Any] = {"ha": "left", "va": "bottom", "fontsize": 7.5}
+                ax.text(0.0, height - 0.1, _coverage(pair.cells), color="#555555", **beside)
+        ax.set_xlim(-0.02, 1.02)
+        ax.set_xlabel("P(X > Y)")
+    axes[0].set_yticks(range(len(rows)), [f"{_ascii(x)} > {_ascii(y)}" for x, y in rows])
+    axes[0].set_ylim(len(rows) - 0.5, -0.5)
+    return figure
+
+
+def _side_by_side(
+    groups: Sequence[str], cells: Mapping[str, int], height: float, sharey: bool
+) -> tuple[Figure, list[Axes]]:
+    """One panel for each group of cells."""
+    figure = Figure(figsize=(9.0 if len(groups) > 1 else 5.6, height), layout="constrained")
+    axes = list(figure.subplots(1, len(groups), squeeze=False, sharey=sharey).flat)
+    for ax, group in zip(axes, groups, strict=True):
+        plural = "s" if cells[group] > 1 else ""
+        ax.set_title(f"{group} symmetry, {cells[group]} cell{plural}")
+    return figure, axes
+
+
 def _panels(tables: Sequence[Table], ylabel: str) -> tuple[Figure, list[Axes]]:
     columns = min(COLUMNS, len(tables))
     rows = -(-len(tables) // columns)
@@ -264,21 +443,19 @@ def _title(table: Table, tables: Sequence[Table]) -> str:
     return _ascii(", ".join(parts), 60)
 
 
-def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch]) -> None:
+def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int = 7) -> None:
     if handles:
         figure.legend(
             list(handles.values()),
             list(handles),
             loc="outside lower center",
-            ncols=min(len(handles), 6),
+            ncols=min(len(handles), columns),
             frameon=False,
         )
 
 
-def _style(row: Row) -> Style:
-    if row.agent in STYLES:
-        return STYLES[row.agent]
-    return OTHERS[sum(map(ord, row.agent)) % len(OTHERS)]
+def _style(agent: str) -> Style:
+    return STYLES.get(agent) or OTHERS[sum(map(ord, agent)) % len(OTHERS)]
 
 
 def _common(runs: Sequence[Run]) -> tuple[list[int], np.ndarray]:

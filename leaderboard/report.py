@@ -11,26 +11,36 @@ import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from leaderboard.defects import Audit, read_audit
 from leaderboard.errors import RecordError
 from leaderboard.figures import render_figures, to_svg
+from leaderboard.findings import analyse
+from leaderboard.page import render_page
 from leaderboard.summary import Run, load_runs, summarize
-from leaderboard.tables import relative_link, render_csv, render_page
+from leaderboard.tables import render_csv
+from leaderboard.text import relative_link
 from leaderboard.verification import Verification, differences
 
 DEFAULT_OUT = Path(__file__).resolve().parent
 DEFAULT_RECORDS = DEFAULT_OUT / "results"
-FIGURE_NAME = re.compile(r"(success|q)-[a-z0-9-]+-[0-9a-f]{6}\.svg")
+FIGURE_NAME = re.compile(r"(map|profiles|improvement|(success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
 
 
-def generate(records: Sequence[Path] = (DEFAULT_RECORDS,), out: Path = DEFAULT_OUT) -> list[Path]:
+def generate(
+    records: Sequence[Path] = (DEFAULT_RECORDS,),
+    out: Path = DEFAULT_OUT,
+    audit: Path | None = None,
+) -> list[Path]:
     """Write LEADERBOARD.md, leaderboard.csv and figures/ into `out`; returns the files written.
+
+    `audit` is the summary of an audit, the committed one by default (`read_audit`).
 
     Everything is rendered, then everything is written under temporary names, before the first file
     is replaced: bad records, a full disk or a read-only folder leave `out` as it was. Figures of an
     earlier call that no longer belong to a table are removed. Raises RecordError.
     """
     out = _folder(out)
-    files = render(load_runs(records), out)
+    files = render(load_runs(records), out, read_audit(audit))
     _replace_together(
         {out / name: data for name, data in files.items()},
         [out / name for name in _stale(out, files)],
@@ -38,34 +48,39 @@ def generate(records: Sequence[Path] = (DEFAULT_RECORDS,), out: Path = DEFAULT_O
     return [out / name for name in files]
 
 
-def verify(records: Sequence[Path] = (DEFAULT_RECORDS,), out: Path = DEFAULT_OUT) -> Verification:
+def verify(
+    records: Sequence[Path] = (DEFAULT_RECORDS,),
+    out: Path = DEFAULT_OUT,
+    audit: Path | None = None,
+) -> Verification:
     """Compare the files in `out` with what `generate` would write; changes nothing.
 
-    Raises RecordError.
+    Arguments as of `generate`. Raises RecordError.
     """
     out = _folder(out)
     runs = load_runs(records)
-    files = render(runs, out)
+    files = render(runs, out, read_audit(audit))
     found = differences(files, _stale(out, files), out)
     return Verification(len(runs), len(files), found)
 
 
-def render(runs: Sequence[Run], out: Path) -> dict[str, bytes]:
+def render(runs: Sequence[Run], out: Path, audit: Audit) -> dict[str, bytes]:
     """Every file of the leaderboard, by its path relative to `out` (with `/`); nothing is written.
 
-    Depends on the records and on where they lie relative to the folder `out`, nothing else.
+    Depends on the records, the audit, and where the records lie relative to `out`, nothing else.
     """
     summary = summarize(runs)
+    findings = analyse(summary, audit)
     files: dict[str, bytes] = {}
-    shown: dict[tuple[str, str], list[tuple[str, str]]] = {}
-    for place, figures in render_figures(summary).items():
-        for text, kind, figure in figures:
-            name = f"figures/{kind}-{slug(*place)}.svg"
-            files[name] = to_svg(figure)
-            shown.setdefault(place, []).append((text, name))
+    shown: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
+    for drawing in render_figures(summary, findings):
+        stem = "-".join([drawing.kind, *([slug(*drawing.place)] if drawing.place else [])])
+        name = f"figures/{stem}.svg"
+        files[name] = to_svg(drawing.figure)
+        shown.setdefault(drawing.place, {})[drawing.kind] = (drawing.text, name)
     links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
     files["leaderboard.csv"] = render_csv(summary).encode()
-    files["LEADERBOARD.md"] = render_page(summary, shown, links).encode()
+    files["LEADERBOARD.md"] = render_page(summary, findings, shown, links).encode()
     return files
 
 

@@ -6,19 +6,22 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from leaderboard.paths import record_files
-from leaderboard.records import Evaluation, RunRecord, config_hash, read_record
+from leaderboard.records import Evaluation, Provenance, RunRecord, config_hash, read_record
 from leaderboard.statistics import (
+    Array,
     Interval,
+    Sample,
     area_under_curve,
+    area_weights,
     censored_median,
     deepest_dip,
-    final_window_mean,
     paired_differences,
     steps_to_threshold,
     success_interval,
@@ -30,13 +33,18 @@ SYMMETRIC_EMBODIMENT = "floating"
 
 ARM = "arm kinematics"
 
-AGENTS = ("base", "zero", "standard", "standard-matched", "equivariant", "approximate")
-"""The order of the rows; agents that are not listed follow in alphabetical order."""
-
-REFERENCES = ("base", "zero")
+REFERENCES = ("base", "zero", "golden-ticket")
 """Agents that do not learn: they are compared with, never ranked."""
 
+AGENTS = (*REFERENCES, "standard", "standard-matched", "equivariant", "approximate")
+"""The order of the rows; agents that are not listed follow in alphabetical order."""
+
 MIN_SEEDS = 5
+"""Finished runs that a ranking and a verdict need."""
+
+FINAL_WINDOW = 5
+"""The final window is the last fifth of the budget."""
+
 THRESHOLD = 0.8
 """Steps are counted to this share of the best agent's final success."""
 
@@ -68,19 +76,57 @@ class Run:
     def finished(self) -> bool:
         return self.record.status == "finished"
 
+    @property
+    def provenances(self) -> list[Provenance]:
+        """Where the run began and where it was continued."""
+        return [self.record.provenance, *self.record.continued]
+
     @cached_property
     def curve(self) -> dict[int, Evaluation]:
         """Evaluations by env_steps; of two at the same step the later one counts."""
         return {evaluation.env_steps: evaluation for evaluation in self.record.evaluations}
 
+    @property
+    def is_reference(self) -> bool:
+        return self.agent in REFERENCES
+
     @cached_property
     def final_success(self) -> dict[int, float]:
         """success_once of the final evaluation by episode seed (empty before the end)."""
+        return _episodes(self.record.final) if self.record.final else {}
+
+    @cached_property
+    def window(self) -> dict[tuple[int, int], float]:
+        """success_once in the final window by (env_steps, episode seed); empty before the end.
+
+        These are all evaluations in the last fifth of the budget; a reference has its one final
+        evaluation, wherever it stands.
+        """
         final = self.record.final
         if final is None:
             return {}
-        columns = final.episodes
-        return dict(zip(columns.seed, map(float, columns.success_once), strict=True))
+        start = (FINAL_WINDOW - 1) * self.record.cell.env_steps
+        inside = [
+            evaluation
+            for step, evaluation in self.curve.items()
+            if evaluation is final or (not self.is_reference and FINAL_WINDOW * step >= start)
+        ]
+        return {
+            (evaluation.env_steps, seed): success
+            for evaluation in inside
+            for seed, success in _episodes(evaluation).items()
+        }
+
+    @property
+    def success(self) -> float:
+        """Share of successful episodes in the final window; the run must be finished."""
+        return float(np.mean(list(self.window.values())))
+
+    @property
+    def diverged(self) -> bool | None:
+        """Whether Q diverged; None without a critic and while an unfinished run may still do so."""
+        verdict = self.record.diverged
+        return verdict if self.finished or verdict else None
 
     def diagnostics(self, name: str) -> list[float]:
         """All finite values of a diagnostic, in the order of the evaluations."""
@@ -92,6 +138,11 @@ class Run:
         final = self.record.final
         values = [final.diagnostics.get(name) for name in names] if final else []
         return next((value for value in values if value is not None), None)
+
+
+def _episodes(evaluation: Evaluation) -> dict[int, float]:
+    columns = evaluation.episodes
+    return dict(zip(columns.seed, map(float, columns.success_once), strict=True))
 
 
 @dataclass(frozen=True, order=True)
@@ -146,8 +197,9 @@ class Row:
     missing: int = 0
     label: str = ""
     success: Interval | None = None
+    last: Interval | None = None
     difference: Interval | None = None
-    window: float | None = None
+    against_best: Interval | None = None
     area: float | None = None
     threshold_steps: list[int | None] = field(default_factory=list)
     dip: float | None = None
@@ -163,8 +215,15 @@ class Row:
 
     @property
     def episodes(self) -> list[int]:
-        """Final evaluation episodes of each finished run."""
-        return [len(run.final_success) for run in self.finished]
+        """Episodes in the final window of each finished run."""
+        return [len(run.window) for run in self.finished]
+
+    @property
+    def search_steps(self) -> float | None:
+        """Mean environment steps that a reference spent on search; None if it spent none."""
+        if not self.is_reference or not self.finished:
+            return None
+        return float(np.mean([run.record.budget.env_steps for run in self.finished])) or None
 
     @property
     def median_threshold_steps(self) -> float | None:
@@ -193,6 +252,17 @@ class Table:
     key: Key
     rows: list[Row]
     threshold: float | None
+    best_reference: Row | None = None
+
+    @property
+    def learners(self) -> list[Row]:
+        """Rows with finished runs of agents that learn."""
+        return [row for row in self.rows if row.finished and not row.is_reference]
+
+    def row_of(self, agent: str) -> Row | None:
+        """The agent's row with the most finished runs; None if it finished none."""
+        rows = [row for row in self.rows if row.agent == agent and row.finished]
+        return max(rows, key=lambda row: len(row.finished), default=None)
 
     @property
     def runs(self) -> list[Run]:
@@ -296,75 +366,134 @@ def _table(key: Key, groups: Mapping[tuple[str, str], list[Run]], agents: set[st
         twins = sum(other.agent == row.agent for other in rows)
         row.label = row.agent if twins == 1 else f"{row.agent} {row.recipe[:6]}"
 
-    base_runs = [run for row in rows if row.agent == "base" for run in row.finished]
     for row in rows:
-        _fill(row, base_runs, key.env_steps)
-    finals = [row.success.value for row in rows if row.success and not row.is_reference]
-    threshold = THRESHOLD * max(finals) if finals else None
-    if threshold is not None:
-        for row in rows:
-            if not row.is_reference:
-                row.threshold_steps = [
-                    steps_to_threshold(*_points(run), threshold) for run in row.finished
-                ]
+        _fill(row, key.env_steps)
+    table = Table(key, rows, _threshold(rows))
+    base = table.row_of("base")
+    for row in rows:
+        if base and row.agent != "base":
+            _against_base(row, base)
+        if table.threshold is not None and not row.is_reference:
+            row.threshold_steps = [
+                steps_to_threshold(*_points(run), table.threshold) for run in row.finished
+            ]
+    references = [row for row in rows if row.is_reference and row.success]
+    table.best_reference = max(
+        references, key=lambda row: row.success.value if row.success else 0.0, default=None
+    )
+    if table.best_reference:
+        for row in table.learners:
+            row.against_best = compare(row, table.best_reference)
     _rank(rows)
-    return Table(key, rows, threshold)
+    return table
 
 
 def _points(run: Run) -> tuple[list[int], list[float]]:
     return list(run.curve), [evaluation.success_once for evaluation in run.curve.values()]
 
 
-def _fill(row: Row, base_runs: Sequence[Run], budget: int) -> None:
-    """Compute the numbers of a row from its finished runs."""
-    runs = row.finished
-    if not runs:
+def _fill(row: Row, budget: int) -> None:
+    """Compute the numbers of a row that need no other row."""
+    if not row.finished:
         return
-    row.success = success_interval([list(run.final_success.values()) for run in runs])
-    row.window = float(np.mean([final_window_mean(*_points(run), budget) for run in runs]))
-    row.area = float(np.mean([area_under_curve(*_points(run), budget) for run in runs]))
-    if row.agent == "base":
+    row.success = success_interval([list(run.window.values()) for run in row.finished])
+    row.last = success_interval([list(run.final_success.values()) for run in row.finished])
+    if row.search_steps is None:
+        areas = [area_under_curve(*_points(run), budget) for run in row.finished]
+        row.area = float(np.mean(areas))
+
+
+def _threshold(rows: Sequence[Row]) -> float | None:
+    finals = [row.success.value for row in rows if row.success and not row.is_reference]
+    return THRESHOLD * max(finals) if finals else None
+
+
+def _against_base(row: Row, base: Row) -> None:
+    row.difference = compare(row, base)
+    if row.is_reference:
         return
-    differences, dips = [], []
-    for run in runs:
-        base = base_success(run, base_runs)
-        difference = paired_differences(run.final_success, base)
-        if difference.size:
-            differences.append(difference)
-            dips.append(deepest_dip(_points(run)[1], float(np.mean(list(base.values())))))
-    if differences:
-        row.difference = two_stage_bootstrap(differences)
-        row.dip = None if row.is_reference else min(dips)
+    dips = []
+    for run in row.finished:
+        reference = reference_success(run, base.finished)
+        below = [
+            differences.mean()
+            for evaluation in run.curve.values()
+            if (differences := paired_differences(_episodes(evaluation), reference)).size
+        ]
+        if below:
+            dips.append(deepest_dip(below))
+    row.dip = min(dips, default=None)
 
 
-def base_success(run: Run, base_runs: Sequence[Run]) -> dict[int, float]:
-    """Success of the frozen base policy that `run` steers, by episode seed; empty if unknown.
+def reference_success(run: Run, references: Sequence[Run]) -> dict[int, float]:
+    """Success of a reference on the base policy that `run` steers, by episode seed.
 
-    Taken from the base run with the same policy (content hash) and the same run seed, else from the
-    mean of all base runs with that policy.
+    Taken from the reference's run with the same policy (content hash) and the same run seed, else
+    from the mean of all its runs with that policy; empty if there is none.
     """
     same = [
-        base
-        for base in base_runs
-        if base.record.base_policy.content_hash == run.record.base_policy.content_hash
+        reference
+        for reference in references
+        if reference.record.base_policy.content_hash == run.record.base_policy.content_hash
     ]
-    same = [base for base in same if base.seed == run.seed] or same
+    same = [reference for reference in same if reference.seed == run.seed] or same
     values: dict[int, list[float]] = defaultdict(list)
-    for base in same:
-        for seed, success in base.final_success.items():
+    for reference in same:
+        for seed, success in reference.final_success.items():
             values[seed].append(success)
     return {seed: float(np.mean(successes)) for seed, successes in values.items()}
 
 
+def success_pairs(first: Row, second: Row) -> dict[int, Sample]:
+    """Differences of final-window success, first minus second, by run seed.
+
+    Two learners are paired by run seed, then by (env_steps, episode seed); with a reference, which
+    is evaluated once, the episode seed alone pairs (`reference_success`).
+    """
+    if first.is_reference and not second.is_reference:
+        reverse = success_pairs(second, first)
+        return {
+            seed: Sample(tuple(-block for block in sample.blocks), sample.weights)
+            for seed, sample in reverse.items()
+        }
+    pairs = {}
+    others = {run.seed: run for run in second.finished}
+    for run in first.finished:
+        if second.is_reference:
+            reference = reference_success(run, second.finished)
+            other = {key: reference[key[1]] for key in run.window if key[1] in reference}
+        else:
+            other = others[run.seed].window if run.seed in others else {}
+        differences = paired_differences(run.window, other)
+        if differences.size:
+            pairs[run.seed] = Sample.of(differences)
+    return pairs
+
+
+def area_pairs(first: Row, second: Row, budget: int) -> dict[int, Sample]:
+    """Differences of the area under the curve, first minus second, by run seed.
+
+    Over the evaluations (env_steps) that both runs have, on the episodes that both have there.
+    """
+    pairs = {}
+    others = {run.seed: run for run in second.finished}
+    for run in first.finished:
+        other = others[run.seed].curve if run.seed in others else {}
+        blocks: dict[int, Array] = {}
+        for step, evaluation in run.curve.items():
+            if step in other:
+                found = paired_differences(_episodes(evaluation), _episodes(other[step]))
+                blocks |= {step: found} if found.size else {}
+        if blocks:
+            weights = area_weights(list(blocks), budget)
+            pairs[run.seed] = Sample(tuple(blocks.values()), weights)
+    return pairs
+
+
 def compare(first: Row, second: Row) -> Interval | None:
-    """Difference of two rows, paired by run seed and episode seed; None without common ones."""
-    others = {run.seed: run.final_success for run in second.finished}
-    differences = [
-        difference
-        for run in first.finished
-        if (difference := paired_differences(run.final_success, others.get(run.seed, {}))).size
-    ]
-    return two_stage_bootstrap(differences) if differences else None
+    """Paired difference of final-window success; None without common episodes."""
+    pairs = success_pairs(first, second)
+    return two_stage_bootstrap(list(pairs.values())) if pairs else None
 
 
 def _rank(rows: Sequence[Row]) -> None:
@@ -373,5 +502,9 @@ def _rank(rows: Sequence[Row]) -> None:
     if len(candidates) < 2:
         return
     for row in candidates:
-        comparisons = [compare(other, row) for other in candidates if other is not row]
-        row.rank = 1 + sum(c is not None and c.sign > 0 for c in comparisons)
+        row.rank = 1
+    for first, second in combinations(candidates, 2):
+        found = compare(first, second)
+        if found and found.sign:
+            worse = second if found.sign > 0 else first
+            worse.rank = (worse.rank or 1) + 1
