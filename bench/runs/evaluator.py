@@ -48,6 +48,9 @@ class Evaluator:
         learns: whether the agent has a critic to diagnose.
         variant: how the world is broken in these episodes.
         workers: processes that share the environments.
+
+    Attributes:
+        played: the episodes of the deterministic actor in the last measurement, if there was one.
     """
 
     def __init__(
@@ -60,6 +63,7 @@ class Evaluator:
         workers: int = 1,
     ):
         self.config, self.base, self.feasible = config, base, feasible
+        self.played: Rollout | None = None
         self.extra = config.evaluation.diagnostic_episodes if learns else 0
         self.env = make_env(
             config, base, config.evaluation.episodes + self.extra, variant, True, workers
@@ -77,12 +81,13 @@ class Evaluator:
         state = agent.generator.get_state()
         try:
             if not agent.learns:
-                played = rollout(self.env, lambda obs, rows: agent.act(obs), seeds)
-                return played.episodes, agent.scalars()
+                self.played = rollout(self.env, lambda obs, rows: agent.act(obs), seeds)
+                return self.played.episodes, agent.scalars()
             agent.generator.manual_seed(DIAGNOSTIC_SEED + self.config.seed)
             greedy, on_policy = self._learner_episodes(agent, seeds)
             generator = torch.Generator(agent.device).manual_seed(self.config.seed)
             diagnostics = measure(agent, self.base, greedy, on_policy, self.feasible, generator)
+            self.played = greedy
             return greedy.episodes, dict(diagnostics)
         finally:
             # An evaluation draws noise of its own, so that training goes on as if without it.

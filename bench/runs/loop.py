@@ -28,7 +28,9 @@ from bench.runs.folder import (
     load_checkpoint,
     save_checkpoint,
 )
+from bench.runs.pictures import draw_paths, film
 from bench.runs.tensorboard import RunLog
+from bench.sim.headless import rendering_works
 from bench.steering.evaluation import HELD_OUT_SEED
 from bench.steering.latent_env import Clock
 from bench.steering.search import search_ticket
@@ -120,7 +122,8 @@ class Loop:
         earlier = self._restore(checkpoint) if checkpoint else 0.0
         self.start = time.perf_counter() - earlier
         write_record(self.record, folder / RECORD)
-        self.log = RunLog(folder, resolved, purge_step=self.env_steps + 1 if checkpoint else None)
+        # Without a checkpoint an earlier session may have left events all the same.
+        self.log = RunLog(folder, self.record, self.env_steps + 1 if checkpoint else 0)
         self.heartbeat = Heartbeat(folder, config.env_steps, self.env_steps)
         self.evaluator = Evaluator(
             config,
@@ -143,9 +146,8 @@ class Loop:
             self._checkpoint(with_replay=False)
         self.evaluator.close()
         self._close("finished")
-        self.log.finish(
-            {name.removeprefix("eval/"): value for name, value in self.last_scalars.items()}
-        )
+        self._draw()
+        self.log.finish()
 
     def stop(self, error: BaseException) -> None:
         """Close the record of a run that did not finish; its last checkpoint stays."""
@@ -289,6 +291,8 @@ class Loop:
     def _checkpoint(self, with_replay: bool) -> None:
         """Everything that the rest of the run depends on."""
         keep = self.replay if with_replay else None
+        # A continued run does not write again what lies before its checkpoint.
+        self.log.flush()
         save_checkpoint(
             self.folder,
             {
@@ -376,6 +380,21 @@ class Loop:
             base_policy=describe_base(self.base),
             feasible_q=FeasibleQ(low=feasible[0], high=feasible[1]) if self.agent.learns else None,
         )
+
+    def _draw(self) -> None:
+        """Pictures of the last evaluation; the record is closed, so they can harm no number."""
+        config, played = self.config, self.evaluator.played
+        if played is None:
+            return
+        try:
+            paths = draw_paths(played, self.base.obs_layout, _title(config))
+            self.log.picture("eval/paths", paths, self.env_steps)
+            if rendering_works():
+                frames = film(config, self.base, self.agent)
+                self.log.picture("eval/frames", frames, self.env_steps)
+        except Exception as error:
+            if self.progress:
+                tqdm.write(f"no picture of the evaluation: {type(error).__name__}: {error}")
 
     def _close(self, status: Literal["finished", "failed", "interrupted"]) -> None:
         self.record.ended = datetime.now(UTC)

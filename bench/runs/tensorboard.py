@@ -1,48 +1,81 @@
-"""TensorBoard as a view of the record: the same numbers, nothing that the record lacks."""
+"""TensorBoard as a view of the record: the same numbers, nothing that the record contradicts."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from torch.utils.tensorboard import SummaryWriter
 
-# The tags of a Multiline chart are regular expressions.
+from leaderboard.records import Provenance, RunRecord
+
+# The tags of a Multiline chart are regular expressions; a Margin chart takes value, low, high.
 LAYOUT = {
     "SymSteer": {
-        "Success on held-out episodes": [
-            "Multiline",
-            ["^eval/success_once$", "^eval/success_at_end$"],
-        ],
+        "Success on held-out episodes": ["Multiline", ["^eval/success_once$"]],
         "Q against its feasible band": ["Margin", ["diag/q_mean", "diag/q_low", "diag/q_high"]],
+        "Share of Q outside its band": ["Multiline", ["^diag/q_violation$"]],
         "Q bias against fresh returns": ["Multiline", ["^diag/q_bias$"]],
         "Equivariance errors": ["Multiline", ["^diag/equivariance_(decode|actor|critic)$"]],
-        "Temperature": ["Multiline", ["^diag/alpha$"]],
-    }
+        "Temperature alpha": ["Multiline", ["^diag/alpha$"]],
+    },
+    "Training": {
+        "Success of training episodes": ["Multiline", ["^train/success_once$"]],
+        "Loss of the critics": ["Multiline", ["^losses/critic$"]],
+        "Loss of the actor": ["Multiline", ["^losses/actor$"]],
+        "Control steps per second": ["Multiline", ["^time/env_steps_per_second$"]],
+    },
 }
+
+IDENTITY = frozenset({"task", "embodiment", "variant", "agent", "seed"})
+"""Settings that the HParams tab shows first; the others are there to be ticked."""
+
+FINAL_METRICS = (
+    "eval/success_once",
+    "eval/success_at_end",
+    "eval/return",
+    "eval/episode_len",
+    "diag/q_mean",
+    "diag/q_bias",
+    "diag/q_violation",
+    "diag/equivariance_actor",
+    "diag/equivariance_critic",
+    "diag/alpha",
+    "time/env_steps_per_second",
+)
+"""Columns of the HParams tab: the last value of each of these scalars."""
 
 
 class RunLog:
-    """Scalars of one run, against control steps.
+    """What TensorBoard shows of one run: scalars against control steps, settings, pictures.
 
-    Namespaces: ``eval/`` held-out episodes, ``train/`` training episodes, ``losses/``, ``time/``
-    seconds and rates, ``diag/`` Q and equivariance diagnostics. docs/metrics.md has the formulas.
+    Namespaces: ``eval/`` held-out episodes, ``train/`` training episodes and batches, ``losses/``,
+    ``time/`` seconds and rates, ``diag/`` Q and equivariance diagnostics. docs/metrics.md has the
+    formulas.
 
     Args:
         folder: the run's folder; the events stand beside its record.
-        config: the resolved configuration.
-        purge_step: for a run that continues: TensorBoard drops what the earlier session wrote at
-            this step and later, since the continued run writes it again.
+        record: the run's record, with everything that is known before the first step.
+        purge_step: TensorBoard drops what earlier sessions of the run wrote at this step and
+            later, since the run writes it again.
     """
 
-    def __init__(self, folder: Path, config: Mapping[str, Any], purge_step: int | None = None):
+    def __init__(self, folder: Path, record: RunRecord, purge_step: int = 0):
         self.writer = SummaryWriter(str(folder), purge_step=purge_step)
         self.writer.add_custom_scalars(LAYOUT)
-        text = json.dumps(config, indent=2).replace("\n", "  \n")
-        self.writer.add_text("config", f"```\n{text}\n```")
-        self._config = config
+        # A continued run may stand on another commit: its text is added to the first session's.
+        self.writer.add_text("config", config_text(record), purge_step)
+        settings = flat(record.config)
+        self._hparams(metadata.EXPERIMENT_TAG, experiment=_experiment(settings))
+        self._hparams(
+            metadata.SESSION_START_INFO_TAG, session_start_info=_session(record, settings)
+        )
+        self.flush()
 
     def scalars(self, namespace: str, values: Mapping[str, float | None], step: int) -> None:
         """Write every value that was measured."""
@@ -50,15 +83,129 @@ class RunLog:
             if value is not None:
                 self.writer.add_scalar(f"{namespace}/{name}", value, step)
 
-    def finish(self, metrics: Mapping[str, float]) -> None:
-        """Write the table of hyperparameters with the final metrics, and close."""
-        hparams = {k: v for k, v in self._config.items() if isinstance(v, bool | int | float | str)}
-        # run_name="." keeps the table in this run's own folder.
-        self.writer.add_hparams(
-            hparams, {f"final/{k}": v for k, v in metrics.items()}, run_name="."
+    def picture(self, tag: str, picture: np.ndarray, step: int) -> None:
+        """Write a picture ``[height, width, 3]`` uint8."""
+        self.writer.add_image(tag, picture, step, dataformats="HWC")
+
+    def finish(self) -> None:
+        """Mark the run as finished in the HParams tab, and close."""
+        end = plugin_data_pb2.SessionEndInfo(
+            status=api_pb2.STATUS_SUCCESS, end_time_secs=time.time()
         )
+        self._hparams(metadata.SESSION_END_INFO_TAG, session_end_info=end)
         self.close()
 
+    def flush(self) -> None:
+        """Bring to disk what was written so far."""
+        self.writer.flush()
+
     def close(self) -> None:
-        """Flush to disk."""
+        """Flush to disk; nothing can be written any more."""
         self.writer.close()
+
+    def _hparams(self, tag: str, **content: Any) -> None:
+        data = plugin_data_pb2.HParamsPluginData(**content)
+        summary = Summary()
+        summary.value.add(
+            tag=tag, metadata=metadata.create_summary_metadata(data), tensor=metadata.NULL_TENSOR
+        )
+        # SummaryWriter's own add_hparams opens a second event file and renames the metrics.
+        assert self.writer.file_writer is not None
+        self.writer.file_writer.add_summary(summary)
+
+
+def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:
+    """A nested configuration with dotted names, e.g. ``sac.lr``; None reads "none"."""
+    result: dict[str, bool | int | float | str] = {}
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            result.update(flat(value, f"{prefix}{name}."))
+        elif isinstance(value, bool | int | float | str):
+            result[prefix + name] = value
+        else:
+            result[prefix + name] = "none" if value is None else str(value)
+    return result
+
+
+def config_text(record: RunRecord) -> str:
+    """Two markdown tables: where a run stands, and its whole configuration."""
+    base = record.base_policy
+    facts = {
+        "run": record.run_id,
+        "started": record.started.isoformat(),
+        "commit": _commit(record.provenance),
+        "continued": "; ".join(map(_commit, record.continued)) or None,
+        "device": f"{record.provenance.device}, {record.provenance.platform}",
+        "packages": ", ".join(f"{k} {v}" for k, v in record.provenance.packages.items()),
+        "parameters": f"{record.parameters.actor:,} in the actor, "
+        f"{record.parameters.critic:,} in all critics",
+        "base policy": f"{base.name}, group {base.group}, content {base.content_hash[:12]}",
+        "its success": f"{_share(base.base_success)} of {base.episodes} episodes with random noise",
+        "its steerability": f"{_share(base.solvable)} of the initial states are solved by one of "
+        f"{base.draws} noise draws; the noise moves the normalised actions by "
+        f"{base.action_std:.2f}"
+        if base.action_std is not None
+        else None,
+        "its warning": base.warning,
+        "feasible Q": f"{record.feasible_q.low:g} to {record.feasible_q.high:g}"
+        if record.feasible_q
+        else None,
+    }
+    return "\n".join(
+        [
+            *_table("this run", "", {k: v for k, v in facts.items() if v is not None}),
+            "",
+            *_table("setting", "value", flat(record.config)),
+        ]
+    )
+
+
+def _commit(provenance: Provenance) -> str:
+    name = provenance.commit or "unknown"
+    return f"{name} with uncommitted changes" if provenance.dirty else name
+
+
+def _table(left: str, right: str, rows: Mapping[str, Any]) -> Iterator[str]:
+    yield f"| {left} | {right} |"
+    yield "| :-- | :-- |"
+    for name, value in rows.items():
+        text = str(value).replace("|", "\\|").replace("\n", " ")
+        yield f"| {name} | `{text}` |"
+
+
+def _share(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.0%}"
+
+
+def _experiment(settings: Mapping[str, Any]) -> api_pb2.Experiment:
+    """Columns of the HParams tab. All runs have the same: TensorBoard reads any one run's."""
+    types = {
+        bool: api_pb2.DATA_TYPE_BOOL,
+        int: api_pb2.DATA_TYPE_FLOAT64,
+        float: api_pb2.DATA_TYPE_FLOAT64,
+        str: api_pb2.DATA_TYPE_STRING,
+    }
+    return api_pb2.Experiment(
+        hparam_infos=[
+            api_pb2.HParamInfo(name=name, type=types[type(value)], differs=name in IDENTITY)
+            for name, value in settings.items()
+        ],
+        metric_infos=[
+            api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag)) for tag in FINAL_METRICS
+        ],
+    )
+
+
+def _session(record: RunRecord, settings: Mapping[str, Any]) -> plugin_data_pb2.SessionStartInfo:
+    # The table's first column, where a whole run's name would be cut to what all have in common.
+    session = plugin_data_pb2.SessionStartInfo(
+        group_name=record.run_id.rpartition("-")[2], start_time_secs=record.started.timestamp()
+    )
+    for name, value in settings.items():
+        if isinstance(value, bool):
+            session.hparams[name].bool_value = value
+        elif isinstance(value, str):
+            session.hparams[name].string_value = value
+        else:
+            session.hparams[name].number_value = value
+    return session

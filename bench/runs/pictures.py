@@ -1,0 +1,197 @@
+"""What the last evaluation looked like: paths from above, and frames of one episode.
+
+The paths are drawn from the observations that the evaluation went through anyway. The frames need
+a Vulkan driver and simulate one episode anew, in a scene of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from bench.runs.config import RunConfig
+from bench.steering.evaluation import Rollout, held_out_seeds
+from bench.tasks import make
+from bench.tasks.picture import CAMERA, SIZE
+from bench.variants import evaluated
+from policies.base import ChunkPolicy
+from policies.geometry import Layout
+
+EPISODES = 32
+"""Episodes whose paths are drawn; more would hide one another."""
+
+SECTORS = 12
+"""Directions that successes are counted in."""
+
+FRAMES = 6
+"""Frames of a strip."""
+
+# Told apart with colour blindness, after Okabe and Ito.
+SUCCESS, FAILURE, TOOL = "#0072B2", "#D55E00", "#999999"
+
+
+def positions(layout: Layout) -> list[str]:
+    """Fields that are horizontal positions in the workspace: the tool's first, the goal's last."""
+    return [
+        field.name
+        for field in layout.fields
+        if field.name.endswith("_xy") and "_to_" not in field.name
+    ]
+
+
+def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
+    """Where tool and objects went, seen from above, and in which directions there was success.
+
+    Left: the first 32 episodes up to their first success. Middle: the same, each turned about the
+    workspace centre so that the way from the last but one named position to the last (object to
+    goal, or tool to object where there is no goal) points to the right; what a symmetric agent
+    does in a symmetric world does not depend on that turn. Right: episodes and successes by the
+    direction of that way.
+
+    Args:
+        rollout: episodes of the deterministic actor.
+        layout: of the observation; what it says is drawn, also where a variant distorts it.
+        title: what the run is called.
+
+    Returns:
+        A picture ``[height, width, 3]`` uint8.
+    """
+    names = positions(layout)
+    # Decisions begin with an observation; the last one also ends with one.
+    seen = torch.cat([rollout.obs, rollout.next_obs[-1:]]).double().cpu()
+    paths = np.stack([seen[..., layout.slice(name)].numpy() for name in names])
+    paths *= 100  # [names, T + 1, N, 2] in cm
+    lengths = rollout.running.sum(dim=0).cpu().numpy() + 1
+    success = rollout.episodes["success_once"].cpu().numpy().astype(bool)
+    way = paths[-1, 0] - paths[-2, 0]
+    direction = np.arctan2(way[:, 1], way[:, 0])
+
+    with mpl.rc_context({"font.family": "DejaVu Sans", "font.size": 9}):
+        figure = Figure(figsize=(13, 4.9), dpi=110, layout="constrained")
+        drawn = min(EPISODES, len(success))
+        figure.suptitle(
+            f"{title}: {success.sum()} of {len(success)} held-out episodes succeed; "
+            f"paths of the first {drawn}, each up to its first success",
+            fontsize=10,
+        )
+        above, turned = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
+        rose = figure.add_subplot(1, 3, 3, projection="polar")
+        source, target = (name.removesuffix("_xy").replace("_", " ") for name in names[-2:])
+        kind = f"{source} to {target}"
+        _draw_paths(above, paths[:, :, :drawn], lengths, success)
+        above.set_title("from above")
+        _draw_paths(turned, _turn(paths, -direction)[:, :, :drawn], lengths, success)
+        turned.set_title(f"turned: {kind} points right")
+        _draw_rose(rose, direction, success)
+        rose.set_title(f"number of episodes by direction, {kind}")
+        turned.legend(
+            handles=[
+                Line2D([], [], color=SUCCESS, lw=1.6, label="object, success"),
+                Line2D([], [], color=FAILURE, lw=1.6, label="object, no success"),
+                Line2D([], [], color=TOOL, lw=0.8, label="tool"),
+                Line2D([], [], color=TOOL, lw=0, marker=".", label="start"),
+                Line2D([], [], color=TOOL, lw=0, marker="o", mfc="none", label=target),
+            ],
+            loc="upper left",
+            fontsize=7.5,
+        )
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _turn(paths: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Turn the paths ``[..., N, 2]`` of episode i by ``angle[i]``."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = paths[..., 0], paths[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def _draw_paths(axes: Axes, paths: np.ndarray, lengths: np.ndarray, success: np.ndarray) -> None:
+    """Draw the episodes ``paths [names, T + 1, N, 2]``, as long as they are."""
+    for i in range(paths.shape[2]):
+        color = SUCCESS if success[i] else FAILURE
+        tool, *objects = paths[:, : lengths[i], i]
+        axes.plot(*tool.T, color=TOOL, lw=0.6, alpha=0.7, zorder=1)
+        for path in objects:
+            axes.plot(*path.T, color=color, lw=1.4, alpha=0.8, zorder=2)
+            axes.plot(*path[0], ".", color=color, ms=4, zorder=3)
+        axes.plot(*objects[-1][-1], "o", color=color, mfc="none", ms=7, mew=0.8, zorder=3)
+    # A square about the workspace centre: turning is then seen as turning.
+    reach = 1.05 * np.abs(axes.dataLim.get_points()).max()
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    axes.set(xlabel="x (cm)", ylabel="y (cm)")
+    axes.grid(color="#E4E4E4", lw=0.6)
+    axes.set_axisbelow(True)
+
+
+def _draw_rose(axes: Axes, direction: np.ndarray, success: np.ndarray) -> None:
+    """Count episodes and successes in sectors of the directions."""
+    width = 2 * math.pi / SECTORS
+    sector = np.round(direction / width).astype(int) % SECTORS
+    counts = np.bincount(sector, minlength=SECTORS)
+    good = np.bincount(sector[success], minlength=SECTORS)
+    angles = width * np.arange(SECTORS)
+    axes.bar(angles, good, width=0.9 * width, color=SUCCESS)
+    axes.bar(angles, counts - good, bottom=good, width=0.9 * width, color=FAILURE)
+    axes.tick_params(labelsize=7.5, colors="#555555")
+    axes.set_yticks(range(0, counts.max() + 1, max(1, math.ceil(counts.max() / 5))))
+
+
+def film(config: RunConfig, policy: ChunkPolicy, agent: Any) -> np.ndarray:
+    """Frames of the first held-out episode, from its start to its first success or its time limit.
+
+    Args:
+        config: says which world, as it is in evaluations.
+        policy: decodes the noise.
+        agent: its deterministic actor plays.
+
+    Returns:
+        Six frames side by side, evenly spaced in time, ``[height, width, 3]`` uint8.
+
+    Raises:
+        UserError: if there is no Vulkan driver.
+    """
+    env = make(
+        config.task,
+        num_envs=1,
+        embodiment=config.embodiment,
+        variant=evaluated(config.variant),
+        sim=config.sim,
+        render=True,
+        render_mode="rgb_array",
+        human_render_camera_configs=CAMERA,
+    )
+    # Not through the latent-noise environment, which starts a new episode before the last frame.
+    try:
+        obs, _ = env.reset(seed=held_out_seeds(1))
+        frames = [_frame(env)]
+        for _ in range(math.ceil(env.max_episode_steps / policy.execute)):
+            obs = obs.to(config.device)
+            actions = policy.decode(obs, agent.act(obs, deterministic=True)).to(env.device)
+            done = False
+            for t in range(policy.execute):
+                obs, _, _, truncated, info = env.step(actions[:, t])
+                done = bool(info["success"] | truncated)
+                if done:
+                    break
+            frames.append(_frame(env))
+            if done:
+                break
+    finally:
+        env.close()
+    chosen = np.linspace(0, len(frames) - 1, FRAMES).round().astype(int)
+    return np.concatenate([frames[i] for i in chosen], axis=1)
+
+
+def _frame(env: Any) -> np.ndarray:
+    # The upper fifth shows no more than the horizon.
+    return env.render()[0].cpu().numpy()[SIZE // 5 :, :, :3]

@@ -1,0 +1,101 @@
+"""Pictures of an evaluation: symmetric where the world is, true to the episodes."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bench.runs.base_policy import prepare_base
+from bench.runs.loop import new_agent
+from bench.runs.pictures import FAILURE, FRAMES, SUCCESS, draw_paths, film, positions
+from bench.sim.headless import rendering_works
+from bench.steering.evaluation import Rollout
+from bench.tasks import task_class, task_names
+from tests.bench.tiny_run import tiny_config
+
+LAYOUT = task_class("PushCube-v1").observation_layout
+
+
+def walks(count=6, decisions=5):
+    """Episodes of random walks, every second one a success after its third decision."""
+    generator = torch.Generator().manual_seed(0)
+    path = torch.randn(decisions + 1, count, LAYOUT.dim, generator=generator).cumsum(0) / 20
+    success = torch.arange(count) % 2 == 0
+    running = torch.ones(decisions, count, dtype=torch.bool)
+    running[3:, success] = False
+    return Rollout(
+        episodes={"success_once": success},
+        obs=path[:-1],
+        noise=torch.zeros(decisions, count, 8, 7),
+        reward=-running.float(),
+        next_obs=path[1:],
+        running=running,
+        terminal=torch.zeros_like(running),
+    )
+
+
+def turned(rollout, angle):
+    obs, next_obs = (LAYOUT.transform(x, angle) for x in (rollout.obs, rollout.next_obs))
+    return Rollout(**{**vars(rollout), "obs": obs, "next_obs": next_obs})
+
+
+def panels(picture):
+    """The three panels below the title."""
+    return np.array_split(picture[40:].astype(int), 3, axis=1)
+
+
+def color(picture, name):
+    wanted = [int(name[i : i + 2], 16) for i in (1, 3, 5)]
+    return (np.abs(picture.astype(int) - wanted).max(axis=-1) < 12).sum()
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_every_task_names_a_tool_and_something_to_move(task):
+    names = positions(task_class(task).observation_layout)
+    assert names[0] == "tcp_xy"
+    assert len(names) >= 2
+
+
+def test_turning_the_world_turns_the_view_from_above_alone():
+    episodes = walks()
+    above, straight, _ = panels(draw_paths(episodes, LAYOUT, "walks"))
+    other_above, other_straight, _ = panels(
+        draw_paths(turned(episodes, math.pi / 2), LAYOUT, "walks")
+    )
+    assert np.abs(above - other_above).mean() > 1
+    # Up to the rounding of the transformation, which shifts a few pixels of thin lines.
+    assert np.abs(straight - other_straight).mean() < 0.05
+
+
+def test_colours_tell_success():
+    episodes = walks()
+    rose = panels(draw_paths(episodes, LAYOUT, "walks"))[2]
+    assert color(rose, SUCCESS) > 500
+    assert color(rose, FAILURE) > 500
+    episodes.episodes["success_once"][:] = True
+    rose = panels(draw_paths(episodes, LAYOUT, "walks"))[2]
+    assert color(rose, SUCCESS) > 1000
+    assert color(rose, FAILURE) == 0
+
+
+def test_what_follows_the_first_success_is_not_drawn():
+    episodes = walks()
+    before = draw_paths(episodes, LAYOUT, "walks")
+    tail = episodes.episodes["success_once"]
+    episodes.obs[4:, tail] += 1
+    episodes.next_obs[3:, tail] += 1
+    assert np.array_equal(draw_paths(episodes, LAYOUT, "walks"), before)
+    episodes.next_obs[4:, ~tail] += 1
+    assert not np.array_equal(draw_paths(episodes, LAYOUT, "walks"), before)
+
+
+@pytest.mark.skipif(not rendering_works(), reason="needs a Vulkan driver")
+def test_frames_of_an_episode_show_it_moving(finished):
+    config, folder = finished
+    base = prepare_base(tiny_config(), folder.parent, progress=False)
+    strip = film(config, base, new_agent("base", config, base))
+    frames = np.split(strip.astype(int), FRAMES, axis=1)
+    assert strip.dtype == np.uint8
+    assert all(np.abs(a - b).max() > 50 for a, b in itertools.pairwise(frames))

@@ -1,0 +1,221 @@
+"""What TensorBoard shows of a run, read back with TensorBoard's own loader."""
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar import layout_pb2
+from tensorboard.plugins.hparams import api_pb2, metadata
+
+from agents import AGENTS
+from bench.runs import loop
+from bench.runs.loop import Loop
+from bench.runs.run import execute, resume
+from bench.runs.tensorboard import FINAL_METRICS, IDENTITY
+from bench.sim.headless import rendering_works
+from leaderboard.records import read_record
+from tests.bench.tiny_run import tiny_config
+
+DOCUMENTATION = Path(__file__).parents[3] / "docs" / "metrics.md"
+NAMESPACES = {"eval", "train", "losses", "time", "diag"}
+
+
+def load(folder):
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
+    events.Reload()
+    return events
+
+
+def scalar_tags(folder):
+    return set(load(folder).Tags()["scalars"])
+
+
+def documented_tags():
+    """Names in the first column of the tables under headings that name a namespace."""
+    tags, namespaces = set(), []
+    for line in DOCUMENTATION.read_text().splitlines():
+        if line.startswith("#"):
+            namespaces = re.findall(r"`(\w+)/`", line.partition("TensorBoard")[2])
+        elif line.startswith("| `"):
+            names = re.findall(r"`(\w+)`", line.split("|")[1])
+            tags |= {f"{namespace}/{name}" for namespace in namespaces for name in names}
+    return tags
+
+
+@pytest.fixture(scope="module")
+def runs(finished):
+    """A finished run of each agent that learns, of a reference and of the search."""
+    _, folder = finished
+    names = [name for name, agent in AGENTS.items() if agent.learns] + ["base", "golden-ticket"]
+    return {
+        name: folder
+        if name == "equivariant"
+        else execute(tiny_config(agent=name), folder.parent, progress=False)
+        for name in names
+    }
+
+
+@pytest.fixture(scope="module")
+def continued(finished):
+    """A run that was stopped after an evaluation that no checkpoint knows of, and continued."""
+    _, folder = finished
+    evaluate = Loop.evaluate
+
+    def evaluate_and_stop(self, final=False):
+        evaluate(self, final)
+        if self.env_steps >= 320:
+            raise RuntimeError("stopped")
+
+    config = tiny_config(env_steps=480, checkpoint_every=60)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Loop, "evaluate", evaluate_and_stop)
+        with pytest.raises(RuntimeError, match="stopped"):
+            execute(config, folder.parent, progress=False)
+    [stopped] = (f for f in folder.parent.iterdir() if is_failed(f))
+    written = load(stopped).Scalars("eval/success_once")[-1].step
+    assert resume(stopped, progress=False) == stopped
+    return stopped, written
+
+
+def is_failed(folder):
+    return (folder / "record.json").is_file() and read_record(
+        folder / "record.json"
+    ).status == "failed"
+
+
+def test_every_tag_is_documented_and_every_documented_tag_written(runs):
+    written = set().union(*map(scalar_tags, runs.values()))
+    assert written == documented_tags()
+    assert {tag.partition("/")[0] for tag in written} == NAMESPACES
+
+
+def assert_equals_record(folder):
+    """Points of eval/ and diag/ are the record's evaluations: all of them, once, no others."""
+    events, record = load(folder), read_record(folder / "record.json")
+    wanted: dict[str, list[tuple[int, float]]] = {}
+    for evaluation in record.evaluations:
+        episodes = evaluation.episodes.model_dump(by_alias=True)
+        values = {
+            f"eval/{name}": sum(column) / len(column)
+            for name, column in episodes.items()
+            if name not in ("seed", "nonfinite")
+        }
+        for name, value in evaluation.diagnostics.items():
+            kind = evaluation.nonfinite.get(f"diagnostics/{name}")
+            if value is not None or kind is not None:
+                values[f"diag/{name}"] = float(kind) if value is None else value
+        for tag, value in values.items():
+            wanted.setdefault(tag, []).append((evaluation.env_steps, value))
+    tags = {tag for tag in events.Tags()["scalars"] if tag.startswith(("eval/", "diag/"))}
+    assert tags == set(wanted)
+    for tag, points in wanted.items():
+        found = [(point.step, point.value) for point in events.Scalars(tag)]
+        assert [step for step, _ in found] == [step for step, _ in points]
+        for (_, shown), (_, stored) in zip(found, points, strict=True):
+            assert shown == pytest.approx(stored, rel=1e-6, nan_ok=True)
+
+
+def test_evaluations_are_those_of_the_record(runs):
+    for folder in runs.values():
+        assert_equals_record(folder)
+
+
+def test_a_continued_run_shows_every_point_once(continued):
+    folder, written = continued
+    steps = [e.env_steps for e in read_record(folder / "record.json").evaluations]
+    # The stopped session had shown an evaluation that was done again.
+    assert written in steps[:-1]
+    assert len(list(folder.glob("events.*"))) == 2
+    assert_equals_record(folder)
+    events = load(folder)
+    for tag in events.Tags()["scalars"]:
+        points = [point.step for point in events.Scalars(tag)]
+        assert points == sorted(set(points)), tag
+
+
+def test_the_charts_show_tags_that_exist(runs):
+    tags = scalar_tags(runs["equivariant"])
+    [event] = load(runs["equivariant"]).Tensors("custom_scalars__config__")
+    layout = layout_pb2.Layout.FromString(event.tensor_proto.string_val[0])
+    charts = {chart.title: chart for category in layout.category for chart in category.chart}
+    for chart in charts.values():
+        for pattern in chart.multiline.tag:
+            assert any(re.search(pattern, tag) for tag in tags), pattern
+    [margin] = charts["Q against its feasible band"].margin.series
+    shown = [margin.value, margin.lower, margin.upper]
+    assert shown == ["diag/q_mean", "diag/q_low", "diag/q_high"]
+    assert set(shown) <= tags
+    [errors] = charts["Equivariance errors"].multiline.tag
+    assert sum(bool(re.search(errors, tag)) for tag in tags) == 3
+
+
+def test_hyperparameters_can_be_compared_across_runs(runs):
+    experiments = []
+    for name, folder in runs.items():
+        events = load(folder)
+
+        def content(tag, events=events):
+            return events.SummaryMetadata(tag).plugin_data.content
+
+        record = read_record(folder / "record.json")
+        start = metadata.parse_session_start_info_plugin_data(
+            content(metadata.SESSION_START_INFO_TAG)
+        )
+        values = start.hparams
+        assert values["agent"].string_value == name
+        assert values["sac.lr"].number_value == record.config["sac"]["lr"]
+        assert values["demonstrations.count"].number_value == 3
+        assert values["sac.layer_norm"].bool_value is True
+        assert values["sac.target_entropy"].string_value == "none"
+        assert folder.name.endswith(start.group_name)
+        experiment = metadata.parse_experiment_plugin_data(content(metadata.EXPERIMENT_TAG))
+        assert {info.name for info in experiment.hparam_infos} == set(values)
+        assert {info.name for info in experiment.hparam_infos if info.differs} == IDENTITY
+        end = metadata.parse_session_end_info_plugin_data(content(metadata.SESSION_END_INFO_TAG))
+        assert end.status == api_pb2.STATUS_SUCCESS
+        experiments.append(experiment)
+    # TensorBoard takes the columns of any one run.
+    assert all(experiment == experiments[0] for experiment in experiments)
+    assert [info.name.tag for info in experiments[0].metric_infos] == list(FINAL_METRICS)
+    assert set(FINAL_METRICS) <= scalar_tags(runs["equivariant"])
+
+
+def test_the_text_says_what_was_run(runs):
+    for folder in runs.values():
+        record = read_record(folder / "record.json")
+        [event] = load(folder).Tensors("config/text_summary")
+        text = event.tensor_proto.string_val[0].decode()
+        rows = dict(re.findall(r"^\| (\S.*?) \| `(.*)` \|$", text, re.MULTILINE))
+        assert rows["run"] == record.run_id
+        assert rows["commit"].startswith(record.provenance.commit or "unknown")
+        assert f"{record.base_policy.base_success:.0%} of 32 episodes" in rows["its success"]
+        assert f"{record.base_policy.action_std:.2f}" in rows["its steerability"]
+        assert rows["its warning"] == record.base_policy.warning
+        assert rows["sac.lr"] == "0.0005"
+        assert rows["evaluation.final_episodes"] == "5"
+
+
+def test_the_final_evaluation_has_a_picture(runs):
+    for folder in runs.values():
+        [event] = load(folder).Images("eval/paths")
+        assert event.step == read_record(folder / "record.json").budget.env_steps
+        pixels = np.asarray(Image.open(io.BytesIO(event.encoded_image_string)))
+        assert pixels.shape[2] == 3
+        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 10
+        assert ("eval/frames" in load(folder).Tags()["images"]) == rendering_works()
+
+
+def test_a_picture_that_fails_does_not_harm_the_run(finished, monkeypatch, capsys):
+    def fail(*args):
+        raise OSError("no fonts")
+
+    monkeypatch.setattr(loop, "draw_paths", fail)
+    _, folder = finished
+    other = execute(tiny_config(agent="zero"), folder.parent, progress=True)
+    assert read_record(other / "record.json").status == "finished"
+    assert load(other).Tags()["images"] == []
+    assert "no fonts" in "".join(capsys.readouterr())
