@@ -127,24 +127,67 @@ def _tell(folder: Path) -> None:
 
 
 @app.command
-def sweep(suite: str, /, out: Path = Path("runs"), workers: int = 0) -> int:
-    """Work off a suite of runs; finished ones are skipped, failed ones are listed at the end.
+def sweep(
+    suite: Annotated[str, tyro.conf.arg(metavar="SUITE")],
+    /,
+    out: Path = Path("runs"),
+    workers: int = 0,
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> int:
+    """Work off a suite of runs; the same command goes on where it stopped.
+
+    Finished runs are skipped, unfinished ones continue, failed ones are tried once more and listed
+    at the end.
 
     Args:
         suite: Name of a suite (see `symsteer list`) or path of a .toml file.
-        out: Folder of the runs.
-        workers: Runs side by side; 0 means one a core.
+        out: Folder of the runs; a sweep on a cluster needs one that all its machines share.
+        workers: Runs side by side; 0 means one a core, or as many as the cluster has room for.
+        ray: Address of a Ray cluster to run on: auto, or host:port of its head.
+        dry_run: Say what there is to do and how long it may take, and do nothing.
     """
-    from bench.sweep.pool import run_suite
+    from bench.sweep.command import preview, run_plan
+    from bench.sweep.plan import make_plan, manifest_path
     from bench.sweep.suite import load_suite
 
-    grid = load_suite(suite)
-    print(f"{grid.name}: {grid.description} ({len(grid.runs)} runs)")
-    outcomes = run_suite(grid, out, workers or os.cpu_count() or 1)
+    plan = make_plan(load_suite(suite), out)
+    if dry_run:
+        print(preview(plan, workers))
+        return 0
+    outcomes = run_plan(plan, workers, ray)
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     for outcome in failed:
-        print(f"failed: {outcome.label}: {outcome.detail}", file=sys.stderr)
-    return 1 if failed else 0
+        print(f"failed: {outcome.cell.label}: {outcome.reason}", file=sys.stderr)
+    if any(outcome.trace for outcome in failed):
+        log = manifest_path(out, plan.name).with_suffix(".log")
+        print(f"where it went wrong in the code: {log}", file=sys.stderr)
+    elsewhere = sum(outcome.status == "elsewhere" for outcome in outcomes)
+    if elsewhere:
+        print(
+            f"{elsewhere} runs are worked on by another process; `symsteer status {out}` says "
+            "when they are finished",
+            file=sys.stderr,
+        )
+    return 1 if failed or elsewhere else 0
+
+
+@app.command
+def status(
+    folder: Annotated[Path, tyro.conf.arg(metavar="[FOLDER]")] = Path("runs"),
+    /,
+    suite: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
+) -> int:
+    """Say how far the sweeps in a folder are: runs by state, failures, time left.
+
+    Args:
+        folder: Folder of the runs, the --out of a sweep.
+        suite: Only the sweep of this suite.
+    """
+    from bench.sweep.status import read_status, to_text
+
+    print(to_text(read_status(folder, suite), folder))
+    return 0
 
 
 @app.command
@@ -154,27 +197,37 @@ def demo(out: Path = Path("runs/demo")) -> int:
     Args:
         out: Folder of the runs and of their leaderboard.
     """
-    status = sweep("demo", out=out)
-    report(out, out=out / "leaderboard")
+    exit_code = sweep("demo", out=out)
+    report((out,), out=out / "leaderboard")
     page = out / "leaderboard" / "LEADERBOARD.md"
     print(
         f"\nOpen the leaderboard:  {page}"
         f"\nSee the runs:          {_program('tensorboard')} --logdir {out}"
         "  then http://localhost:6006"
     )
-    return status
+    return exit_code
 
 
 @app.command
-def report(records: Path | None = None, /, out: Path | None = None) -> int:
+def report(
+    records: tyro.conf.Positional[tuple[Path, ...]] = (),
+    out: Path | None = None,
+    audit: Path | None = None,
+    verify: bool = False,
+    check: bool = False,
+) -> int:
     """Write the leaderboard (markdown, CSV, figures) from run records; `python -m leaderboard`.
 
     Args:
-        records: Record file, run folder or folder of runs; default: the committed records.
+        records: Record files, run folders or folders of runs; default: the committed records.
         out: Where to write; default: the leaderboard folder of this repository.
+        audit: The summary.json of an audit, for the map; default: the committed one.
+        verify: Write nothing; fail if OUT is not, byte for byte, what the records give.
+        check: Write nothing; say of each record whether the leaderboard admits it, and why not.
     """
-    arguments = [str(records)] if records else []
-    arguments += ["--out", str(out)] if out else []
+    options = {"--out": out, "--audit": audit}
+    arguments = [text for name, value in options.items() if value for text in (name, str(value))]
+    arguments += ["--verify"] * verify + ["--check"] * check + ["--", *map(str, records)]
     # By name, not by import: the bench writes records and draws nothing.
     saved, sys.argv = sys.argv, ["leaderboard", *arguments]
     try:

@@ -38,6 +38,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="FOLDER",
         help="where the leaderboard is written (default: the leaderboard folder of the repository)",
     )
+    parser.add_argument(
+        "--audit",
+        type=Path,
+        metavar="FILE",
+        help="summary.json of an audit, for the map (default: the committed one)",
+    )
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument(
         "--verify",
@@ -59,8 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.check:
             return _check(records)
         if options.verify:
-            return _verify(records, options.out)
-        files = generate(records, options.out)
+            return _verify(records, options.out, options.audit)
+        files = generate(records, options.out, options.audit)
     except RecordError as error:
         _say(f"error: {error}", sys.stderr)
         return 2
@@ -69,8 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _verify(records: Sequence[Path], out: Path) -> int:
-    result = verify(records, out)
+def _verify(records: Sequence[Path], out: Path, audit: Path | None) -> int:
+    result = verify(records, out, audit)
     if not result.differences:
         _say(f"{result.records} records and {result.files} files of the leaderboard agree")
         return 0

@@ -1,0 +1,227 @@
+"""Hostile paths: one sentence, exit code 2, and nothing written."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from record_factory import make_record
+
+from leaderboard.__main__ import main
+from leaderboard.errors import RecordError
+from leaderboard.paths import record_files
+from leaderboard.records import MAX_BYTES, write_record
+from leaderboard.report import generate, slug
+
+needs_a_user = pytest.mark.skipif(os.geteuid() == 0, reason="root may read and write everything")
+
+
+@pytest.fixture
+def good(tmp_path: Path) -> Path:
+    record = make_record(agent="base")
+    write_record(record, tmp_path / "good" / f"{record.run_id}.json")
+    return tmp_path / "good"
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """The one sentence with which the command refuses."""
+    assert main([str(argument) for argument in arguments]) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("error: ")
+    assert shown.err.count("\n") == 1
+    return shown.err
+
+
+def test_run_folders_hold_other_json_and_committed_records_none(good: Path, tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "a-run"
+    write_record(make_record(), run / "record.json")
+    (run / "config.json").write_text("{}")
+    (tmp_path / "runs" / "base").mkdir()
+    (tmp_path / "runs" / "base" / "demonstrations.json").write_text('{"episodes": []}')
+    assert record_files([tmp_path / "runs"]) == [run / "record.json"]
+    # A run folder laid among committed records does not hide them.
+    shutil.copytree(run, good / "a-run")
+    assert [path.name for path in record_files([good])] == ["record.json", "run-none-base-0.json"]
+
+
+def test_each_file_counts_once(good: Path, tmp_path: Path) -> None:
+    (file,) = good.iterdir()
+    (tmp_path / "link.json").symlink_to(file)
+    (tmp_path / "folder").symlink_to(good)
+    paths = [good, file, tmp_path / "link.json", tmp_path / "folder", good / ".." / "good"]
+    assert record_files(paths) == [file]
+
+
+def test_links_to_folders_are_not_followed(good: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (good / "loop").symlink_to(good)
+    (good / "root").symlink_to("/")
+    assert len(record_files([good])) == 1
+
+
+def test_paths_that_are_no_records(
+    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "loop.json").symlink_to(tmp_path / "loop.json")
+    os.mkfifo(tmp_path / "pipe.json")
+    (tmp_path / "empty").mkdir()
+    cases = {
+        tmp_path / "nowhere": "does not exist",
+        tmp_path / "loop.json": "cannot be read",
+        tmp_path / "pipe.json": "no ordinary file",
+        Path("/dev/zero"): "no ordinary file",
+        tmp_path / ("x" * 5000): "cannot be read",
+        tmp_path / "empty": "holds no record",
+        next(good.iterdir()) / "below": "cannot be read",
+    }
+    for path, words in cases.items():
+        for verb in ("--verify", "--check"):
+            assert words in refused(capsys, path, verb)
+        assert words in refused(capsys, path, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["pipe.json", "broken.json"])
+def test_a_folder_with_something_else_called_json(
+    name: str, good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name == "pipe.json":
+        os.mkfifo(good / name)
+    else:
+        (good / name).symlink_to(tmp_path / "gone")
+    assert name in refused(capsys, good, "--out", tmp_path / "out")
+    # Beside a run folder it is not taken for a record.
+    write_record(make_record(), good / "run" / "record.json")
+    if name == "pipe.json":
+        assert len(record_files([good])) == 2
+
+
+def test_a_folder_full_of_other_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number, text in enumerate(["[]", "{}", "3", '"x"', "null", '{"schema_version": {}}', ""]):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / "a.json").write_text(text)
+        assert str(folder / "a.json") in refused(capsys, folder, "--out", tmp_path / "out")
+    assert main(["--check", str(tmp_path)]) == 2
+    assert capsys.readouterr().out.count("NOT ADMISSIBLE") == 7
+
+
+def test_a_huge_file_is_not_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with open(tmp_path / "huge.json", "wb") as file:
+        file.truncate(MAX_BYTES + 1)
+    assert "larger than 64 MiB" in refused(capsys, tmp_path, "--verify")
+
+
+def test_a_name_that_is_no_text(
+    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    strange = good / os.fsdecode(b"caf\xe9.json")
+    next(good.iterdir()).rename(strange)
+    assert "not UTF-8: rename it" in refused(capsys, good, "--out", tmp_path / "out")
+    strange.rename(good / "caf\u00e9 [x](y).json")
+    out = tmp_path / os.fsdecode(b"out\xe9")
+    assert main([str(good), "--out", str(out)]) == 0
+    assert "](../good/caf%C3%A9%20%5Bx%5D%28y%29.json)" in (out / "LEADERBOARD.md").read_text()
+
+
+# Where it is written
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"folder"
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def test_an_output_that_is_no_folder(
+    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for out in ("file", "file/below", "loop", "x" * 300):
+        for verb in ([], ["--verify"]):
+            refused(capsys, good, "--out", tmp_path / out, *verb)
+    assert (tmp_path / "file").read_text() == "x"
+
+
+def test_what_cannot_be_replaced_leaves_the_rest_alone(
+    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    generate([good], out)
+    write_record(make_record(agent="zero"), good / "another.json")
+    (out / "LEADERBOARD.md").unlink()
+    (out / "LEADERBOARD.md").mkdir()
+    stale = out / "figures" / f"q-{slug('OldTask-v1', 'floating')}.svg"
+    stale.write_text("")
+    before = snapshot(out)
+    assert "LEADERBOARD.md cannot be written: Is a directory" in refused(capsys, good, "--out", out)
+    assert snapshot(out) == before
+
+
+def test_a_full_disk_leaves_everything_as_it_was(
+    good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    generate([good], out)
+    write_record(make_record(agent="zero"), good / "another.json")
+    before = snapshot(out)
+    real, calls = os.fsync, []
+
+    def full(descriptor: int) -> None:
+        calls.append(descriptor)
+        if len(calls) == 3:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(RecordError, match=r"No space left on device; free space"):
+        generate([good], out)
+    assert snapshot(out) == before
+
+
+def test_figures_are_not_written_through_a_link(
+    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    out.mkdir()
+    elsewhere.mkdir()
+    (out / "figures").symlink_to(elsewhere)
+    assert "figures is a link" in refused(capsys, good, "--out", out)
+    assert list(elsewhere.iterdir()) == []
+    # The folder itself may be one.
+    (tmp_path / "linked").symlink_to(elsewhere)
+    assert main([str(good), "--out", str(tmp_path / "linked")]) == 0
+    assert (elsewhere / "LEADERBOARD.md").exists()
+
+
+def test_files_are_replaced_not_written_through_links(good: Path, tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "leaderboard.csv").symlink_to(precious)
+    generate([good], tmp_path / "out")
+    assert precious.read_text() == "mine"
+    assert not (tmp_path / "out" / "leaderboard.csv").is_symlink()
+
+
+@needs_a_user
+def test_folders_without_permission(
+    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (good / "closed").mkdir()
+    (good / "closed").chmod(0)
+    out = tmp_path / "out"
+    out.mkdir()
+    try:
+        assert "closed cannot be read: Permission denied" in refused(capsys, good, "--verify")
+        refused(capsys, good / "closed" / "x.json", "--verify")
+        (good / "closed").rmdir()
+        out.chmod(0o500)
+        assert "cannot be written: Permission denied" in refused(capsys, good, "--out", out)
+    finally:
+        out.chmod(0o700)
