@@ -16,8 +16,6 @@ from leaderboard.paths import record_files
 from leaderboard.records import MAX_BYTES, write_record
 from leaderboard.report import generate, slug
 
-needs_a_user = pytest.mark.skipif(os.geteuid() == 0, reason="root may read and write everything")
-
 
 @pytest.fixture
 def good(tmp_path: Path) -> Path:
@@ -209,12 +207,13 @@ def test_files_are_replaced_not_written_through_links(good: Path, tmp_path: Path
     assert not (tmp_path / "out" / "leaderboard.csv").is_symlink()
 
 
-@needs_a_user
 def test_folders_without_permission(
     good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (good / "closed").mkdir()
     (good / "closed").chmod(0)
+    if os.access(good / "closed", os.R_OK):
+        pytest.skip("this user may read and write everything")
     out = tmp_path / "out"
     out.mkdir()
     try:
