@@ -44,6 +44,9 @@ PLACE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*")
 """Markers of the map, one for each task and embodiment."""
 
 COLUMNS = 3
+WIDEST = 125
+"""Characters of a line of the legend."""
+
 MAX_MARKERS = 15
 BAND_RESAMPLES = 1000
 
@@ -286,7 +289,7 @@ def advantage_map(found: DefectMap) -> Figure:
             if column == 0:
                 ax.set_ylabel(f"advantage over {BASELINE}")
     handles = {
-        _ascii(", ".join(place)): Line2D(
+        _ascii(", ".join(place), 26): Line2D(
             [], [], color="#555555", marker=marker, linestyle="none", markersize=5
         )
         for place, marker in markers.items()
@@ -393,7 +396,7 @@ def improvement_chart(found: Comparisons) -> Figure:
                 ax.text(0.0, height - 0.1, _coverage(pair.cells), color="#555555", **beside)
         ax.set_xlim(-0.02, 1.02)
         ax.set_xlabel("P(X > Y)")
-    axes[0].set_yticks(range(len(rows)), [f"{_ascii(x)} > {_ascii(y)}" for x, y in rows])
+    axes[0].set_yticks(range(len(rows)), [f"{_ascii(x, 24)} > {_ascii(y, 24)}" for x, y in rows])
     axes[0].set_ylim(len(rows) - 0.5, -0.5)
     return figure
 
@@ -444,12 +447,13 @@ def _title(table: Table, tables: Sequence[Table]) -> str:
 
 
 def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int = 7) -> None:
+    """Entries below the panels, in fewer columns where they are long."""
     if handles:
         figure.legend(
             list(handles.values()),
             list(handles),
             loc="outside lower center",
-            ncols=min(len(handles), columns),
+            ncols=max(1, min(len(handles), columns, WIDEST // max(map(len, handles)))),
             frameon=False,
         )
 

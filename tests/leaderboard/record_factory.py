@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -151,3 +151,33 @@ def make_curve(
             )
         )
     return curve
+
+
+def make_cell(
+    rates: Mapping[str, float | Sequence[float]], seeds: int = 5, episodes: int = 40, **config: Any
+) -> list[RunRecord]:
+    """Runs of several agents in one cell, evaluated at even distances with the given success rates.
+
+    Exactly `round(rate * episodes)` episodes succeed, other ones for every run, so that sums are
+    known while pairs differ. References (base, zero, golden-ticket) are evaluated once.
+    """
+    records = []
+    for index, (agent, rate) in enumerate(rates.items()):
+        curve = [rate] * 3 if isinstance(rate, float | int) else list(rate)
+        for seed in range(seeds):
+            generator = np.random.default_rng((index, seed))
+
+            def outcomes(share: float, generator: np.random.Generator = generator) -> list[int]:
+                order = generator.permutation(episodes)
+                return (order < round(share * episodes)).astype(int).tolist()
+
+            steps = np.linspace(0, config.get("env_steps", 50_000), len(curve)).astype(int)
+            if agent not in ("base", "zero", "golden-ticket"):
+                evaluations = [
+                    make_evaluation(outcomes(share), int(step), step == steps[-1], q_mean=-5.0)
+                    for share, step in zip(curve, steps, strict=True)
+                ]
+            else:
+                evaluations = [make_evaluation(outcomes(curve[-1]), 0)]
+            records.append(make_record(evaluations, agent=agent, seed=seed, **config))
+    return records

@@ -1,0 +1,85 @@
+"""Profiles and probabilities of improvement from records: which runs and cells they compare."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from record_factory import make_cell, make_evaluation, make_record
+
+from leaderboard.comparisons import THRESHOLDS, compare_agents, gap_closed
+from leaderboard.records import RunRecord
+from leaderboard.summary import Run, Summary, summarize
+
+
+def summary_of(records: list[RunRecord]) -> Summary:
+    return summarize([Run(Path(f"{i}.json"), record) for i, record in enumerate(records)])
+
+
+def test_the_gap_is_measured_on_the_same_episodes() -> None:
+    base = make_record([make_evaluation([1, 0, 0, 0], 0)], agent="base")
+    better = make_record([make_evaluation([1, 1, 0, 0])])
+    worse = make_record([make_evaluation([0, 0, 0, 0])], seed=1)
+    # The first two episodes alone, of which the base solves one.
+    short = make_record([make_evaluation([1, 1])], seed=2)
+    table = summary_of([base, better, worse, short]).tables[0]
+    standard, reference = table.row_of("standard"), table.row_of("base")
+    assert standard is not None
+    assert reference is not None
+    assert gap_closed(standard, reference) == pytest.approx([1 / 3, -1 / 3, 1.0])
+    perfect = make_record([make_evaluation([1, 1, 1, 1], 0)], agent="base")
+    table = summary_of([perfect, better]).tables[0]
+    standard, reference = table.row_of("standard"), table.row_of("base")
+    assert standard is not None
+    assert reference is not None
+    assert gap_closed(standard, reference) == []
+
+
+def test_profiles_and_pairs_by_group() -> None:
+    agents = {"base": 0.5, "zero": 0.75, "standard": 0.5, "equivariant": 1.0}
+    records = make_cell(agents)
+    records += make_cell(agents | {"equivariant": 0.25}, variant="wind:1")
+    records += make_cell({"base": 0.5, "standard": 0.5}, embodiment="panda")
+    found = compare_agents(summary_of(records))
+    assert found.cells == {"unbroken": 1, "broken": 2}
+    unbroken = {profile.agent: profile for profile in found.profiles["unbroken"]}
+    assert list(unbroken) == ["zero", "standard", "equivariant"]
+    assert unbroken["equivariant"].share.tolist() == [1.0] * len(THRESHOLDS)
+    zero = unbroken["zero"].share
+    assert (zero[THRESHOLDS < 0.49].min(), zero[THRESHOLDS > 0.51].max()) == (1.0, 0.0)
+    broken = {profile.agent: profile for profile in found.profiles["broken"]}
+    assert (broken["standard"].cells, broken["standard"].runs) == (2, 10)
+    assert (broken["equivariant"].cells, broken["equivariant"].runs) == (1, 5)
+    (pair,) = found.improvements["unbroken"]
+    assert (pair.first, pair.second, pair.runs) == ("equivariant", "standard", (5, 5))
+    assert pair.probability.value == 1.0
+    (pair,) = found.improvements["broken"]
+    assert (pair.probability.value, pair.cells) == (0.0, 1)
+
+
+def test_ties_and_unfinished_runs() -> None:
+    records = make_cell({"standard": 0.5, "equivariant": 0.5})
+    records.append(make_record([make_evaluation([1] * 40)], "failed", seed=9))
+    found = compare_agents(summary_of(records))
+    (pair,) = found.improvements["unbroken"]
+    assert (pair.probability.value, pair.runs) == (0.5, (5, 5))
+    assert found.profiles["unbroken"] == []
+    only = compare_agents(summary_of(make_cell({"base": 0.5, "zero": 0.6})))
+    assert only.cells == {}
+
+
+def test_the_order_of_runs_does_not_matter() -> None:
+    generator = np.random.default_rng(0)
+    records = [
+        make_record([make_evaluation(generator.random(40) < 0.5)], agent=agent, seed=seed)
+        for agent in ("base", "standard", "equivariant")
+        for seed in range(5)
+    ]
+    runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(records)]
+    first = compare_agents(summarize(runs))
+    second = compare_agents(summarize(runs[::-1]))
+    assert first.improvements == second.improvements
+    assert first.improvements["unbroken"][0].probability.low > 0
+    for one, other in zip(first.profiles["unbroken"], second.profiles["unbroken"], strict=True):
+        np.testing.assert_array_equal(one.low, other.low)

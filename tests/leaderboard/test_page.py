@@ -1,0 +1,266 @@
+"""The page and its figures on a realistic set of records: what it says, and in which words."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from record_factory import make_cell, make_evaluation, make_record
+
+from leaderboard.records import RunRecord, write_record
+from leaderboard.report import generate
+
+DEFECTS = {"none": 0.002, "wind:0.25": 0.1, "wind:0.5": 0.2, "wind:1": 0.4}
+HOSTILE = "x`</td><img src=x onerror=alert(1)>`|$a$\n# H [l](javascript:alert(1))"
+
+
+def audit(folder: Path, group: str = "C8", variants: dict[str, float] = DEFECTS) -> Path:
+    """A summary as `symsteer audit --out` writes it."""
+    rows = [
+        {
+            "task": "PickCube-v1",
+            "embodiment": "floating",
+            "variant": variant,
+            "group": group,
+            "tool_step": [defect, 0.9 * defect, 1.1 * defect],
+            "cost": [0.0, 0.0, 0.0],
+            "observation": [0.0, 0.0, 0.0],
+        }
+        for variant, defect in variants.items()
+    ]
+    path = folder / "summary.json"
+    path.write_text(json.dumps(rows))
+    return path
+
+
+def write(folder: Path, records: list[RunRecord]) -> None:
+    for index, record in enumerate(records):
+        write_record(record, folder / "results" / f"{index}.json")
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four audited cells and one that is not; strictness pays up to a defect of 0.3."""
+    folder = tmp_path_factory.mktemp("board")
+    records = []
+    for variant, defect in (DEFECTS | {"wind:0.75": 0.3}).items():
+        rates = {"base": 0.3, "zero": 0.4, "golden-ticket": 0.45, "standard": 0.5}
+        rates |= {"standard-matched": 0.5, "equivariant": 0.8 - defect, "approximate": 0.7}
+        records += make_cell(rates, variant=variant)
+    for record in records:
+        if record.cell.agent == "golden-ticket":
+            record.budget.env_steps = 12_800
+    first = records[0]
+    other = first.provenance.model_copy(update={"commit": "f" * 40, "device": "cuda"})
+    first.continued = [other]
+    first.wall_clock.resumed = 1
+    write(folder, records)
+    generate([folder / "results"], folder, audit(folder))
+    return folder
+
+
+def text_of(board: Path) -> str:
+    return (board / "LEADERBOARD.md").read_text().replace("\u00a0", " ")
+
+
+def table_after(text: str, heading: str) -> list[list[str]]:
+    """Cells of the first table after a line that starts with `heading`."""
+    lines = text[text.index(f"\n{heading}") :].splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("|"))
+    rows = []
+    for line in lines[start:]:
+        if not line.startswith("|"):
+            break
+        rows.append([cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]])
+    return rows
+
+
+def test_the_main_table_ranks_with_ties_and_never_references(board: Path) -> None:
+    header, _, *rows = table_after(text_of(board), "### Unbroken symmetry")
+    assert header == [
+        "Rank",
+        "Agent",
+        "Success (final window)",
+        "Last checkpoint",
+        "Against base",
+        "AUC",
+        "Steps to 80 %",
+        "Dip",
+        "Seeds \u00d7 episodes",
+        "Status",
+    ]
+    shown = {row[1]: row for row in rows}
+    ranks = {agent: row[0] for agent, row in shown.items()}
+    assert ranks == {
+        "`base`": "\u2013",
+        "`zero`": "\u2013",
+        "`golden-ticket`": "\u2013",
+        "`equivariant`": "1",
+        "`approximate`": "2",
+        "`standard`": "3=",
+        "`standard-matched`": "3=",
+    }
+    assert list(ranks) == [row[1] for row in rows]
+    assert shown["`golden-ticket`"][6] == "search 12.8 k"
+    assert shown["`standard`"][6] == "> 50 k (0/5)"
+    assert shown["`equivariant`"][6] == "0 (5/5)"
+    assert re.fullmatch(r"0\.80<br>\[0\.\d\d, 0\.\d\d\]", shown["`equivariant`"][2])
+    assert re.fullmatch(r"\+0\.50 \u25b2<br>\[\+0\.\d\d, \+0\.\d\d\]", shown["`equivariant`"][4])
+    links = re.findall(r"\[(\d)\]\((results/\d+\.json)\)", shown["`equivariant`"][8])
+    assert [seed for seed, _ in links] == list("01234")
+    assert all((board / target).exists() for _, target in links)
+    assert shown["`equivariant`"][8].startswith("5 \u00d7 40<br>")
+
+
+def test_learners_are_held_against_the_best_reference(board: Path) -> None:
+    text = text_of(board)
+    assert "Best reference: `golden-ticket`, 0.45. Against it: `equivariant` +0.35 [" in text
+    assert "`approximate` clearly above in 5, clearly below in 0 of 5" in text
+
+
+def test_the_second_table_shows_q_cost_and_device(board: Path) -> None:
+    text = text_of(board)
+    header, _, *rows = table_after(text, "Q-values, symmetry and cost")
+    assert "Largest \\|Q\\| (feasible Q: \u221220 to 0)" in header
+    assert [row[-1] for row in rows] == ["`cpu`"] * 4
+    assert [row[1] for row in rows] == ["0/5"] * 4
+
+
+def test_every_claim_has_a_verdict(board: Path) -> None:
+    _, _, *rows = table_after(text_of(board), "## The paper's claims")
+    assert len(rows) == 8
+    verdicts = [re.match(r"\*\*(\w+)\*\*", row[-1]) for row in rows]
+    assert [verdict and verdict[1] for verdict in verdicts] == [
+        "supported",
+        "supported",
+        "undecided",
+        "undecided",
+        "undecided",
+        "supported",
+        "supported",
+        "supported",
+    ]
+    assert all(":" in row[-1] for row in rows if "undecided" in row[-1])
+
+
+def test_the_map_names_the_crossing_and_what_is_missing(board: Path) -> None:
+    text = text_of(board)
+    _, _, *rows = table_after(text, "## Where symmetry stops paying")
+    by_agent = {(row[0], row[1]): row for row in rows}
+    strict = by_agent["`equivariant`", "success"]
+    assert strict[2] == "4 of 4"
+    assert strict[4].startswith("0.30 [0.2")
+    assert "stays above 0" in by_agent["`approximate`", "success"][4]
+    assert "Not audited, so not in the map: `PickCube-v1` `floating` `wind:0.75`." in text
+    assert (
+        "`symsteer audit --task PickCube-v1 --embodiment floating --group C8 "
+        "--variant wind:0.75 --out runs/audit`" in text
+    )
+    _, _, *cells = table_after(text, "<summary>The map's numbers")
+    assert [cell[1].split(" ")[0] for cell in cells] == ["0.002", "0.100", "0.200", "0.400"]
+
+
+def test_provenance_names_every_session(board: Path) -> None:
+    text = text_of(board)
+    assert "1 of them continued after an interruption" in text
+    assert "- Commits: `0123456789ab`, `ffffffffffff`" in text
+    assert "- Devices: `cpu`, `cuda`" in text
+    assert "symsteer report" in text
+
+
+def test_all_figures_are_there(board: Path) -> None:
+    names = sorted(path.name for path in (board / "figures").iterdir())
+    assert names[:2] == ["improvement.svg", "map.svg"]
+    assert "profiles.svg" in names
+    for name in names:
+        root = ElementTree.fromstring((board / "figures" / name).read_bytes())
+        assert f"](figures/{name})" in text_of(board)
+        # No text elements: outlines look the same everywhere.
+        assert not root.findall(".//{http://www.w3.org/2000/svg}text")
+
+
+def test_the_csv_holds_both_comparisons(board: Path) -> None:
+    with open(board / "leaderboard.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    row = next(r for r in rows if r["agent"] == "equivariant" and r["variant"] == "none")
+    assert row["best_reference"] == "golden-ticket"
+    assert float(row["against_best"]) == pytest.approx(0.35)
+    assert float(row["against_base"]) == pytest.approx(0.5)
+    assert row["devices"] == "cpu"
+    ticket = next(r for r in rows if r["agent"] == "golden-ticket")
+    assert (ticket["search_steps"], ticket["auc"]) == ("12800", "")
+
+
+def test_the_audit_changes_the_page_and_nothing_else_does(board: Path, tmp_path: Path) -> None:
+    """The same records in another order and under other names give the same bytes."""
+    again = tmp_path / "again"
+    paths = sorted((board / "results").iterdir(), reverse=True)
+    for path in paths:
+        target = again / "results" / path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+    files = generate([again / "results" / path.name for path in paths], again, audit(tmp_path))
+    for path in files:
+        assert path.read_bytes() == (board / path.relative_to(again)).read_bytes()
+    few = [again / "results" / f"{index}.json" for index in range(35)]
+    generate(few, again, audit(tmp_path, variants={"none": 0.1}))
+    assert "no cell has an audited defect" in text_of(again)
+    assert (again / "figures" / "map.svg").exists()
+    generate(few, again, audit(tmp_path, group="D4"))
+    assert "There is no map yet" in text_of(again)
+    assert not (again / "figures" / "map.svg").exists()
+
+
+def test_hostile_names_stay_text_in_every_section(tmp_path: Path) -> None:
+    """Finished runs of hostile agents in a hostile, audited cell: map, pairs, claims, notes."""
+    markdown = pytest.importorskip("markdown_it")
+    cell = {"base": 0.3, "standard": 0.5, "equivariant": 0.6, HOSTILE: 0.7, f"{HOSTILE}2": 0.4}
+    records = make_cell(cell, task=HOSTILE, variant=HOSTILE, embodiment=HOSTILE)
+    records += make_cell(cell, task=HOSTILE, variant="none", embodiment=HOSTILE)
+    records += make_cell({"standard": 0.5}, task="a; rm -rf b", seeds=1)
+    for index, record in enumerate(records):
+        record.run_id = f"run-{index}"
+        record.provenance.device = HOSTILE
+        record.base_policy.warning = HOSTILE
+    write(tmp_path, records)
+    rows = json.loads(audit(tmp_path).read_text())
+    rows[0] |= {"task": HOSTILE, "embodiment": HOSTILE, "variant": HOSTILE}
+    (tmp_path / "summary.json").write_text(json.dumps(rows))
+    generate([tmp_path / "results"], tmp_path, tmp_path / "summary.json")
+    parser = markdown.MarkdownIt("commonmark").enable(["table", "strikethrough"])
+    page = (tmp_path / "LEADERBOARD.md").read_text()
+    tokens = [token for block in parser.parse(page) for token in [block, *(block.children or [])]]
+    raw = {t.content.strip() for t in tokens if t.type in ("html_block", "html_inline")}
+    assert all(re.fullmatch(r"<br>|</?details>(\n<summary>[\w' ]+</summary>)?", r) for r in raw)
+    links = {str(t.attrs.get("href") or t.attrs.get("src")) for t in tokens if t.attrs}
+    assert all(re.fullmatch(r"None|(results|figures)/[\w.%-]+", link) for link in links)
+    plain = " ".join(t.content for t in tokens if t.type == "text")
+    assert "alert" not in plain
+    assert "symsteer audit --task" not in page
+    assert (tmp_path / "figures" / "map.svg").exists()
+    for path in (tmp_path / "figures").iterdir():
+        assert re.fullmatch(r"[a-z0-9-]+\.svg", path.name)
+        ElementTree.fromstring(path.read_bytes())
+
+
+def test_uneven_cells_are_drawn_with_their_coverage(tmp_path: Path) -> None:
+    """An agent in one of two cells, and twins of an agent, neither hide nor break anything."""
+    generator = np.random.default_rng(0)
+    records = make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.6})
+    records += make_cell({"base": 0.3, "standard": 0.5}, variant="wind:1")
+    records += make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.6}, variant="wind:0.5")
+    twin = make_record([make_evaluation(generator.random(40) < 0.5)], learning_rate=1e-3, seed=0)
+    records.append(twin.model_copy(update={"run_id": "twin"}))
+    write(tmp_path, records)
+    generate([tmp_path / "results"], tmp_path, audit(tmp_path))
+    text = text_of(tmp_path)
+    assert "Same agent with different settings, in rows of their own" in text
+    _, _, *pairs = table_after(text, "Probability of improvement")
+    assert pairs[0][0] == "`equivariant` > `standard`"
+    assert pairs[0][1].endswith("(1; 5, 5)")
+    assert pairs[0][2].endswith("(1; 5, 5)")
