@@ -23,7 +23,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
 from leaderboard.defects import BASELINE, COMPARED, MEASURES, DefectMap, Line, Panel
 from leaderboard.findings import Findings
-from leaderboard.statistics import iqm, success_interval
+from leaderboard.statistics import Interval, iqm, success_interval
 from leaderboard.summary import MIN_SEEDS, REFERENCES, Row, Run, Summary, Table
 
 Style = tuple[str, str, Any]
@@ -310,8 +310,8 @@ def _draw_panel(
         ax.errorbar(
             defect.value,
             gain.value,
-            xerr=[[defect.value - defect.low], [defect.high - defect.value]],
-            yerr=[[gain.value - gain.low], [gain.high - gain.value]],
+            xerr=_arms(defect),
+            yerr=_arms(gain),
             color=color,
             elinewidth=0.8,
             alpha=0.85,
@@ -323,6 +323,12 @@ def _draw_panel(
         ax.text(0.5, 0.5, "no paired runs", transform=ax.transAxes, ha="center", color="#777777")
     if panel.line:
         _draw_line(ax, panel.line, color, right)
+
+
+def _arms(interval: Interval) -> list[list[float]]:
+    """Lengths of the error bar below and above the value, not negative by rounding."""
+    low, high = interval.value - interval.low, interval.high - interval.value
+    return [[max(0.0, low)], [max(0.0, high)]]
 
 
 def _draw_line(ax: Axes, line: Line, color: str, right: float) -> None:

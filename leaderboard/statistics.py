@@ -228,7 +228,7 @@ def performance_profile(
         reached = (np.asarray(values, float)[:, None] >= levels).astype(np.float64)
         drawn = _occurrences(len(values), resamples, generator) / len(values)
         share += reached.mean(axis=0) / len(cells)
-        draws += drawn @ reached / len(cells)
+        draws += np.einsum("ri,it->rt", drawn, reached) / len(cells)
     tail = (1 - CONFIDENCE) / 2
     low, high = np.quantile(draws, (tail, 1 - tail), axis=0)
     return share, low, high

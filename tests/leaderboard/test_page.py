@@ -253,7 +253,9 @@ def test_uneven_cells_are_drawn_with_their_coverage(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     records = make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.6})
     records += make_cell({"base": 0.3, "standard": 0.5}, variant="wind:1")
-    records += make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.6}, variant="wind:0.5")
+    # All differences of this cell are alike: its intervals have no width.
+    alike = {"base": [0.3], "standard": [0.0] * 7, "equivariant": [0.0, *[1.0] * 6]}
+    records += make_cell(alike, seeds=7, variant="wind:0.5")
     twin = make_record([make_evaluation(generator.random(40) < 0.5)], learning_rate=1e-3, seed=0)
     records.append(twin.model_copy(update={"run_id": "twin"}))
     write(tmp_path, records)
@@ -263,4 +265,4 @@ def test_uneven_cells_are_drawn_with_their_coverage(tmp_path: Path) -> None:
     _, _, *pairs = table_after(text, "Probability of improvement")
     assert pairs[0][0] == "`equivariant` > `standard`"
     assert pairs[0][1].endswith("(1; 5, 5)")
-    assert pairs[0][2].endswith("(1; 5, 5)")
+    assert pairs[0][2].endswith("(1; 7, 7)")
