@@ -1,118 +1,114 @@
-"""Work off a suite in a pool of processes: one run a process, one thread a run."""
+"""A pool of processes on this machine, one thread each, that survives the death of any of them."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-import time
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import Any
 
-from bench.runs.base_policy import prepare_base
-from bench.runs.config import RunConfig
-from bench.runs.folder import is_finished, run_id
-from bench.runs.run import check, execute
-from bench.sweep.suite import Suite
-from leaderboard.records import read_record
-from policies.errors import UserError
+from pebble import ProcessExpired, ProcessPool
 
+from bench.sweep.work import Result, one_thread
 
-@dataclass
-class Outcome:
-    """What became of a cell: ``finished``, ``skipped`` (finished before) or ``failed``."""
-
-    config: RunConfig
-    status: str
-    detail: str = ""
-
-    @property
-    def label(self) -> str:
-        """The cell in words."""
-        c = self.config
-        return f"{c.task} {c.embodiment} {c.variant:16s} {c.agent:16s} seed {c.seed}"
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
-def run_suite(suite: Suite, out: Path, workers: int) -> list[Outcome]:
-    """Run every cell that is not finished; a failed one does not stop the others.
+class LocalPool:
+    """Processes that are kept from task to task, since importing all that they need takes seconds.
 
-    Base policies that several cells share are built first, once.
+    Each has a pool of its own: a pool of several gives up as a whole when one of them dies while
+    none has a task yet, as during its imports.
 
-    Raises:
-        UserError: if ``workers`` is not positive, or a cell names what does not exist.
-        OSError: if ``out`` cannot be made.
+    Args:
+        workers: how many processes; each is started when it is first needed.
+        log: file to which they write what they have to say.
     """
-    if workers < 1:
-        raise UserError(f"--workers is {workers}; it must be at least 1")
-    for config in suite.runs:
-        check(config)
-    out.mkdir(parents=True, exist_ok=True)
-    outcomes, todo = [], []
-    for config in suite.runs:
-        folder = out / run_id(config, {})
-        if is_finished(folder):
-            outcomes.append(Outcome(config, "skipped", _describe(folder)))
-            print(f"  skipped   {outcomes[-1].label}  {outcomes[-1].detail}", flush=True)
-        else:
-            todo.append(config)
-    broken: dict[tuple, str] = {}
-    for config in {_base_key(c): c for c in todo}.values():
+
+    patience = 10.0
+
+    def __init__(self, workers: int, log: Path):
+        self.capacity: int | None = workers
+        # Processes read these before they import anything.
+        os.environ.update(dict.fromkeys(THREADS, "1"))
+        self._log = log
+        self._idle: list[ProcessPool] = [self._start() for _ in range(workers)]
+        self._busy: dict[Future, ProcessPool] = {}
+
+    def submit(self, function: Callable[..., Result], *args: Any) -> Future:
+        """Begin a task; there must be fewer than ``capacity``."""
+        pool = self._idle.pop()
+        # Whoever starts a process hands its signal mask on: Ctrl-C is for the sweep, which ends its
+        # processes itself, and not for one that is busy with its imports.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            prepare_base(config, out)
-        except Exception as error:
-            broken[_base_key(config)] = f"its base policy failed: {_reason(error)}"
-    for config in todo:
-        if _base_key(config) in broken:
-            outcomes.append(Outcome(config, "failed", broken[_base_key(config)]))
-    todo = [config for config in todo if _base_key(config) not in broken]
-    started = time.monotonic()
-    # Spawned, because forking a process that has used torch's threads can deadlock.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
-        workers, mp_context=context, initializer=_limit_threads, initargs=(workers,)
-    ) as pool:
-        futures: dict[Future[Path], RunConfig] = {
-            pool.submit(execute, config, out, progress=False): config for config in todo
-        }
+            future = pool.schedule(function, args)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        self._busy[future] = pool
+        return future
+
+    def result(self, future: Future) -> Result:
+        """How a task ended; a process that died is replaced."""
+        pool = self._busy.pop(future)
         try:
-            for done, future in enumerate(as_completed(futures), 1):
-                config = futures[future]
-                try:
-                    outcome = Outcome(config, "finished", _describe(future.result()))
-                except Exception as error:
-                    outcome = Outcome(config, "failed", _reason(error))
-                outcomes.append(outcome)
-                left = (time.monotonic() - started) / done * (len(futures) - done)
-                print(
-                    f"  {outcome.status:9s} {outcome.label}  {outcome.detail}  "
-                    f"[{done}/{len(futures)}, about {left / 60:.1f} min left]",
-                    flush=True,
-                )
-        except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return outcomes
+            result = future.result()
+        except (ProcessExpired, BrokenProcessPool) as error:
+            pool.stop()
+            pool.join()
+            pool = self._start()
+            result = Result("failed", _death(getattr(error, "exitcode", None)))
+        self._idle.append(pool)
+        return result
+
+    def stop(self) -> None:
+        """End all processes, whatever they are doing."""
+        pools = [*self._busy.values(), *self._idle]
+        for pool in pools:
+            pool.stop()
+        for pool in pools:
+            pool.join()
+
+    def _start(self) -> ProcessPool:
+        # Spawned, because forking a process that has used torch's threads can deadlock.
+        return ProcessPool(
+            max_workers=1,
+            initializer=_begin,
+            initargs=(str(self._log),),
+            context=multiprocessing.get_context("spawn"),
+        )
 
 
-def _base_key(config: RunConfig) -> tuple:
-    return config.task, config.embodiment, config.demonstrations, config.policy, config.policy_seed
+def _begin(log: str) -> None:
+    """Prepare a new process."""
+    one_thread()
+    # Warnings of libraries and the last words of a crash must not tear the display.
+    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    for stream in (1, 2):
+        os.dup2(file, stream)
+    os.close(file)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _reason(error: Exception) -> str:
-    return str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+def _end_with_parent() -> None:
+    """End when the sweep does, even if that was killed: a run continues from its checkpoint."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
-def _limit_threads(workers: int) -> None:
-    import torch
-
-    torch.set_num_threads(max(1, (os.cpu_count() or 1) // workers))
-
-
-def _describe(folder: Path) -> str:
-    record = read_record(folder / "record.json")
-    final = record.evaluations[-1]
-    success = sum(final.episodes.success_once)
-    return (
-        f"success {success / len(final.episodes.seed):4.0%} of {len(final.episodes.seed)}, "
-        f"{record.wall_clock.total:.0f} s"
-    )
+def _death(code: int | None) -> str:
+    """What the exit code of a process says."""
+    if code is None:
+        return "its process ended before it began to work"
+    if code >= 0:
+        return f"its process ended with exit code {code}"
+    name = signal.Signals(-code).name
+    why = "; the system does so when memory runs out" if -code == signal.SIGKILL else ""
+    return f"its process was killed by {name}{why}"

@@ -1,14 +1,10 @@
-"""Suites as data: products, defaults, mistakes; and a pool that isolates a failing cell."""
+"""Suites as data: products, defaults, mistakes."""
 
 import pytest
 
-from agents.sac import SacConfig
 from bench.runs.config import build_config
-from bench.sweep import pool
-from bench.sweep.suite import Suite, load_suite, suite_names
-from leaderboard.records import read_record
+from bench.sweep.suite import load_suite, suite_names
 from policies.errors import UserError
-from tests.bench.tiny_run import tiny_config
 
 
 def write(tmp_path, text: str) -> str:
@@ -73,23 +69,3 @@ def test_mistakes_in_a_suite(text, words, tmp_path):
 def test_an_unknown_suite_lists_the_known_ones():
     with pytest.raises(UserError, match="demo"):
         load_suite("dmeo")
-
-
-def test_a_failed_cell_is_isolated_and_finished_ones_are_skipped(tmp_path, capsys):
-    good = tiny_config(agent="zero")
-    # Passes every check on the configuration and fails inside the run.
-    bad = tiny_config(agent="standard", sac=SacConfig(width=16, replay_capacity=2))
-    suite = Suite("two", "", (good,))
-    [outcome] = pool.run_suite(suite, tmp_path, workers=1)
-    assert outcome.status == "finished"
-    record = next(tmp_path.glob("*/record.json"))
-    written = record.stat().st_mtime_ns
-    mixed = Suite("two", "", (good, bad))
-    outcomes = pool.run_suite(mixed, tmp_path, workers=1)
-    assert [o.status for o in outcomes] == ["skipped", "failed"]
-    assert "replay_capacity" in outcomes[1].detail
-    assert record.stat().st_mtime_ns == written
-    assert read_record(record).status == "finished"
-    with pytest.raises(UserError, match="there is no embodiment"):
-        pool.run_suite(Suite("three", "", (tiny_config(embodiment="hand"),)), tmp_path, workers=1)
-    assert "failed" in capsys.readouterr().out

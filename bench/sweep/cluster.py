@@ -1,0 +1,175 @@
+"""A Ray cluster that does the tasks of a sweep, in a folder that all its machines share."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import uuid
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import grpc
+
+from bench.runs.config import RunConfig
+from bench.sweep.work import Result
+from policies.errors import UserError
+
+CONNECT_SECONDS = 10
+"""An address that does not answer within this time is given up."""
+
+ADDRESS = re.compile(r"auto|(\[[0-9a-fA-F:]+\]|[^:/\s]+):[0-9]{1,5}")
+
+
+class RayCluster:
+    """Tasks on a cluster: one processor and one thread each, and a GPU if the run wants CUDA.
+
+    Args:
+        address: ``auto`` for the cluster that this machine belongs to, or ``host:port`` of its
+            head.
+        out: folder of the runs; every machine must see it under the same path.
+        capacity: how many tasks at once at most; None for as many as the cluster has room for.
+
+    Raises:
+        UserError: if Ray is not installed, no cluster answers, or a machine does not see ``out``.
+    """
+
+    # A file server may take this long to see that a machine is gone and holds a run no more.
+    patience = 120.0
+
+    def __init__(self, address: str, out: Path, capacity: int | None):
+        self.capacity = capacity
+        self._out = out.resolve()
+        self._ray = _connect(address)
+        self._references: dict[Future, Any] = {}
+        try:
+            _check_shared(self._ray, self._out)
+        except BaseException:
+            self.stop()
+            raise
+
+    def submit(self, function: Callable[..., Result], *args: Any) -> Future:
+        """Begin a task."""
+        cuda = any(isinstance(a, RunConfig) and "cuda" in (a.sim, a.device) for a in args)
+        # The other machines know the folder by its full path only.
+        args = tuple(self._out if isinstance(a, Path) else a for a in args)
+        remote = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)(function)
+        reference = remote.remote(*args)
+        future = reference.future()
+        self._references[future] = reference
+        return future
+
+    def result(self, future: Future) -> Result:
+        """How a task ended, whatever became of its machine."""
+        del self._references[future]
+        errors = self._ray.exceptions
+        try:
+            return future.result()
+        except errors.OutOfMemoryError:
+            return Result("failed", "Ray ended its process because memory ran out")
+        except errors.RayTaskError as error:
+            return Result("failed", f"Ray could not run it: {_first_line(error)}", str(error))
+        except errors.WorkerCrashedError as error:
+            return Result("failed", f"its process died: {_first_line(error)}")
+        except errors.RayError as error:
+            return Result("lost", _first_line(error))
+
+    def stop(self) -> None:
+        """End all tasks and leave the cluster."""
+        for reference in self._references.values():
+            self._ray.cancel(reference, force=True)
+        self._references.clear()
+        self._ray.shutdown()
+
+
+def _connect(address: str) -> Any:
+    """The ray module, connected."""
+    if not ADDRESS.fullmatch(address):
+        raise UserError(f"--ray {address} is no address; use auto or the host:port of a Ray head")
+    # Before the import, which reads it.
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    try:
+        import ray
+    except ImportError as error:
+        raise UserError('--ray needs Ray; install it with: pip install "symsteer[ray]"') from error
+    if address != "auto" and not os.environ.get("RAY_USE_TLS"):
+        _knock(address)
+    try:
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+        raise UserError(
+            f"no Ray cluster can be joined at {address} ({_first_line(error)}); start one with "
+            "`ray start --head`"
+        ) from error
+    return ray
+
+
+def _knock(address: str) -> None:
+    """Give up soon where no Ray head answers: Ray itself would wait for minutes."""
+    channel = grpc.insecure_channel(address)
+    try:
+        grpc.channel_ready_future(channel).result(timeout=CONNECT_SECONDS)
+    except grpc.FutureTimeoutError as error:
+        raise UserError(
+            f"no Ray cluster answers at {address}; start one with `ray start --head`, or check "
+            "the address"
+        ) from error
+    finally:
+        channel.close()
+
+
+def _check_shared(ray: Any, out: Path) -> None:
+    """Refuse a folder that a machine with processors does not see as this one does."""
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    token = out / f".token-{uuid.uuid4().hex}"
+    token.write_text(token.name)
+    try:
+        nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
+        if not nodes:
+            raise UserError("the Ray cluster has no processor; add a machine with `ray start`")
+        answers = {
+            node["NodeID"]: ray.remote(
+                num_cpus=1,
+                max_retries=0,
+                scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False),
+            )(_answer).remote(token, node["NodeID"])
+            for node in nodes
+        }
+        blind = []
+        for node in nodes:
+            try:
+                seen = ray.get(answers[node["NodeID"]])
+            except ray.exceptions.RayError as error:
+                raise UserError(
+                    f"the machine {node['NodeManagerAddress']} of the Ray cluster cannot run "
+                    f"SymSteer ({_first_line(error)}); install the same version there"
+                ) from error
+            reply = token.with_name(f"{token.name}-{node['NodeID']}")
+            if not seen or not reply.is_file():
+                blind.append(node["NodeManagerAddress"])
+        if blind:
+            raise UserError(
+                f"the folder {out} is not shared: {', '.join(blind)} of the Ray cluster does not "
+                "see the same files there; choose one that all machines mount with --out"
+            )
+    finally:
+        for path in out.glob(f"{token.name}*"):
+            path.unlink(missing_ok=True)
+
+
+def _answer(token: Path, node: str) -> bool:
+    """On another machine: whether the token is there and an answer can be laid beside it."""
+    try:
+        if token.read_text() != token.name:
+            return False
+        token.with_name(f"{token.name}-{node}").touch()
+    except OSError:
+        return False
+    return True
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -1,0 +1,166 @@
+"""What a sweep has to do: its cells, and the list of them that ``symsteer status`` reads."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from bench.runs.config import RunConfig
+from bench.runs.folder import run_id, write_json
+from bench.runs.run import check
+from bench.sweep.suite import Suite
+from policies.errors import UserError
+
+BASIC = ("task", "embodiment", "variant", "agent", "seed")
+"""The keys of a configuration that every table and line shows."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one needs to know of a run to show it and to guess how long it takes."""
+
+    run_id: str
+    task: str
+    embodiment: str
+    variant: str
+    agent: str
+    seed: int
+    env_steps: int
+    extra: dict[str, Any] = field(default_factory=dict, hash=False)
+    """What else tells the cells of a suite apart: ``{"demonstrations.count": 5}``."""
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any], name: str, extra: Iterable[str] = ()) -> Cell:
+        """The cell of a configuration as nested plain data."""
+        flat = _flatten(config)
+        values = {key: config[key] for key in (*BASIC, "env_steps")}
+        return cls(name, **values, extra={key: flat[key] for key in extra})
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """What tells the cell apart, in the order in which it is shown."""
+        return {key: getattr(self, key) for key in BASIC} | self.extra
+
+    @property
+    def label(self) -> str:
+        """The cell in words."""
+        extra = "".join(f" {key.rpartition('.')[2]} {value}" for key, value in self.extra.items())
+        return f"{self.task} {self.embodiment} {self.variant} {self.agent}{extra} seed {self.seed}"
+
+
+def short_labels(cells: Sequence[Cell], everything: bool) -> dict[Cell, str]:
+    """The cells in as few words as tell them apart, agent first.
+
+    Args:
+        cells: of one sweep.
+        everything: name task and variant even where all cells share them.
+    """
+    shared = {key for key in BASIC if len({cell.keys[key] for cell in cells}) == 1}
+    shared -= {"agent", "seed"} | ({"task", "variant"} if everything else set())
+    labels = {}
+    for cell in cells:
+        order = ("agent", "task", "embodiment", "variant", *cell.extra)
+        words = [str(cell.keys[key]) for key in order if key not in shared]
+        labels[cell] = f"{' '.join(words)} s{cell.seed}"
+    return labels
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The cells of a suite, in its order, and the folder of their runs."""
+
+    name: str
+    description: str
+    out: Path
+    configs: dict[Cell, RunConfig]
+
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells, in the order of the suite."""
+        return list(self.configs)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The resolved list of a sweep, ``OUT/sweeps/<suite>.json``."""
+
+    suite: str
+    description: str
+    workers: int
+    """Runs side by side; 0 if the cluster decides."""
+    updated: str
+    runs: tuple[Cell, ...]
+    failures: dict[str, str] = field(default_factory=dict)
+    """Why runs failed in the last sweep, by run id. A run whose process was killed cannot say so
+    in its own record."""
+
+
+def make_plan(suite: Suite, out: Path) -> Plan:
+    """Resolve a suite, and refuse what cannot run before anything is built.
+
+    Raises:
+        UserError: if a cell names what does not exist.
+    """
+    flat = []
+    for config in suite.runs:
+        check(config)
+        flat.append(_flatten(config.to_json()))
+    extra = [
+        key
+        for key in flat[0]
+        if key not in (*BASIC, "env_steps") and any(one[key] != flat[0][key] for one in flat)
+    ]
+    cells = {Cell.of(config.to_json(), run_id(config, {}), extra): config for config in suite.runs}
+    return Plan(suite.name, suite.description, out, cells)
+
+
+def manifest_path(out: Path, suite: str) -> Path:
+    """Where the list of a sweep lies."""
+    return out / "sweeps" / f"{suite}.json"
+
+
+def write_manifest(plan: Plan, workers: int, failures: Mapping[str, str]) -> None:
+    """Write the list of a sweep atomically.
+
+    Raises:
+        RecordError: if it cannot be written.
+    """
+    manifest = Manifest(
+        plan.name,
+        plan.description,
+        workers,
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        tuple(plan.cells),
+        dict(failures),
+    )
+    write_json(manifest_path(plan.out, plan.name), asdict(manifest))
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read the list of a sweep.
+
+    Raises:
+        UserError: if the file is no such list.
+    """
+    try:
+        return TypeAdapter(Manifest).validate_python(json.loads(path.read_text()))
+    except (OSError, ValueError, ValidationError) as error:
+        raise UserError(
+            f"{path} is not the list of a sweep; run the sweep again to write it anew"
+        ) from error
+
+
+def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            flat |= _flatten(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat

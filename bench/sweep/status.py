@@ -1,0 +1,146 @@
+"""``symsteer status``: how far the sweeps of a folder are."""
+
+from __future__ import annotations
+
+import difflib
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bench.runs.folder import CONFIG, read_config
+from bench.sweep.estimate import Estimate, duration
+from bench.sweep.plan import BASIC, Cell, Manifest, manifest_path, read_manifest
+from bench.sweep.survey import Sighting, look
+from policies.errors import UserError
+
+STATES = ("finished", "running", "interrupted", "failed", "missing")
+
+
+@dataclass(frozen=True)
+class Status:
+    """The runs of a sweep, or those of a folder that belong to none."""
+
+    title: str
+    runs: dict[Cell, Sighting]
+    reasons: dict[str, str] = field(default_factory=dict)
+    """Why runs failed, by run id."""
+    workers: int = 0
+    """Runs that the last sweep had side by side; 0 if that is not known."""
+
+    def state(self, cell: Cell) -> str:
+        """One of :data:`STATES`."""
+        state = self.runs[cell].state
+        # A run that was killed could not write it down; the sweep that saw it did.
+        if state in ("interrupted", "missing") and cell.run_id in self.reasons:
+            return "failed"
+        return state
+
+    def cells(self, state: str) -> list[Cell]:
+        """The cells in a state."""
+        return [cell for cell in self.runs if self.state(cell) == state]
+
+    def seconds_left(self) -> float | None:
+        """Until all is finished, by as many workers as run now; None where nothing is known."""
+        estimate = Estimate()
+        for cell in self.cells("finished"):
+            estimate.add(cell, self.runs[cell].seconds)
+        running = self.cells("running")
+        todo = [cell for cell in self.runs if self.state(cell) not in ("finished", "running")]
+        progress = {cell: self.runs[cell].progress for cell in running}
+        return estimate.left(todo, progress, len(running) or self.workers or 1)
+
+
+def read_status(folder: Path, suite: str | None = None) -> list[Status]:
+    """The sweeps of a folder, and the runs that belong to none.
+
+    Args:
+        folder: of the runs.
+        suite: look at the sweep of this suite only.
+
+    Raises:
+        UserError: if there is no such folder or sweep, or its list is damaged.
+    """
+    if not folder.is_dir():
+        raise UserError(f"there is no folder {folder}; name the --out of a sweep or a run")
+    manifests = {
+        path.stem: path for path in sorted(manifest_path(folder, "*").parent.glob("*.json"))
+    }
+    if suite is not None:
+        if suite not in manifests:
+            close = difflib.get_close_matches(suite, manifests, n=1) or list(manifests)
+            hint = f"there: {', '.join(close)}" if close else "no sweep was begun there"
+            raise UserError(f"{folder} holds no sweep of a suite {suite!r}; {hint}")
+        return [_of_sweep(folder, read_manifest(manifests[suite]))]
+    found = [_of_sweep(folder, read_manifest(path)) for path in manifests.values()]
+    listed = {cell.run_id for status in found for cell in status.runs}
+    others = {}
+    for path in sorted(folder.glob(f"*/{CONFIG}")):
+        if path.parent.name not in listed:
+            config = read_config(path.parent)
+            if all(key in config for key in (*BASIC, "env_steps")):
+                others[Cell.of(config, path.parent.name)] = look(path.parent)
+    if others:
+        found.append(Status("runs of no sweep" if found else "runs", others))
+    return found
+
+
+def to_text(found: list[Status], folder: Path) -> str:
+    """What :func:`read_status` found, for reading."""
+    if not found:
+        return (
+            f"there are no runs in {folder} yet; `symsteer sweep SUITE --out {folder}` begins some"
+        )
+    return "\n\n".join(_text(status) for status in found)
+
+
+def _of_sweep(folder: Path, manifest: Manifest) -> Status:
+    return Status(
+        f"{manifest.suite}: {manifest.description}",
+        {cell: look(folder / cell.run_id) for cell in manifest.runs},
+        manifest.failures,
+        manifest.workers,
+    )
+
+
+def _text(status: Status) -> str:
+    lines = [f"{status.title} ({len(status.runs)} runs)"]
+    counts = Counter(status.state(cell) for cell in status.runs)
+    lines += [f"  {state:12s}{counts[state]:6d}" for state in STATES]
+    for state in ("running", "interrupted", "failed"):
+        if cells := status.cells(state):
+            lines.append(f"{state}:")
+            lines += [f"  {cell.label}: {_detail(status, cell)}" for cell in cells]
+    if counts["finished"] < len(status.runs):
+        left = status.seconds_left()
+        workers = counts["running"] or status.workers or 1
+        lines.append(
+            "time left: unknown, no such runs are finished yet"
+            if left is None
+            else f"time left: about {duration(left)} with {workers} "
+            f"worker{'s' if workers > 1 else ''}"
+            + ("" if counts["running"] else ", once they run: none does now")
+        )
+    return "\n".join(lines)
+
+
+def _detail(status: Status, cell: Cell) -> str:
+    """What there is to say of a run that is not finished."""
+    seen = status.runs[cell]
+    state = status.state(cell)
+    if state == "failed":
+        own = seen.record.failure if seen.record else None
+        return status.reasons.get(cell.run_id) or own or "it does not say why"
+    if state == "interrupted":
+        done = seen.record.budget.env_steps if seen.record else 0
+        return f"after {done:,} of {cell.env_steps:,} steps at least; it continues from there"
+    progress = seen.progress
+    if not progress:
+        return "starting"
+    words = [f"{progress['env_steps']:,} of {progress['budget']:,} steps"]
+    if progress.get("success") is not None:
+        words.append(f"success {progress['success']:.0%}")
+    if progress.get("steps_per_second"):
+        words.append(f"{progress['steps_per_second']:,.0f} steps/s")
+    if progress.get("seconds_left") is not None:
+        words.append(f"about {duration(progress['seconds_left'])} left")
+    return ", ".join(words)

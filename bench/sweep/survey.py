@@ -1,0 +1,47 @@
+"""What has become of runs, as their folders tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bench.runs.folder import RECORD, State, read_progress, state_of
+from leaderboard.errors import RecordError
+from leaderboard.records import RunRecord, read_record
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A run as its folder shows it."""
+
+    state: State
+    record: RunRecord | None = None
+    progress: Mapping[str, Any] | None = None
+    """Of a running run: what :func:`bench.runs.folder.read_progress` says."""
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that the run took, all its sessions together."""
+        return self.record.wall_clock.total if self.record else 0.0
+
+    @property
+    def success(self) -> str:
+        """Success of the last evaluation in words."""
+        if not self.record or not self.record.evaluations:
+            return "no evaluation"
+        last = self.record.evaluations[-1]
+        return f"success {last.success_once:4.0%} of {len(last.episodes.seed)}"
+
+
+def look(folder: Path) -> Sighting:
+    """Read the folder of a run."""
+    try:
+        record = read_record(folder / RECORD)
+    except RecordError:
+        record = None
+    if record and record.status == "finished":
+        return Sighting("finished", record)
+    state = state_of(folder)
+    return Sighting(state, record, read_progress(folder) if state == "running" else None)

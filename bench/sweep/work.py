@@ -1,0 +1,91 @@
+"""What the processes of a sweep do, on this machine or on a cluster: build a base, play a cell.
+
+These functions return what went wrong instead of raising it, so that an error never has to be
+rebuilt in another process.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from bench.runs.base_policy import demonstration_file, prepare_base
+from bench.runs.config import RunConfig
+from bench.runs.folder import RunBusyError, is_finished, run_id
+from bench.runs.run import execute
+from leaderboard.errors import RecordError
+from policies.errors import UserError
+
+POLL_SECONDS = 0.5
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a task ended."""
+
+    status: Literal["done", "failed", "busy", "lost"]
+    """``busy``: another process works on the run. ``lost``: the machine went away, which is no
+    fault of the task."""
+    reason: str = ""
+    trace: str = ""
+    """Where it went wrong, if that is a surprise."""
+
+
+def one_thread() -> None:
+    """Let this process compute with one thread: the runs share the cores as processes."""
+    torch.set_num_threads(1)
+
+
+def build_demonstrations(config: RunConfig, out: Path) -> Result:
+    """Collect the demonstrations of a cell, if they are not there."""
+    return _guarded(lambda: demonstration_file(config, out, progress=False))
+
+
+def build_base(config: RunConfig, out: Path) -> Result:
+    """Train the base policy of a cell, if it is not there."""
+    return _guarded(lambda: prepare_base(config, out, progress=False))
+
+
+def play(config: RunConfig, out: Path, patience: float) -> Result:
+    """Run a cell, or continue it.
+
+    Args:
+        config: of the run.
+        out: folder of the runs.
+        patience: seconds to wait for another process that works on the run: one that has just
+            died on another machine may seem to hold it for a while.
+    """
+    folder = out / run_id(config, {})
+    deadline = time.monotonic() + patience
+    while True:
+        if is_finished(folder):
+            return Result("done")
+        try:
+            return _guarded(lambda: execute(config, out, progress=False))
+        except RunBusyError as error:
+            if time.monotonic() > deadline:
+                return Result("busy", str(error))
+        time.sleep(POLL_SECONDS)
+
+
+def _guarded(action: Callable[[], object]) -> Result:
+    one_thread()
+    try:
+        action()
+    except RunBusyError:
+        raise
+    except (UserError, RecordError) as error:
+        return Result("failed", str(error))
+    except Exception as error:
+        return Result("failed", f"{type(error).__name__}: {error}", traceback.format_exc())
+    finally:
+        # A run that failed leaves simulations behind, of which one process holds so many.
+        gc.collect()
+    return Result("done")
