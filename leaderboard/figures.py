@@ -288,14 +288,16 @@ def advantage_map(found: DefectMap) -> Figure:
                 ax.set_xlabel("audited defect")
             if column == 0:
                 ax.set_ylabel(f"advantage over {BASELINE}")
-    handles = {
+    handles: dict[str, Line2D | Patch] = {
         _ascii(", ".join(place), 26): Line2D(
             [], [], color="#555555", marker=marker, linestyle="none", markersize=5
         )
         for place, marker in markers.items()
     }
-    diamond = Line2D([], [], color="black", marker="d", linestyle="-", markersize=7)
-    _legend(figure, {**handles, "falls through 0, 95 %": diamond}, columns=4)
+    if any(panel.line and panel.line.crossing.value is not None for panel in found.panels.values()):
+        shape: dict[str, Any] = {"marker": "d", "linestyle": "-", "markersize": 7}
+        handles["falls through 0, 95 %"] = Line2D([], [], color="black", **shape)
+    _legend(figure, handles, columns=4)
     return figure
 
 
