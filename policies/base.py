@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -27,7 +27,7 @@ PolicyName = Literal["edp", "plain", "plain-augmented"]
 Network = Literal["mlp", "unet"]
 
 FORMAT = "symsteer-policy"
-VERSION = 1
+VERSION = 2
 FILE_NAME = "policy.safetensors"
 
 DECODE_FIELDS = (
@@ -323,37 +323,49 @@ def save_policy(
 
     Returns:
         The file's path.
+
+    Raises:
+        UserError: if the file cannot be written; an earlier one stays as it was.
     """
     path = policy_path(folder_or_path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    description = json.dumps(
+        {
+            "config": policy.config.to_json(),
+            "obs_layout": policy.obs_layout.to_json(),
+            "act_layout": policy.act_layout.to_json(),
+            "training_record": policy.training_record,
+            "report": {**policy.report, **(extra or {})},
+            "content_hash": policy.content_hash(),
+        }
+    )
     metadata = {
         "format": FORMAT,
         "version": str(VERSION),
-        "policy": json.dumps(
-            {
-                "config": policy.config.to_json(),
-                "obs_layout": policy.obs_layout.to_json(),
-                "act_layout": policy.act_layout.to_json(),
-                "training_record": policy.training_record,
-                "report": {**policy.report, **(extra or {})},
-                "content_hash": policy.content_hash(),
-            }
-        ),
+        "policy": description,
+        "policy_sha256": _sha256(description),
     }
     tensors = {key: value.cpu().contiguous() for key, value in policy.state_dict().items()}
     payload = serialize(tensors, metadata)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with os.fdopen(handle, "wb") as file:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "wb") as file:
             file.write(payload)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    except OSError as error:
+        raise UserError(
+            f"{path} cannot be written: {error.strerror}; free space or choose another folder"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
     return path
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def load_policy(
@@ -386,10 +398,16 @@ def load_policy(
         ) from error
     if metadata.get("format") != FORMAT:
         raise UserError(f"{path} holds no SymSteer policy; give a file that SymSteer wrote")
-    if metadata.get("version") != str(VERSION):
+    if metadata.get("version") not in ("1", str(VERSION)):
         raise UserError(
             f"{path} has policy format version {metadata.get('version')}, and this SymSteer reads "
             f"version {VERSION}; train the policy again or use the SymSteer that wrote it"
+        )
+    # Version 1 had a checksum of the tensors alone.
+    wanted = metadata.get("policy_sha256", None if metadata["version"] == "1" else "")
+    if wanted is not None and wanted != _sha256(metadata.get("policy", "")):
+        raise UserError(
+            f"{path} is damaged: its description does not match its checksum; copy it again"
         )
     try:
         description = json.loads(metadata["policy"])

@@ -4,7 +4,16 @@
 - `load(...)` reads such files, ours and ManiSkill's published ones.
 """
 
-from bench.demos.collect import CLEAN, DIVERSE, MODES, Diversity, collect
+from bench.demos.collect import CLEAN, DIVERSE, FORMAT, MODES, Diversity, collect
 from bench.demos.load import Demonstrations, load
 
-__all__ = ["CLEAN", "DIVERSE", "MODES", "Demonstrations", "Diversity", "collect", "load"]
+__all__ = [
+    "CLEAN",
+    "DIVERSE",
+    "FORMAT",
+    "MODES",
+    "Demonstrations",
+    "Diversity",
+    "collect",
+    "load",
+]

@@ -8,6 +8,7 @@ offset of the point that is grasped or pushed, and only successes are kept.
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 from collections.abc import Callable
@@ -19,11 +20,16 @@ import h5py
 import numpy as np
 import torch
 
+from bench.demos.seal import SEAL, checksum
 from bench.sim.environment import Simulator
 from bench.tasks import make
 from bench.tasks.base import SymmetricTask
 from bench.tasks.experts import Expert
+from leaderboard.records import write_atomically
 from policies.errors import UserError
+
+FORMAT = 2
+"""Of our files; 2 has a checksum."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,7 @@ def collect(
 
     Raises:
         UserError: for a bad argument, or if the expert fails too often.
+        RecordError: if the files cannot be written; earlier ones stay as they were.
     """
     path = Path(out_path)
     if path.suffix != ".h5":
@@ -212,31 +219,6 @@ def _write(
     tried: int,
     variant: str,
 ) -> None:
-    # Written aside first: an interrupted run leaves no half file under the final name.
-    partial = path.with_name(path.name + ".partial")
-    episodes = []
-    with h5py.File(partial, "w") as file:
-        for i, attempt in enumerate(attempts):
-            group = file.create_group(f"traj_{i}", track_order=True)
-            end = len(attempt.actions)
-            last = np.arange(end) == end - 1
-            group.create_dataset("obs", data=attempt.obs, dtype=np.float32)
-            group.create_dataset("actions", data=attempt.actions, dtype=np.float32)
-            group.create_dataset("terminated", data=last)
-            group.create_dataset("truncated", data=last & (end >= env.max_episode_steps))
-            group.create_dataset("success", data=last)
-            group.create_dataset("rewards", data=attempt.rewards, dtype=np.float32)
-            _write_tree(group.create_group("env_states", track_order=True), attempt.states)
-            episodes.append(
-                {
-                    "episode_id": i,
-                    "episode_seed": attempt.seed,
-                    "control_mode": env.control_mode,
-                    "elapsed_steps": end,
-                    "reset_kwargs": {"seed": attempt.seed},
-                    "success": True,
-                }
-            )
     description = {
         "env_info": {
             "env_id": f"SymSteer/{env.task_id}",
@@ -251,10 +233,21 @@ def _write(
             },
             "max_episode_steps": env.max_episode_steps,
         },
-        "episodes": episodes,
+        "episodes": [
+            {
+                "episode_id": i,
+                "episode_seed": attempt.seed,
+                "control_mode": env.control_mode,
+                "elapsed_steps": len(attempt.actions),
+                "reset_kwargs": {"seed": attempt.seed},
+                "success": True,
+            }
+            for i, attempt in enumerate(attempts)
+        ],
         "source_type": "scripted",
         "source_desc": f"SymSteer's scripted expert, {mode} demonstrations",
         "symsteer": {
+            "format": FORMAT,
             "mode": mode,
             "diversity": dataclasses.asdict(settings),
             "seed": seed,
@@ -263,9 +256,24 @@ def _write(
             "action_layout": env.action_layout.to_json(),
         },
     }
-    text = json.dumps(description, indent=2)
-    path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    # In memory first: HDF5 itself reports a full disk late, and leaves a file behind.
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for i, attempt in enumerate(attempts):
+            group = file.create_group(f"traj_{i}", track_order=True)
+            end = len(attempt.actions)
+            last = np.arange(end) == end - 1
+            group.create_dataset("obs", data=attempt.obs, dtype=np.float32)
+            group.create_dataset("actions", data=attempt.actions, dtype=np.float32)
+            group.create_dataset("terminated", data=last)
+            group.create_dataset("truncated", data=last & (end >= env.max_episode_steps))
+            group.create_dataset("success", data=last)
+            group.create_dataset("rewards", data=attempt.rewards, dtype=np.float32)
+            _write_tree(group.create_group("env_states", track_order=True), attempt.states)
+        file.attrs[SEAL] = checksum(file, description)
+    text = json.dumps(description, indent=2) + "\n"
+    write_atomically(path.with_suffix(".json"), text.encode())
+    write_atomically(path, buffer.getvalue())
 
 
 def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import torch
 
+from bench.demos.seal import SEAL, checksum
 from bench.tasks import check_embodiment, make, task_class
 from bench.tasks.embodiments import EMBODIMENTS
 from policies.errors import UserError
@@ -76,9 +77,14 @@ def load(
     try:
         with h5py.File(path, "r") as file:
             groups = [_read_group(path, file, record, own) for record in records]
-    except OSError as error:
+            seal = file.attrs.get(SEAL)
+            # Ours say so twice, so that damage cannot make a file pass for somebody else's.
+            sealed = seal is not None or "symsteer" in description
+            intact = not sealed or str(seal) == checksum(file, description)
+    # HDF5 meets damage with many kinds of errors.
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError, MemoryError) as error:
         raise UserError(
-            f"{path} is truncated or not an HDF5 file; download or collect it again"
+            f"{path} is truncated or not an HDF5 file of trajectories; download or collect it again"
         ) from error
     for group in groups:
         _check_actions(path, group, env_class.action_layout.dim)
@@ -86,6 +92,11 @@ def load(
         _rebuild_observations(path, groups, env_class.task_id, embodiment)
     for group in groups:
         _check_observations(path, group, layout.dim)
+    if not intact:
+        raise UserError(
+            f"{path} and its .json do not match the checksum that they were written with: one of "
+            "them is damaged, edited, or of another pair; collect both again"
+        )
     episodes = [(torch.from_numpy(g["obs"]), torch.from_numpy(g["actions"])) for g in groups]
     digest = hashlib.sha256()
     for obs, actions in episodes:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from bench.demos import MODES, Demonstrations, collect, load
+from bench.demos import FORMAT, MODES, Demonstrations, collect, load
 from bench.runs.config import RunConfig, content_key
 from bench.steering.evaluation import DRAWS, Steerability, steerability
 from bench.steering.latent_env import LatentNoiseEnv
@@ -66,10 +66,7 @@ def prepare_base(
     if report.warning and progress:
         tqdm.write(f"warning: {report.warning}")
     base.report["steerability"] = dataclasses.asdict(report)
-    try:
-        save_policy(base, folder)
-    except OSError as error:
-        raise UserError(f"cannot write the base policy to {folder}: {error.strerror}") from error
+    save_policy(base, folder)
     return base.to(config.device)
 
 
@@ -90,7 +87,7 @@ def demonstration_path(config: RunConfig, out: Path) -> Path:
     """Where the scripted expert's demonstrations for a run lie, or will."""
     wanted = config.demonstrations
     # The mode's own settings are part of the name: a change of theirs must not find old files.
-    key = content_key(dataclasses.asdict(MODES[wanted.mode]))
+    key = content_key(dataclasses.asdict(MODES[wanted.mode]), FORMAT)
     name = f"{config.task}-{config.embodiment}-{wanted.mode}-{wanted.count}-s{wanted.seed}-{key}.h5"
     return out / "base" / name
 
@@ -101,28 +98,20 @@ def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> P
     path = demonstration_path(config, out)
     if path.is_file():
         return path
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tqdm(
-            total=wanted.count, desc="demonstrations", disable=None if progress else True
-        ) as bar:
+    with tqdm(total=wanted.count, desc="demonstrations", disable=None if progress else True) as bar:
 
-            def advance(done: int, total: int) -> None:
-                bar.update(done - bar.n)
+        def advance(done: int, total: int) -> None:
+            bar.update(done - bar.n)
 
-            return collect(
-                config.task,
-                config.embodiment,
-                wanted.count,
-                wanted.mode,
-                wanted.seed,
-                path,
-                progress=advance,
-            )
-    except OSError as error:
-        raise UserError(
-            f"cannot write demonstrations to {path.parent}: {error.strerror}"
-        ) from error
+        return collect(
+            config.task,
+            config.embodiment,
+            wanted.count,
+            wanted.mode,
+            wanted.seed,
+            path,
+            progress=advance,
+        )
 
 
 def describe_base(policy: ChunkPolicy) -> BasePolicy:

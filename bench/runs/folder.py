@@ -7,6 +7,7 @@ progress.json, the TensorBoard events, and .lock, held by the process that works
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import os
@@ -29,7 +30,7 @@ State = Literal["missing", "running", "interrupted", "failed", "finished"]
 CONFIG, RECORD, CHECKPOINT = "config.json", "record.json", "checkpoint.pt"
 PROGRESS, LOCK = "progress.json", ".lock"
 
-CHECKPOINT_FORMAT = 1
+CHECKPOINT_FORMAT = 2
 
 HEARTBEAT_SECONDS = 2.0
 
@@ -147,10 +148,25 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint of tensors and plain data atomically: the old one stays until then."""
-    buffer = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, "run_id": folder.name, **state}, buffer)
-    write_atomically(folder / CHECKPOINT, buffer.getvalue())
+    """Write a checkpoint of tensors and plain data atomically: the old one stays until then.
+
+    The state lies inside as bytes beside their SHA-256, because ``torch.load`` does not look at
+    the checksums of the archive that it reads.
+    """
+    inner = io.BytesIO()
+    torch.save(state, inner)
+    payload = inner.getvalue()
+    outer = io.BytesIO()
+    torch.save(
+        {
+            "format": CHECKPOINT_FORMAT,
+            "run_id": folder.name,
+            "sha256": hashlib.sha256(payload).hexdigest(),
+            "state": torch.frombuffer(bytearray(payload), dtype=torch.uint8),
+        },
+        outer,
+    )
+    write_atomically(folder / CHECKPOINT, outer.getvalue())
 
 
 def load_checkpoint(folder: Path) -> dict[str, Any] | None:
@@ -160,26 +176,28 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
         UserError: if the file is damaged or of another run.
     """
     path = folder / CHECKPOINT
+    cure = "delete it to start the run from the beginning"
     try:
-        state = torch.load(io.BytesIO(path.read_bytes()), weights_only=True)
+        file = torch.load(io.BytesIO(path.read_bytes()), weights_only=True)
     except FileNotFoundError:
         return None
     # A damaged archive fails in many ways: zip, pickle, key and runtime errors.
     except Exception as error:
+        raise UserError(f"{path} cannot be read as a checkpoint; {cure}") from error
+    if not isinstance(file, dict) or file.get("format") != CHECKPOINT_FORMAT:
+        raise UserError(f"{path} is not a checkpoint that this version reads; {cure}")
+    if file.get("run_id") != folder.name:
         raise UserError(
-            f"{path} cannot be read as a checkpoint; delete it to start the run from the beginning"
-        ) from error
-    if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
-        raise UserError(
-            f"{path} is not a checkpoint that this version reads; delete it to start the run "
-            "from the beginning"
+            f"{path} is of another run ({str(file.get('run_id'))[:120]}); put it back, or {cure}"
         )
-    if state.get("run_id") != folder.name:
-        raise UserError(
-            f"{path} is of another run ({str(state.get('run_id'))[:120]}); put it back, or delete "
-            "it to start the run from the beginning"
-        )
-    return state
+    try:
+        payload = file["state"].numpy().tobytes()
+        intact = hashlib.sha256(payload).hexdigest() == file["sha256"]
+    except (KeyError, AttributeError, TypeError, RuntimeError):
+        intact = False
+    if not intact:
+        raise UserError(f"{path} is damaged: its contents do not match its checksum; {cure}")
+    return torch.load(io.BytesIO(payload), weights_only=True)
 
 
 class Heartbeat:

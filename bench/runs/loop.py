@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from agents import ReplayBuffer, make_agent
 from bench.runs.base_policy import describe_base
-from bench.runs.config import RunConfig, training_seeds
+from bench.runs.config import RunConfig, content_key, training_seeds
 from bench.runs.evaluator import Evaluator, make_env
 from bench.runs.folder import (
     CHECKPOINT,
@@ -46,6 +46,7 @@ from leaderboard.records import (
     Provenance,
     RunRecord,
     WallClock,
+    config_hash,
     read_record,
     write_record,
 )
@@ -307,6 +308,7 @@ class Loop:
                 "next_evaluation": self.next_evaluation,
                 "fresh_starts": self.fresh_starts,
                 "evaluations": len(self.record.evaluations),
+                "history": _history(self.record),
                 "final": self.final,
                 "last_scalars": self.last_scalars,
                 "seconds": {
@@ -353,6 +355,13 @@ class Loop:
         if checkpoint:
             record = read_record(self.folder / RECORD)
             del record.evaluations[checkpoint["evaluations"] :]
+            mine = (self.folder.name, config_hash(resolved), checkpoint["history"])
+            if (record.run_id, record.config_hash, _history(record)) != mine:
+                raise UserError(
+                    f"{self.folder / RECORD} is not the record that {CHECKPOINT} beside it "
+                    "continues; restore both as they were, or delete the run's folder to start "
+                    "again"
+                )
             if provenance not in (record.provenance, *record.continued):
                 record.continued = [*record.continued, provenance]
             record.wall_clock.resumed += 1
@@ -470,6 +479,13 @@ class _Means:
         self._sums.clear()
         self._counts.clear()
         return means
+
+
+def _history(record: RunRecord) -> str:
+    """A key of all that the record says about the evaluations so far."""
+    return content_key(
+        [evaluation.model_dump(mode="json", by_alias=True) for evaluation in record.evaluations]
+    )
 
 
 def _title(config: RunConfig) -> str:

@@ -104,6 +104,7 @@ def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
         UserError: if the folder is no run's, the run is finished, its checkpoint is damaged, or
             another process is working on it.
     """
+    folder = folder.resolve()  # its name is the run's, also where it is called "."
     config, files = _stored(folder)
     _check_all(config, workers)
 
@@ -159,6 +160,7 @@ def evaluate(
     Raises:
         UserError: if the folder is no run's, or it has no checkpoint yet.
     """
+    folder = folder.resolve()
     config, _ = _stored(folder)
     _check_all(config, workers)
     own = evaluated(config.variant)
@@ -257,7 +259,7 @@ def _stored(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
     files = data.pop("files", {})
     data.pop("evaluation_variant", None)
     config = build_config(data, str(folder / CONFIG))
-    if not isinstance(files, dict) or run_id(config, files) != folder.resolve().name:
+    if not isinstance(files, dict) or run_id(config, files) != folder.name:
         raise UserError(
             f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or the "
             "folder renamed; undo that"

@@ -1,5 +1,7 @@
 """Saving and loading policies: bit-equal round trip, checksums, one-sentence errors."""
 
+import errno
+import hashlib
 import json
 import os
 
@@ -73,10 +75,10 @@ def test_a_failed_write_leaves_the_old_file(trained, tmp_path, monkeypatch):
     old = path.read_bytes()
 
     def full_disk(*_):
-        raise OSError("no space left")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full_disk)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(UserError, match=r"policy\.safetensors cannot be written: No space"):
         save_policy(policy, tmp_path)
     assert path.read_bytes() == old
     assert os.listdir(tmp_path) == [path.name]
@@ -128,13 +130,22 @@ def test_other_files(saved, tmp_path):
 
 def test_other_version(saved):
     rewrite(saved, {"version": "99"})
-    refuse(saved, "version 99", "version 1")
+    refuse(saved, "version 99", "version 2")
 
 
 @pytest.mark.parametrize("description", ["{", "{}", "[]", '{"config": {"name": "edp"}}'])
 def test_damaged_description(saved, description):
-    rewrite(saved, {"policy": description})
+    digest = hashlib.sha256(description.encode()).hexdigest()
+    rewrite(saved, {"policy": description, "policy_sha256": digest})
     refuse(saved, "damaged")
+
+
+def test_an_edited_report_is_noticed(trained, tmp_path):
+    path = save_policy(trained(group="C8"), tmp_path, extra={"success": 0.25})
+    with safe_open(path, framework="pt") as file:
+        description = file.metadata()["policy"]
+    rewrite(path, {"policy": description.replace('"success": 0.25', '"success": 0.95')})
+    refuse(path, "does not match its checksum")
 
 
 def test_damaged_tensors(saved):

@@ -83,7 +83,7 @@ def kill_after(folder, seconds):
 def _killed_anywhere(undisturbed, begun, kills, seed):
     """Kill ``kills`` runs at random moments each, continue them; how many checkpoints were used."""
     generator = random.Random(seed)
-    pristine = begun.parent.parent / "pristine"
+    pristine = begun.parent / "pristine"
     shutil.copytree(begun, pristine)
     whole = duration(begun)
     assert without_clock(begun) == without_clock(undisturbed)
