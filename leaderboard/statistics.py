@@ -264,8 +264,19 @@ def area_weights(steps: Sequence[int], budget: int) -> tuple[float, ...]:
 def steps_to_threshold(
     steps: Sequence[int], values: Sequence[float], threshold: float
 ) -> int | None:
-    """Steps of the first evaluation at or above `threshold`; None (censored) if there is none."""
-    return next((s for s, v in zip(steps, values, strict=True) if v >= threshold), None)
+    """Steps of the evaluation from which on all are at or above `threshold`; None (censored) if
+    the last one is below.
+
+    Not of the first one above it: an untrained actor steers with about zero noise, which often is
+    good; what counts is when the agent has got over what learning does to that.
+    """
+    reached = None
+    for step, value in zip(steps, values, strict=True):
+        if value < threshold:
+            reached = None
+        elif reached is None:
+            reached = step
+    return reached
 
 
 def censored_median(values: Sequence[int | None]) -> float | None:

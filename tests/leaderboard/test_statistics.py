@@ -136,7 +136,9 @@ def test_area_under_curve() -> None:
 
 
 def test_steps_to_threshold_and_their_median() -> None:
-    assert steps_to_threshold([0, 10, 20], [0.1, 0.5, 0.4], 0.5) == 10
+    assert steps_to_threshold([0, 10, 20], [0.1, 0.5, 0.6], 0.5) == 10
+    assert steps_to_threshold([0, 10, 20], [0.9, 0.1, 0.5], 0.5) == 20
+    assert steps_to_threshold([0, 10, 20], [0.9, 0.9, 0.4], 0.5) is None
     assert steps_to_threshold([0, 10, 20], [0.1, 0.5, 0.4], 0.6) is None
     assert censored_median([10, None, 30]) == 30
     assert censored_median([10, 20]) == 15
