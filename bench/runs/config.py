@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
@@ -123,6 +124,12 @@ def training_seeds(run_seed: int, start: int, count: int) -> list[int]:
     return [FIRST_TRAINING_SEED + int(word % span) for word in words]
 
 
+@functools.cache
+def _adapter() -> TypeAdapter[RunConfig]:
+    # Made once: a suite has thousands of configurations, and making it takes longer than using it.
+    return TypeAdapter(RunConfig)
+
+
 def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
     """A run's configuration from nested plain data; what is left out keeps its default.
 
@@ -141,7 +148,7 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
     except (TypeError, ValueError) as error:
         raise UserError(f"{source}: a value is neither a number nor text: {error}") from error
     try:
-        return TypeAdapter(RunConfig).validate_json(text, strict=True)
+        return _adapter().validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
