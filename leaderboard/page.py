@@ -61,8 +61,8 @@ the budget and the held-out episodes that score them.
 - **AUC** is the area under the success curve as a share of the budget's maximum: how good the
   agent was on average while it learned. **Steps** is the median number of environment steps after
   which the success stays at {100 * THRESHOLD:.0f} % of the best learning agent's or above, and how
-  many seeds got there; `>` means that the median seed did not within the budget. **Dip** is the deepest fall
-  below the base policy at any evaluation of any seed.
+  many seeds got there; `>` means that the median seed did not within the budget. **Dip** is the
+  deepest fall below the base policy at any evaluation of any seed.
 - **Q diverged** († at a glance) counts the seeds whose Q-values left the range of returns that the
   reward allows (more than {100 * DIVERGED_SHARE:.0f} % of the states at {DIVERGED_EVALUATIONS}
   evaluations in a row, once learning has begun) or were not finite.
