@@ -47,7 +47,8 @@ MAX_TEXT = 2000
 
 HELD_OUT_SEED = 1_000_000
 """Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
-and run. Training and steerability draw their seeds below it, demonstrations at random from 2^31."""
+and run. Steerability draws its seeds below it, training far above it (from 2^22 on), and
+demonstrations anywhere below 2^31."""
 
 DIVERGED_SHARE = 0.05
 DIVERGED_EVALUATIONS = 3

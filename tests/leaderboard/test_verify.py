@@ -24,18 +24,13 @@ REPOSITORY = Path(__file__).parents[2]
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("verify")
     generator = np.random.default_rng(0)
-    for variant in ("none", "action_gain:0.5"):
-        for seed in range(2):
-            for agent in ("base", "standard", "equivariant"):
-                learns = agent != "base"
-                curve = make_curve(generator, [0.35, 0.5, 0.65]) if learns else None
-                record = make_record(
-                    curve or [make_evaluation(generator.random(100) < 0.35)],
-                    agent=agent,
-                    seed=seed,
-                    variant=variant,
-                )
-                write_record(record, folder / "records" / f"{record.run_id}.json")
+    for seed in range(2):
+        for agent in ("base", "standard", "equivariant"):
+            curve = make_curve(generator, [0.35, 0.5, 0.65])
+            if agent == "base":
+                curve = [make_evaluation(generator.random(100) < 0.35)]
+            record = make_record(curve, agent=agent, seed=seed, variant="action_gain:0.5")
+            write_record(record, folder / "records" / f"{record.run_id}.json")
     generate([folder / "records"], folder / "board")
     return folder
 
@@ -75,7 +70,7 @@ def test_what_was_generated_agrees(board: Path, capsys: pytest.CaptureFixture[st
     assert (code, error) == (0, "")
     assert len(lines) == 1
     files = len(snapshot(board)) - 3
-    assert f"12 records and {files} files of the leaderboard agree" in lines[0]
+    assert f"6 records and {files} files of the leaderboard agree" in lines[0]
 
 
 def test_each_file_that_differs_has_its_line(
