@@ -32,7 +32,7 @@ SECTORS = 12
 """Directions that successes are counted in."""
 
 FRAMES = 6
-"""Frames of a strip."""
+"""Frames of an episode, in two rows."""
 
 # Told apart with colour blindness, after Okabe and Ito.
 SUCCESS, FAILURE, TOOL = "#0072B2", "#D55E00", "#999999"
@@ -50,11 +50,11 @@ def positions(layout: Layout) -> list[str]:
 def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
     """Where tool and objects went, seen from above, and in which directions there was success.
 
-    Left: the first 32 episodes up to their first success. Middle: the same, each turned about the
-    workspace centre so that the way from the last but one named position to the last (object to
-    goal, or tool to object where there is no goal) points to the right; what a symmetric agent
-    does in a symmetric world does not depend on that turn. Right: episodes and successes by the
-    direction of that way.
+    The paths are those of the first 32 episodes up to their first success. Beside them the same,
+    each turned about the workspace centre so that the way from the last but one named position to
+    the last (object to goal, or tool to object where there is no goal) points to the right: what a
+    symmetric agent does in a symmetric world does not depend on that turn. Below, episodes and
+    successes by the direction of that way.
 
     Args:
         rollout: episodes of the deterministic actor.
@@ -74,35 +74,44 @@ def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
     way = paths[-1, 0] - paths[-2, 0]
     direction = np.arctan2(way[:, 1], way[:, 0])
 
+    source, target = (name.removesuffix("_xy").replace("_", " ") for name in names[-2:])
+    drawn = min(EPISODES, len(success))
+    note = (
+        f"{success.sum()} of {len(success)} held-out episodes succeed.\n"
+        f"Paths: the first {drawn}, each up to its first success.\n"
+        "Seen from above, about the workspace centre."
+    )
     with mpl.rc_context({"font.family": "DejaVu Sans", "font.size": 9}):
-        figure = Figure(figsize=(13, 4.9), dpi=110, layout="constrained")
-        drawn = min(EPISODES, len(success))
-        figure.suptitle(
-            f"{title}: {success.sum()} of {len(success)} held-out episodes succeed; "
-            f"paths of the first {drawn}, each up to its first success",
-            fontsize=10,
-        )
-        above, turned = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
-        rose = figure.add_subplot(1, 3, 3, projection="polar")
-        source, target = (name.removesuffix("_xy").replace("_", " ") for name in names[-2:])
-        kind = f"{source} to {target}"
+        # Nearly square: TensorBoard fits pictures to the width of a card.
+        figure = Figure(figsize=(8.4, 8.4), dpi=110, layout="constrained")
+        figure.suptitle(title, fontsize=11)
+        above, turned = figure.add_subplot(2, 2, 1), figure.add_subplot(2, 2, 2)
+        rose, key = figure.add_subplot(2, 2, 3, projection="polar"), figure.add_subplot(2, 2, 4)
         _draw_paths(above, paths[:, :, :drawn], lengths, success)
-        above.set_title("from above")
+        above.set_title("paths")
         _draw_paths(turned, _turn(paths, -direction)[:, :, :drawn], lengths, success)
-        turned.set_title(f"turned: {kind} points right")
+        # One scale, about the workspace centre: turning is then seen as turning.
+        reach = 1.05 * max(np.abs(a.dataLim.get_points()).max() for a in (above, turned))
+        for axes in (above, turned):
+            axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+            axes.set(xlabel="x (cm)", ylabel="y (cm)")
+        turned.set_title(f"paths turned: {source} to {target} points right")
         _draw_rose(rose, direction, success)
-        rose.set_title(f"number of episodes by direction, {kind}")
-        turned.legend(
+        rose.set_title(f"episodes by direction, {source} to {target}")
+        key.axis("off")
+        key.legend(
             handles=[
-                Line2D([], [], color=SUCCESS, lw=1.6, label="object, success"),
-                Line2D([], [], color=FAILURE, lw=1.6, label="object, no success"),
+                Line2D([], [], color=SUCCESS, lw=2.5, label="object, success"),
+                Line2D([], [], color=FAILURE, lw=2.5, label="object, no success"),
                 Line2D([], [], color=TOOL, lw=0.8, label="tool"),
-                Line2D([], [], color=TOOL, lw=0, marker=".", label="start"),
-                Line2D([], [], color=TOOL, lw=0, marker="o", mfc="none", label=target),
+                Line2D([], [], color="black", lw=0, marker=".", label="start"),
+                Line2D([], [], color="black", lw=0, marker="o", mfc="none", label=target),
             ],
             loc="upper left",
-            fontsize=7.5,
+            fontsize=10,
+            frameon=False,
         )
+        key.text(0.03, 0.6, note, fontsize=10, va="top", transform=key.transAxes)
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -125,10 +134,6 @@ def _draw_paths(axes: Axes, paths: np.ndarray, lengths: np.ndarray, success: np.
             axes.plot(*path.T, color=color, lw=1.4, alpha=0.8, zorder=2)
             axes.plot(*path[0], ".", color=color, ms=4, zorder=3)
         axes.plot(*objects[-1][-1], "o", color=color, mfc="none", ms=7, mew=0.8, zorder=3)
-    # A square about the workspace centre: turning is then seen as turning.
-    reach = 1.05 * np.abs(axes.dataLim.get_points()).max()
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    axes.set(xlabel="x (cm)", ylabel="y (cm)")
     axes.grid(color="#E4E4E4", lw=0.6)
     axes.set_axisbelow(True)
 
@@ -155,7 +160,7 @@ def film(config: RunConfig, policy: ChunkPolicy, agent: Any) -> np.ndarray:
         agent: its deterministic actor plays.
 
     Returns:
-        Six frames side by side, evenly spaced in time, ``[height, width, 3]`` uint8.
+        Six frames in two rows, evenly spaced in time, ``[height, width, 3]`` uint8.
 
     Raises:
         UserError: if there is no Vulkan driver.
@@ -189,7 +194,8 @@ def film(config: RunConfig, policy: ChunkPolicy, agent: Any) -> np.ndarray:
     finally:
         env.close()
     chosen = np.linspace(0, len(frames) - 1, FRAMES).round().astype(int)
-    return np.concatenate([frames[i] for i in chosen], axis=1)
+    rows = np.split(np.stack([frames[i] for i in chosen]), 2)
+    return np.concatenate([np.concatenate(row, axis=1) for row in rows])
 
 
 def _frame(env: Any) -> np.ndarray:

@@ -42,8 +42,10 @@ def turned(rollout, angle):
 
 
 def panels(picture):
-    """The three panels below the title."""
-    return np.array_split(picture[40:].astype(int), 3, axis=1)
+    """Paths, turned paths and directions."""
+    rows = np.array_split(picture[40:].astype(int), 2)
+    (above, straight), (rose, _) = (np.array_split(row, 2, axis=1) for row in rows)
+    return above, straight, rose
 
 
 def color(picture, name):
@@ -95,7 +97,8 @@ def test_what_follows_the_first_success_is_not_drawn():
 def test_frames_of_an_episode_show_it_moving(finished):
     config, folder = finished
     base = prepare_base(tiny_config(), folder.parent, progress=False)
-    strip = film(config, base, new_agent("base", config, base))
-    frames = np.split(strip.astype(int), FRAMES, axis=1)
-    assert strip.dtype == np.uint8
+    picture = film(config, base, new_agent("base", config, base))
+    assert picture.dtype == np.uint8
+    rows = np.split(picture.astype(int), 2)
+    frames = [frame for row in rows for frame in np.split(row, FRAMES // 2, axis=1)]
     assert all(np.abs(a - b).max() > 50 for a, b in itertools.pairwise(frames))
