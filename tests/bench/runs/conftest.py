@@ -1,4 +1,4 @@
-"""A finished run that the tests of this folder look at."""
+"""Finished runs that the tests of this folder look at."""
 
 from pathlib import Path
 
@@ -15,3 +15,17 @@ def finished(tmp_path_factory) -> tuple[RunConfig, Path]:
 
     config = tiny_config()
     return config, execute(config, tmp_path_factory.mktemp("runs"), progress=False)
+
+
+@pytest.fixture(scope="session")
+def broken(finished) -> dict[str, Path]:
+    """A finished run of every agent where the symmetry is broken: the folders by agent."""
+    from agents import AGENTS
+    from bench.runs.run import execute
+
+    _, folder = finished
+    change = {"variant": "action_gain:0.5", "env_steps": 240}
+    return {
+        name: execute(tiny_config(agent=name, **change), folder.parent, progress=False)
+        for name in AGENTS
+    }

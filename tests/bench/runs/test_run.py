@@ -126,22 +126,18 @@ def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
     assert jumps.tolist() == [1] * config.num_envs
 
 
-@pytest.mark.parametrize(
-    "agent", ["standard", "standard-matched", "approximate", "base", "zero", "golden-ticket"]
-)
-def test_every_agent_runs_on_a_broken_world(agent, finished):
+def test_every_agent_runs_on_a_broken_world(broken):
     """The base policy is shared with the unbroken run, not trained again."""
-    _, folder = finished
-    out = folder.parent
-    policies = set((out / "base").iterdir())
-    config = tiny_config(agent=agent, variant="action_gain:0.5", env_steps=240)
-    record = read_record(execute(config, out, progress=False) / "record.json")
-    assert record.status == "finished"
-    assert set((out / "base").iterdir()) == policies
-    assert (record.feasible_q is None) == (agent in REFERENCES)
-    # References do not learn; the search of a golden ticket plays whole episodes.
-    used = {"base": 0, "zero": 0, "golden-ticket": 200}
-    assert record.budget.env_steps == used.get(agent, record.budget.env_steps)
+    for agent, folder in broken.items():
+        record = read_record(folder / "record.json")
+        assert record.status == "finished"
+        assert record.config["variant"] == "action_gain:0.5"
+        assert (record.feasible_q is None) == (agent in REFERENCES)
+        # References do not learn; the search of a golden ticket plays whole episodes.
+        used = {"base": 0, "zero": 0, "golden-ticket": 200}
+        assert record.budget.env_steps == used.get(agent, record.budget.env_steps)
+    policies = [p for p in (folder.parent / "base").iterdir() if p.is_dir()]
+    assert len(policies) == 1
 
 
 def test_a_finished_run_is_not_overwritten(finished):
