@@ -447,8 +447,8 @@ def reference_success(run: Run, references: Sequence[Run]) -> dict[int, float]:
 def success_pairs(first: Row, second: Row) -> dict[int, Sample]:
     """Differences of final-window success, first minus second, by run seed.
 
-    Two learners are paired by run seed, then by (env_steps, episode seed); with a reference, which
-    is evaluated once, the episode seed alone pairs (`reference_success`).
+    Two learners are paired by run seed on the same base policy, then by (env_steps, episode seed);
+    with a reference, which is evaluated once, the episode seed alone pairs (`reference_success`).
     """
     if first.is_reference and not second.is_reference:
         reverse = success_pairs(second, first)
@@ -457,13 +457,13 @@ def success_pairs(first: Row, second: Row) -> dict[int, Sample]:
             for seed, sample in reverse.items()
         }
     pairs = {}
-    others = {run.seed: run for run in second.finished}
     for run in first.finished:
         if second.is_reference:
             reference = reference_success(run, second.finished)
             other = {key: reference[key[1]] for key in run.window if key[1] in reference}
         else:
-            other = others[run.seed].window if run.seed in others else {}
+            partner = _partner(run, second)
+            other = partner.window if partner else {}
         differences = paired_differences(run.window, other)
         if differences.size:
             pairs[run.seed] = Sample.of(differences)
@@ -476,9 +476,9 @@ def area_pairs(first: Row, second: Row, budget: int) -> dict[int, Sample]:
     Over the evaluations (env_steps) that both runs have, on the episodes that both have there.
     """
     pairs = {}
-    others = {run.seed: run for run in second.finished}
     for run in first.finished:
-        other = others[run.seed].curve if run.seed in others else {}
+        partner = _partner(run, second)
+        other = partner.curve if partner else {}
         blocks: dict[int, Array] = {}
         for step, evaluation in run.curve.items():
             if step in other:
@@ -488,6 +488,19 @@ def area_pairs(first: Row, second: Row, budget: int) -> dict[int, Sample]:
             weights = area_weights(list(blocks), budget)
             pairs[run.seed] = Sample(tuple(blocks.values()), weights)
     return pairs
+
+
+def _partner(run: Run, row: Row) -> Run | None:
+    """The row's run with the same seed on the same base policy: on another one, success differs."""
+    policy = run.record.base_policy.content_hash
+    return next(
+        (
+            other
+            for other in row.finished
+            if other.seed == run.seed and other.record.base_policy.content_hash == policy
+        ),
+        None,
+    )
 
 
 def compare(first: Row, second: Row) -> Interval | None:
