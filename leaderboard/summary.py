@@ -510,14 +510,18 @@ def compare(first: Row, second: Row) -> Interval | None:
 
 
 def _rank(rows: Sequence[Row]) -> None:
-    """Rank learning agents with enough seeds: 1 + the number of rows that are clearly better."""
+    """Rank learning agents with enough seeds: 1 + the number of rows that are clearly better.
+
+    A row that can be compared with no other one (on the same base policy) gets no rank.
+    """
     candidates = [row for row in rows if not row.is_reference and len(row.finished) >= MIN_SEEDS]
     if len(candidates) < 2:
         return
-    for row in candidates:
-        row.rank = 1
     for first, second in combinations(candidates, 2):
         found = compare(first, second)
-        if found and found.sign:
+        if found is None:
+            continue
+        first.rank, second.rank = first.rank or 1, second.rank or 1
+        if found.sign:
             worse = second if found.sign > 0 else first
             worse.rank = (worse.rank or 1) + 1

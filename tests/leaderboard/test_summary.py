@@ -285,6 +285,25 @@ def test_ranks_have_ties_and_need_five_seeds() -> None:
     assert not few.tables[0].is_ranked
 
 
+def test_learners_on_different_base_policies_are_not_compared() -> None:
+    others = five("approximate", 0.9)
+    for other in others:
+        other.record.base_policy.content_hash = "f" * 64
+    summary = summarize(five("standard", 0.5) + five("equivariant", 0.8) + others)
+    first, second = row(summary, "standard"), row(summary, "approximate")
+    assert success_pairs(first, second) == {}
+    assert area_pairs(first, second, 50_000) == {}
+    # The best number has beaten nobody, and nobody has beaten it.
+    assert {r.agent: r.rank for r in summary.tables[0].rows} == {
+        "equivariant": 1,
+        "standard": 2,
+        "approximate": None,
+    }
+    # Where seeds agree on the policy only in part, those pairs count.
+    others[3].record.base_policy.content_hash = first.runs[3].record.base_policy.content_hash
+    assert list(success_pairs(first, second)) == [3]
+
+
 def test_a_second_attempt_replaces_the_first_in_plain_sight() -> None:
     failed = run(make_record(status="failed"), "a.json")
     old = of(0.5)
