@@ -46,8 +46,6 @@ COMPARED = ("standard", "standard-matched", "equivariant", "approximate")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
 """Names that can be part of a run's folder and record."""
 
-PARTS = ("learns", "act", "update", "state_dict", "load_state_dict", "parameter_counts")
-
 
 class SteeringAgent(Protocol):
     """What the collecting loop needs of an agent."""
@@ -81,7 +79,7 @@ def registry() -> Mapping[str, AgentClass]:
 
     Raises:
         UserError: if a module cannot be imported, two agents have one name, or an agent's name
-            cannot be part of a run's folder, or it lacks a part of :class:`SteeringAgent`.
+            cannot be part of a run's folder, or it inherits from no agent.
     """
     found: dict[str, AgentClass] = {}
     for agent in _classes():
@@ -91,10 +89,11 @@ def registry() -> Mapping[str, AgentClass]:
                 f"{where} has the name {agent.name!r}; use at most 60 letters, digits, dots, "
                 "dashes and underscores, as the name becomes part of file names"
             )
-        if missing := [part for part in PARTS if not hasattr(agent, part)]:
+        if not issubclass(agent, SacAgent | BaseAgent):
             raise UserError(
-                f"{where} lacks {', '.join(missing)}; inherit from agents.sac.SacAgent, or start "
-                "the class's name with an underscore if it is no agent"
+                f"{where} has a name but is no agent; inherit from agents.sac.SacAgent (or, if it "
+                "does not learn, from agents.references.BaseAgent), or start the class's name with "
+                "an underscore"
             )
         if agent.name in found:
             other = found[agent.name]

@@ -77,7 +77,10 @@ def test_a_new_file_is_a_new_agent(add, problem):
         (MINE.replace('"also-mine"', '"../mine"'), r"AlsoMine has the name '\.\./mine'; use"),
         (MINE.replace('"also-mine"', '""'), r"letters, digits"),
         (MINE.replace('"also-mine"', f'"{"m" * 61}"'), r"at most 60"),
-        ('class Bare:\n    name = "bare"\n', r"Bare lacks learns, act, update, .*SacAgent"),
+        (
+            'class Bare:\n    name = "bare"\n',
+            r"Bare has a name but is no agent; inherit .*SacAgent",
+        ),
         ("import nothing_of_the_sort\n", r"ModuleNotFoundError.*line 1\); mend or remove it"),
         ("class Mine(\n", r"agents/mine\.py cannot be imported \(SyntaxError"),
     ],
