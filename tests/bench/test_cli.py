@@ -108,6 +108,21 @@ def test_records_that_are_none(monkeypatch, capsys, tmp_path):
     assert "record.json" in sentence(capsys)
 
 
+def test_report_checks_and_verifies_from_any_folder(monkeypatch, capsys, tmp_path):
+    (tmp_path / "--odd").mkdir()
+    for name in ("a.json", "--odd/b.json"):
+        (tmp_path / name).write_text(json.dumps({"hello": 1}))
+    monkeypatch.chdir(tmp_path)
+    assert symsteer(monkeypatch, "report", "--check", "a.json", "./--odd") == 2
+    shown = capsys.readouterr().out
+    assert shown.count("NOT ADMISSIBLE") == 2
+    assert "0 of 2 records are admissible" in shown
+    assert symsteer(monkeypatch, "report", "--verify", "--out", tmp_path / "page") == 1
+    assert "LEADERBOARD.md: missing" in capsys.readouterr().out
+    assert symsteer(monkeypatch, "report", "--verify", "--check") == 2
+    assert {path.name for path in tmp_path.iterdir()} == {"a.json", "--odd"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
