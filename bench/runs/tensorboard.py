@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,6 +16,7 @@ from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from torch.utils.tensorboard import SummaryWriter
 
 from leaderboard.records import Provenance, RunRecord
+from policies.errors import UserError
 
 # The tags of a Multiline chart are regular expressions; a Margin chart takes value, low, high.
 LAYOUT = {
@@ -63,45 +67,69 @@ class RunLog:
         record: the run's record, with everything that is known before the first step.
         purge_step: TensorBoard drops what earlier sessions of the run wrote at this step and
             later, since the run writes it again.
+
+    Raises:
+        UserError: here and in all methods that write, if the disk is full or not writable.
     """
 
     def __init__(self, folder: Path, record: RunRecord, purge_step: int = 0):
-        self.writer = SummaryWriter(str(folder), purge_step=purge_step)
-        self.writer.add_custom_scalars(LAYOUT)
-        # A continued run may stand on another commit: its text is added to the first session's.
-        self.writer.add_text("config", config_text(record), purge_step)
-        settings = flat(record.config)
-        self._hparams(metadata.EXPERIMENT_TAG, experiment=_experiment(settings))
-        self._hparams(
-            metadata.SESSION_START_INFO_TAG, session_start_info=_session(record, settings)
-        )
-        self.flush()
+        self.folder = folder
+        _silence_writing_thread()
+        with self._reported():
+            self.writer = SummaryWriter(str(folder), purge_step=purge_step)
+            self.writer.add_custom_scalars(LAYOUT)
+            # A continued run may stand on another commit: its text is added to the first session's.
+            self.writer.add_text("config", config_text(record), purge_step)
+            settings = flat(record.config)
+            self._hparams(metadata.EXPERIMENT_TAG, experiment=_experiment(settings))
+            self._hparams(
+                metadata.SESSION_START_INFO_TAG, session_start_info=_session(record, settings)
+            )
+            self.writer.flush()
 
     def scalars(self, namespace: str, values: Mapping[str, float | None], step: int) -> None:
         """Write every value that was measured."""
-        for name, value in values.items():
-            if value is not None:
-                self.writer.add_scalar(f"{namespace}/{name}", value, step)
+        with self._reported():
+            for name, value in values.items():
+                if value is not None:
+                    self.writer.add_scalar(f"{namespace}/{name}", value, step)
 
     def picture(self, tag: str, picture: np.ndarray, step: int) -> None:
         """Write a picture ``[height, width, 3]`` uint8."""
-        self.writer.add_image(tag, picture, step, dataformats="HWC")
+        with self._reported():
+            self.writer.add_image(tag, picture, step, dataformats="HWC")
 
     def finish(self) -> None:
         """Mark the run as finished in the HParams tab, and close."""
         end = plugin_data_pb2.SessionEndInfo(
             status=api_pb2.STATUS_SUCCESS, end_time_secs=time.time()
         )
-        self._hparams(metadata.SESSION_END_INFO_TAG, session_end_info=end)
+        with contextlib.suppress(OSError):
+            self._hparams(metadata.SESSION_END_INFO_TAG, session_end_info=end)
         self.close()
 
     def flush(self) -> None:
         """Bring to disk what was written so far."""
-        self.writer.flush()
+        with self._reported():
+            self.writer.flush()
 
     def close(self) -> None:
-        """Flush to disk; nothing can be written any more."""
-        self.writer.close()
+        """Flush to disk; nothing can be written any more.
+
+        The record is closed by then: what cannot be written is left out.
+        """
+        with contextlib.suppress(OSError):
+            self.writer.close()
+
+    @contextlib.contextmanager
+    def _reported(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise UserError(
+                f"cannot write TensorBoard's events to {self.folder}: {error.strerror}; free space "
+                "or choose another folder, then continue the run"
+            ) from error
 
     def _hparams(self, tag: str, **content: Any) -> None:
         data = plugin_data_pb2.HParamsPluginData(**content)
@@ -112,6 +140,19 @@ class RunLog:
         # SummaryWriter's own add_hparams opens a second event file and renames the metrics.
         assert self.writer.file_writer is not None
         self.writer.file_writer.add_summary(summary)
+
+
+@functools.cache
+def _silence_writing_thread() -> None:
+    """Keep TensorBoard's thread from printing a traceback; its errors come back in later calls."""
+    others = threading.excepthook
+
+    def hook(args: threading.ExceptHookArgs) -> None:
+        ours = type(args.thread).__module__.startswith("tensorboard.")
+        if not (ours and issubclass(args.exc_type, OSError)):
+            others(args)
+
+    threading.excepthook = hook
 
 
 def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:

@@ -1,6 +1,8 @@
 """What TensorBoard shows of a run, read back with TensorBoard's own loader."""
 
+import errno
 import io
+import os
 import re
 from pathlib import Path
 
@@ -15,9 +17,10 @@ from bench.runs import loop
 from bench.runs.folder import run_id, state_of
 from bench.runs.loop import Loop
 from bench.runs.run import execute, resume
-from bench.runs.tensorboard import FINAL_METRICS, IDENTITY
+from bench.runs.tensorboard import FINAL_METRICS, IDENTITY, RunLog
 from bench.sim.headless import rendering_works
 from leaderboard.records import read_record
+from policies.errors import UserError
 from tests.bench.tiny_run import tiny_config
 
 DOCUMENTATION = Path(__file__).parents[3] / "docs" / "metrics.md"
@@ -201,3 +204,21 @@ def test_a_picture_that_fails_does_not_harm_the_run(finished, monkeypatch, capsy
     assert read_record(other / "record.json").status == "finished"
     assert load(other).Tags()["images"] == []
     assert "no fonts" in "".join(capsys.readouterr())
+
+
+def test_a_full_disk_is_reported_in_one_sentence(finished, tmp_path, monkeypatch):
+    record = read_record(finished[1] / "record.json")
+    log = RunLog(tmp_path, record)
+    # TensorBoard hands on in later calls what its writing thread met.
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def fail(*args):
+        raise full
+
+    monkeypatch.setattr(log.writer.file_writer.event_writer._async_writer, "write", fail)
+    with pytest.raises(UserError, match=r"cannot write TensorBoard's events .*No space left"):
+        log.scalars("eval", {"success_once": 0.5}, 0)
+    log.finish()
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot write TensorBoard's events"):
+        RunLog(tmp_path / "file" / "run", record)
