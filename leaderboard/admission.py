@@ -100,18 +100,18 @@ def finished(file: Path, record: RunRecord) -> Iterator[str]:
 
 
 def reproducible(file: Path, record: RunRecord) -> Iterator[str]:
-    """Every session of the run used code of a known commit without local changes."""
-    sessions = [("", record.provenance)]
-    sessions += [(f"session {n} of ", p) for n, p in enumerate(record.continued, 2)]
-    for session, provenance in sessions:
+    """Every part of the run used code of a known commit without local changes."""
+    parts = [("", record.provenance)]
+    parts += [(f"part {n} of ", p) for n, p in enumerate(record.continued, 2)]
+    for part, provenance in parts:
         if provenance.commit is None:
             yield (
-                f"{session}the run names no commit, so nobody knows its code: run it again in a "
+                f"{part}the run names no commit, so nobody knows its code: run it again in a "
                 "git clone of the repository."
             )
         elif provenance.dirty is not False:
             yield (
-                f"{session}the run used code that is not in commit {provenance.commit[:12]}: "
+                f"{part}the run used code that is not in commit {provenance.commit[:12]}: "
                 "commit all changes and new files, then run it again."
             )
 

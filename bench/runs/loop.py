@@ -53,7 +53,7 @@ from leaderboard.records import (
 from policies.base import ChunkPolicy
 from policies.errors import UserError
 
-LOG_EVERY = 25
+LOG_EVERY = 10
 """Vectorised decisions between two writes of training scalars."""
 
 
@@ -123,7 +123,7 @@ class Loop:
         earlier = self._restore(checkpoint) if checkpoint else 0.0
         self.start = time.perf_counter() - earlier
         write_record(self.record, folder / RECORD)
-        # Without a checkpoint an earlier session may have left events all the same.
+        # Without a checkpoint an earlier process may have left events all the same.
         self.log = RunLog(folder, self.record, self.env_steps + 1 if checkpoint else 0)
         self.heartbeat = Heartbeat(folder, config.env_steps, self.env_steps)
         self.evaluator = Evaluator(

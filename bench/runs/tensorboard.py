@@ -65,7 +65,7 @@ class RunLog:
     Args:
         folder: the run's folder; the events stand beside its record.
         record: the run's record, with everything that is known before the first step.
-        purge_step: TensorBoard drops what earlier sessions of the run wrote at this step and
+        purge_step: TensorBoard drops what earlier processes wrote at this step and
             later, since the run writes it again.
 
     Raises:
@@ -78,7 +78,7 @@ class RunLog:
         with self._reported():
             self.writer = SummaryWriter(str(folder), purge_step=purge_step)
             self.writer.add_custom_scalars(LAYOUT)
-            # A continued run may stand on another commit: its text is added to the first session's.
+            # A continued run may stand on another commit: its text is added to the first one's.
             self.writer.add_text("config", config_text(record), purge_step)
             settings = flat(record.config)
             self._hparams(metadata.EXPERIMENT_TAG, experiment=_experiment(settings))

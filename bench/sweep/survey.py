@@ -23,7 +23,7 @@ class Sighting:
 
     @property
     def seconds(self) -> float:
-        """Seconds that the run took, all its sessions together."""
+        """Seconds that the run took, all its parts together."""
         return self.record.wall_clock.total if self.record else 0.0
 
     @property

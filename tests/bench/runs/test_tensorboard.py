@@ -112,7 +112,7 @@ def test_evaluations_are_those_of_the_record(broken):
 def test_a_continued_run_shows_every_point_once(continued):
     folder, written = continued
     steps = [e.env_steps for e in read_record(folder / "record.json").evaluations]
-    # The stopped session had shown an evaluation that was done again.
+    # The stopped process had shown an evaluation that was done again.
     assert written in steps[:-1]
     assert len(list(folder.glob("events.*"))) == 2
     assert_equals_record(folder)
