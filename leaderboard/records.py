@@ -596,7 +596,9 @@ def read_record(path: Path | str) -> RunRecord:
     except OSError as error:
         raise RecordError(f"{path} cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
-        raise RecordError(f"{path} is not UTF-8 text: not a run record; remove it.") from error
+        raise RecordError(
+            f"{path} is not UTF-8 text: not a run record; name records or run folders only."
+        ) from error
     try:
         data = json.loads(
             text,
@@ -611,7 +613,9 @@ def read_record(path: Path | str) -> RunRecord:
             "restore it or run the cell again."
         ) from error
     if not isinstance(data, dict) or "schema_version" not in data:
-        raise RecordError(f"{path} is JSON but has no schema_version: not a run record; remove it.")
+        raise RecordError(
+            f"{path} is JSON but has no schema_version: not a run record; name records or run folders only."
+        )
     version = data["schema_version"]
     if type(version) is not int or not 1 <= version <= SCHEMA_VERSION:
         raise RecordError(
