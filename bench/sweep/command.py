@@ -56,7 +56,6 @@ def run_plan(plan: Plan, workers: int = 0, ray: str | None = None) -> list[Outco
         OSError: if the folder of the runs cannot be made.
     """
     number = number_of_workers(workers, list(plan.configs.values()))
-    plan.out.mkdir(parents=True, exist_ok=True)
     estimate = Estimate()
     outcomes, todo = [], []
     for cell, seen in look_at(plan).items():
@@ -66,8 +65,8 @@ def run_plan(plan: Plan, workers: int = 0, ray: str | None = None) -> list[Outco
         else:
             todo.append(cell)
     limit = workers if ray is not None else number
-    write_manifest(plan, limit, {})
     log = manifest_path(plan.out, plan.name).with_suffix(".log")
+    log.parent.mkdir(parents=True, exist_ok=True)
     console = Console(file=sys.stdout)
     with contextlib.ExitStack() as stack:
         pool: Workers | None = None
@@ -79,8 +78,9 @@ def run_plan(plan: Plan, workers: int = 0, ray: str | None = None) -> list[Outco
             pool = RayCluster(ray, plan.out, limit or None)
         elif todo:
             pool = LocalPool(min(number, len(todo)), log)
+        write_manifest(plan, limit, {})
         if console.is_terminal:
-            print(f"{plan.name}: {plan.description} ({len(plan.cells)} runs)", file=console.file)
+            print(f"{plan.title} ({len(plan.cells)} runs)", file=console.file)
         if outcomes:
             words = f"{len(outcomes)} of {len(plan.cells)} runs are finished already"
             print(f"{'skipped':9s} {words}", file=console.file, flush=True)
@@ -119,7 +119,7 @@ def preview(plan: Plan, workers: int = 0) -> str:
     """
     number = number_of_workers(workers, list(plan.configs.values()))
     seen = look_at(plan)
-    lines = [f"{plan.name}: {plan.description}", "", *_counts(seen), ""]
+    lines = [plan.title, "", *_counts(seen), ""]
     todo = [cell for cell in plan.cells if seen[cell].state != "finished"]
     bases = [task for task in tasks_of(plan, todo) if task.kind == "base policy"]
     lines.append(f"base policies to build: {len(bases) or 'none'}")

@@ -81,6 +81,11 @@ class Plan:
     configs: dict[Cell, RunConfig]
 
     @property
+    def title(self) -> str:
+        """Name and description."""
+        return _title(self.name, self.description)
+
+    @property
     def cells(self) -> list[Cell]:
         """The cells, in the order of the suite."""
         return list(self.configs)
@@ -100,6 +105,11 @@ class Manifest:
     """Why runs failed in the last sweep, by run id. A run whose process was killed cannot say so
     in its own record."""
 
+    @property
+    def title(self) -> str:
+        """Name and description."""
+        return _title(self.suite, self.description)
+
 
 def make_plan(suite: Suite, out: Path) -> Plan:
     """Resolve a suite, and refuse what cannot run before anything is built.
@@ -112,9 +122,7 @@ def make_plan(suite: Suite, out: Path) -> Plan:
         check(config)
         flat.append(_flatten(config.to_json()))
     extra = [
-        key
-        for key in flat[0]
-        if key not in (*BASIC, "env_steps") and any(one[key] != flat[0][key] for one in flat)
+        key for key in flat[0] if key not in BASIC and any(one[key] != flat[0][key] for one in flat)
     ]
     cells = {Cell.of(config.to_json(), run_id(config, {}), extra): config for config in suite.runs}
     return Plan(suite.name, suite.description, out, cells)
@@ -154,6 +162,10 @@ def read_manifest(path: Path) -> Manifest:
         raise UserError(
             f"{path} is not the list of a sweep; run the sweep again to write it anew"
         ) from error
+
+
+def _title(name: str, description: str) -> str:
+    return f"{name}: {description}" if description else name
 
 
 def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

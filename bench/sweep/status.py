@@ -95,7 +95,7 @@ def to_text(found: list[Status], folder: Path) -> str:
 
 def _of_sweep(folder: Path, manifest: Manifest) -> Status:
     return Status(
-        f"{manifest.suite}: {manifest.description}",
+        manifest.title,
         {cell: look(folder / cell.run_id) for cell in manifest.runs},
         manifest.failures,
         manifest.workers,

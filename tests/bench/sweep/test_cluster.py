@@ -1,0 +1,118 @@
+"""The cells of a sweep on a Ray cluster of two machines, one of which dies."""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+
+import psutil
+import pytest
+
+from bench.runs.folder import CHECKPOINT, LOCK
+from bench.runs.run import execute
+from bench.sweep import cluster as cluster_module
+from bench.sweep.cluster import RayCluster
+from bench.sweep.command import run_plan
+from bench.sweep.plan import make_plan
+from bench.sweep.suite import Suite
+from leaderboard.records import read_record
+from policies.errors import UserError
+from tests.bench.sweep.cells import LONG, wait_for, without_clock
+from tests.bench.tiny_run import tiny_config
+
+MACHINE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+
+
+def test_without_ray_the_extra_is_named(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UserError, match=r'pip install "symsteer\[ray\]"'):
+        RayCluster("auto", tmp_path, None)
+
+
+def test_an_address_that_does_not_answer(monkeypatch, tmp_path):
+    monkeypatch.setattr(cluster_module, "CONNECT_SECONDS", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(UserError, match=f"no Ray cluster answers at {address}"):
+            RayCluster(address, tmp_path, None)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A head without processors and two machines with one each, all on this one."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(
+        initialize_head=True,
+        head_node_args={**MACHINE, "num_cpus": 0, "include_dashboard": False},
+    )
+    for _ in range(2):
+        cluster.add_node(**MACHINE)
+    yield cluster
+    cluster.shutdown()
+
+
+def machine_of(run, machines):
+    """The machine whose process holds a run, or None."""
+    raylets = {machine.all_processes["raylet"][0].process.pid: machine for machine in machines}
+    for pid, machine in raylets.items():
+        for process in psutil.Process(pid).children(recursive=True):
+            if str(run / LOCK) in (file.path for file in process.open_files()):
+                return machine
+    return None
+
+
+@pytest.mark.slow
+def test_a_folder_that_is_not_shared_is_refused(cluster, tmp_path):
+    """The sweep alone sees a file system of its own where the runs are to lie."""
+    own = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
+    if shutil.which("unshare") is None or subprocess.run([*own, "true"], check=False).returncode:
+        pytest.skip("this machine allows no mount namespaces")
+    out = tmp_path / "runs"
+    out.mkdir()
+    sweep = f"{sys.executable} -m bench sweep smoke --out {out} --ray {cluster.address}"
+    done = subprocess.run(
+        [*own, f"mount -t tmpfs tmpfs {out} && exec {sweep}"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: the folder {out} is not shared: ")
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+
+
+@pytest.mark.slow
+def test_a_machine_dies_and_nothing_is_lost(cluster, undisturbed, tmp_path, capsys):
+    out = tmp_path / "runs"
+    other = tiny_config(agent="zero")
+    plan = make_plan(Suite("two", "", (LONG, other)), out)
+    run = out / plan.cells[0].run_id
+
+    def kill() -> None:
+        wait_for(lambda: machine_of(run, cluster.worker_nodes))
+        machine = machine_of(run, cluster.worker_nodes)
+        raylet = psutil.Process(machine.all_processes["raylet"][0].process.pid)
+        victims = [raylet, *raylet.children(recursive=True)]
+        wait_for((run / CHECKPOINT).is_file)
+        # As when its power fails: all at once, the one first that would tell of the others.
+        for process in victims:
+            process.kill()
+        cluster.remove_node(machine, allow_graceful=False)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    outcomes = run_plan(plan, ray=cluster.address)
+    killer.join()
+    assert len(cluster.worker_nodes) == 1
+    assert [outcome.status for outcome in outcomes] == ["finished", "finished"]
+    assert capsys.readouterr().out.count("finished  [") == 2
+    assert read_record(run / "record.json").wall_clock.resumed == 1
+    assert without_clock(run) == without_clock(undisturbed)
+    alone = execute(other, undisturbed.parent, progress=False)
+    assert without_clock(out / alone.name) == without_clock(alone)

@@ -1,0 +1,246 @@
+"""Sweeps with real runs: cells that fail, workers that are killed, Ctrl-C, skipped cells."""
+
+import contextlib
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+
+import psutil
+import pytest
+
+from agents.sac import SacConfig
+from bench.cli import main
+from bench.runs.base_policy import demonstration_path
+from bench.runs.config import DemonstrationConfig, RunConfig
+from bench.runs.folder import CHECKPOINT, state_of
+from bench.sweep.plan import Plan, make_plan
+from bench.sweep.pool import LocalPool
+from bench.sweep.schedule import Outcome, Task, work_off
+from bench.sweep.status import read_status, to_text
+from bench.sweep.suite import Suite, load_suite
+from bench.sweep.work import Result
+from leaderboard.records import read_record
+from tests.bench.sweep.cells import LONG, wait_for, without_clock
+from tests.bench.tiny_run import tiny_config
+
+
+class Witness:
+    """Remembers what a sweep did."""
+
+    def __init__(self):
+        self.tasks: list[tuple[str, str]] = []
+        self.again: list[tuple[str, str]] = []
+
+    def started(self, task: Task) -> None:
+        self.tasks.append((task.kind, task.cell.agent if task.cell else ""))
+
+    def retried(self, task: Task, result: Result) -> None:
+        self.again.append((task.kind, result.reason))
+
+    def refresh(self, running: list[Task]) -> None:
+        pass
+
+
+def work(plan: Plan, tmp_path, witness: Witness) -> dict[str, Outcome]:
+    """Work off a plan with one worker; the outcomes by agent and variant."""
+    pool = LocalPool(1, tmp_path / "log")
+    try:
+        found = work_off(plan, plan.cells, pool, witness)
+        return {f"{o.cell.agent} {o.cell.variant}": o for o in found}
+    finally:
+        pool.stop()
+
+
+def workers() -> list[int]:
+    return [process.pid for process in multiprocessing.active_children()]
+
+
+def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tmp_path):
+    # Both pass every check on the configuration. One fails inside the run, the other before it:
+    # something is in the way of its demonstrations.
+    bad = tiny_config(agent="standard", sac=SacConfig(width=16, replay_capacity=2))
+    baseless = tiny_config(
+        agent="zero", variant="wind:1", demonstrations=DemonstrationConfig(count=3, seed=1)
+    )
+    out = tmp_path / "runs"
+    demonstration_path(baseless, out).mkdir(parents=True)
+    plan = make_plan(Suite("mixed", "", (LONG, bad, tiny_config(agent="zero"), baseless)), out)
+    folder = out / plan.cells[0].run_id
+    killed = []
+
+    def kill() -> None:
+        wait_for((folder / CHECKPOINT).is_file)
+        killed.extend(workers())
+        os.kill(killed[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    witness = Witness()
+    outcomes = work(plan, tmp_path, witness)
+    killer.join()
+    assert len(killed) == 1
+    assert {key: outcome.status for key, outcome in outcomes.items()} == {
+        "equivariant none": "finished",
+        "standard none": "failed",
+        "zero none": "finished",
+        "zero wind:1": "failed",
+    }
+    # The killed run continued from its checkpoint, and nobody can tell.
+    assert read_record(folder / "record.json").wall_clock.resumed == 1
+    assert without_clock(folder) == without_clock(undisturbed)
+    assert "replay_capacity" in outcomes["standard none"].reason
+    reason = outcomes["zero wind:1"].reason
+    assert reason.startswith("its demonstrations failed: ")
+    assert "Is a directory" in reason
+    # What is shared was built once, before the cells; what failed was tried once more, at the end.
+    assert witness.tasks == [
+        ("demonstrations", ""),
+        ("demonstrations", ""),
+        ("base policy", ""),
+        ("cell", "equivariant"),
+        ("cell", "standard"),
+        ("cell", "zero"),
+        ("demonstrations", ""),
+        ("cell", "equivariant"),
+        ("cell", "standard"),
+    ]
+    assert [kind for kind, _ in witness.again] == ["demonstrations", "cell", "cell"]
+    assert "killed by SIGKILL" in witness.again[1][1]
+    assert workers() == []
+
+
+def write_suite(tmp_path, config: RunConfig, grid: str) -> str:
+    """A suite file of which every cell is ``config`` but for the grid."""
+    lines = [f"[grid]\n{grid}\n[run]"]
+    for key, value in config.to_json().items():
+        if isinstance(value, dict):
+            items = {name: item for name, item in value.items() if item is not None}
+            lines += [f"{key}.{name} = {json.dumps(item)}" for name, item in items.items()]
+        elif key not in grid:
+            lines.append(f"{key} = {json.dumps(value)}")
+    path = tmp_path / "tiny.toml"
+    path.write_text("\n".join(lines))
+    return str(path)
+
+
+def symsteer(monkeypatch, *arguments) -> int:
+    monkeypatch.setattr(sys, "argv", ["symsteer", *map(str, arguments)])
+    return main()
+
+
+@pytest.mark.parametrize(
+    "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
+)
+def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_path, capsys):
+    """Ctrl-C reaches all processes of the terminal's group, a kill only the sweep itself."""
+    path = write_suite(tmp_path, LONG, 'agent = ["equivariant"]\nseed = [0, 1]')
+    out = tmp_path / "runs"
+    shutil.copytree(undisturbed.parent / "base", out / "base")
+    # A test suite that runs in the background has its children ignore interrupts.
+    program = (
+        "import signal, sys; from bench.cli import main; "
+        "signal.signal(signal.SIGINT, signal.default_int_handler); "
+        f"sys.argv = ['symsteer', 'sweep', {path!r}, '--out', {str(out)!r}, '--workers', '1']; "
+        "sys.exit(main())"
+    )
+    sweep = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    folder = out / undisturbed.name
+    try:
+        wait_for(lambda: (folder / CHECKPOINT).is_file() or sweep.poll() is not None)
+        assert state_of(folder) == "running"
+        [status] = read_status(out)
+        assert [len(status.cells(state)) for state in ("running", "missing")] == [1, 1]
+        if end == signal.SIGINT:
+            os.killpg(sweep.pid, end)
+        else:
+            sweep.kill()
+        output, errors = sweep.communicate(timeout=60)
+        wait_for(lambda: not group(sweep.pid), seconds=10)
+    finally:
+        sweep.kill()
+    if end == signal.SIGINT:
+        assert sweep.returncode == 130
+        assert errors.splitlines() == [
+            "interrupted",
+            "the same command goes on where this one stopped",
+        ]
+        assert output == ""
+    text = to_text(read_status(out), out)
+    assert "interrupted      1" in text
+    assert "missing          1" in text
+
+
+def group(leader: int) -> list[int]:
+    """The living processes of a process group."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error, ProcessLookupError):
+            if os.getpgid(process.pid) == leader and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process.pid)
+    return found
+
+
+def test_the_command_line(undisturbed, monkeypatch, capsys, tmp_path):
+    """Finished cells are skipped, failed ones are named with their reason, and counted."""
+    path = write_suite(tmp_path, LONG, 'agent = ["equivariant"]\nenv_steps = [480, 481]')
+    out = tmp_path / "runs"
+    shutil.copytree(undisturbed, out / undisturbed.name)
+    other = make_plan(load_suite(path), out).cells[1]
+    # Whoever comes to this folder cannot make a run of it.
+    (out / other.run_id).write_text("in the way")
+    before = sorted(out.rglob("*"))
+    assert symsteer(monkeypatch, "sweep", path, "--out", out, "--dry-run") == 0
+    text = capsys.readouterr().out
+    assert re.search(r"env_steps +480 +1 +1 +0 +0 +0\n +481 +1 +0 +0 +0 +1\n", text)
+    assert "base policies to build: 1\n  edp for PickCube-v1 floating, 3 diverse" in text
+    assert "judged by 1 finished run" in text
+    assert sorted(out.rglob("*")) == before
+    record = (out / undisturbed.name / "record.json").stat().st_mtime_ns
+    shutil.copytree(undisturbed.parent / "base", out / "base")
+    assert symsteer(monkeypatch, "sweep", path, "--out", out, "--workers", 1) == 1
+    output, errors = capsys.readouterr()
+    lines = output.splitlines()
+    assert lines[0] == "skipped   1 of 2 runs are finished already"
+    assert lines[1].startswith(f"failed    [2/2] {other.label}  cannot write")
+    reason = lines[1].partition(f"{other.label}  ")[2]
+    assert errors.splitlines() == [f"failed: {other.label}: {reason}"]
+    assert (out / undisturbed.name / "record.json").stat().st_mtime_ns == record
+    assert symsteer(monkeypatch, "status", out) == 0
+    text = capsys.readouterr().out
+    assert f"failed:\n  {other.label}: cannot write" in text
+    assert workers() == []
+
+
+@pytest.mark.parametrize(
+    ("run", "options", "words"),
+    [
+        ("embodiment = 'hand'", [], "there is no embodiment 'hand'"),
+        ("task = 'PickCub-v1'", [], "PickCube-v1"),
+        ("agent = 'ppo'", ["--dry-run"], "there is no agent"),
+        ("", ["--workers", "-1"], "--workers is -1"),
+        ("", ["--workers", "-1", "--dry-run"], "--workers is -1"),
+        ("", ["--ray", "here"], "--ray here is no address"),
+    ],
+)
+def test_what_cannot_run_is_refused_before_anything_happens(
+    run, options, words, monkeypatch, capsys, tmp_path
+):
+    path = tmp_path / "bad.toml"
+    path.write_text(f"[grid]\nseed = [0, 1]\n[run]\n{run}")
+    assert symsteer(monkeypatch, "sweep", path, "--out", tmp_path / "runs", *options) == 2
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert words in errors
+    assert errors.count("\n") == 1
