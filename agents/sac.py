@@ -88,11 +88,16 @@ class SacConfig:
     def __post_init__(self) -> None:
         positive = (
             *("lr", "alpha_lr", "batch_size", "critics", "width", "depth", "noise_bound"),
-            *("initial_alpha", "reward_scale", "replay_capacity"),
+            *("initial_alpha", "reward_scale", "replay_capacity", "utd"),
         )
         for name in positive:
             if not getattr(self, name) > 0:
                 raise UserError(f"agent option {name} must be positive, not {getattr(self, name)}")
+        for name in ("warmup", "initial_output", "free_init"):
+            if not getattr(self, name) >= 0:
+                raise UserError(
+                    f"agent option {name} must not be negative, not {getattr(self, name)}"
+                )
         if not 0 <= self.gamma < 1:
             raise UserError(f"agent option gamma must lie in [0, 1), not {self.gamma}")
         if not 0 < self.tau <= 1:

@@ -27,6 +27,9 @@ from policies.errors import UserError
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
+LONGEST_COMPLAINT = 900
+"""Characters of an error message; the middle of a longer one is left out."""
+
 app = tyro.extras.SubcommandApp()
 
 
@@ -151,7 +154,7 @@ def sweep(
     from bench.sweep.plan import make_plan, manifest_path
     from bench.sweep.suite import load_suite
 
-    plan = make_plan(load_suite(suite), out)
+    plan = make_plan(load_suite(suite), out, elsewhere=ray is not None)
     if dry_run:
         print(preview(plan, workers))
         return 0
@@ -529,5 +532,10 @@ def main() -> int:
 
 def _complain(error: BaseException, text: str, code: int) -> int:
     """One sentence on stderr, and how to go on where that is known; returns the exit code."""
-    print(text, *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
+    # It may quote what the input held: line breaks, control characters, pages of text.
+    line = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    if len(line) > LONGEST_COMPLAINT:
+        half = LONGEST_COMPLAINT // 2
+        line = f"{line[:half]} ... {line[-half:]}"
+    print(line, *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
     return code

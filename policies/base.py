@@ -146,7 +146,7 @@ class PolicyConfig:
             )
         if self.sampling_steps > self.diffusion_steps:
             raise UserError(
-                f"the sampler can take at most diffusion_steps = {self.diffusion_steps} steps, "
+                f"sampling_steps must be at most diffusion_steps, {self.diffusion_steps}, "
                 f"not {self.sampling_steps}"
             )
         if not (self.learning_rate > 0 and self.weight_decay >= 0 and self.warmup_steps >= 0):

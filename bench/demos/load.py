@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from bench.demos.seal import SEAL, checksum
 from bench.tasks import check_embodiment, make, task_class
@@ -26,6 +27,36 @@ _SAME_ROBOT = {"panda_wristcam": "panda"}
 _STOCK_ROBOT = "panda"
 
 _REBUILD_BATCH = 64
+
+
+class _Table(BaseModel):
+    """A part of a trajectory file's .json: what is read has its type, the rest is kept."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class _Episode(_Table):
+    episode_id: int
+    control_mode: str | None = None
+    success: bool = True
+
+
+class _EnvInfo(_Table):
+    env_id: str
+    env_kwargs: dict[str, Any]
+
+
+class _Description(_Table):
+    env_info: _EnvInfo
+    episodes: list[_Episode]
+    symsteer: dict[str, Any] = {}
+
+    @field_validator("episodes")
+    @classmethod
+    def _once(cls, episodes: list[_Episode]) -> list[_Episode]:
+        if len({episode.episode_id for episode in episodes}) < len(episodes):
+            raise ValueError("an episode_id occurs twice")
+        return episodes
 
 
 @dataclass(frozen=True)
@@ -128,16 +159,16 @@ def _read_description(path: Path) -> dict[str, Any]:
         raise UserError(f"{side} is missing; ManiSkill trajectories are a pair of .h5 and .json")
     try:
         description = json.loads(side.read_text(encoding="utf-8"))
-        info = description["env_info"]
-        if not isinstance(description["episodes"], list):
-            raise TypeError("episodes is not a list")
-        str(info["env_id"]), dict(info["env_kwargs"])
-    except (ValueError, KeyError, TypeError) as error:
+        return _Description.model_validate(description).model_dump(exclude_unset=True)
+    except (ValueError, RecursionError) as error:
+        problem = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False, include_input=False)[0]
+            problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise UserError(
-            f"{side} does not describe ManiSkill trajectories ({error!r}); "
+            f"{side} does not describe ManiSkill trajectories ({problem}); "
             "collect or download the pair again"
         ) from error
-    return description
 
 
 def _usable_records(
@@ -156,10 +187,10 @@ def _usable_records(
     if found != embodiment:
         raise UserError(f"{path} was recorded with {found!r}, but {embodiment!r} is wanted")
     records = description["episodes"]
-    modes = {r.get("control_mode", kwargs.get("control_mode")) for r in records}
+    modes = {str(r.get("control_mode", kwargs.get("control_mode"))) for r in records}
     if modes - {body.control_mode}:
         raise UserError(
-            f"{path} was recorded with control mode {', '.join(sorted(map(str, modes)))}, but "
+            f"{path} was recorded with control mode {', '.join(sorted(modes))}, but "
             f"{body.control_mode} is wanted; convert it with ManiSkill's replay_trajectory"
         )
     usable = [r for r in records if r.get("success", True)]
@@ -173,7 +204,7 @@ def _usable_records(
 
 def _read_group(path: Path, file: h5py.File, record: dict[str, Any], own: bool) -> dict[str, Any]:
     """Actions, and observations or states, of one episode."""
-    name = f"traj_{record.get('episode_id')}"
+    name = f"traj_{record['episode_id']}"
     wanted = ["actions", "obs" if own else "env_states"]
     if name not in file or any(key not in file[name] for key in wanted):
         raise UserError(

@@ -7,6 +7,7 @@ import difflib
 import functools
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -17,6 +18,11 @@ from pydantic import TypeAdapter, ValidationError
 from agents.sac import SacConfig
 from policies.base import PolicyConfig
 from policies.errors import UserError
+
+LARGEST_COUNT = 10**12
+
+LONGEST_VARIANT = 120
+"""Characters; the variant is a part of the run's name."""
 
 
 @dataclass(frozen=True)
@@ -97,16 +103,28 @@ class RunConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
-        for name in ("env_steps", "num_envs", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        if self.seed < 0:
-            raise UserError(f"seed is {self.seed}; it must not be negative")
-        if self.demonstrations.count < 1:
-            raise UserError("demonstrations.count must be at least 1")
-        evaluation = self.evaluation
-        if min(dataclasses.astuple(evaluation)) < 1:
-            raise UserError("every number under evaluation must be at least 1")
+        _check_plain(dataclasses.asdict(self), "", "")
+        counts = {
+            **{name: getattr(self, name) for name in ("env_steps", "num_envs", "checkpoint_every")},
+            "demonstrations.count": self.demonstrations.count,
+            **{f"evaluation.{k}": v for k, v in dataclasses.asdict(self.evaluation).items()},
+        }
+        for name, count in counts.items():
+            if not 1 <= count <= LARGEST_COUNT:
+                raise UserError(f"{name} is {count}; it must lie between 1 and 10^12")
+        seeds = {
+            "seed": self.seed,
+            "policy_seed": self.policy_seed,
+            "demonstrations.seed": self.demonstrations.seed,
+        }
+        for name, seed in seeds.items():
+            if not 0 <= seed < 2**32:
+                raise UserError(f"{name} is {seed}; it must lie in [0, 2^32)")
+        if len(self.variant) > LONGEST_VARIANT:
+            raise UserError(
+                f"the variant {self.variant[:40]!r}... has {len(self.variant)} characters; it must "
+                f"not have more than {LONGEST_VARIANT}, so join fewer of them"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Nested plain data."""
@@ -142,13 +160,13 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
     """
     defaults = RunConfig().to_json()
     _check_nested_keys(data, defaults, source, "")
-    try:
-        # As JSON, in which strictness still takes 1 for 1.0, but "1" or true for no number.
-        text = json.dumps(_merge(defaults, data), allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"{source}: a value is neither a number nor text: {error}") from error
+    _check_plain(data, f"{source}: ", "")
+    # As JSON, in which strictness still takes 1 for 1.0, but "1" or true for no number.
+    text = json.dumps(_merge(defaults, data))
     try:
         return _adapter().validate_json(text, strict=True)
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -189,6 +207,21 @@ def _check_nested_keys(
             if not isinstance(value, dict):
                 raise UserError(f"{source}: {prefix}{key} must be a table, not {value!r}")
             _check_nested_keys(value, defaults[key], source, f"{prefix}{key}.")
+
+
+def _check_plain(data: Any, head: str, key: str) -> None:
+    """Refuse what JSON has no word for: NaN, infinities, and TOML's dates and times."""
+    if isinstance(data, Mapping):
+        for name, value in data.items():
+            _check_plain(value, head, f"{key}.{name}" if key else name)
+    elif isinstance(data, list | tuple):
+        for value in data:
+            _check_plain(value, head, key)
+    elif isinstance(data, float):
+        if not math.isfinite(data):
+            raise UserError(f"{head}{key} is {data}; it must be finite")
+    elif data is not None and not isinstance(data, str | int):
+        raise UserError(f"{head}{key} must be a number, a text or a flag, not {data!r}")
 
 
 def content_key(*parts: Any) -> str:

@@ -138,7 +138,7 @@ def read_config(folder: Path) -> dict[str, Any]:
             f"{folder} is not the folder of a run: it has no {CONFIG}; name a folder that "
             "`symsteer run` or `symsteer sweep` wrote"
         ) from error
-    except (OSError, UnicodeDecodeError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path} cannot be read ({error}); restore it, or start the run again"
         ) from error
@@ -228,7 +228,7 @@ class Heartbeat:
             "budget": self._budget,
             "success": success,
             "steps_per_second": rate,
-            "seconds_left": (self._budget - env_steps) / rate if rate > 0 else None,
+            "seconds_left": max(0, self._budget - env_steps) / rate if rate > 0 else None,
             "updated": datetime.now(UTC).isoformat(timespec="seconds"),
         }
         # A display is not worth a run: a full disk is reported where results are written.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from bench.runs.config import RunConfig, build_config, check_keys
 from policies.errors import UserError
 
 SUITES = Path(__file__).parent.parent / "suites"
+
+LARGEST_GRID = 100_000
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,14 @@ def load_suite(name_or_path: str) -> Suite:
             f"no suite {name_or_path!r}; use one of {', '.join(suite_names())} or the path of a "
             ".toml file"
         ) from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UserError(f"the suite {path.name} cannot be read as TOML: {error}") from error
+    except OSError as error:
+        raise UserError(
+            f"the suite {path} cannot be read: {error.strerror}; name another file"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(
+            f"the suite {path.name} cannot be read as TOML: {error}; correct it there"
+        ) from error
     check_keys(data, {"description", "grid", "run"}, path.name)
     shared, description = data.get("run", {}), data.get("description", "")
     if not isinstance(shared, dict):
@@ -76,6 +85,11 @@ def _cells(grid: Any, source: str) -> Iterator[dict[str, Any]]:
     for key, values in grid.items():
         if not isinstance(values, list) or not values:
             raise UserError(f"{source}: grid.{key} must be a list with at least one value")
+    if (count := math.prod(map(len, grid.values()))) > LARGEST_GRID:
+        raise UserError(
+            f"{source}: a grid has {count} runs; it must not have more than {LARGEST_GRID}, so "
+            "shorten its lists"
+        )
     for chosen in itertools.product(*grid.values()):
         cell = dict(zip(grid, chosen, strict=True))
         if "strength" in cell:

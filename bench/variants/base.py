@@ -212,6 +212,8 @@ def parse(text: str, strength: Strength | None = None) -> tuple[Variant, ...]:
                 "variant='action_gain'"
             )
         return ()
+    if "," in text or ";" in text:
+        raise UserError(f"variants are joined with +, e.g. action_gain:0.5+wind:0.5, not {text!r}")
     parts = text.split("+")
     variants: list[Variant] = []
     for part in parts:
