@@ -44,6 +44,7 @@ class RayCluster:
         self._out = out.resolve()
         self._ray = _connect(address)
         self._references: dict[Future, Any] = {}
+        self._functions: dict[tuple, Any] = {}
         try:
             _check_shared(self._ray, self._out)
         except BaseException:
@@ -55,8 +56,10 @@ class RayCluster:
         cuda = any(isinstance(a, RunConfig) and "cuda" in (a.sim, a.device) for a in args)
         # The other machines know the folder by its full path only.
         args = tuple(self._out if isinstance(a, Path) else a for a in args)
-        remote = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)(function)
-        reference = remote.remote(*args)
+        if (function, cuda) not in self._functions:
+            options = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)
+            self._functions[function, cuda] = options(function)
+        reference = self._functions[function, cuda].remote(*args)
         future = reference.future()
         self._references[future] = reference
         return future

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -111,15 +111,20 @@ class Manifest:
         return _title(self.suite, self.description)
 
 
-def make_plan(suite: Suite, out: Path) -> Plan:
+def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
     """Resolve a suite, and refuse what cannot run before anything is built.
+
+    Args:
+        suite: what to run.
+        out: folder of the runs.
+        elsewhere: whether other machines run it, whose devices this one does not know.
 
     Raises:
         UserError: if a cell names what does not exist.
     """
     flat = []
     for config in suite.runs:
-        check(config)
+        check(replace(config, sim="cpu", device="cpu") if elsewhere else config)
         flat.append(_flatten(config.to_json()))
     extra = [
         key for key in flat[0] if key not in BASIC and any(one[key] != flat[0][key] for one in flat)

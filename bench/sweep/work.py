@@ -16,7 +16,7 @@ from typing import Literal
 
 import torch
 
-from bench.runs.base_policy import demonstration_file, prepare_base
+from bench.runs.base_policy import demonstration_file, find_base, prepare_base
 from bench.runs.config import RunConfig
 from bench.runs.folder import RunBusyError, is_finished, run_id
 from bench.runs.run import execute
@@ -24,6 +24,8 @@ from leaderboard.errors import RecordError
 from policies.errors import UserError
 
 POLL_SECONDS = 0.5
+
+LONGEST_REASON = 500
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,11 @@ class Result:
     reason: str = ""
     trace: str = ""
     """Where it went wrong, if that is a surprise."""
+
+    def __post_init__(self) -> None:
+        # A message of whatever library failed becomes one line of bounded length.
+        line = "".join(c if c.isprintable() else "?" for c in " ".join(self.reason.split()))
+        object.__setattr__(self, "reason", line[:LONGEST_REASON])
 
 
 def one_thread() -> None:
@@ -59,11 +66,13 @@ def play(config: RunConfig, out: Path, patience: float) -> Result:
     Args:
         config: of the run.
         out: folder of the runs.
-        patience: seconds to wait for another process that works on the run: one that has just
-            died on another machine may seem to hold it for a while.
+        patience: seconds to wait for what another machine has done to show here: a base policy
+            that it has built, or that it is gone and holds the run no more.
     """
     folder = out / run_id(config, {})
     deadline = time.monotonic() + patience
+    while find_base(config, out) is None and time.monotonic() < deadline:
+        time.sleep(POLL_SECONDS)
     while True:
         if is_finished(folder):
             return Result("done")

@@ -1,0 +1,202 @@
+"""What one sees of a sweep: status, time left, the lines of the display."""
+
+import io
+import json
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import pytest
+from filelock import FileLock
+from rich.console import Console
+
+from bench.cli import main
+from bench.runs.folder import CONFIG, LOCK, PROGRESS, RECORD
+from bench.sweep.display import Display, LiveDisplay
+from bench.sweep.estimate import Estimate, duration
+from bench.sweep.plan import Cell, make_plan, manifest_path, write_manifest
+from bench.sweep.schedule import Outcome, Task, tasks_of
+from bench.sweep.status import read_status, to_text
+from bench.sweep.suite import Suite
+from bench.sweep.work import Result
+from leaderboard.records import read_record
+from policies.errors import UserError
+from tests.bench.sweep.cells import LONG
+from tests.bench.tiny_run import tiny_config
+
+AGENTS = ("equivariant", "standard", "approximate", "standard-matched", "zero")
+
+
+def cell(agent="equivariant", task="PickCube-v1", env_steps=1000, embodiment="floating"):
+    return Cell("x", task, embodiment, "none", agent, 0, env_steps)
+
+
+def test_a_run_is_judged_by_the_most_similar_finished_ones():
+    estimate = Estimate()
+    assert estimate.left([cell()], {}, 1) is None
+    estimate.add(cell(), 100.0)
+    estimate.add(cell(), 300.0)
+    estimate.add(cell("standard"), 50.0)
+    estimate.add(cell("zero"), 1.0)
+    assert estimate.left([cell()] * 4, {}, 1) == pytest.approx(800)
+    assert estimate.left([cell()] * 4, {}, 2) == pytest.approx(400)
+    # Ten workers are as fast as the longest run.
+    assert estimate.left([cell()] * 4, {}, 10) == pytest.approx(200)
+    assert estimate.left([cell("standard", env_steps=4000)], {}, 1) == pytest.approx(200)
+    assert estimate.left([cell("standard", task="PushCube-v1")], {}, 1) == pytest.approx(50)
+    # Another agent that learns is like those that do; the golden ticket is like none of them.
+    assert estimate.left([cell("approximate")], {}, 1) == pytest.approx(100)
+    assert estimate.left([cell("golden-ticket")], {}, 1) is None
+    half = {"env_steps": 500, "budget": 1000, "steps_per_second": 10.0}
+    assert estimate.left([], {cell("standard"): half}, 1) == pytest.approx(25)
+    # Before the first of its kind is finished, one that runs tells.
+    ticket = cell("golden-ticket")
+    assert estimate.left([ticket], {ticket: half}, 1) == pytest.approx(150)
+
+
+def test_lengths_of_time():
+    texts = [duration(seconds) for seconds in (5, 89, 90, 3600, 5400, 86400, 200000)]
+    assert texts == ["5 s", "89 s", "2 min", "60 min", "1.5 h", "24.0 h", "2.3 days"]
+
+
+@pytest.fixture
+def sweep(undisturbed, tmp_path):
+    """A sweep of which one run is finished, one runs, one was stopped, one failed, one is to do."""
+    configs = [replace(LONG, agent=agent) for agent in AGENTS]
+    plan = make_plan(Suite("tiny", "five", tuple(configs)), tmp_path)
+    folders = [tmp_path / one.run_id for one in plan.cells]
+    shutil.copytree(undisturbed, folders[0])
+    for folder in folders[1:3]:
+        shutil.copytree(undisturbed, folder)
+        record = read_record(folder / RECORD)
+        record.status, record.ended = "running", None
+        (folder / RECORD).write_text(record.model_dump_json(by_alias=True))
+    progress = {
+        "phase": "training",
+        "env_steps": 120,
+        "budget": 480,
+        "success": 0.25,
+        "steps_per_second": 12.0,
+        "seconds_left": 30.0,
+        "updated": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    (folders[1] / PROGRESS).write_text(json.dumps(progress))
+    # What an earlier process left is not what the present one does.
+    old = {**progress, "updated": "2026-01-01T00:00:00+00:00"}
+    (folders[2] / PROGRESS).write_text(json.dumps(old))
+    write_manifest(plan, 2, {plan.cells[3].run_id: "its process was killed by SIGKILL"})
+    with FileLock(folders[1] / LOCK):
+        yield plan
+
+
+def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
+    [status] = read_status(sweep.out)
+    assert [status.state(one) for one in sweep.cells] == [
+        "finished",
+        "running",
+        "interrupted",
+        "failed",
+        "missing",
+    ]
+    text = to_text([status], sweep.out)
+    assert text.startswith("tiny: five (5 runs)\n  finished         1\n")
+    assert "standard seed 0: 120 of 480 steps, success 25%, 12 steps/s, about 30 s left" in text
+    assert "standard-matched seed 0: its process was killed by SIGKILL" in text
+    # zero does not learn: nothing is known of it.
+    assert text.endswith("time left: unknown, no such runs are finished yet")
+    monkeypatch.setattr("sys.argv", ["symsteer", "status", str(sweep.out), "--suite", "tiny"])
+    assert main() == 0
+    assert capsys.readouterr().out == text + "\n"
+
+
+def test_runs_of_no_sweep_are_reported_too(sweep, undisturbed, tmp_path):
+    other = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0"
+    shutil.copytree(undisturbed, other)
+    assert [len(status.runs) for status in read_status(tmp_path)] == [5, 1]
+    manifest_path(tmp_path, "tiny").unlink()
+    [status] = read_status(tmp_path)
+    # The two that never began have left nothing.
+    assert len(status.runs) == 4
+    (other / CONFIG).write_text("{")
+    with pytest.raises(UserError, match=CONFIG):
+        read_status(tmp_path)
+
+
+def test_mistakes_with_status(sweep, tmp_path):
+    with pytest.raises(UserError, match="there is no folder"):
+        read_status(tmp_path / "nowhere")
+    with pytest.raises(UserError, match=r"no sweep of a suite 'tin'; there: tiny"):
+        read_status(tmp_path, "tin")
+    (tmp_path / "empty").mkdir()
+    assert to_text(read_status(tmp_path / "empty"), tmp_path).startswith("there are no runs in")
+    path = manifest_path(tmp_path, "tiny")
+    for damage in (path.read_text()[:-9], "[]", '{"suite": 3}', "\x00"):
+        path.write_text(damage)
+        with pytest.raises(UserError, match="run the sweep again to write it anew"):
+            read_status(tmp_path)
+
+
+def screen(sweep, width: int) -> list[str]:
+    """The live lines of a sweep, as a terminal of this width shows them."""
+    console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
+    todo = sweep.cells[1:]
+    display = LiveDisplay(sweep, todo, Estimate(), 3, console)
+    tasks = [task for task in tasks_of(sweep, todo) if task.cell]
+    base = Task("base policy", "edp for PickCube-v1", print, ())
+    for task in (tasks[0], tasks[1], base):
+        display.started(task)
+    display.refresh([tasks[0], tasks[1], base])
+    console.print(display.live.get_renderable())
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+
+
+def test_the_live_lines(sweep):
+    wide = screen(sweep, 120)
+    assert wide[0].startswith("standard PickCube-v1 none s0")
+    assert wide[0].split("━")[-1].split() == ["120/480", "25%", "12", "steps/s", "30", "s"]
+    assert wide[1].startswith("approximate PickCube-v1 none s0")
+    assert wide[1].endswith("starting")
+    assert wide[2].startswith("base policy edp for PickCube-v1")
+    assert wide[3] == "1 of 5 runs finished, time left unknown"
+    narrow = screen(sweep, 60)
+    assert narrow[0].split() == ["standard", "s0", "120/480", "25%", "12", "steps/s", "30", "s"]
+    assert len(narrow) == 4
+    assert max(len(line) for line in narrow) <= 60
+
+
+def test_a_pipe_gets_one_plain_line_a_run_that_ended(sweep):
+    stream = io.StringIO()
+    one = Task("cell", "c", print, (), sweep.cells[1])
+    with Display(sweep, sweep.cells[1:], Estimate(), 2, Console(file=stream, width=20)) as display:
+        display.started(one)
+        display.refresh([one])
+        display.retried(one, Result("failed", "why"))
+        assert stream.getvalue() == ""
+        display.ended(Outcome(sweep.cells[1], "failed", "why " * 30))
+    assert stream.getvalue() == (
+        "failed    [2/5] PickCube-v1 floating none standard seed 0          " + "why " * 30 + "\n"
+    )
+
+
+def test_a_reason_is_one_line_of_bounded_length():
+    reason = Result("failed", "first\nsecond\x1b[2J " + "x" * 9999).reason
+    assert reason.startswith("first second?[2J xxx")
+    assert len(reason) == 500
+
+
+def test_equal_demonstrations_and_bases_are_built_once(tmp_path):
+    one = tiny_config()
+    configs = (
+        one,
+        replace(one, seed=1),
+        replace(one, variant="wind:1"),
+        replace(one, policy=replace(one.policy, name="plain")),
+        replace(one, task="PushCube-v1"),
+    )
+    plan = make_plan(Suite("shared", "", configs), tmp_path)
+    tasks = tasks_of(plan, plan.cells)
+    assert [task.kind for task in tasks] == ["demonstrations"] * 2 + ["base policy"] * 3 + [
+        "cell"
+    ] * 5
+    assert [task.waits for task in tasks] == [False] * 2 + [True] * 8
+    assert [len(task.then) for task in tasks[:5]] == [2, 1, 3, 1, 1]
