@@ -106,6 +106,7 @@ class SymmetricTask(GymEnv):
                 )
             part.bind(self)
         self._reset_rows: torch.Tensor | None = None
+        self._closed = False
         kwargs.setdefault("control_mode", self.body.control_mode)
         kwargs.setdefault("robot_uids", self.body.robot_uid)
         super().__init__(*args, **kwargs)
@@ -221,9 +222,23 @@ class SymmetricTask(GymEnv):
     # ------------------------------------------------------------------- step
 
     def step(self, action: Any) -> tuple:
-        """As ManiSkill's; ``truncated`` is set after ``max_episode_steps``, reward is float32."""
+        """As ManiSkill's; ``truncated`` is set after ``max_episode_steps``, reward is float32.
+
+        Raises:
+            UserError: if the environment was closed.
+        """
+        self._check_open()
         obs, reward, terminated, _, info = super().step(action)
         return obs, reward.float(), terminated, self.elapsed_steps >= self.max_episode_steps, info
+
+    def close(self) -> None:
+        """Free the simulation; neither `reset` nor `step` works afterwards."""
+        self._closed = True
+        super().close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise UserError("this environment was closed and cannot be used any more; make another")
 
     def _step_action(self, action: Any) -> Any:
         if not self.variants:
@@ -298,9 +313,10 @@ class SymmetricTask(GymEnv):
             options: ``env_idx`` selects the environments to reset; the others are untouched.
 
         Raises:
-            UserError: if the list of seeds has another length, or ``env_idx`` names environments
-                that are not there.
+            UserError: if the list of seeds has another length, ``env_idx`` names environments
+                that are not there, or the environment was closed.
         """
+        self._check_open()
         options = dict(options or {})
         partial = options.get("env_idx")
         if partial is not None:

@@ -355,6 +355,16 @@ def test_reward_in_the_stock_direction_is_maniskills(task, angle):
     assert len(ours.round(decimals=3).unique()) >= 5
 
 
+def test_a_closed_environment_says_so():
+    env = make("PushCube-v1", num_envs=1)
+    env.reset(seed=[0])
+    env.close()
+    with pytest.raises(UserError, match="was closed"):
+        env.step(torch.zeros(1, 7))
+    with pytest.raises(UserError, match="was closed"):
+        env.reset(seed=[0])
+
+
 def test_truncation_at_the_limit():
     env = make("PickCube-v1", num_envs=2)
     env.reset(seed=[0, 1])
