@@ -614,7 +614,8 @@ def read_record(path: Path | str) -> RunRecord:
         ) from error
     if not isinstance(data, dict) or "schema_version" not in data:
         raise RecordError(
-            f"{path} is JSON but has no schema_version: not a run record; name records or run folders only."
+            f"{path} is JSON but has no schema_version: not a run record; "
+            "name records or run folders only."
         )
     version = data["schema_version"]
     if type(version) is not int or not 1 <= version <= SCHEMA_VERSION:
