@@ -78,6 +78,7 @@ def claims(summary: Summary, audit: Audit, found: DefectMap) -> list[Claim]:
     return [
         *(_sample_efficiency(symmetric, rival) for rival in ("standard", "standard-matched")),
         _divergence(summary.tables),
+        _bias(summary.tables),
         _fewest_demonstrations(symmetric),
         _fewer_demonstrations(symmetric),
         *(_falls(found.panels["equivariant", measure]) for measure in ("auc", "success")),
@@ -145,8 +146,10 @@ def _threshold_steps(tables: Sequence[Table], agent: str) -> str:
     return f"{text} ({reached}/{len(shares)})"
 
 
+VALUES = "Value divergence: symmetry prevents it"
+
+
 def _divergence(tables: Sequence[Table]) -> Claim:
-    name = "Value divergence: symmetry prevents it"
     test = "share of seeds whose Q diverged, `standard` minus `equivariant`, all cells"
 
     def verdicts(table: Table, agent: str) -> dict[int, bool]:
@@ -163,12 +166,34 @@ def _divergence(tables: Sequence[Table]) -> Claim:
         found.append((table, {seed: (one[seed], other[seed]) for seed in seeds_of}))
     cells, reason = _enough(found, "`standard` and `equivariant` with a critic")
     if not cells:
-        return Claim(name, test, 1, reason=reason)
+        return Claim(VALUES, test, 1, reason=reason)
     both = [pair for _, pairs in cells for pair in pairs.values()]
     counts, seeds = [sum(pair[i] for pair in both) for i in (0, 1)], len(both)
     effect = newcombe((counts[0], seeds), (counts[1], seeds))
     beside = f"{counts[0]}/{seeds} against {counts[1]}/{seeds} diverged"
-    return Claim(name, test, 1, effect, len(cells), seeds, reason, beside)
+    return Claim(VALUES, test, 1, effect, len(cells), seeds, reason, beside)
+
+
+def _bias(tables: Sequence[Table]) -> Claim:
+    """The milder form of divergence: how far Q is from the returns that it should predict."""
+    test = "absolute Q bias, `standard` minus `equivariant`, all cells"
+
+    def biases(table: Table, agent: str) -> dict[int, float]:
+        row = table.row_of(agent)
+        found = {run.seed: run.in_window("q_bias") for run in row.finished} if row else {}
+        return {seed: abs(float(np.mean(values))) for seed, values in found.items() if values}
+
+    found: Cells[Sample] = []
+    for table in tables:
+        one, other = biases(table, "standard"), biases(table, "equivariant")
+        seeds_of = sorted(one.keys() & other.keys())
+        found.append((table, {seed: Sample.of([one[seed] - other[seed]]) for seed in seeds_of}))
+    cells, reason = _enough(found, "`standard` and `equivariant` with a critic")
+    if not cells:
+        return Claim(VALUES, test, 1, reason=reason)
+    effect = stratified_bootstrap([list(samples.values()) for _, samples in cells])
+    seeds = sum(len(samples) for _, samples in cells)
+    return Claim(VALUES, test, 1, effect, len(cells), seeds, reason, "in units of return")
 
 
 FEW = "Few demonstrations: symmetry helps most there"

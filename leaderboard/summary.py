@@ -128,6 +128,13 @@ class Run:
         verdict = self.record.diverged
         return verdict if self.finished or verdict else None
 
+    def in_window(self, name: str) -> list[float]:
+        """Finite values of a diagnostic in the evaluations of the final window."""
+        start = (FINAL_WINDOW - 1) * self.record.cell.env_steps
+        evaluations = [e for step, e in self.curve.items() if FINAL_WINDOW * step >= start]
+        values = [evaluation.diagnostics.get(name) for evaluation in evaluations]
+        return [value for value in values if value is not None]
+
     def diagnostics(self, name: str) -> list[float]:
         """All finite values of a diagnostic, in the order of the evaluations."""
         values = (e.diagnostics.get(name) for e in self.record.evaluations)
@@ -242,6 +249,17 @@ class Row:
     def largest(self, name: str) -> float | None:
         """Largest finite value of a diagnostic over all evaluations and runs."""
         values = [value for run in self.runs for value in run.diagnostics(name)]
+        return max(values) if values else None
+
+    @property
+    def highest_q(self) -> float | None:
+        """Largest finite Q of the minimum over critics, since learning began."""
+        values = [
+            value
+            for run in self.runs
+            for evaluation in run.record.evaluations
+            if evaluation.updates and (value := evaluation.diagnostics.get("q_max")) is not None
+        ]
         return max(values) if values else None
 
 

@@ -19,6 +19,7 @@ NAMES = (
     "faster than standard",
     "faster than standard-matched",
     "divergence",
+    "bias",
     "fewest demonstrations",
     "fewer demonstrations",
     "slope, area",
@@ -127,6 +128,25 @@ def test_divergence_counts_seeds() -> None:
     claim = found(diverging("standard", [0]) + diverging("equivariant", [1]))["divergence"]
     assert (value(claim), claim.verdict) == (0.0, "undecided")
     claim = found(diverging("standard", []) + diverging("equivariant", range(5)))["divergence"]
+    assert claim.verdict == "contradicted"
+
+
+def test_the_bias_of_q_counts_by_its_size_in_the_final_window() -> None:
+    def biased(agent: str, biases: Sequence[float]) -> list[RunRecord]:
+        records = []
+        for seed, bias in enumerate(biases):
+            curve = [
+                make_evaluation([1, 0], steps, steps == 50_000, q_mean=0.0, q_bias=value)
+                for steps, value in ((0, 99.0), (45_000, bias - 1), (50_000, bias + 1))
+            ]
+            records.append(make_record(curve, agent=agent, seed=seed))
+        return records
+
+    far, near = [-6.0, 6.0, 7.0, -7.0, 6.0], [2.0, -2.0, 3.0, -3.0, 2.0]
+    claim = found(biased("standard", far) + biased("equivariant", near))["bias"]
+    assert value(claim) == pytest.approx(4.0)
+    assert (claim.verdict, claim.seeds) == ("supported", 5)
+    claim = found(biased("standard", near) + biased("equivariant", far))["bias"]
     assert claim.verdict == "contradicted"
 
 

@@ -126,14 +126,14 @@ def test_learners_are_held_against_the_best_reference(board: Path) -> None:
 def test_the_second_table_shows_q_cost_and_device(board: Path) -> None:
     text = text_of(board)
     header, _, *rows = table_after(text, "Q-values, symmetry and cost")
-    assert "Largest \\|Q\\| (feasible Q: \u221220 to 0)" in header
+    assert "Largest \\|Q\\|, highest Q (feasible Q: \u221220 to 0)" in header
     assert [row[-1] for row in rows] == ["`cpu`"] * 4
     assert [row[1] for row in rows] == ["0/5"] * 4
 
 
 def test_every_claim_has_a_verdict(board: Path) -> None:
     _, _, *rows = table_after(text_of(board), "## The paper's claims")
-    assert len(rows) == 8
+    assert len(rows) == 9
     verdicts = [re.match(r"\*\*(\w+)\*\*", row[-1]) for row in rows]
     assert [verdict and verdict[1] for verdict in verdicts] == [
         "supported",
