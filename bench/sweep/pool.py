@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
+from tqdm import tqdm
 
 from bench.sweep.work import Result, one_thread
 
@@ -92,6 +93,9 @@ def _begin(log: str) -> None:
     for stream in (1, 2):
         os.dup2(file, stream)
     os.close(file)
+    # The usual lock of progress bars is a semaphore of the system, which a process that is ended
+    # can leave behind.
+    tqdm.set_lock(threading.RLock())
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
