@@ -6,6 +6,7 @@ machine where the simulator does not.
 
 from __future__ import annotations
 
+import errno
 import inspect
 import os
 import runpy
@@ -26,6 +27,8 @@ from policies.base import PolicyName
 from policies.errors import UserError
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 LONGEST_COMPLAINT = 900
 """Characters of an error message; the middle of a longer one is left out."""
@@ -525,7 +528,19 @@ def main() -> int:
         # A path that cannot be read or written; without one it is a fault of ours.
         if error.filename is None:
             raise
-        return _complain(error, f"error: {error.filename}: {error.strerror}", 2)
+        cure = "free space" if error.errno in FULL else "choose another path"
+        return _complain(error, f"error: {error.filename}: {error.strerror}; {cure}", 2)
+    except (MemoryError, RuntimeError) as error:
+        # On the CPU torch raises a plain RuntimeError.
+        full = isinstance(error, MemoryError | torch.OutOfMemoryError)
+        if not full and "allocate memory" not in str(error):
+            raise
+        return _complain(
+            error,
+            "error: the memory of this machine does not suffice for what was asked; lower the "
+            "numbers of environments and episodes, the replay capacity or the networks' width",
+            2,
+        )
     except KeyboardInterrupt as error:
         return _complain(error, "interrupted", 130)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import os
 import platform
 import statistics
@@ -31,6 +32,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 from bench.sim import create, prepare_headless
+from bench.sim.environment import MAX_SCENES
 from bench.sim.shards.messages import divide
 from bench.sim.shards.server import WorkerProcess
 from bench.tasks import task_class
@@ -359,11 +361,17 @@ def measure(
         UserError: an unknown task, or a number out of range.
     """
     env_cls = stock_class(task)
-    if repeats < 1 or seconds <= 0 or not num_envs or min(num_envs) < 1:
+    if repeats < 1 or not 0 < seconds < math.inf or not num_envs or min(num_envs) < 1:
         raise UserError("repeats, seconds and every number of environments must be positive")
-    cores = cores or len(os.sched_getaffinity(0))
-    if cores < 1:
-        raise UserError(f"cores is {cores}; it must be at least 1")
+    if sum(set(num_envs)) > MAX_SCENES:
+        raise UserError(
+            f"one process holds at most {MAX_SCENES} environments, all of --num-envs together; "
+            f"these are {sum(set(num_envs))}, so lower them"
+        )
+    there = len(os.sched_getaffinity(0))
+    cores = cores or there
+    if not 1 <= cores <= there:
+        raise UserError(f"cores is {cores}; it must lie between 1 and {there}, which are here")
     torch.set_num_threads(1)
     report("making environments")
     contenders, pool = _contenders(env_cls, sorted(set(num_envs)), cores)

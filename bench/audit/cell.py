@@ -85,8 +85,8 @@ class Settings:
         for name, least in (("count", LEAST_STATES), ("chunk", 1), ("resets", 16)):
             if getattr(self, name) < least:
                 raise UserError(f"{name} is {getattr(self, name)}; it must be at least {least}")
-        if self.seed < 0:
-            raise UserError(f"seed is {self.seed}; it must not be negative")
+        if not 0 <= self.seed < 2**32:
+            raise UserError(f"seed is {self.seed}; it must lie in [0, 2^32)")
         if self.chunk > task_class(self.task).max_episode_steps:
             raise UserError(
                 f"a chunk of {self.chunk} steps is longer than an episode of {self.task}; "

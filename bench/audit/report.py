@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 
 from bench.audit.cell import BIN, Cell, Defect, Settings
 from bench.audit.estimates import Estimate
+from leaderboard.records import write_atomically
 from policies.errors import UserError
 
 EXACT = 1e-3
@@ -298,17 +299,16 @@ def write_cell(cell: Cell, folder: Path) -> None:
     """Write ``audit.json``, ``map.csv`` and ``map.png``.
 
     Raises:
-        UserError: if the folder cannot be written.
+        RecordError: if the folder cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "audit.json").write_text(json.dumps(cell.to_json(), indent=1) + "\n")
-        rows = ["body,x_mm,y_mm,copies,mm"]
-        rows += [f"{b.body},{b.x_mm:g},{b.y_mm:g},{b.copies},{b.mm:.4g}" for b in cell.map]
-        (folder / "map.csv").write_text("\n".join(rows) + "\n")
-        map_figure(cell).savefig(folder / "map.png", dpi=110, metadata={"Software": None})
-    except OSError as error:
-        raise UserError(f"cannot write the audit to {folder}: {error.strerror}") from error
+    rows = ["body,x_mm,y_mm,copies,mm"]
+    rows += [f"{b.body},{b.x_mm:g},{b.y_mm:g},{b.copies},{b.mm:.4g}" for b in cell.map]
+    picture = io.BytesIO()
+    map_figure(cell).savefig(picture, format="png", dpi=110, metadata={"Software": None})
+    write_atomically(folder / "map.csv", ("\n".join(rows) + "\n").encode())
+    write_atomically(folder / "map.png", picture.getvalue())
+    # Last: a cell with this file is complete, and is not measured again.
+    write_atomically(folder / "audit.json", (json.dumps(cell.to_json(), indent=1) + "\n").encode())
 
 
 def read_cell(path: Path) -> Cell:
@@ -320,8 +320,10 @@ def read_cell(path: Path) -> Cell:
     try:
         return Cell.from_json(json.loads(path.read_text()))
     except OSError as error:
-        raise UserError(f"cannot read the audit {path}: {error.strerror}") from error
-    except ValueError as error:
+        raise UserError(
+            f"cannot read the audit {path}: {error.strerror}; name another, or run it again"
+        ) from error
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is no audit ({error}); run the audit again") from error
 
 
@@ -329,16 +331,12 @@ def write_table(cells: Sequence[Cell], folder: Path) -> None:
     """Write ``table.csv``, ``table.md`` and ``summary.json`` of many cells.
 
     Raises:
-        UserError: if the folder cannot be written.
+        RecordError: if the folder cannot be written.
     """
     rows = [summary(cell) for cell in cells]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "table.csv").write_text(to_csv(rows))
-        (folder / "table.md").write_text(to_markdown(rows))
-        (folder / "summary.json").write_text(summary_json(rows))
-    except OSError as error:
-        raise UserError(f"cannot write the table to {folder}: {error.strerror}") from error
+    write_atomically(folder / "table.csv", to_csv(rows).encode())
+    write_atomically(folder / "table.md", to_markdown(rows).encode())
+    write_atomically(folder / "summary.json", summary_json(rows).encode())
 
 
 def summary_json(rows: Sequence[dict[str, Any]]) -> str:

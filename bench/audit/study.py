@@ -81,6 +81,8 @@ def run_cells(
     """
     for settings in cells:
         settings.check()
+    if resume and out is None:
+        raise UserError("--resume takes cells from --out; name that folder")
     places = {(s.task, s.embodiment) for s in cells}
     if base_policy is not None:
         if len(places) > 1:
@@ -91,6 +93,13 @@ def run_cells(
             )
         # Refuse a bad file before the simulation starts.
         _policy(cells[0], runs, base_policy, progress)
+    if out is not None:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(
+                f"cannot write to {out}: {error.strerror}; choose another folder with --out"
+            ) from error
     results: dict[Settings, Cell] = {}
     for place in dict.fromkeys((s.task, s.embodiment) for s in cells):
         todo = []

@@ -7,6 +7,7 @@ offset of the point that is grasped or pushed, and only successes are kept.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -112,7 +113,11 @@ def collect(
     """
     path = Path(out_path)
     if path.suffix != ".h5":
-        raise UserError(f"demonstrations are written to a file ending in .h5, not {path.name!r}")
+        raise UserError(
+            f"demonstrations are written to a file, whose name must end in .h5, not {path.name!r}"
+        )
+    if path.is_dir():
+        raise UserError(f"{path} is a folder; name a file for the demonstrations")
     if count < 1:
         raise UserError(f"the number of demonstrations must be at least 1; it is {count}")
     if not 0 <= seed < 2**32:
@@ -123,7 +128,9 @@ def collect(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"no folder can be made for {path}: {error.strerror}") from error
+        raise UserError(
+            f"no folder can be made for {path}: {error.strerror}; choose another place"
+        ) from error
     env = make(
         task, num_envs=min(num_envs, 2 * count), embodiment=embodiment, variant=variant, sim=sim
     )
@@ -272,8 +279,15 @@ def _write(
             _write_tree(group.create_group("env_states", track_order=True), attempt.states)
         file.attrs[SEAL] = checksum(file, description)
     text = json.dumps(description, indent=2) + "\n"
-    write_atomically(path.with_suffix(".json"), text.encode())
-    write_atomically(path, buffer.getvalue())
+    # Both or none: an earlier pair survives a disk that gets full on the way.
+    partial = path.with_name(path.name + ".partial")
+    try:
+        write_atomically(partial, buffer.getvalue())
+        write_atomically(path.with_suffix(".json"), text.encode())
+        os.replace(partial, path)
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink()
 
 
 def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:

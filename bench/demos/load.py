@@ -156,7 +156,9 @@ def _read_description(path: Path) -> dict[str, Any]:
         raise UserError(f"there is no demonstration file {path}; collect one first")
     side = path.with_suffix(".json")
     if not side.is_file():
-        raise UserError(f"{side} is missing; ManiSkill trajectories are a pair of .h5 and .json")
+        raise UserError(
+            f"{side} is missing; ManiSkill trajectories are a pair of .h5 and .json, so copy both"
+        )
     try:
         description = json.loads(side.read_text(encoding="utf-8"))
         return _Description.model_validate(description).model_dump(exclude_unset=True)

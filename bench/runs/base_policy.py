@@ -189,5 +189,7 @@ def origin(demonstrations: Path | None, policy: Path | None) -> dict[str, Any]:
             try:
                 hashes[kind] = hashlib.sha256(path.read_bytes()).hexdigest()
             except OSError as error:
-                raise UserError(f"cannot read the {kind} file {path}: {error.strerror}") from error
+                raise UserError(
+                    f"cannot read the {kind} file {path}: {error.strerror}; name another one"
+                ) from error
     return hashes

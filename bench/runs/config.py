@@ -20,6 +20,7 @@ from policies.base import PolicyConfig
 from policies.errors import UserError
 
 LARGEST_COUNT = 10**12
+LARGEST_BATCH = 100_000
 
 LONGEST_VARIANT = 120
 """Characters; the variant is a part of the run's name."""
@@ -112,6 +113,8 @@ class RunConfig:
         for name, count in counts.items():
             if not 1 <= count <= LARGEST_COUNT:
                 raise UserError(f"{name} is {count}; it must lie between 1 and 10^12")
+        if self.num_envs > LARGEST_BATCH:
+            raise UserError(f"num_envs is {self.num_envs}; it must not exceed {LARGEST_BATCH}")
         seeds = {
             "seed": self.seed,
             "policy_seed": self.policy_seed,

@@ -231,18 +231,21 @@ class Heartbeat:
             "seconds_left": max(0, self._budget - env_steps) / rate if rate > 0 else None,
             "updated": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-        # A display is not worth a run: a full disk is reported where results are written.
-        with contextlib.suppress(OSError):
-            temporary = self._path.with_name(f".{self._path.name}.tmp")
+        temporary = self._path.with_name(f".{self._path.name}.tmp")
+        try:
             temporary.write_text(json.dumps(data))
             os.replace(temporary, self._path)
+        except OSError:
+            # A display is not worth a run: a full disk is reported where results are written.
+            with contextlib.suppress(OSError):
+                temporary.unlink()
 
 
 def read_progress(folder: Path) -> dict[str, Any] | None:
     """What :class:`Heartbeat` wrote last; None if there is nothing legible."""
     try:
         data = json.loads((folder / PROGRESS).read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return data if isinstance(data, dict) and "env_steps" in data else None
 

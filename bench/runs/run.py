@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -104,7 +105,7 @@ def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
         UserError: if the folder is no run's, the run is finished, its checkpoint is damaged, or
             another process is working on it.
     """
-    folder = folder.resolve()  # its name is the run's, also where it is called "."
+    folder = _named(folder)
     config, files = _stored(folder)
     _check_all(config, workers)
 
@@ -160,7 +161,7 @@ def evaluate(
     Raises:
         UserError: if the folder is no run's, or it has no checkpoint yet.
     """
-    folder = folder.resolve()
+    folder = _named(folder)
     config, _ = _stored(folder)
     _check_all(config, workers)
     own = evaluated(config.variant)
@@ -251,6 +252,11 @@ def _play(
             error.add_note(f"continue the run with: symsteer resume {folder}")
             raise
     return folder
+
+
+def _named(folder: Path) -> Path:
+    """The folder by its own name, which is the run's, however it was called (".", a link)."""
+    return Path(os.path.realpath(folder))
 
 
 def _stored(folder: Path) -> tuple[RunConfig, dict[str, Any]]:

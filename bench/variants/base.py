@@ -213,7 +213,9 @@ def parse(text: str, strength: Strength | None = None) -> tuple[Variant, ...]:
             )
         return ()
     if "," in text or ";" in text:
-        raise UserError(f"variants are joined with +, e.g. action_gain:0.5+wind:0.5, not {text!r}")
+        raise UserError(
+            f"variants must be joined with +, e.g. action_gain:0.5+wind:0.5, not {text!r}"
+        )
     parts = text.split("+")
     variants: list[Variant] = []
     for part in parts:

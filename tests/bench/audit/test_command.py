@@ -41,7 +41,7 @@ def symsteer(monkeypatch, *arguments) -> int:
         (["--count", "2"], "at least 8"),
         (["--chunk", "0"], "at least 1"),
         (["--chunk", "500"], "smaller --chunk"),
-        (["--seed", "-1"], "negative"),
+        (["--seed", "-1"], "must lie in"),
         (["--base-policy", "nowhere.safetensors"], "nowhere.safetensors"),
         (["--base-policy", "x.safetensors", "--states", "expert"], "does not use it"),
         (["--base-policy", "x.safetensors", "--embodiment", "all"], "one task and embodiment"),
