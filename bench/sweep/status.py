@@ -132,7 +132,7 @@ def _detail(status: Status, cell: Cell) -> str:
         return status.reasons.get(cell.run_id) or own or "it does not say why"
     if state == "interrupted":
         done = seen.record.budget.env_steps if seen.record else 0
-        return f"after {done:,} of {cell.env_steps:,} steps at least; it continues from there"
+        return f"after {done:,} of {cell.env_steps:,} steps; it continues from its last checkpoint"
     progress = seen.progress
     if not progress:
         return "starting"

@@ -6,7 +6,13 @@ import time
 
 from tests.bench.tiny_run import tiny_config
 
-LONG = dataclasses.replace(tiny_config(env_steps=480), checkpoint_every=120)
+_TINY = tiny_config()
+LONG = dataclasses.replace(
+    _TINY,
+    env_steps=480,
+    checkpoint_every=120,
+    evaluation=dataclasses.replace(_TINY.evaluation, every=240),
+)
 """Long enough to be killed behind its first checkpoint."""
 
 

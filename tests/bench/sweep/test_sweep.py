@@ -69,7 +69,8 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
         agent="zero", variant="wind:1", demonstrations=DemonstrationConfig(count=3, seed=1)
     )
     out = tmp_path / "runs"
-    demonstration_path(baseless, out).mkdir(parents=True)
+    obstacle = demonstration_path(baseless, out)
+    obstacle.mkdir(parents=True)
     plan = make_plan(Suite("mixed", "", (LONG, bad, tiny_config(agent="zero"), baseless)), out)
     folder = out / plan.cells[0].run_id
     killed = []
@@ -97,7 +98,7 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
     assert "replay_capacity" in outcomes["standard none"].reason
     reason = outcomes["zero wind:1"].reason
     assert reason.startswith("its demonstrations failed: ")
-    assert "Is a directory" in reason
+    assert obstacle.name in reason
     # What is shared was built once, before the cells; what failed was tried once more, at the end.
     assert witness.tasks == [
         ("demonstrations", ""),
