@@ -192,7 +192,7 @@ def status(
     """
     from bench.sweep.status import read_status, to_text
 
-    print(to_text(read_status(folder, suite), folder))
+    print(_printable(to_text(read_status(folder, suite), folder)))
     return 0
 
 
@@ -545,10 +545,15 @@ def main() -> int:
         return _complain(error, "interrupted", 130)
 
 
+def _printable(text: str) -> str:
+    """Text without control characters, which a file may have brought into it."""
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
+
+
 def _complain(error: BaseException, text: str, code: int) -> int:
     """One sentence on stderr, and how to go on where that is known; returns the exit code."""
     # It may quote what the input held: line breaks, control characters, pages of text.
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    line = _printable(" ".join(text.split()))
     if len(line) > LONGEST_COMPLAINT:
         half = LONGEST_COMPLAINT // 2
         line = f"{line[:half]} ... {line[-half:]}"

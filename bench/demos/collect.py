@@ -131,6 +131,8 @@ def collect(
         raise UserError(
             f"no folder can be made for {path}: {error.strerror}; choose another place"
         ) from error
+    if not os.access(path.parent, os.W_OK):
+        raise UserError(f"{path.parent} cannot be written to; choose another folder")
     env = make(
         task, num_envs=min(num_envs, 2 * count), embodiment=embodiment, variant=variant, sim=sim
     )

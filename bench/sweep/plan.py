@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from bench.runs.config import RunConfig
 from bench.runs.folder import run_id, write_json
@@ -124,7 +124,10 @@ def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
     """
     flat = []
     for config in suite.runs:
-        check(replace(config, sim="cpu", device="cpu") if elsewhere else config)
+        try:
+            check(replace(config, sim="cpu", device="cpu") if elsewhere else config)
+        except UserError as error:
+            raise UserError(f"{suite.name}: {error}") from error
         flat.append(_flatten(config.to_json()))
     extra = [
         key for key in flat[0] if key not in BASIC and any(one[key] != flat[0][key] for one in flat)
@@ -163,7 +166,7 @@ def read_manifest(path: Path) -> Manifest:
     """
     try:
         return TypeAdapter(Manifest).validate_python(json.loads(path.read_text()))
-    except (OSError, ValueError, ValidationError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path} is not the list of a sweep; run the sweep again to write it anew"
         ) from error

@@ -1,0 +1,86 @@
+"""Intact inputs of every kind: a stopped run, its demonstrations and policy, some records."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+
+from bench.runs.config import RunConfig
+from bench.runs.folder import load_checkpoint
+from bench.runs.loop import Loop
+from bench.runs.run import execute
+from bench.sweep.plan import make_plan, write_manifest
+from bench.sweep.suite import Suite
+from leaderboard.records import dump_record
+from tests.bench.tiny_run import tiny_config
+from tests.fuzz.kinds import Workshop, flat
+from tests.leaderboard.record_factory import make_record
+
+CHECKPOINT_EVERY = 20
+
+CONFIG = replace(tiny_config(agent="standard"), checkpoint_every=CHECKPOINT_EVERY)
+OTHER = replace(CONFIG, agent="zero")
+
+
+def stop_after(config, out, checkpoints, progress=False):
+    """The folder of a run that was interrupted right after some checkpoint."""
+    written = []
+
+    def save(loop, with_replay):
+        whole(loop, with_replay)
+        written.append(loop.folder)
+        if len(written) == checkpoints:
+            raise KeyboardInterrupt
+
+    whole = Loop._checkpoint
+    with patch.object(Loop, "_checkpoint", save), pytest.raises(KeyboardInterrupt):
+        execute(config, out, progress=progress)
+    return written[0]
+
+
+def options_of(config: RunConfig) -> list[str]:
+    """The command line that asks for a configuration."""
+    defaults = flat(RunConfig().to_json())
+    return [
+        word
+        for key, value in flat(config.to_json()).items()
+        if value != defaults[key]
+        for word in ("--" + key.replace("_", "-"), str(value))
+    ]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    names = ("config.json", "record.json", "checkpoint.pt", "policy.safetensors")
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+@pytest.fixture(scope="session")
+def workshop(tmp_path_factory) -> Workshop:
+    out = tmp_path_factory.mktemp("workshop")
+    folder = stop_after(CONFIG, out, checkpoints=2)
+    other = stop_after(OTHER, out, checkpoints=1)
+    h5 = next((out / "base").glob("*.h5"))
+    state = load_checkpoint(folder)
+    assert state is not None
+    write_manifest(make_plan(Suite("two", "", (CONFIG, OTHER)), out), 1, {other.name: "it broke"})
+    records = {
+        "a": make_record(agent="standard"),
+        "b": make_record(agent="equivariant", seed=1),
+        "c": make_record(agent="base", status="failed"),
+    }
+    return Workshop(
+        config=CONFIG,
+        options=options_of(CONFIG),
+        run=contents(folder),
+        run_id=folder.name,
+        state=state,
+        progress=(folder / "progress.json").read_bytes(),
+        sweeps=out / "sweeps",
+        base=out / "base",
+        demos=(h5.read_bytes(), h5.with_suffix(".json").read_bytes()),
+        records={name: dump_record(record) for name, record in records.items()},
+        other=(other / "checkpoint.pt").read_bytes(),
+    )

@@ -1,0 +1,123 @@
+"""Run the command line in this process, and judge how it ended.
+
+Bad input has to end in one sentence and exit code 2. ``Reached`` is raised in place of the work
+that begins when all input has been read: it tells that the input was accepted; no run starts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+from unittest.mock import patch
+
+from bench import cli
+
+CURE = re.compile(
+    r"\b(must|should|needs?|wanted|valid|did you mean|use|choose|name|give|free|restore|delete|"
+    r"remove|train|copy|collect|download|record|run|raise|lower|ask|write|put|wait|convert|start|correct|shorten|undo|mend)\b",
+    re.IGNORECASE,
+)
+"""What a sentence has to contain to say how to mend the input."""
+
+LONGEST = 950
+
+
+class Reached(BaseException):
+    """All input was read and accepted; ``found`` is what the work would have begun with."""
+
+    def __init__(self, found: Any = None):
+        super().__init__()
+        self.found = found
+
+
+@dataclass
+class Ending:
+    """How a command line ended.
+
+    Attributes:
+        kind: "refused" (one sentence), "usage" (the parser's own message), "accepted", "done".
+        sentence: on stderr, if refused.
+        found: what ``Reached`` brought.
+    """
+
+    kind: str
+    sentence: str = ""
+    found: Any = None
+
+
+class BadEndingError(AssertionError):
+    """A traceback, or a message that is not one clear sentence."""
+
+
+@contextlib.contextmanager
+def stopped_at(*places: tuple[Any, str]) -> Iterator[None]:
+    """Raise ``Reached`` with the arguments where one of the places would be called."""
+
+    def stop(*args: Any, **kwargs: Any) -> None:
+        raise Reached(args)
+
+    with contextlib.ExitStack() as stack:
+        for owner, name in places:
+            stack.enter_context(patch.object(owner, name, stop))
+        yield
+
+
+def end_of(arguments: Sequence[Any], mentions: Sequence[str] = ()) -> Ending:
+    """Run ``symsteer ARGUMENTS`` in this process.
+
+    Args:
+        arguments: of the command line.
+        mentions: one of these has to occur in the sentence (the names of the files at fault).
+
+    Raises:
+        BadEndingError: if it ended in anything else than the endings of :class:`Ending`.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    command = ["symsteer", *map(str, arguments)]
+    with (
+        patch.object(sys, "argv", command),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            code = cli.main()
+        except Reached as reached:
+            return Ending("accepted", found=reached.found)
+        except SystemExit as stop:
+            if stop.code == 2 and "For full helptext" in err.getvalue():
+                return Ending("usage")
+            raise BadEndingError(f"left with {stop.code!r}: {err.getvalue()[-500:]}") from stop
+        except BaseException as error:
+            raise BadEndingError("".join(traceback.format_exception(error)[-3:])) from error
+    if code == 0:
+        return Ending("done", found=out.getvalue())
+    text = err.getvalue()
+    if code != 2:
+        raise BadEndingError(f"exit code {code}: {text[-500:]}")
+    return Ending("refused", one_sentence(text, mentions))
+
+
+def one_sentence(text: str, mentions: Sequence[str] = ()) -> str:
+    """The sentence of an error, without "error: ".
+
+    Raises:
+        BadEndingError: if it is not one clear line that names its subject and a cure.
+    """
+    lines = text.removesuffix("\n").split("\n")
+    problems = [
+        f"{len(lines)} lines" * (len(lines) != 1),
+        "no 'error: '" * (not text.startswith("error: ")),
+        "unprintable characters" * (not lines[0].isprintable()),
+        f"{len(lines[0])} characters" * (not 25 <= len(lines[0]) <= LONGEST),
+        "no cure" * (CURE.search(lines[0]) is None),
+        f"names none of {mentions}" * bool(mentions and not any(m in text for m in mentions)),
+    ]
+    if any(problems):
+        raise BadEndingError(f"{', '.join(filter(None, problems))}: {text[:900]!r}")
+    return lines[0].removeprefix("error: ")

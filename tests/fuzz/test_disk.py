@@ -1,0 +1,287 @@
+"""Full disks and read-only folders: one sentence, nothing lost, and the run can go on."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from unittest.mock import patch
+
+import pytest
+
+from bench import cli
+from bench.demos import load
+from bench.runs.folder import load_checkpoint, state_of
+from bench.runs.loop import Loop
+from bench.runs.run import execute, resume
+from leaderboard.records import read_record
+from tests.fuzz.conftest import CONFIG, options_of
+from tests.fuzz.judge import CURE, one_sentence
+
+SHORT = replace(CONFIG, env_steps=160)
+"""A run with one checkpoint on the way and one at the end."""
+
+
+# Making a disk full.
+
+
+@contextlib.contextmanager
+def files_end_at(size):
+    """Let no file of this process grow beyond ``size`` bytes.
+
+    Writing then fails with EFBIG ("File too large") where a full disk says ENOSPC; both take the
+    same way through Python, and this one needs no rights.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextlib.contextmanager
+def no_space_in(folder):
+    """Fill the file system that ``folder`` lies on, to the last byte."""
+    ballast = folder / "ballast"
+    with open(ballast, "wb", buffering=0) as file, contextlib.suppress(OSError):
+        for size in (2**16, 2**10, 1):
+            with contextlib.suppress(OSError):
+                while True:
+                    file.write(bytes(size))
+    try:
+        yield
+    finally:
+        ballast.unlink()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of its own, of a few megabytes."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(place)],
+        capture_output=True,
+        check=False,
+    )
+    if made.returncode:
+        pytest.skip("no file system can be mounted here")
+    yield place
+    subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
+@pytest.fixture
+def read_only(tmp_path):
+    """Make a folder read-only, also for root; gives a function."""
+    mounted, changed = [], []
+
+    def lock(folder):
+        if os.geteuid():
+            folder.chmod(0o555)
+            changed.append(folder)
+            return folder
+        for options in (["--bind"], ["-o", "remount,bind,ro"]):
+            command = ["mount", *options, str(folder), str(folder)]
+            if subprocess.run(command, capture_output=True, check=False).returncode:
+                pytest.skip("root can write everywhere, and nothing can be mounted here")
+            if options == ["--bind"]:
+                mounted.append(folder)
+        return folder
+
+    yield lock
+    for folder in mounted:
+        subprocess.run(["umount", str(folder)], check=True)
+    for folder in changed:
+        folder.chmod(0o755)
+
+
+# What is watched.
+
+
+@pytest.fixture(scope="module")
+def undisturbed(workshop, tmp_path_factory):
+    """A run that nothing happened to; its demonstrations and base policy lie beside it."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    shutil.copytree(workshop.base, out / "base")
+    return execute(SHORT, out, progress=False)
+
+
+def called(*arguments):
+    """Exit code and lines on stderr."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        patch.object(sys, "argv", ["symsteer", *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        code = cli.main()
+    return code, err.getvalue().splitlines()
+
+
+def complaint(*arguments):
+    """The sentence of a command that must fail, and what follows it."""
+    code, lines = called(*arguments)
+    assert code == 2, lines
+    return one_sentence(lines[0]), lines[1:]
+
+
+def leftovers(folder):
+    """Files that only a write that failed can have left."""
+    return [p.name for p in folder.rglob("*") if p.name.endswith((".tmp", ".partial", ".part"))]
+
+
+def without_clock(folder):
+    data = json.loads((folder / "record.json").read_text())
+    for key in ("started", "ended", "wall_clock", "provenance", "continued"):
+        del data[key]
+    del data["base_policy"]["training_seconds"]
+    for evaluation in data["evaluations"]:
+        del evaluation["wall_clock"]
+    return data
+
+
+def full_after_the_first_checkpoint(full):
+    """A patch: the disk is full from the first checkpoint on, until the stack is closed."""
+    whole = Loop._checkpoint
+    stack = contextlib.ExitStack()
+
+    def save(loop, with_replay):
+        whole(loop, with_replay)
+        stack.enter_context(full())
+
+    stack.enter_context(patch.object(Loop, "_checkpoint", save))
+    return stack
+
+
+def run_into(full, undisturbed, out):
+    """Start a run whose disk gets full; it keeps its last checkpoint, and continues to the end."""
+    shutil.copytree(undisturbed.parent / "base", out / "base")
+    folder = out / undisturbed.name
+    with full_after_the_first_checkpoint(full):
+        sentence, notes = complaint("run", "--quiet", *options_of(SHORT), "--out", out)
+    assert str(folder) in sentence
+    assert any(word in sentence for word in ("File too large", "No space left on device"))
+    assert CURE.search(sentence)
+    assert notes == [f"continue the run with: symsteer resume {folder}"]
+    assert not leftovers(folder)
+    assert state_of(folder) in ("interrupted", "failed")
+    state = load_checkpoint(folder)
+    assert state["env_steps"] == 80
+    assert len(read_record(folder / "record.json").evaluations) >= state["evaluations"]
+    resume(folder, progress=False)
+    assert without_clock(folder) == without_clock(undisturbed)
+    assert read_record(folder / "record.json").wall_clock.resumed == 1
+    assert not leftovers(folder)
+
+
+# Runs.
+
+
+@pytest.mark.parametrize(
+    "size",
+    [
+        pytest.param(0, id="every file", marks=pytest.mark.slow),
+        pytest.param(25_000, id="large ones"),
+    ],
+)
+def test_a_run_outlives_a_full_disk(size, undisturbed, tmp_path):
+    run_into(lambda: files_end_at(size), undisturbed, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_run_outlives_a_disk_that_is_really_full(undisturbed, small_disk):
+    run_into(lambda: no_space_in(small_disk), undisturbed, small_disk)
+
+
+def test_a_disk_that_is_full_from_the_beginning(undisturbed, tmp_path):
+    with files_end_at(0):
+        sentence, _ = complaint("run", "--quiet", *options_of(SHORT), "--out", tmp_path / "runs")
+    assert "config.json" in sentence
+    assert [p for p in (tmp_path / "runs").rglob("*") if p.is_file()] == []
+
+
+@pytest.mark.parametrize(
+    ("kept", "size", "blamed"),
+    [("nothing", 10_000, ".h5"), ("demonstrations", 10_000, "policy.safetensors")],
+)
+def test_demonstrations_and_base_policies_appear_whole(kept, size, blamed, undisturbed, tmp_path):
+    base = tmp_path / "base"
+    base.mkdir()
+    if kept == "demonstrations":
+        for path in (undisturbed.parent / "base").glob("*.*"):
+            shutil.copy(path, base)
+    before = sorted(p for p in base.rglob("*") if p.is_file())
+    with files_end_at(size):
+        sentence, _ = complaint("run", "--quiet", *options_of(SHORT), "--out", tmp_path)
+    assert blamed in sentence
+    assert sorted(p for p in base.rglob("*") if p.is_file()) == before
+    assert not (tmp_path / undisturbed.name).exists()
+
+
+# The other verbs.
+
+
+def test_earlier_demonstrations_survive(tmp_path):
+    path = tmp_path / "a.h5"
+    arguments = ("demos", path, "--task", "PushCube-v1", "--mode", "clean", "--count")
+    assert called(*arguments, 1)[0] == 0
+    found = load(path, "PushCube-v1", "floating")
+    for size in (0, 3_000):
+        with files_end_at(size):
+            sentence, _ = complaint(*arguments, 2)
+        assert "a.h5" in sentence or "a.json" in sentence
+    assert load(path, "PushCube-v1", "floating").content_hash == found.content_hash
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.h5", "a.json"]
+
+
+def test_the_bookkeeping_of_a_sweep(tmp_path):
+    with files_end_at(10):
+        sentence, _ = complaint("sweep", "smoke", "--out", tmp_path, "--workers", 1)
+    assert str(tmp_path / "sweeps") in sentence
+    assert not leftovers(tmp_path)
+    assert not list(tmp_path.rglob("record.json"))
+
+
+def test_an_earlier_leaderboard_survives(workshop, tmp_path):
+    results, board = tmp_path / "results", tmp_path / "board"
+    results.mkdir()
+    for name in ("a", "b"):
+        (results / f"{name}.json").write_text(workshop.records[name])
+    assert called("report", results / "a.json", "--out", board)[0] == 0
+    before = {p: p.read_bytes() for p in board.rglob("*") if p.is_file()}
+    with files_end_at(3_000):
+        sentence, _ = complaint("report", results, "--out", board)
+    assert str(board) in sentence
+    assert {p: p.read_bytes() for p in board.rglob("*") if p.is_file()} == before
+
+
+def test_read_only_folders(undisturbed, workshop, read_only, tmp_path):
+    """Nothing can be written, and what only reads works all the same."""
+    runs = tmp_path / "runs"
+    shutil.copytree(undisturbed.parent, runs)
+    stopped = workshop.restore_run(runs)
+    finished = runs / undisturbed.name
+    read_only(runs)
+    for arguments in (
+        ("run", "--quiet", "--seed", 5, *options_of(SHORT), "--out", runs),
+        ("resume", stopped),
+        ("sweep", "smoke", "--out", runs),
+        ("demos", runs / "a.h5", "--count", 1),
+        ("report", finished, "--out", runs / "board"),
+        ("audit", "--out", runs / "audit"),
+    ):
+        sentence, _ = complaint(*arguments)
+        assert str(runs) in sentence
+        reasons = (os.strerror(errno.EROFS), os.strerror(errno.EACCES), "cannot be written to")
+        assert any(reason in sentence for reason in reasons)
+    assert called("status", runs)[0] == 0
+    assert called("report", finished, "--out", tmp_path / "board")[0] == 0
+    assert called("evaluate", finished)[0] == 0

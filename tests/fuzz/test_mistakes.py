@@ -1,0 +1,110 @@
+"""Mistakes of users, some for every verb: one sentence and exit code 2, before any work begins."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from tests.fuzz.judge import end_of
+
+MISTAKES = """
+list extra
+list --nothing
+run --task Nothing
+run --variant action_gain:0.5,wind:0.3
+run --out file
+run --out file/x
+run --base-policy folder
+run --base-policy file
+run --demos folder
+run --demos file
+run --demos folder.h5
+run --env-steps -5
+run --num-envs many
+run --num-envs 99999999
+run --workers -1
+run --policy.steps 0
+sweep nowhere.toml
+sweep folder.toml
+sweep demoo
+sweep file
+sweep smoke --workers -3
+sweep smoke --out file
+sweep smoke --workers many
+resume nowhere
+resume file
+resume folder
+resume loop
+resume
+evaluate nowhere
+evaluate file
+evaluate folder --episodes -1
+evaluate folder --episodes many
+status nowhere
+status file
+status folder extra
+report nowhere
+report file
+report folder
+report x.json
+report x.json --out file
+report nowhere --check
+report folder --verify
+audit --task Nothing
+audit --count -3
+audit --group E8
+audit --states nobody
+audit --base-policy folder
+audit --variant wnid:1
+audit --strength 0.5
+audit --resume
+audit --out file
+audit --seed 99999999999999999999
+throughput --task Nothing
+throughput --repeats 0
+throughput --num-envs -4
+throughput --num-envs 99999999
+throughput --seconds nan
+throughput --cores 100000
+demos
+demos folder.h5
+demos folder
+demos file/a.h5
+demos a.h5 --count -1
+demos a.h5 --seed 99999999999999
+demos a.h5 --mode messy
+base --task Nothing
+base --demonstrations -5
+base --out file
+base --policies none
+doctor extra
+doctor --nothing
+demo extra
+demo --out file
+"""
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder with things of the wrong kind."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("text")
+    (tmp_path / "x.json").write_text("{}")
+    for name in ("folder", "folder.toml", "folder.h5"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    return tmp_path
+
+
+def listing(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize("line", MISTAKES.strip().splitlines())
+def test_a_mistake_is_told_in_one_sentence(line, place):
+    before = listing(place)
+    assert end_of(line.split()).kind in ("refused", "usage")
+    # A folder that results would have gone to may be there, but nothing in it.
+    shutil.rmtree(place / "runs", ignore_errors=True)
+    assert listing(place) == before
