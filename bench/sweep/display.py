@@ -56,7 +56,7 @@ class Display(contextlib.AbstractContextManager):
         self.waiting = dict.fromkeys(todo)
         self.total = len(plan.cells)
         self.counts = Counter({"finished": self.total - len(todo)})
-        self.width = max((len(cell.label) for cell in todo), default=0)
+        self.labels = {cell: cell.label for cell in todo}
 
     def __exit__(self, *details: object) -> None:
         pass
@@ -77,7 +77,8 @@ class Display(contextlib.AbstractContextManager):
             self.estimate.add(outcome.cell, seen.seconds)
             detail = f"{seen.success}, {duration(seen.seconds)}"
         count = f"[{self.counts.total():{len(str(self.total))}d}/{self.total}]"
-        self.write(outcome.status, f"{count} {outcome.cell.label:{self.width}s}  {detail}")
+        width = max(len(label) for label in self.labels.values())
+        self.write(outcome.status, f"{count} {self.labels[outcome.cell]:{width}s}  {detail}")
 
     def refresh(self, running: list[Task]) -> None:
         """Some time has passed."""
@@ -96,7 +97,12 @@ class LiveDisplay(Display):
     def __init__(self, *args: Any):
         super().__init__(*args)
         todo = list(self.waiting)
-        self.labels = short_labels(todo, True), short_labels(todo, False)
+        self.room = self.console.width - sum(NUMBERS) - GAP * len(NUMBERS)
+        for everything in (True, False):
+            self.labels = short_labels(todo, everything)
+            self.longest = max((len(label) for label in self.labels.values()), default=0)
+            if self.longest <= self.room:
+                break
         self.begun: dict[Task, tuple[float, datetime]] = {}
         self.live = Live(console=self.console, transient=True, refresh_per_second=2)
 
@@ -113,7 +119,8 @@ class LiveDisplay(Display):
 
     def retried(self, task: Task, result: Result) -> None:
         """A task did not succeed and will be tried again."""
-        self.write("again", f"{task.label}: {result.reason}")
+        label = self.labels[task.cell] if task.cell else f"{task.kind} {task.label}"
+        self.write("again", f"{label}: {result.reason}")
 
     def write(self, status: str, text: str) -> None:
         """One line that stays."""
@@ -128,10 +135,7 @@ class LiveDisplay(Display):
         said = {task: self._progress(task) for task in running}
         # A cluster holds tasks that wait for a processor: those that say nothing do nothing.
         shown = [task for task in running if self.workers or said[task]]
-        room = self.console.width - sum(NUMBERS) - GAP * len(NUMBERS)
-        longest = max((len(label) for label in self.labels[0].values()), default=0)
-        labels = self.labels[longest > room]
-        bars = longest + BAR + GAP <= room
+        bars = self.longest + BAR + GAP <= self.room
         table = Table.grid(padding=(0, GAP, 0, 0), expand=True)
         table.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
         if bars:
@@ -140,7 +144,7 @@ class LiveDisplay(Display):
             table.add_column(no_wrap=True, justify="right", min_width=width)
         height = max(1, self.console.height - 3)
         for task in shown[:height]:
-            label = labels[task.cell] if task.cell else f"{task.kind} {task.label}"
+            label = self.labels[task.cell] if task.cell else f"{task.kind} {task.label}"
             table.add_row(label, *self._row(task, said[task], bars))
         lines: list[Any] = [table]
         if len(shown) > height:
@@ -161,7 +165,7 @@ class LiveDisplay(Display):
         """What follows the label of a live line."""
         if not task.cell:
             elapsed = duration(time.monotonic() - self.begun[task][0])
-            return [*([""] if bars else []), "", "", "since", elapsed]
+            return [*([""] if bars else []), "", "", "for", elapsed]
         share = share_done(progress)
         first = [ProgressBar(total=1.0, completed=share, width=BAR)] if bars else []
         if progress is None:

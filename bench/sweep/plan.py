@@ -65,8 +65,9 @@ def short_labels(cells: Sequence[Cell], everything: bool) -> dict[Cell, str]:
     shared -= {"agent", "seed"} | ({"task", "variant"} if everything else set())
     labels = {}
     for cell in cells:
-        order = ("agent", "task", "embodiment", "variant", *cell.extra)
+        order = ("agent", "task", "embodiment", "variant")
         words = [str(cell.keys[key]) for key in order if key not in shared]
+        words += [f"{key.rpartition('.')[2]}={value}" for key, value in cell.extra.items()]
         labels[cell] = f"{' '.join(words)} s{cell.seed}"
     return labels
 
