@@ -12,6 +12,7 @@ import io
 import json
 import os
 import time
+import warnings
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -178,7 +179,9 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
     path = folder / CHECKPOINT
     cure = "delete it to start the run from the beginning"
     try:
-        file = torch.load(io.BytesIO(path.read_bytes()), weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what torch thinks of a foreign pickle
+            file = torch.load(io.BytesIO(path.read_bytes()), weights_only=True)
     except FileNotFoundError:
         return None
     # A damaged archive fails in many ways: zip, pickle, key and runtime errors.

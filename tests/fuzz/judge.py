@@ -11,6 +11,7 @@ import io
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -82,9 +83,13 @@ def end_of(arguments: Sequence[Any], mentions: Sequence[str] = ()) -> Ending:
     command = ["symsteer", *map(str, arguments)]
     with (
         patch.object(sys, "argv", command),
+        warnings.catch_warnings(record=True) as told,
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):
+        warnings.simplefilter("default")
+        for kind in (DeprecationWarning, PendingDeprecationWarning, ResourceWarning):
+            warnings.simplefilter("ignore", kind)
         try:
             code = cli.main()
         except Reached as reached:
@@ -95,6 +100,9 @@ def end_of(arguments: Sequence[Any], mentions: Sequence[str] = ()) -> Ending:
             raise BadEndingError(f"left with {stop.code!r}: {err.getvalue()[-500:]}") from stop
         except BaseException as error:
             raise BadEndingError("".join(traceback.format_exception(error)[-3:])) from error
+    if told:
+        # Python would print it between the lines.
+        raise BadEndingError(f"a warning: {told[0].category.__name__}: {told[0].message}")
     if code == 0:
         return Ending("done", found=out.getvalue())
     text = err.getvalue()
