@@ -90,7 +90,8 @@ def claimed(folder: Path) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / LOCK, timeout=0)
+        # Not at once: whoever asks for the state of a run holds its lock for a moment.
+        lock = FileLock(folder / LOCK, timeout=1)
         lock.acquire()
     except Timeout as error:
         raise RunBusyError(

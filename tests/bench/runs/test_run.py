@@ -9,7 +9,7 @@ import torch
 from agents import make_agent
 from bench.runs import evaluator, loop
 from bench.runs.base_policy import prepare_base
-from bench.runs.folder import is_finished, state_of
+from bench.runs.folder import is_finished, load_checkpoint, state_of
 from bench.runs.run import execute
 from bench.steering.evaluation import held_out_seeds
 from bench.tasks import task_class
@@ -56,7 +56,7 @@ def test_no_path_of_this_machine_is_recorded(finished):
 
 def test_the_checkpoint_restores_the_agent(finished):
     config, folder = finished
-    state = torch.load(folder / "checkpoint.pt", weights_only=True)
+    state = load_checkpoint(folder)
     base = prepare_base(config, folder.parent, progress=False)
     agent = make_agent(
         config.agent,

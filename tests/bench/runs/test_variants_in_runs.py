@@ -2,7 +2,7 @@
 
 import pytest
 
-from bench.runs import run as run_module
+from bench.runs import evaluator
 from bench.runs.run import execute
 from bench.tasks import make, task_class
 from leaderboard.records import read_record
@@ -18,7 +18,7 @@ def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, mon
         made.append(kwargs["variant"])
         return make(task, **kwargs)
 
-    monkeypatch.setattr(run_module, "make", noting)
+    monkeypatch.setattr(evaluator, "make", noting)
     variant = "spawn_sector:1+directional_reward:0.5"
     config = tiny_config(variant=variant, env_steps=160)
     record = read_record(execute(config, folder.parent, progress=False) / "record.json")
