@@ -7,9 +7,9 @@ machine where the simulator does not.
 from __future__ import annotations
 
 import errno
+import importlib
 import inspect
 import os
-import runpy
 import shutil
 import sys
 import textwrap
@@ -235,14 +235,7 @@ def report(
     arguments = [text for name, value in options.items() if value for text in (name, str(value))]
     arguments += ["--verify"] * verify + ["--check"] * check + ["--", *map(str, records)]
     # By name, not by import: the bench writes records and draws nothing.
-    saved, sys.argv = sys.argv, ["leaderboard", *arguments]
-    try:
-        runpy.run_module("leaderboard", run_name="__main__")
-    except SystemExit as finished:
-        return int(finished.code or 0)
-    finally:
-        sys.argv = saved
-    return 0
+    return importlib.import_module("leaderboard.__main__").main(arguments)
 
 
 @app.command(name="list")
