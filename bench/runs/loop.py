@@ -8,6 +8,7 @@ a run that was killed and continued ends with the record of an undisturbed one b
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -184,7 +185,9 @@ class Loop:
             "ticket_candidates": float(found.candidates),
         }
         self.env_steps = env.control_steps
-        self.decisions = env.control_steps // self.base.execute
+        # The last decision of an episode is cut short where its time limit is.
+        episodes = env.control_steps // env.max_episode_steps
+        self.decisions = episodes * math.ceil(env.max_episode_steps / env.execute)
         env.close()
 
     def _train(self) -> None:

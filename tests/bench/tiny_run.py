@@ -1,5 +1,7 @@
 """A tiny but complete configuration: everything happens, nothing is learned."""
 
+import json
+
 from agents.sac import SacConfig
 from bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
 from policies.base import PolicyConfig
@@ -18,3 +20,14 @@ def tiny_config(**changes) -> RunConfig:
         ),
     }
     return RunConfig(**{**values, **changes})
+
+
+def without_clock(folder):
+    """The record, but for times and the checkout, which may change while the tests run."""
+    data = json.loads((folder / "record.json").read_text())
+    for key in ("started", "ended", "wall_clock", "provenance", "continued"):
+        del data[key]
+    del data["base_policy"]["training_seconds"]
+    for evaluation in data["evaluations"]:
+        del evaluation["wall_clock"]
+    return data

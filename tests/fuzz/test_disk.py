@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
-import json
 import os
 import resource
 import shutil
@@ -22,6 +21,7 @@ from bench.runs.folder import load_checkpoint, state_of
 from bench.runs.loop import Loop
 from bench.runs.run import execute, resume
 from leaderboard.records import read_record
+from tests.bench.tiny_run import without_clock
 from tests.fuzz.conftest import CONFIG, options_of
 from tests.fuzz.judge import CURE, one_sentence
 
@@ -136,16 +136,6 @@ def complaint(*arguments):
 def leftovers(folder):
     """Files that only a write that failed can have left."""
     return [p.name for p in folder.rglob("*") if p.name.endswith((".tmp", ".partial", ".part"))]
-
-
-def without_clock(folder):
-    data = json.loads((folder / "record.json").read_text())
-    for key in ("started", "ended", "wall_clock", "provenance", "continued"):
-        del data[key]
-    del data["base_policy"]["training_seconds"]
-    for evaluation in data["evaluations"]:
-        del evaluation["wall_clock"]
-    return data
 
 
 def full_after_the_first_checkpoint(full):

@@ -16,13 +16,18 @@ from bench.runs.folder import RunBusyError, claimed, load_checkpoint, read_progr
 from bench.runs.run import evaluate, execute, resume
 from leaderboard.records import read_record
 from policies.errors import UserError
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import tiny_config, without_clock
 
 # Fresh processes that have their imports done: a kill then falls into the run, not into these.
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(["tests.bench.runs.test_resume", "torch._dynamo"])
 
-CONFIG = replace(tiny_config(env_steps=960), checkpoint_every=60)
+# Fractions of an update are owed from one decision to the next.
+CONFIG = replace(
+    tiny_config(env_steps=960),
+    checkpoint_every=60,
+    sac=replace(tiny_config().sac, utd=0.3),
+)
 
 
 def _work(folder):
@@ -34,17 +39,6 @@ def start(folder):
     process = PROCESSES.Process(target=_work, args=(folder,), daemon=True)
     process.start()
     return process
-
-
-def without_clock(folder):
-    data = json.loads((folder / "record.json").read_text())
-    # Nor the checkout, which a developer may change while the tests run.
-    for key in ("started", "ended", "wall_clock", "provenance", "continued"):
-        del data[key]
-    del data["base_policy"]["training_seconds"]
-    for evaluation in data["evaluations"]:
-        del evaluation["wall_clock"]
-    return data
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from bench.steering.evaluation import held_out_seeds
 from bench.tasks import task_class
 from leaderboard.records import read_record
 from policies.errors import UserError
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import tiny_config, without_clock
 
 REFERENCES = ("base", "zero", "golden-ticket")
 
@@ -74,16 +74,6 @@ def test_the_checkpoint_restores_the_agent(finished):
     assert not torch.equal(before, agent.act(obs, deterministic=True))
 
 
-def without_clock(folder):
-    data = json.loads((folder / "record.json").read_text())
-    for key in ("started", "ended", "wall_clock", "provenance"):
-        del data[key]
-    del data["base_policy"]["training_seconds"]
-    for evaluation in data["evaluations"]:
-        del evaluation["wall_clock"]
-    return data
-
-
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_path):
     config, folder = finished
@@ -136,6 +126,9 @@ def test_every_agent_runs_on_a_broken_world(broken):
         # References do not learn; the search of a golden ticket plays whole episodes.
         used = {"base": 0, "zero": 0, "golden-ticket": 200}
         assert record.budget.env_steps == used.get(agent, record.budget.env_steps)
+    if agent == "golden-ticket":
+        # Four episodes of 50 steps, each of 12 whole decisions and a short one.
+        assert record.budget.decisions == 4 * 13
     policies = [p for p in (folder.parent / "base").iterdir() if p.is_dir()]
     assert len(policies) == 1
 

@@ -19,8 +19,8 @@ from bench.sweep.plan import make_plan
 from bench.sweep.suite import Suite
 from leaderboard.records import read_record
 from policies.errors import UserError
-from tests.bench.sweep.cells import LONG, wait_for, without_clock
-from tests.bench.tiny_run import tiny_config
+from tests.bench.sweep.cells import LONG, wait_for
+from tests.bench.tiny_run import tiny_config, without_clock
 
 MACHINE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
 

@@ -26,8 +26,8 @@ from bench.sweep.status import read_status, to_text
 from bench.sweep.suite import Suite, load_suite
 from bench.sweep.work import Result
 from leaderboard.records import read_record
-from tests.bench.sweep.cells import LONG, wait_for, without_clock
-from tests.bench.tiny_run import tiny_config
+from tests.bench.sweep.cells import LONG, wait_for
+from tests.bench.tiny_run import tiny_config, without_clock
 
 
 class Witness:
