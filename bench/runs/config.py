@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from agents.sac import SacConfig
+from bench.variants import canonical
 from policies.base import PolicyConfig
 from policies.errors import UserError
 
@@ -128,6 +129,8 @@ class RunConfig:
                 f"the variant {self.variant[:40]!r}... has {len(self.variant)} characters; it must "
                 f"not have more than {LONGEST_VARIANT}, so join fewer of them"
             )
+        # The variant is a part of the run's identity, however its strengths were written.
+        object.__setattr__(self, "variant", canonical(self.variant))
 
     def to_json(self) -> dict[str, Any]:
         """Nested plain data."""

@@ -7,7 +7,6 @@ import time
 
 import numpy as np
 import pytest
-import torch
 
 from bench import throughput
 from bench.throughput import Replay, Row, Turn, _Stopwatch
@@ -140,7 +139,6 @@ def test_bad_input(options, words):
 @pytest.mark.slow
 def test_the_whole_measurement():
     """All contenders in turns; ours is ahead of stock and behind the limit."""
-    torch.set_num_threads(1)
     data = throughput.measure(TASK, num_envs=(16,), repeats=2, seconds=0.2, cores=2)
     kinds = [(row["letter"], row["processes"]) for row in data["rows"]]
     assert [k for k in kinds if k[0] != "g"] == [

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shutil
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ import torch
 from agents import make_agent
 from bench.runs import evaluator, loop
 from bench.runs.base_policy import prepare_base
-from bench.runs.folder import is_finished, load_checkpoint, state_of
+from bench.runs.folder import is_finished, load_checkpoint, run_id, state_of
 from bench.runs.run import execute
 from bench.steering.evaluation import held_out_seeds
 from bench.tasks import task_class
@@ -141,7 +142,13 @@ def test_a_finished_run_is_not_overwritten(finished):
     assert (folder / "record.json").read_bytes() == before
 
 
-def test_a_failed_run_says_so_and_is_continued(finished, monkeypatch):
+def test_a_strength_written_otherwise_is_the_same_run():
+    ids = {run_id(tiny_config(variant=f"action_gain:{text}"), {}) for text in ("0.5", "0.50", ".5")}
+    assert len(ids) == 1
+
+
+@pytest.mark.parametrize("place", [(evaluator, "measure"), (loop, "Evaluator")])
+def test_a_failed_run_says_so_and_is_continued(place, finished, monkeypatch):
     _, folder = finished
     broken = tiny_config(seed=1)
 
@@ -149,7 +156,7 @@ def test_a_failed_run_says_so_and_is_continued(finished, monkeypatch):
         raise RuntimeError("the network exploded")
 
     with monkeypatch.context() as patch:
-        patch.setattr(evaluator, "measure", fail)
+        patch.setattr(*place, fail)
         with pytest.raises(RuntimeError):
             execute(broken, folder.parent, progress=False)
     [failed] = folder.parent.glob("*-s1-*")
@@ -159,6 +166,7 @@ def test_a_failed_run_says_so_and_is_continued(finished, monkeypatch):
     execute(broken, folder.parent, progress=False)
     assert state_of(failed) == "finished"
     assert read_record(failed / "record.json").failure is None
+    shutil.rmtree(failed)
 
 
 @pytest.mark.parametrize(
