@@ -12,7 +12,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.runs.folder import RunBusyError, claimed, load_checkpoint, read_progress, state_of
+from bench.runs.folder import (
+    CHECKPOINT,
+    RunBusyError,
+    claimed,
+    is_finished,
+    load_checkpoint,
+    read_progress,
+    state_of,
+)
 from bench.runs.run import evaluate, execute, resume
 from leaderboard.records import read_record
 from policies.errors import UserError
@@ -31,7 +39,6 @@ CONFIG = replace(
 
 
 def _work(folder):
-    torch.set_num_threads(1)
     resume(folder, progress=False)
 
 
@@ -95,8 +102,24 @@ def _killed_anywhere(undisturbed, begun, kills, seed):
     return resumed
 
 
-def test_killed_at_a_random_moment(undisturbed, begun):
-    _killed_anywhere(undisturbed, begun, kills=2, seed=0)
+def test_killed_behind_every_checkpoint(undisturbed, begun):
+    kills, seen = 0, None
+    while not is_finished(begun):
+        process = start(begun)
+        while process.is_alive() and seen == (seen := _version(begun / CHECKPOINT)):
+            process.join(0.005)
+        if process.is_alive():
+            process.kill()
+            kills += 1
+        process.join()
+        # One that it came to behind the look at it.
+        seen = _version(begun / CHECKPOINT)
+    assert kills >= 3
+    assert without_clock(begun) == without_clock(undisturbed)
+
+
+def _version(path):
+    return path.stat().st_mtime_ns if path.exists() else None
 
 
 @pytest.mark.slow
