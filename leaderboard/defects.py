@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from leaderboard.errors import RecordError
+from leaderboard.records import canonical_variant
 from leaderboard.statistics import (
     RESAMPLES,
     Array,
@@ -122,7 +123,7 @@ def read_audit(path: Path | None = None) -> Audit:
             "name the summary.json that `symsteer audit --out` wrote."
         ) from error
     return {
-        (cell.task, cell.embodiment, canonical_variant(cell.variant), cell.group): _largest(cell)
+        (cell.task, cell.embodiment, _in_order(cell.variant), cell.group): _largest(cell)
         for cell in cells
     }
 
@@ -138,21 +139,14 @@ def _largest(cell: _AuditCell) -> Defect:
     return Defect(Interval(*getattr(cell, name)), name)
 
 
-def canonical_variant(variant: str) -> str:
-    """One spelling for one variant: parts in alphabetical order, strengths without idle zeros."""
-    parts = []
-    for part in variant.split("+"):
-        name, _, strength = part.partition(":")
-        try:
-            parts.append(f"{name}:{float(strength):g}" if strength else name)
-        except ValueError:
-            parts.append(part)
-    return "+".join(sorted(parts))
+def _in_order(variant: str) -> str:
+    """One spelling for one variant, its parts in alphabetical order."""
+    return "+".join(sorted(canonical_variant(variant).split("+")))
 
 
 def defect_of(key: Key, audit: Audit) -> Defect | None:
     """The audited defect of a table's task, embodiment, variant and group; None if not audited."""
-    return audit.get((key.task, key.embodiment, canonical_variant(key.variant), key.group))
+    return audit.get((key.task, key.embodiment, _in_order(key.variant), key.group))
 
 
 def audit_commands(keys: Sequence[Key]) -> list[str]:

@@ -536,6 +536,24 @@ class RunRecord(_Block):
         return False
 
 
+def canonical_variant(variant: str) -> str:
+    """``variant`` with each strength in its shortest form: ``wind:0.50`` becomes ``wind:0.5``.
+
+    What is no number stays as it is.
+    """
+    parts = [part.partition(":") for part in variant.split("+")]
+    return "+".join(f"{name}{colon}{_shortest(strength)}" for name, colon, strength in parts)
+
+
+def _shortest(number: str) -> str:
+    try:
+        value = float(number)
+    except ValueError:
+        return number
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
 def canonical_json(data: Any) -> str:
     """One text for one value: sorted keys, no spaces, ASCII. Raises ValueError on NaN, infinity."""
     return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False)

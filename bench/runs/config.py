@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from agents.sac import SacConfig
-from bench.variants import canonical
+from leaderboard.records import canonical_variant
 from policies.base import PolicyConfig
 from policies.errors import UserError
 
@@ -130,7 +130,7 @@ class RunConfig:
                 f"not have more than {LONGEST_VARIANT}, so join fewer of them"
             )
         # The variant is a part of the run's identity, however its strengths were written.
-        object.__setattr__(self, "variant", canonical(self.variant))
+        object.__setattr__(self, "variant", canonical_variant(self.variant))
 
     def to_json(self) -> dict[str, Any]:
         """Nested plain data."""

@@ -247,24 +247,6 @@ def evaluated(text: str) -> str:
     return "+".join(kept) or "none"
 
 
-def canonical(text: str) -> str:
-    """``text`` with each strength in its shortest form, so that ``wind:0.50`` is ``wind:0.5``.
-
-    What :func:`parse` refuses is returned as it is.
-    """
-    parts = [part.partition(":") for part in text.split("+")]
-    return "+".join(f"{name}{colon}{_shortest(number)}" for name, colon, number in parts)
-
-
-def _shortest(number: str) -> str:
-    try:
-        value = float(number)
-    except ValueError:
-        return number
-    short = f"{value:g}"
-    return short if float(short) == value else repr(value)
-
-
 def _training_only(part: str) -> bool:
     name = part.partition(":")[0]
     return name in registry() and registry()[name].training_only

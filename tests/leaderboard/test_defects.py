@@ -18,7 +18,6 @@ from leaderboard.defects import (
     Panel,
     Point,
     audit_commands,
-    canonical_variant,
     crossing,
     defect_map,
     fit,
@@ -105,10 +104,9 @@ def test_a_missing_audit_is_an_error_only_if_it_was_named(
     assert read_audit() == {}
 
 
-def test_variants_have_one_spelling() -> None:
-    assert canonical_variant("wind:0.50+obstacle:1.0") == "obstacle:1+wind:0.5"
-    assert canonical_variant("none") == "none"
-    assert canonical_variant("wind:strong") == "wind:strong"
+def test_the_order_of_variants_does_not_matter(tmp_path: Path) -> None:
+    audit = read_audit(write(tmp_path, [CELL | {"variant": "wind:0.50+obstacle:1.0"}]))
+    assert list(audit) == [("PickCube-v1", "floating", "obstacle:1+wind:0.5", "C8")]
 
 
 def test_defects_are_drawn_within_their_interval() -> None:

@@ -22,6 +22,7 @@ from leaderboard.records import (
     FeasibleQ,
     Provenance,
     RunRecord,
+    canonical_variant,
     config_hash,
     dump_record,
     portable,
@@ -379,3 +380,21 @@ def test_random_damage_gives_a_record_error_or_a_valid_record(tmp_path: Path) ->
         except RecordError:
             refused += 1
     assert refused > 300
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("wind:0.50", "wind:0.5"),
+        ("wind:1.0", "wind:1"),
+        ("wind:5e-1+action_gain:.3", "wind:0.5+action_gain:0.3"),
+        ("wind:0.123456789", "wind:0.123456789"),
+        ("none", "none"),
+        ("wind", "wind"),
+        ("wind:", "wind:"),
+        ("wind:much+", "wind:much+"),
+    ],
+)
+def test_one_way_to_write_a_strength(text, expected):
+    assert canonical_variant(text) == expected
+    assert canonical_variant(expected) == expected

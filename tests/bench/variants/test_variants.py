@@ -9,7 +9,6 @@ import torch
 from bench.tasks import embodiments, make, task_names
 from bench.tasks.experts import Expert
 from bench.variants import (
-    canonical,
     describe,
     evaluated,
     highest_cost,
@@ -97,24 +96,6 @@ def test_highest_cost():
     assert highest_cost(parse("wind:1")) == 1
     assert highest_cost(parse("directional_reward:0.5+wind:1")) == 1.5
     assert highest_cost(parse("directional_reward", torch.tensor([0.2, 0.75]))) == 1.75
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("wind:0.50", "wind:0.5"),
-        ("wind:1.0", "wind:1"),
-        ("wind:5e-1+action_gain:.3", "wind:0.5+action_gain:0.3"),
-        ("wind:0.123456789", "wind:0.123456789"),
-        ("none", "none"),
-        ("wind", "wind"),
-        ("wind:", "wind:"),
-        ("wind:much+", "wind:much+"),
-    ],
-)
-def test_one_way_to_write_a_strength(text, expected):
-    assert canonical(text) == expected
-    assert canonical(expected) == expected
 
 
 @pytest.mark.parametrize("name", NAMES)
