@@ -315,6 +315,20 @@ def test_the_command_says_what_to_mend(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.usefixtures("alone")
+def test_of_many_records_the_command_names_those_it_complains_about(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = [store(admissible(seed=seed), tmp_path / "new") for seed in range(11)]
+    assert command.main(["--check", str(tmp_path / "new")]) == 0
+    assert capsys.readouterr().out == "11 of 11 records are admissible\n"
+    edit(paths[4], status="running", ended=None)
+    assert command.main(["--check", str(tmp_path / "new")]) == 2
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if ".json: " in line] == [f"{paths[4]}: NOT ADMISSIBLE"]
+    assert lines[-1] == "10 of 11 records are admissible"
+
+
+@pytest.mark.usefixtures("alone")
 def test_the_command_refuses_two_things_at_once(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         command.main(["--check", "--verify"])
