@@ -128,6 +128,26 @@ class Run:
         verdict = self.record.diverged
         return verdict if self.finished or verdict else None
 
+    @cached_property
+    def rise(self) -> Array:
+        """Success in the last fifth of the budget minus that in the fifth before it.
+
+        An entry for each episode seed that both have; empty before the end.
+        """
+        if not self.finished:
+            return np.array([])
+        return paired_differences(self._in_fifth(FINAL_WINDOW), self._in_fifth(FINAL_WINDOW - 1))
+
+    def _in_fifth(self, number: int) -> dict[int, float]:
+        """Mean success by episode seed over the evaluations in a fifth of the budget, 1 to 5."""
+        values: dict[int, list[float]] = defaultdict(list)
+        for step, evaluation in self.curve.items():
+            inside = 1 + FINAL_WINDOW * step // self.record.cell.env_steps
+            if min(inside, FINAL_WINDOW) == number:
+                for seed, success in _episodes(evaluation).items():
+                    values[seed].append(success)
+        return {seed: float(np.mean(successes)) for seed, successes in values.items()}
+
     def in_window(self, name: str) -> list[float]:
         """Finite values of a diagnostic in the evaluations of the final window."""
         start = (FINAL_WINDOW - 1) * self.record.cell.env_steps
@@ -207,6 +227,7 @@ class Row:
     last: Interval | None = None
     difference: Interval | None = None
     against_best: Interval | None = None
+    rise: Interval | None = None
     area: float | None = None
     threshold_steps: list[int | None] = field(default_factory=list)
     dip: float | None = None
@@ -416,6 +437,8 @@ def _fill(row: Row, budget: int) -> None:
         return
     row.success = success_interval([list(run.window.values()) for run in row.finished])
     row.last = success_interval([list(run.final_success.values()) for run in row.finished])
+    rises = [run.rise for run in row.finished if run.rise.size and not row.is_reference]
+    row.rise = two_stage_bootstrap(rises) if rises else None
     if row.search_steps is None:
         areas = [area_under_curve(*_points(run), budget) for run in row.finished]
         row.area = float(np.mean(areas))

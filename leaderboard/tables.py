@@ -77,7 +77,7 @@ def section(table: Table, links: Links) -> list[str]:
         ]
         rows.append([_rank(row, table), *cells] if table.is_ranked else cells)
     parts.append(grid(header, rows, left=2 if table.is_ranked else 1))
-    parts += [*_against_best(table), *_diagnostics(table)]
+    parts += [*_against_best(table), *_plateau(table), *_diagnostics(table)]
     if notes := _notes(table):
         parts.append("\n".join(f"- {note}" for note in notes))
     return parts
@@ -171,6 +171,15 @@ def _against_best(table: Table) -> list[str]:
     ]
     text = f"Best reference: {code(best.label)}, {number(best.success.value)}."
     return [text + (f" Against it: {'; '.join(against)}." if against else "")]
+
+
+def _plateau(table: Table) -> list[str]:
+    rises = [
+        f"{code(row.label)} {difference(row.rise)}"
+        for row in sorted(table.learners, key=_place)
+        if row.rise
+    ]
+    return [f"From the fourth to the last fifth of the budget: {'; '.join(rises)}."] * bool(rises)
 
 
 def _diagnostics(table: Table) -> list[str]:
@@ -313,6 +322,9 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
         "against_best": best and best.value,
         "against_best_low": best and best.low,
         "against_best_high": best and best.high,
+        "rise": row.rise and row.rise.value,
+        "rise_low": row.rise and row.rise.low,
+        "rise_high": row.rise and row.rise.high,
         "auc": row.area,
         "threshold": table.threshold,
         "threshold_steps": row.median_threshold_steps,

@@ -192,9 +192,19 @@ def test_the_csv_holds_both_comparisons(board: Path) -> None:
     assert row["best_reference"] == "golden-ticket"
     assert float(row["against_best"]) == pytest.approx(0.35)
     assert float(row["against_base"]) == pytest.approx(0.5)
+    # Three evaluations, none in the fourth fifth.
+    assert row["rise"] == ""
     assert row["devices"] == "cpu"
     ticket = next(r for r in rows if r["agent"] == "golden-ticket")
     assert (ticket["search_steps"], ticket["auc"]) == ("12800", "")
+
+
+def test_cells_with_too_few_seeds_are_not_counted_as_wins(tmp_path: Path) -> None:
+    records = make_cell({"base": 0.3, "standard": 0.1}, seeds=5)
+    records += make_cell({"base": 0.3, "standard": 0.9}, seeds=4, variant="wind:1")
+    write(tmp_path, records)
+    generate([tmp_path / "results"], tmp_path, audit(tmp_path))
+    assert "`standard` clearly above in 0, clearly below in 1 of 1." in text_of(tmp_path)
 
 
 def test_the_audit_changes_the_page_and_nothing_else_does(board: Path, tmp_path: Path) -> None:
@@ -263,6 +273,8 @@ def test_uneven_cells_are_drawn_with_their_coverage(tmp_path: Path) -> None:
     generate([tmp_path / "results"], tmp_path, audit(tmp_path))
     text = text_of(tmp_path)
     assert "Same agent with different settings, in rows of their own" in text
+    alike_rise = "`equivariant` 0.00 [0.00, 0.00]; `standard` 0.00 [0.00, 0.00]."
+    assert f"From the fourth to the last fifth of the budget: {alike_rise}" in text
     _, _, *pairs = table_after(text, "Probability of improvement")
     assert pairs[0][0] == "`equivariant` > `standard`"
     assert pairs[0][1].endswith("(1; 5, 5)")

@@ -217,6 +217,21 @@ def test_the_final_window_pools_the_last_fifth_of_the_budget() -> None:
     assert run(make_record(curve, "interrupted")).window == {}
 
 
+def test_the_rise_compares_the_last_two_fifths_on_the_same_episodes() -> None:
+    curve = points(
+        (29_999, [1, 1, 1]), (30_000, [0, 0]), (39_999, [1, 0]), (40_000, [1, 1]), (50_000, [1] * 4)
+    )
+    learner = run(make_record(curve))
+    assert sorted(learner.rise) == [0.5, 1.0]
+    standard = row(summarize([learner]), "standard")
+    assert standard.rise is not None
+    assert standard.rise.value == pytest.approx(0.75)
+    assert not run(make_record(curve, "interrupted")).rise.size
+    without = points((0, [0, 0]), (50_000, [1, 1]))
+    assert row(summarize([run(make_record(without))]), "standard").rise is None
+    assert row(summarize([run(make_record(curve, agent="zero"))]), "zero").rise is None
+
+
 def test_a_reference_is_measured_where_its_search_ended() -> None:
     ticket = make_record(points((12_800, [1, 1, 0])), agent="golden-ticket")
     ticket.budget.env_steps = 12_800
