@@ -127,18 +127,21 @@ class Loop:
         # Without a checkpoint an earlier process may have left events all the same.
         self.log = RunLog(folder, self.record, self.env_steps + 1 if checkpoint else 0)
         self.heartbeat = Heartbeat(folder, config.env_steps, self.env_steps)
+        try:
+            self.evaluator = Evaluator(
+                config,
+                base,
+                feasible_return(config, base),
+                self.agent.learns,
+                evaluated(config.variant),
+                workers,
+            )
+        except BaseException as error:
+            self.stop(error)
+            raise
 
     def play(self) -> None:
         """Search or train to the end of the budget, evaluate the last checkpoint, close."""
-        config = self.config
-        self.evaluator = Evaluator(
-            config,
-            self.base,
-            feasible_return(config, self.base),
-            self.agent.learns,
-            evaluated(config.variant),
-            self.workers,
-        )
         if not self.final:
             if self.agent.searches:
                 self._search()
