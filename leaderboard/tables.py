@@ -179,7 +179,9 @@ def _plateau(table: Table) -> list[str]:
         for row in sorted(table.learners, key=_place)
         if row.rise
     ]
-    return [f"From the fourth to the last fifth of the budget: {'; '.join(rises)}."] * bool(rises)
+    if not rises:
+        return []
+    return [f"From the fourth to the last fifth of the budget: {'; '.join(rises)}."]
 
 
 def _diagnostics(table: Table) -> list[str]:

@@ -181,6 +181,17 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
         raise UserError(f"{source}: {key}{': ' * bool(key)}{problem}{given}") from error
 
 
+def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as one, keys joined by dots, e.g. ``sac.critic_lr``."""
+    found: dict[str, Any] = {}
+    for key, value in data.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = value
+    return found
+
+
 def check_keys(data: Iterable[str], valid: Iterable[str], source: str, prefix: str = "") -> None:
     """Refuse keys that are not valid.
 

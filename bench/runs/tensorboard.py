@@ -15,6 +15,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from torch.utils.tensorboard import SummaryWriter
 
+from bench.runs.config import flat
 from leaderboard.records import Provenance, RunRecord
 from policies.errors import UserError
 
@@ -80,7 +81,7 @@ class RunLog:
             self.writer.add_custom_scalars(LAYOUT)
             # A continued run may stand on another commit: its text is added to the first one's.
             self.writer.add_text("config", config_text(record), purge_step)
-            settings = flat(record.config)
+            settings = _settings(record.config)
             self._hparams(metadata.EXPERIMENT_TAG, experiment=_experiment(settings))
             self._hparams(
                 metadata.SESSION_START_INFO_TAG, session_start_info=_session(record, settings)
@@ -155,17 +156,15 @@ def _silence_writing_thread() -> None:
     threading.excepthook = hook
 
 
-def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:
-    """A nested configuration with dotted names, e.g. ``sac.lr``; None reads "none"."""
-    result: dict[str, bool | int | float | str] = {}
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            result.update(flat(value, f"{prefix}{name}."))
-        elif isinstance(value, bool | int | float | str):
-            result[prefix + name] = value
-        else:
-            result[prefix + name] = "none" if value is None else str(value)
-    return result
+def _settings(config: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
+    """A configuration with dotted names, in values that TensorBoard knows; None reads "none"."""
+
+    def known(value: Any) -> bool | int | float | str:
+        if value is None:
+            return "none"
+        return value if isinstance(value, bool | int | float | str) else str(value)
+
+    return {name: known(value) for name, value in flat(config).items()}
 
 
 def config_text(record: RunRecord) -> str:
@@ -196,7 +195,7 @@ def config_text(record: RunRecord) -> str:
         [
             *_table("this run", "", {k: v for k, v in facts.items() if v is not None}),
             "",
-            *_table("setting", "value", flat(record.config)),
+            *_table("setting", "value", _settings(record.config)),
         ]
     )
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from bench.runs.config import RunConfig
+from bench.runs.config import RunConfig, flat
 from bench.runs.folder import run_id, write_json
 from bench.runs.run import check
 from bench.sweep.suite import Suite
@@ -38,9 +38,9 @@ class Cell:
     @classmethod
     def of(cls, config: Mapping[str, Any], name: str, extra: Iterable[str] = ()) -> Cell:
         """The cell of a configuration as nested plain data."""
-        flat = _flatten(config)
+        settings = flat(config)
         values = {key: config[key] for key in (*BASIC, "env_steps")}
-        return cls(name, **values, extra={key: flat[key] for key in extra})
+        return cls(name, **values, extra={key: settings[key] for key in extra})
 
     @property
     def keys(self) -> dict[str, Any]:
@@ -123,15 +123,17 @@ def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
     Raises:
         UserError: if a cell names what does not exist.
     """
-    flat = []
+    settings = []
     for config in suite.runs:
         try:
             check(replace(config, sim="cpu", device="cpu") if elsewhere else config)
         except UserError as error:
             raise UserError(f"{suite.name}: {error}") from error
-        flat.append(_flatten(config.to_json()))
+        settings.append(flat(config.to_json()))
     extra = [
-        key for key in flat[0] if key not in BASIC and any(one[key] != flat[0][key] for one in flat)
+        key
+        for key, value in settings[0].items()
+        if key not in BASIC and any(one[key] != value for one in settings)
     ]
     cells = {Cell.of(config.to_json(), run_id(config, {}), extra): config for config in suite.runs}
     return Plan(suite.name, suite.description, out, cells)
@@ -175,13 +177,3 @@ def read_manifest(path: Path) -> Manifest:
 
 def _title(name: str, description: str) -> str:
     return f"{name}: {description}" if description else name
-
-
-def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat

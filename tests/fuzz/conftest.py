@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 import pytest
 
-from bench.runs.config import RunConfig
+from bench.runs.config import RunConfig, flat
 from bench.runs.folder import load_checkpoint
 from bench.runs.loop import Loop
 from bench.runs.run import execute
@@ -16,7 +16,7 @@ from bench.sweep.plan import make_plan, write_manifest
 from bench.sweep.suite import Suite
 from leaderboard.records import dump_record
 from tests.bench.tiny_run import tiny_config
-from tests.fuzz.kinds import Workshop, flat
+from tests.fuzz.kinds import Workshop
 from tests.leaderboard.record_factory import make_record
 
 CHECKPOINT_EVERY = 20

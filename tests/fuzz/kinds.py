@@ -34,7 +34,7 @@ from safetensors.torch import save_file
 from bench import cli
 from bench.runs import base_policy
 from bench.runs import run as run_module
-from bench.runs.config import RunConfig
+from bench.runs.config import RunConfig, flat
 from bench.runs.folder import load_checkpoint
 from bench.runs.loop import Loop
 from bench.sweep.suite import load_suite
@@ -92,17 +92,6 @@ class Workshop:
         for name, data in self.run.items():
             (path / name).write_bytes(data)
         return path
-
-
-def flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one, keys joined by dots."""
-    found: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, dict):
-            found |= flat(value, f"{prefix}{key}.")
-        else:
-            found[prefix + key] = value
-    return found
 
 
 def _require(condition: bool, complaint: str) -> None:

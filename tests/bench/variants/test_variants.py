@@ -8,14 +8,7 @@ import torch
 
 from bench.tasks import embodiments, make, task_names
 from bench.tasks.experts import Expert
-from bench.variants import (
-    describe,
-    evaluated,
-    highest_cost,
-    parse,
-    registry,
-    variant_names,
-)
+from bench.variants import describe, evaluated, highest_cost, parse, registry, variant_names
 from policies.errors import UserError
 from tests.bench.variants.scenes import act, scene
 
