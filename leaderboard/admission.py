@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import math
 import subprocess
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -25,7 +26,7 @@ from leaderboard.records import (
     portable,
     read_record,
 )
-from leaderboard.summary import MIN_SEEDS, REFERENCES, Key, recipe_of
+from leaderboard.summary import MIN_SEEDS, REFERENCES, Key, recipe_of, seeds_of
 
 MIN_EPISODES = 100
 """Held-out episodes of an admissible record's final evaluation."""
@@ -133,6 +134,22 @@ def scored_on_held_out_episodes(file: Path, record: RunRecord) -> Iterator[str]:
         )
 
 
+def consistent(file: Path, record: RunRecord) -> Iterator[str]:
+    """Name and seeds of the run are those of its configuration."""
+    cell = record.cell
+    named = f"{cell.task}-{cell.embodiment}-{cell.variant.replace(':', '=')}-{cell.agent}-"
+    if not record.run_id.startswith(f"{named}s{cell.seed}-"):
+        yield (
+            f"the run is named {record.run_id}, but its configuration is that of {named}"
+            f"s{cell.seed}: take the record as `symsteer run` wrote it."
+        )
+    elif record.seeds.get("run") != cell.seed:
+        yield (
+            f"the run drew from seed {record.seeds.get('run')}, but its configuration says "
+            f"{cell.seed}: take the record as `symsteer run` wrote it."
+        )
+
+
 def budget_used_up(file: Path, record: RunRecord) -> Iterator[str]:
     """A learner was scored at the end of its budget, a reference after what it searched."""
     final, budget = record.final, record.cell.env_steps
@@ -142,6 +159,11 @@ def budget_used_up(file: Path, record: RunRecord) -> Iterator[str]:
         yield (
             f"the final evaluation stands at step {final.env_steps}, but the run used "
             f"{record.budget.env_steps}: run it again."
+        )
+    elif final.env_steps >= budget + _steps_of_a_decision(record):
+        yield (
+            f"the run used {final.env_steps} environment steps, more than the {budget} of its "
+            "budget: run it again."
         )
     elif _learns(record) and final.env_steps < budget:
         yield (
@@ -165,6 +187,7 @@ RULES: tuple[Callable[[Path, RunRecord], Iterator[str]], ...] = (
     named_after_its_run,
     finished,
     reproducible,
+    consistent,
     scored_on_held_out_episodes,
     budget_used_up,
     names_no_machine,
@@ -175,32 +198,34 @@ class _Known:
     """The records that one record is held against: the committed ones and those before it."""
 
     def __init__(self) -> None:
-        self._runs: dict[tuple[RowKey, int], tuple[Path, RunRecord]] = {}
+        self._runs: dict[tuple[RowKey, str], tuple[Path, RunRecord]] = {}
         self._outcomes: dict[str, Path] = {}
         self._seeds: dict[RowKey, set[int]] = defaultdict(set)
         self._committed: dict[Key, set[str]] = defaultdict(set)
+        self._committed_seeds: dict[Key, set[int]] = defaultdict(set)
         self._references: dict[tuple[Key, str], set[str]] = defaultdict(set)
 
     def add(self, file: Path, record: RunRecord, committed: bool = False) -> None:
         row = _row(record)
-        self._runs.setdefault((row, record.cell.seed), (file, record))
+        self._runs.setdefault((row, seeds_of(record.config)), (file, record))
         if outcome := _outcome(record):
             self._outcomes.setdefault(outcome, file)
         if committed:
             self._committed[row[0]].add(record.base_policy.content_hash)
+            self._committed_seeds[row[0]].add(record.cell.seed)
         if record.status == "finished":
             self._seeds[row].add(record.cell.seed)
             policy = record.base_policy.content_hash
             self._references[row[0], policy].add(record.cell.agent)
 
     def duplicates(self, record: RunRecord) -> Iterator[str]:
-        twin = self._runs.get((_row(record), record.cell.seed))
+        twin = self._runs.get((_row(record), seeds_of(record.config)))
         outcome = _outcome(record)
         if twin and twin[1] == record:
             yield f"it is a copy of {twin[0]}: remove one of the two."
         elif twin:
             yield (
-                f"{twin[0]} holds the same configuration and seed already: remove one of the two "
+                f"{twin[0]} holds the same configuration and seeds already: remove one of the two "
                 "(to replace a committed record, say why in the pull request)."
             )
         elif outcome in self._outcomes:
@@ -216,6 +241,12 @@ class _Known:
             yield (
                 f"shown, not ranked: its row has {number} of the {MIN_SEEDS} finished seeds that a "
                 "ranking needs."
+            )
+        usual = self._committed_seeds[row[0]]
+        if usual and record.cell.seed not in usual:
+            yield (
+                f"its seed {record.cell.seed} is none of those of the committed runs of its table "
+                f"({', '.join(map(str, sorted(usual)))}): agents are compared on equal seeds."
             )
         policy, committed = record.base_policy.content_hash, self._committed[row[0]]
         if committed and policy not in committed:
@@ -240,6 +271,16 @@ def _row(record: RunRecord) -> RowKey:
 
 def _learns(record: RunRecord) -> bool:
     return record.parameters.total > 0 or record.budget.updates > 0 or record.has_critic
+
+
+def _steps_of_a_decision(record: RunRecord) -> int:
+    """Environment steps of one decision in all environments: a run ends with a whole one."""
+    policy = record.config.get("policy")
+    factors = (
+        record.config.get("num_envs"),
+        policy.get("execute") if isinstance(policy, dict) else None,
+    )
+    return math.prod(factor for factor in factors if type(factor) is int and factor > 0)
 
 
 def _outcome(record: RunRecord) -> str | None:

@@ -8,7 +8,7 @@ that lacks data is undecided with the reason, never left out.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -23,22 +23,24 @@ from leaderboard.defects import (
     defect_of,
 )
 from leaderboard.statistics import (
-    RESAMPLES,
     Interval,
     Sample,
-    bootstrap_draws,
     censored_median,
     newcombe,
     percentile,
     stratified_bootstrap,
+    stratified_draws,
 )
-from leaderboard.summary import MIN_SEEDS, Key, Summary, Table
+from leaderboard.summary import MIN_SEEDS, Key, Pair, Summary, Table
 
 NEARLY_SYMMETRIC = 0.05
 """Cells with an audited defect up to this are where the paper expects symmetry to help."""
 
 STRONGLY_BROKEN = 0.25
 """Cells with an audited defect from this on are where the paper expects strictness to hurt."""
+
+RIVALS = ("standard", "standard-matched")
+"""Agents without symmetry: with the channels of the equivariant one, and with its parameters."""
 
 SLOPE_UNIT = 0.1
 """Slopes are given for this much more defect."""
@@ -68,17 +70,17 @@ class Claim:
 
 
 T = TypeVar("T")
-Cells = list[tuple[Table, dict[int, T]]]
-"""Tables with what each run seed contributes."""
+Cells = list[tuple[Table, dict[Pair, T]]]
+"""Tables with what each pair of runs contributes."""
 
 
 def claims(summary: Summary, audit: Audit, found: DefectMap) -> list[Claim]:
     """All tests, in the order of the paper's claims."""
     symmetric = [t for t in summary.tables if _below(t, audit)]
     return [
-        *(_sample_efficiency(symmetric, rival) for rival in ("standard", "standard-matched")),
-        _divergence(summary.tables),
-        _bias(summary.tables),
+        *(_sample_efficiency(symmetric, rival) for rival in RIVALS),
+        *(_divergence(summary.tables, rival) for rival in RIVALS),
+        *(_bias(summary.tables, rival) for rival in RIVALS),
         _fewest_demonstrations(symmetric),
         _fewer_demonstrations(symmetric),
         *(_falls(found.panels["equivariant", measure]) for measure in ("auc", "success")),
@@ -146,54 +148,56 @@ def _threshold_steps(tables: Sequence[Table], agent: str) -> str:
     return f"{text} ({reached}/{len(shares)})"
 
 
-VALUES = "Value divergence: symmetry prevents it"
+DIVERGENCE = "Value divergence: symmetry prevents it"
 
 
-def _divergence(tables: Sequence[Table]) -> Claim:
-    test = "share of seeds whose Q diverged, `standard` minus `equivariant`, all cells"
+def _divergence(tables: Sequence[Table], rival: str) -> Claim:
+    test = f"share of runs whose Q diverged, `{rival}` minus `equivariant`, all cells"
 
-    def verdicts(table: Table, agent: str) -> dict[int, bool]:
+    def verdicts(table: Table, agent: str) -> dict[Pair, bool]:
         # A run that broke off because its Q was not finite counts, so rows without any finished
         # run do too.
         rows = [row for row in table.rows if row.agent == agent]
-        found = [{r.seed: r.diverged for r in row.runs if r.diverged is not None} for row in rows]
+        found = [{r.pair: r.diverged for r in row.runs if r.diverged is not None} for row in rows]
         return max(found, key=len, default={})
 
-    found: Cells[tuple[bool, bool]] = []
-    for table in tables:
-        one, other = verdicts(table, "standard"), verdicts(table, "equivariant")
-        seeds_of = sorted(one.keys() & other.keys())
-        found.append((table, {seed: (one[seed], other[seed]) for seed in seeds_of}))
-    cells, reason = _enough(found, "`standard` and `equivariant` with a critic")
+    found = [
+        (table, _joined(verdicts(table, rival), verdicts(table, "equivariant"))) for table in tables
+    ]
+    cells, reason = _enough(found, f"`{rival}` and `equivariant` with a critic")
     if not cells:
-        return Claim(VALUES, test, 1, reason=reason)
+        return Claim(DIVERGENCE, test, 1, reason=reason)
     both = [pair for _, pairs in cells for pair in pairs.values()]
-    counts, seeds = [sum(pair[i] for pair in both) for i in (0, 1)], len(both)
-    effect = newcombe((counts[0], seeds), (counts[1], seeds))
-    beside = f"{counts[0]}/{seeds} against {counts[1]}/{seeds} diverged"
-    return Claim(VALUES, test, 1, effect, len(cells), seeds, reason, beside)
+    counts, runs = [sum(pair[i] for pair in both) for i in (0, 1)], len(both)
+    effect = newcombe((counts[0], runs), (counts[1], runs))
+    beside = f"{counts[0]}/{runs} against {counts[1]}/{runs} diverged"
+    return Claim(DIVERGENCE, test, 1, effect, len(cells), runs, reason, beside)
 
 
-def _bias(tables: Sequence[Table]) -> Claim:
+def _bias(tables: Sequence[Table], rival: str) -> Claim:
     """The milder form of divergence: how far Q is from the returns that it should predict."""
-    test = "absolute Q bias, `standard` minus `equivariant`, all cells"
+    name = "Value error: symmetry makes Q less wrong"
+    test = f"absolute Q bias, `{rival}` minus `equivariant`, all cells"
 
-    def biases(table: Table, agent: str) -> dict[int, float]:
+    def biases(table: Table, agent: str) -> dict[Pair, float]:
         row = table.row_of(agent)
-        found = {run.seed: run.in_window("q_bias") for run in row.finished} if row else {}
-        return {seed: abs(float(np.mean(values))) for seed, values in found.items() if values}
+        found = {run.pair: run.in_window("q_bias") for run in row.finished} if row else {}
+        return {pair: abs(float(np.mean(values))) for pair, values in found.items() if values}
 
     found: Cells[Sample] = []
     for table in tables:
-        one, other = biases(table, "standard"), biases(table, "equivariant")
-        seeds_of = sorted(one.keys() & other.keys())
-        found.append((table, {seed: Sample.of([one[seed] - other[seed]]) for seed in seeds_of}))
-    cells, reason = _enough(found, "`standard` and `equivariant` with a critic")
+        both = _joined(biases(table, rival), biases(table, "equivariant"))
+        found.append((table, {pair: Sample.constant(a - b) for pair, (a, b) in both.items()}))
+    cells, reason = _enough(found, f"`{rival}` and `equivariant` with a critic")
     if not cells:
-        return Claim(VALUES, test, 1, reason=reason)
+        return Claim(name, test, 1, reason=reason)
     effect = stratified_bootstrap([list(samples.values()) for _, samples in cells])
-    seeds = sum(len(samples) for _, samples in cells)
-    return Claim(VALUES, test, 1, effect, len(cells), seeds, reason, "in units of return")
+    runs = sum(len(samples) for _, samples in cells)
+    return Claim(name, test, 1, effect, len(cells), runs, reason, "in units of return")
+
+
+def _joined(first: Mapping[Pair, T], second: Mapping[Pair, T]) -> dict[Pair, tuple[T, T]]:
+    return {pair: (value, second[pair]) for pair, value in first.items() if pair in second}
 
 
 FEW = "Few demonstrations: symmetry helps most there"
@@ -242,8 +246,8 @@ def _fewer_demonstrations(tables: Sequence[Table]) -> Claim:
     if not families:
         return Claim(FEW, test, 1, reason=_one_number(tables))
 
-    def samples(table: Table) -> dict[int, Sample]:
-        return advantage(table, "equivariant", "standard", "success")
+    def samples(table: Table) -> list[Sample]:
+        return list(advantage(table, "equivariant", "standard", "success").values())
 
     ends = [(samples(family[0]), samples(family[-1])) for family in families]
     ends = [(few, many) for few, many in ends if few and many]
@@ -251,16 +255,16 @@ def _fewer_demonstrations(tables: Sequence[Table]) -> Claim:
         return Claim(FEW, test, 1, reason="no runs of `equivariant` and `standard` at both ends")
     enough = [(few, many) for few, many in ends if min(len(few), len(many)) >= MIN_SEEDS]
     reason = "" if enough else f"fewer than {MIN_SEEDS} paired seeds at one of the ends"
-    generator = np.random.default_rng(0)
-    values, draws = [], np.zeros(RESAMPLES)
-    for few, many in enough or ends:
-        value = [np.mean([s.value for s in side.values()]) for side in (few, many)]
-        drawn = [bootstrap_draws(list(side.values()), generator) for side in (few, many)]
-        values.append(value[0] - value[1])
-        draws += (drawn[0] - drawn[1]) / len(enough or ends)
-    seeds = sum(len(few) for few, _ in enough or ends)
-    effect = percentile(float(np.mean(values)), draws)
-    return Claim(FEW, test, 1, effect, len(enough or ends), seeds, reason)
+    # The cells of one family share their episodes, so their draws belong together.
+    cells = [side for end in enough or ends for side in end]
+    signs = np.tile([1.0, -1.0], len(enough or ends))
+    values = np.array([np.mean([sample.value for sample in cell]) for cell in cells])
+    draws = stratified_draws(cells, np.random.default_rng(0))
+    effect = percentile(
+        2 * float(np.mean(signs * values)), 2 * np.mean(signs[:, None] * draws, axis=0)
+    )
+    runs = sum(len(few) for few, _ in enough or ends)
+    return Claim(FEW, test, 1, effect, len(enough or ends), runs, reason)
 
 
 LIMITS = "Limits under breaking: the advantage of strictness falls with the defect"

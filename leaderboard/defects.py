@@ -6,10 +6,11 @@ committed summary is read as data; nothing is simulated here.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,17 +18,17 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from leaderboard.errors import RecordError
-from leaderboard.records import canonical_variant
+from leaderboard.records import canonical_json, canonical_variant
 from leaderboard.statistics import (
     RESAMPLES,
     Array,
     Interval,
     Sample,
-    bootstrap_draws,
-    mean,
+    crossed_bootstrap,
     percentile,
+    stratified_draws,
 )
-from leaderboard.summary import MIN_SEEDS, Key, Summary, Table, area_pairs, success_pairs
+from leaderboard.summary import MIN_SEEDS, Key, Pair, Summary, Table, area_pairs, success_pairs
 
 DEFAULT_AUDIT = Path(__file__).resolve().parents[1] / "docs" / "audit" / "summary.json"
 
@@ -122,10 +123,22 @@ def read_audit(path: Path | None = None) -> Audit:
             f"{path} is no summary of an audit ({problem}): "
             "name the summary.json that `symsteer audit --out` wrote."
         ) from error
-    return {
-        (cell.task, cell.embodiment, _in_order(cell.variant), cell.group): _largest(cell)
-        for cell in cells
-    }
+    audit: dict[Place, Defect] = {}
+    for cell in cells:
+        place = cell.task, cell.embodiment, _in_order(cell.variant), cell.group
+        if place in audit:
+            raise RecordError(
+                f"{path} holds {' '.join(place)} twice: remove the older of the two cells."
+            )
+        audit[place] = _largest(cell)
+    return audit
+
+
+def fingerprint(audit: Audit) -> str:
+    """How many cells an audit has, and a hash of their defects."""
+    defects = [[*place, d.component, *astuple(d.interval)] for place, d in sorted(audit.items())]
+    digest = hashlib.sha256(canonical_json(defects).encode()).hexdigest()
+    return f"{len(audit)} cells, {digest[:12]}"
 
 
 def _with_tuples(cell: Any) -> Any:
@@ -245,17 +258,15 @@ def defect_map(summary: Summary, audit: Audit) -> DefectMap:
                 defect = defect_of(table.key, audit)
                 samples = tuple(advantage(table, agent, BASELINE, measure).values())
                 if defect and samples:
-                    draws = bootstrap_draws(samples, np.random.default_rng(0))
-                    value = float(np.mean([sample.value for sample in samples]))
-                    points.append(Point(table, defect, samples, percentile(value, draws)))
+                    points.append(Point(table, defect, samples, crossed_bootstrap(samples)))
             line = fit([point for point in points if point.counts])
             panels[agent, measure] = Panel(agent, measure, tuple(points), line)
     unaudited = [table.key for table in summary.tables if not defect_of(table.key, audit)]
     return DefectMap(panels, tuple(unaudited))
 
 
-def advantage(table: Table, first: str, second: str, measure: str) -> dict[int, Sample]:
-    """Paired differences of two agents in a table by run seed; empty where one of them lacks."""
+def advantage(table: Table, first: str, second: str, measure: str) -> dict[Pair, Sample]:
+    """Paired differences of two agents in a table; empty where one of them lacks."""
     rows = table.row_of(first), table.row_of(second)
     if rows[0] is None or rows[1] is None:
         return {}
@@ -275,9 +286,7 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> L
         return None
     generator = np.random.default_rng(seed)
     x = np.stack([point.defect.draw(resamples, generator) for point in points], axis=1)
-    y = np.stack(
-        [bootstrap_draws(point.samples, generator, mean, resamples) for point in points], axis=1
-    )
+    y = stratified_draws([point.samples for point in points], generator, resamples).T
     values = np.array([point.advantage.value for point in points])
     slope, intercept = _least_squares(defects, values)
     expected = np.var(y - slope * x, axis=0).mean()

@@ -23,8 +23,8 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
 from leaderboard.defects import BASELINE, COMPARED, MEASURES, DefectMap, Line, Panel
 from leaderboard.findings import Findings
-from leaderboard.statistics import Interval, iqm, success_interval
-from leaderboard.summary import MIN_SEEDS, REFERENCES, Row, Run, Summary, Table
+from leaderboard.statistics import Interval, Sample, iqm, success_interval
+from leaderboard.summary import MIN_SEEDS, REFERENCES, Row, Run, Summary, Table, episode_success
 
 Style = tuple[str, str, Any]
 """Color, marker and line style of an agent."""
@@ -153,7 +153,8 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
         return
     bands = [
         success_interval(
-            [run.curve[step].episodes.success_once for run in row.finished], BAND_RESAMPLES
+            [Sample.pooled(episode_success(run.curve[step]).items()) for run in row.finished],
+            BAND_RESAMPLES,
         )
         for step in steps
     ]
@@ -201,9 +202,7 @@ def q_values(tables: Sequence[Table]) -> Figure:
                 steps, values = _series(run, "q_mean")
                 ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
                 extremes += values
-                if any(
-                    p.startswith("diagnostics/q_") for e in run.curve.values() for p in e.nonfinite
-                ):
+                if run.record.nonfinite_q:
                     ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7, clip_on=False)
             steps, values = _mean_series(runs, "q_mean")
             every = max(1, len(steps) // MAX_MARKERS)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from leaderboard.claims import Claim, claims
 from leaderboard.comparisons import Comparisons, compare_agents
-from leaderboard.defects import Audit, DefectMap, defect_map
+from leaderboard.defects import Audit, DefectMap, defect_map, fingerprint
 from leaderboard.summary import Summary
 
 
@@ -17,9 +17,12 @@ class Findings:
     map: DefectMap
     comparisons: Comparisons
     claims: list[Claim]
+    audit: str
+    """Which audit the defects are from (`fingerprint`)."""
 
 
 def analyse(summary: Summary, audit: Audit) -> Findings:
     """Compute all findings; pure and seeded."""
     found = defect_map(summary, audit)
-    return Findings(found, compare_agents(summary), claims(summary, audit, found))
+    tests = claims(summary, audit, found)
+    return Findings(found, compare_agents(summary), tests, fingerprint(audit))

@@ -49,17 +49,19 @@ the budget and the held-out episodes that score them.
 
 - **Success** is `success_once` in the final window: all held-out evaluations in the last fifth of
   the budget, their episodes pooled (a reference is evaluated once). Shown are the interquartile
-  mean (IQM) over seeds and its 95 % interval, from a bootstrap over seeds and over the episodes of
-  each. With fewer than 4 seeds the IQM is the plain mean; with one seed the interval covers its
-  episodes only. **Last checkpoint** is the same of the final evaluation alone. No number is ever
-  the best of several evaluations. Below each table stands how much success changed *from the fourth
-  to the last fifth of the budget*: an agent with ▲ there was still rising, and more steps may
-  change its place.
-- **Against base** is the mean difference to the base policy on the same episodes and seeds, with
-  its 95 % interval. ▲ or ▼ marks an interval that excludes 0; without a mark, the data do not
-  decide.
+  mean (IQM) over seeds and its 95 % interval, from a bootstrap over seeds and over episodes: all
+  runs are scored on the same initial states, so an episode is drawn for all of them at once. With
+  fewer than 4 seeds the IQM is the plain mean; with one seed the interval covers its episodes
+  only. No interval covers the training of other base policies. **Last checkpoint** is the same of
+  the final evaluation alone. No number is ever the best of several evaluations. Below each table
+  stands how much success changed *from the fourth to the last fifth of the budget*: an agent with ▲
+  there was still rising, and more steps may change its place.
+- **Against base** is the mean difference (not the IQM's) to the base policy on the same episodes
+  and seeds, with its 95 % interval. ▲ or ▼ marks an interval that excludes 0; without a mark, the
+  data do not decide.
 - **Rank** is 1 + the number of agents that are clearly better, by the same paired differences; "="
-  marks a tie. It takes {MIN_SEEDS} finished seeds; agents with fewer are shown without a rank.
+  marks a tie. It takes {MIN_SEEDS} finished seeds in common; agents with fewer are shown without a
+  rank.
 - **AUC** is the area under the success curve as a share of the budget's maximum: how good the
   agent was on average while it learned. **Steps** is the median number of environment steps after
   which the success stays at {100 * THRESHOLD:.0f} % of the best learning agent's or above, and how
@@ -76,16 +78,17 @@ CURVES = (
     "Thick lines are the IQM (success) or the mean (Q) over seeds, bands the 95 % interval of the "
     "IQM, thin lines single seeds, dotted ones with a cross unfinished runs; references are "
     "horizontal, from the step on at which their search ended. The green area holds the returns "
-    "that the reward allows."
+    "that the reward allows; a cross there ends a run whose Q was not finite."
 )
 
 CLAIMS = f"""\
 The paper is arXiv 2512.11345. A claim is *supported* where the 95 % interval of the effect lies on
 the side of 0 that the claim predicts, *contradicted* where it lies on the other side, and
-otherwise *undecided*. Differences are paired by seed and episode, and averaged over cells; only
+otherwise *undecided*. Differences are paired by seed (success and its area by episode, too) and
+averaged over cells; shares of diverged runs are pooled over cells, with Newcombe's interval. Only
 cells with {MIN_SEEDS} paired seeds count, and at least one is needed. Nothing is corrected for the
-number of tests: of tests without any effect, one in twenty would still exclude 0. *Defect* is the
-audited one (next section): cells up to {NEARLY_SYMMETRIC:g} count as symmetric, from
+number of tests: of tests without any effect, up to one in twenty would still exclude 0. *Defect*
+is the audited one (next section): cells up to {NEARLY_SYMMETRIC:g} count as symmetric, from
 {STRONGLY_BROKEN:g} on as strongly broken.
 """
 
@@ -141,7 +144,7 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
                 parts += [image(*figure) for figure in drawn.values()]
                 parts.append(CURVES)
         parts += section(table, links)
-    parts += ["## Provenance", *_provenance(summary, links)]
+    parts += ["## Provenance", *_provenance(summary, findings.audit, links)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -343,7 +346,7 @@ def _comparisons(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> 
     return parts
 
 
-def _provenance(summary: Summary, links: Links) -> list[str]:
+def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
     runs = summary.runs
     records = [run.record for run in runs]
     places = [place for run in runs for place in run.provenances]
@@ -361,11 +364,12 @@ def _provenance(summary: Summary, links: Links) -> list[str]:
         f"{_values(p.platform for p in places)}; Python: {_values(p.python for p in places)}; "
         f"torch threads: {_values(str(p.torch_threads) for p in places)}",
         f"Packages: {_values(packages)}",
+        f"Audit of the defects: {code(audit)}",
     ]
     parts = [
         "Regenerate with `symsteer report`, or `python -m leaderboard RECORDS --out FOLDER`: the "
-        "same records give the same bytes. Each record holds the whole configuration and every "
-        "evaluation episode with its seed.",
+        "same records and audit give the same bytes. Each record holds the whole configuration and "
+        "every evaluation episode with its seed.",
         "\n".join(f"- {fact}" for fact in facts),
     ]
     rows = [

@@ -45,6 +45,12 @@ MAX_BYTES = 64 * 2**20
 
 MAX_TEXT = 2000
 
+LARGEST_COUNT = 2**53
+"""Counts and seeds up to this are exact as floating point numbers."""
+
+LARGEST_NUMBER = 1e39
+"""Beyond single precision, in which everything is measured; larger numbers count as infinite."""
+
 HELD_OUT_SEED = 1_000_000
 """Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
 and run. Steerability draws its seeds below it, training far above it (from 2^22 on), and
@@ -95,7 +101,7 @@ def _flags(value: Any) -> Any:
 
 
 def _nonfinite(value: Any) -> str | None:
-    if isinstance(value, float) and not math.isfinite(value):
+    if isinstance(value, float) and not abs(value) <= LARGEST_NUMBER:
         return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
     return None
 
@@ -110,9 +116,9 @@ Flags = Annotated[
     BeforeValidator(_flags),
     PlainSerializer(lambda flags: [int(flag) for flag in flags], return_type=list[int]),
 ]
-Count = Annotated[int, Field(ge=0)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, le=LARGEST_COUNT)]
+Finite = Annotated[float, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, le=LARGEST_COUNT, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=120)]
 Text = Annotated[str, Field(max_length=MAX_TEXT)]
@@ -200,7 +206,7 @@ class Demonstrations(BaseModel):
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
     mode: Name
     count: Count
-    seed: Annotated[int, Field(ge=0)]
+    seed: Count
 
 
 class Cell(BaseModel):
@@ -211,8 +217,8 @@ class Cell(BaseModel):
     embodiment: Name
     variant: Name
     agent: Name
-    seed: Annotated[int, Field(ge=0)]
-    env_steps: Annotated[int, Field(gt=0)]
+    seed: Count
+    env_steps: Annotated[Count, Field(gt=0)]
     demonstrations: Demonstrations
 
     @property
@@ -233,7 +239,7 @@ class Provenance(_Block):
     python: Name
     platform: Name
     device: Name
-    torch_threads: Annotated[int, Field(ge=1)]
+    torch_threads: Annotated[Count, Field(ge=1)]
 
     @classmethod
     def collect(
@@ -313,7 +319,7 @@ class BasePolicy(_Measured):
     content_hash: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     base_success: Share | None = None
     episodes: Count | None = None
-    action_std: Annotated[float, Field(ge=0)] | None = None
+    action_std: Annotated[Finite, Field(ge=0)] | None = None
     solvable: Share | None = None
     draws: Count = 16
     training_seconds: Seconds | None = None
@@ -329,7 +335,7 @@ class FeasibleQ(_Block):
 
     low: Finite
     high: Finite
-    entropy_allowance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    entropy_allowance: Annotated[Finite, Field(ge=0)] = 0.0
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -341,11 +347,11 @@ class FeasibleQ(_Block):
 class Episodes(_Measured):
     """Evaluation episodes as columns of equal length; ManiSkill's metric names."""
 
-    seed: list[Annotated[int, Field(ge=0)]]
+    seed: list[Count]
     success_once: Flags
     success_at_end: Flags
     return_: list[Finite | None] = Field(alias="return")
-    episode_len: list[Annotated[int, Field(ge=1)]]
+    episode_len: list[Annotated[Count, Field(ge=1)]]
 
     @model_validator(mode="after")
     def _columns_agree(self) -> Self:
@@ -420,7 +426,7 @@ class RunRecord(_Block):
     provenance: Provenance
     continued: list[Provenance] = Field(default_factory=list)
     """Where the run was continued, as far as that differs from where it began."""
-    seeds: dict[Name, int]
+    seeds: dict[Name, Count]
     started: Moment
     ended: Moment | None = None
     status: Literal["running", "finished", "failed", "interrupted"] = "running"

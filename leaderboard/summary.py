@@ -15,17 +15,17 @@ import numpy as np
 from leaderboard.paths import record_files
 from leaderboard.records import Evaluation, Provenance, RunRecord, config_hash, read_record
 from leaderboard.statistics import (
-    Array,
+    Block,
     Interval,
     Sample,
     area_under_curve,
     area_weights,
     censored_median,
+    crossed_bootstrap,
     deepest_dip,
     paired_differences,
     steps_to_threshold,
     success_interval,
-    two_stage_bootstrap,
 )
 
 SYMMETRIC_EMBODIMENT = "floating"
@@ -40,7 +40,7 @@ AGENTS = (*REFERENCES, "standard", "standard-matched", "equivariant", "approxima
 """The order of the rows; agents that are not listed follow in alphabetical order."""
 
 MIN_SEEDS = 5
-"""Finished runs that a ranking and a verdict need."""
+"""Finished runs, or pairs of them, that a rank and a verdict need."""
 
 FINAL_WINDOW = 5
 """The final window is the last fifth of the budget."""
@@ -50,6 +50,10 @@ THRESHOLD = 0.8
 
 MACHINE = frozenset({"device", "threads", "torch_threads", "workers", "progress", "out"})
 """Configuration keys, at any depth, that may differ between runs of one row, as seeds may."""
+
+
+Pair = tuple[str, int]
+"""Content hash of the base policy and run seed."""
 
 
 def agent_rank(agent: str) -> tuple[int, str]:
@@ -67,6 +71,11 @@ class Run:
     @property
     def seed(self) -> int:
         return self.record.cell.seed
+
+    @property
+    def pair(self) -> Pair:
+        """What a run of another agent must share to be paired with this one."""
+        return self.record.base_policy.content_hash, self.seed
 
     @property
     def agent(self) -> str:
@@ -93,7 +102,7 @@ class Run:
     @cached_property
     def final_success(self) -> dict[int, float]:
         """success_once of the final evaluation by episode seed (empty before the end)."""
-        return _episodes(self.record.final) if self.record.final else {}
+        return episode_success(self.record.final) if self.record.final else {}
 
     @cached_property
     def window(self) -> dict[tuple[int, int], float]:
@@ -114,7 +123,7 @@ class Run:
         return {
             (evaluation.env_steps, seed): success
             for evaluation in inside
-            for seed, success in _episodes(evaluation).items()
+            for seed, success in episode_success(evaluation).items()
         }
 
     @property
@@ -129,13 +138,13 @@ class Run:
         return verdict if self.finished or verdict else None
 
     @cached_property
-    def rise(self) -> Array:
+    def rise(self) -> dict[int, float]:
         """Success in the last fifth of the budget minus that in the fifth before it.
 
-        An entry for each episode seed that both have; empty before the end.
+        By episode seed, for those that both have; empty before the end.
         """
         if not self.finished:
-            return np.array([])
+            return {}
         return paired_differences(self._in_fifth(FINAL_WINDOW), self._in_fifth(FINAL_WINDOW - 1))
 
     def _in_fifth(self, number: int) -> dict[int, float]:
@@ -144,7 +153,7 @@ class Run:
         for step, evaluation in self.curve.items():
             inside = 1 + FINAL_WINDOW * step // self.record.cell.env_steps
             if min(inside, FINAL_WINDOW) == number:
-                for seed, success in _episodes(evaluation).items():
+                for seed, success in episode_success(evaluation).items():
                     values[seed].append(success)
         return {seed: float(np.mean(successes)) for seed, successes in values.items()}
 
@@ -167,7 +176,8 @@ class Run:
         return next((value for value in values if value is not None), None)
 
 
-def _episodes(evaluation: Evaluation) -> dict[int, float]:
+def episode_success(evaluation: Evaluation) -> dict[int, float]:
+    """success_once by episode seed."""
     columns = evaluation.episodes
     return dict(zip(columns.seed, map(float, columns.success_once), strict=True))
 
@@ -355,11 +365,26 @@ def recipe_of(config: Mapping[str, Any]) -> str:
             return {
                 key: strip(item)
                 for key, item in value.items()
-                if key not in MACHINE and key != "seed" and not key.endswith("_seed")
+                if key not in MACHINE and not _is_seed(key)
             }
         return [strip(item) for item in value] if isinstance(value, list) else value
 
     return config_hash(strip(config))
+
+
+def seeds_of(config: Mapping[str, Any]) -> str:
+    """Hash of all seeds of a configuration: what tells the runs of a row apart."""
+
+    def keep(data: Mapping[str, Any]) -> dict[str, Any]:
+        nested = {key: keep(item) for key, item in data.items() if isinstance(item, Mapping)}
+        own = {key: item for key, item in data.items() if _is_seed(key)}
+        return {key: item for key, item in nested.items() if item} | own
+
+    return config_hash(keep(config))
+
+
+def _is_seed(key: str) -> bool:
+    return key == "seed" or key.endswith("_seed")
 
 
 def summarize(runs: Sequence[Run]) -> Summary:
@@ -375,10 +400,11 @@ def summarize(runs: Sequence[Run]) -> Summary:
 
 def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
     """Keep, for each cell, the finished record, the newest of several; set the others aside."""
-    cells: dict[tuple[Key, str, str, int], list[Run]] = defaultdict(list)
+    cells: dict[tuple[Key, str, str, str], list[Run]] = defaultdict(list)
     for run in runs:
         record = run.record
-        cells[Key.of(record), run.agent, recipe_of(record.config), run.seed].append(run)
+        recipe = recipe_of(record.config)
+        cells[Key.of(record), run.agent, recipe, seeds_of(record.config)].append(run)
     chosen, set_aside = [], []
     for cell in sorted(cells):
         candidates = sorted(
@@ -435,13 +461,18 @@ def _fill(row: Row, budget: int) -> None:
     """Compute the numbers of a row that need no other row."""
     if not row.finished:
         return
-    row.success = success_interval([list(run.window.values()) for run in row.finished])
-    row.last = success_interval([list(run.final_success.values()) for run in row.finished])
-    rises = [run.rise for run in row.finished if run.rise.size and not row.is_reference]
-    row.rise = two_stage_bootstrap(rises) if rises else None
+    row.success = success_interval([_pooled(run.window) for run in row.finished])
+    row.last = success_interval([Sample.pooled(run.final_success.items()) for run in row.finished])
+    rises = [run.rise for run in row.finished if run.rise and not row.is_reference]
+    row.rise = crossed_bootstrap([Sample.pooled(r.items()) for r in rises]) if rises else None
     if row.search_steps is None:
         areas = [area_under_curve(*_points(run), budget) for run in row.finished]
         row.area = float(np.mean(areas))
+
+
+def _pooled(window: Mapping[tuple[int, int], float]) -> Sample:
+    """Values by (env_steps, episode seed) as one block."""
+    return Sample.pooled((seed, value) for (_, seed), value in window.items())
 
 
 def _threshold(rows: Sequence[Row]) -> float | None:
@@ -457,9 +488,9 @@ def _against_base(row: Row, base: Row) -> None:
     for run in row.finished:
         reference = reference_success(run, base.finished)
         below = [
-            differences.mean()
+            float(np.mean(list(differences.values())))
             for evaluation in run.curve.values()
-            if (differences := paired_differences(_episodes(evaluation), reference)).size
+            if (differences := paired_differences(episode_success(evaluation), reference))
         ]
         if below:
             dips.append(deepest_dip(below))
@@ -485,18 +516,15 @@ def reference_success(run: Run, references: Sequence[Run]) -> dict[int, float]:
     return {seed: float(np.mean(successes)) for seed, successes in values.items()}
 
 
-def success_pairs(first: Row, second: Row) -> dict[int, Sample]:
-    """Differences of final-window success, first minus second, by run seed.
+def success_pairs(first: Row, second: Row) -> dict[Pair, Sample]:
+    """Differences of final-window success, first minus second, by pair of runs.
 
     Two learners are paired by run seed on the same base policy, then by (env_steps, episode seed);
     with a reference, which is evaluated once, the episode seed alone pairs (`reference_success`).
     """
     if first.is_reference and not second.is_reference:
         reverse = success_pairs(second, first)
-        return {
-            seed: Sample(tuple(-block for block in sample.blocks), sample.weights)
-            for seed, sample in reverse.items()
-        }
+        return {pair: sample.negated() for pair, sample in reverse.items()}
     pairs = {}
     for run in first.finished:
         if second.is_reference:
@@ -505,14 +533,13 @@ def success_pairs(first: Row, second: Row) -> dict[int, Sample]:
         else:
             partner = _partner(run, second)
             other = partner.window if partner else {}
-        differences = paired_differences(run.window, other)
-        if differences.size:
-            pairs[run.seed] = Sample.of(differences)
+        if differences := paired_differences(run.window, other):
+            pairs[run.pair] = _pooled(differences)
     return pairs
 
 
-def area_pairs(first: Row, second: Row, budget: int) -> dict[int, Sample]:
-    """Differences of the area under the curve, first minus second, by run seed.
+def area_pairs(first: Row, second: Row, budget: int) -> dict[Pair, Sample]:
+    """Differences of the area under the curve, first minus second, by pair of runs.
 
     Over the evaluations (env_steps) that both runs have, on the episodes that both have there.
     """
@@ -520,48 +547,42 @@ def area_pairs(first: Row, second: Row, budget: int) -> dict[int, Sample]:
     for run in first.finished:
         partner = _partner(run, second)
         other = partner.curve if partner else {}
-        blocks: dict[int, Array] = {}
+        blocks: dict[int, Block] = {}
         for step, evaluation in run.curve.items():
             if step in other:
-                found = paired_differences(_episodes(evaluation), _episodes(other[step]))
-                blocks |= {step: found} if found.size else {}
+                found = paired_differences(
+                    episode_success(evaluation), episode_success(other[step])
+                )
+                if found:
+                    blocks[step] = Sample.pooled(found.items()).blocks[0]
         if blocks:
             weights = area_weights(list(blocks), budget)
-            pairs[run.seed] = Sample(tuple(blocks.values()), weights)
+            pairs[run.pair] = Sample(tuple(blocks.values()), weights)
     return pairs
 
 
 def _partner(run: Run, row: Row) -> Run | None:
     """The row's run with the same seed on the same base policy: on another one, success differs."""
-    policy = run.record.base_policy.content_hash
-    return next(
-        (
-            other
-            for other in row.finished
-            if other.seed == run.seed and other.record.base_policy.content_hash == policy
-        ),
-        None,
-    )
+    return next((other for other in row.finished if other.pair == run.pair), None)
 
 
 def compare(first: Row, second: Row) -> Interval | None:
     """Paired difference of final-window success; None without common episodes."""
     pairs = success_pairs(first, second)
-    return two_stage_bootstrap(list(pairs.values())) if pairs else None
+    return crossed_bootstrap(list(pairs.values())) if pairs else None
 
 
 def _rank(rows: Sequence[Row]) -> None:
-    """Rank learning agents with enough seeds: 1 + the number of rows that are clearly better.
+    """Rank learning agents: 1 + the number of rows that are clearly better.
 
-    A row that can be compared with no other one (on the same base policy) gets no rank.
+    Two rows are compared if they have `MIN_SEEDS` pairs of runs, with the same seed on the same
+    base policy; a row that can be compared with no other one gets no rank.
     """
-    candidates = [row for row in rows if not row.is_reference and len(row.finished) >= MIN_SEEDS]
-    if len(candidates) < 2:
-        return
-    for first, second in combinations(candidates, 2):
-        found = compare(first, second)
-        if found is None:
+    for first, second in combinations([row for row in rows if not row.is_reference], 2):
+        pairs = success_pairs(first, second)
+        if len(pairs) < MIN_SEEDS:
             continue
+        found = crossed_bootstrap(list(pairs.values()))
         first.rank, second.rank = first.rank or 1, second.rank or 1
         if found.sign:
             worse = second if found.sign > 0 else first

@@ -354,5 +354,6 @@ def _csv_cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     text = str(value)
-    # A spreadsheet would run a text that starts like a formula.
-    return f"'{text}" if isinstance(value, str) and text[:1] in ("=", "+", "-", "@") else text
+    # A spreadsheet would run a text that starts like a formula, also behind blanks.
+    formula = isinstance(value, str) and text.lstrip()[:1] in ("=", "+", "-", "@")
+    return f"'{text}" if formula else text

@@ -16,7 +16,7 @@ from record_factory import LEARNING, make_curve, make_evaluation, make_record
 from leaderboard import __main__ as command
 from leaderboard.admission import RULES, Verdict, check
 from leaderboard.errors import RecordError
-from leaderboard.records import HELD_OUT_SEED, RunRecord, write_record
+from leaderboard.records import HELD_OUT_SEED, RunRecord, config_hash, write_record
 
 REPOSITORY = Path(__file__).parents[2]
 COMMIT = subprocess.run(
@@ -34,6 +34,9 @@ def admissible(agent: str = "standard", seed: int = 0, **config: Any) -> RunReco
         evaluation.episodes.seed = [HELD_OUT_SEED + i for i in range(number)]
     record = make_record(curve, agent=agent, seed=seed, **config)
     record.provenance.commit = COMMIT or record.provenance.commit
+    cell = record.cell
+    variant = cell.variant.replace(":", "=")
+    record.run_id = f"{cell.task}-{cell.embodiment}-{variant}-{agent}-s{seed}-0123456789ab"
     return record
 
 
@@ -55,8 +58,8 @@ def test_five_seeds_are_admitted_without_a_word(tmp_path: Path) -> None:
     verdicts = judge(*five(tmp_path), store(admissible("base"), tmp_path))
     assert all(verdict.is_admissible and not verdict.notes for verdict in verdicts)
     assert [verdict.path.name for verdict in verdicts][:2] == [
-        "run-none-standard-0.json",
-        "run-none-standard-1.json",
+        "PickCube-v1-floating-none-standard-s0-0123456789ab.json",
+        "PickCube-v1-floating-none-standard-s1-0123456789ab.json",
     ]
 
 
@@ -112,6 +115,20 @@ def wrong_budget(record: RunRecord) -> None:
     record.budget.env_steps += 8
 
 
+def hundred_budgets(record: RunRecord) -> None:
+    record.evaluations[-1].env_steps = record.budget.env_steps = 5_000_000
+
+
+def another_agent(record: RunRecord) -> None:
+    config = record.config | {"agent": "equivariant"}
+    # Both at once: in between, the hash is wrong, which is refused.
+    record.__dict__.update(config=config, config_hash=config_hash(config))
+
+
+def another_seed(record: RunRecord) -> None:
+    record.seeds["run"] = 77
+
+
 def machine_path(record: RunRecord) -> None:
     record.base_policy.warning = "trained in /home/somebody/runs/base"
 
@@ -134,6 +151,9 @@ def windows_path(record: RunRecord) -> None:
         (chosen_seeds_on_the_way, r"the evaluation at step 25000 is not on the held-out seeds"),
         (half_the_budget, r"the run ended after 25000 of the 50000 environment steps"),
         (wrong_budget, r"stands at step 50000, but the run used 50008: run it again"),
+        (hundred_budgets, r"the run used 5000000 environment steps, more than the 50000"),
+        (another_agent, r"is named PickCube-v1-floating-none-standard-s2-.*-equivariant-s2: take"),
+        (another_seed, r"the run drew from seed 77, but its configuration says 2: take"),
         (machine_path, r"/home/somebody/runs/base' holds a path of the machine: leave it out"),
         (windows_path, r"holds a path of the machine"),
     ],
@@ -145,14 +165,14 @@ def test_each_rule_alone(tmp_path: Path, spoil: Callable[[RunRecord], None], sen
     paths[2].unlink()
     store(record, tmp_path)
     verdicts = judge(*paths)
-    assert [verdict.is_admissible for verdict in verdicts] == [True, True, False, True, True]
+    assert sum(verdict.is_admissible for verdict in verdicts) == 4
     assert len(verdicts[2].problems) == 1
     assert re.search(sentence, verdicts[2].problems[0])
 
 
 def test_every_rule_is_tested() -> None:
     """A rule that joins the list needs a line above."""
-    assert len(RULES) == 6
+    assert len(RULES) == 7
 
 
 def edit(path: Path, **changes: Any) -> None:
@@ -164,7 +184,8 @@ def test_a_file_under_another_name(tmp_path: Path) -> None:
     moved = paths[0].rename(tmp_path / "record.json")
     verdict = judge(moved, *paths[1:])[0]
     assert verdict.problems == [
-        "the file must be named after its run: rename it to run-none-standard-0.json."
+        "the file must be named after its run: rename it to "
+        "PickCube-v1-floating-none-standard-s0-0123456789ab.json."
     ]
 
 
@@ -202,13 +223,14 @@ def test_duplicates(tmp_path: Path) -> None:
     again.wall_clock.total += 1
     data = admissible(seed=3).model_dump(by_alias=True, exclude={"config_hash"})
     data["config"] |= {"seed": 8}
-    renamed = RunRecord.model_validate(data | {"run_id": "eight"})
+    data["seeds"]["run"] = 8
+    renamed = RunRecord.model_validate(data | {"run_id": data["run_id"].replace("-s3-", "-s8-")})
     fresh = store(admissible(seed=9), new)
     verdicts = judge(copy, store(again, new), store(renamed, new), fresh, committed=committed)
     assert [verdict.problems for verdict in verdicts] == [
         [f"it is a copy of {old[1]}: remove one of the two."],
         [
-            f"{old[2]} holds the same configuration and seed already: remove one of the two "
+            f"{old[2]} holds the same configuration and seeds already: remove one of the two "
             "(to replace a committed record, say why in the pull request)."
         ],
         [
@@ -217,6 +239,10 @@ def test_duplicates(tmp_path: Path) -> None:
         ],
         [],
     ]
+    assert verdicts[3].notes[-1] == (
+        "its seed 9 is none of those of the committed runs of its table (0, 1, 2, 3, 4): agents "
+        "are compared on equal seeds."
+    )
     assert all(verdict.is_admissible for verdict in judge(*old, committed=committed))
     twice = judge(fresh, store(admissible(seed=9), new, "other.json"))
     assert [verdict.is_admissible for verdict in twice] == [True, False]
@@ -246,11 +272,11 @@ def test_another_base_policy_is_said(tmp_path: Path) -> None:
         return store(record, new)
 
     learner = on_another_policy("standard", 7)
-    note = judge(learner, committed=committed)[0].notes[0]
+    note = judge(learner, committed=committed)[0].notes[1]
     assert "base policy abababababab is not that of the committed runs" in note
     assert "submit base, zero" in note
     verdicts = judge(learner, on_another_policy("base", 0), committed=committed)
-    assert "submit zero" in verdicts[0].notes[0]
+    assert "submit zero" in verdicts[0].notes[1]
     # A table of its own has nothing to agree with.
     elsewhere = store(admissible(task="PushCube-v1", seed=3), new, "elsewhere.json")
     assert not any("base policy" in n for n in judge(elsewhere, committed=committed)[0].notes)

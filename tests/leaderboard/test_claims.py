@@ -19,7 +19,9 @@ NAMES = (
     "faster than standard",
     "faster than standard-matched",
     "divergence",
+    "divergence, matched",
     "bias",
+    "bias, matched",
     "fewest demonstrations",
     "fewer demonstrations",
     "slope, area",
@@ -129,6 +131,8 @@ def test_divergence_counts_seeds() -> None:
     assert (value(claim), claim.verdict) == (0.0, "undecided")
     claim = found(diverging("standard", []) + diverging("equivariant", range(5)))["divergence"]
     assert claim.verdict == "contradicted"
+    matched = diverging("standard-matched", range(5)) + diverging("equivariant", [])
+    assert found(matched)["divergence, matched"].verdict == "supported"
 
 
 def test_the_bias_of_q_counts_by_its_size_in_the_final_window() -> None:
@@ -148,6 +152,16 @@ def test_the_bias_of_q_counts_by_its_size_in_the_final_window() -> None:
     assert (claim.verdict, claim.seeds) == ("supported", 5)
     claim = found(biased("standard", near) + biased("equivariant", far))["bias"]
     assert claim.verdict == "contradicted"
+    claim = found(biased("standard-matched", far) + biased("equivariant", near))["bias, matched"]
+    assert value(claim) == pytest.approx(4.0)
+
+
+def test_q_is_compared_on_the_same_base_policy() -> None:
+    others = diverging("equivariant", [])
+    for record in others:
+        record.base_policy.content_hash = "f" * 64
+    tests = found(diverging("standard", range(5)) + others)
+    assert tests["divergence"].effect is tests["bias"].effect is None
 
 
 def test_runs_that_broke_off_after_diverging_count() -> None:

@@ -81,6 +81,12 @@ def test_numbers_that_are_not_finite_become_flagged_nulls(tmp_path: Path) -> Non
     assert read_record(path) == record
 
 
+def test_numbers_beyond_single_precision_are_infinite() -> None:
+    evaluation = make_evaluation([1], q_mean=1e300, q_min=-1e300, q_max=3.4e38)
+    assert evaluation.diagnostics == {"q_mean": None, "q_min": None, "q_max": 3.4e38}
+    assert evaluation.nonfinite == {"diagnostics/q_mean": "inf", "diagnostics/q_min": "-inf"}
+
+
 def test_a_flag_without_its_null_is_refused() -> None:
     data = make_evaluation([1], q_mean=1.0).model_dump(by_alias=True)
     for path in ("diagnostics/q_mean", "diagnostics/nothing", "episodes/return/9"):
@@ -279,6 +285,11 @@ EDITS: list[tuple[str, Any, str]] = [
     ("provenance/secret", 1, "secret"),
     ("parameters/actor", "many", "actor"),
     ("parameters/actor", -1, "actor"),
+    ("parameters/actor", 10**400, "actor"),
+    ("budget/env_steps", 2**53 + 1, "env_steps"),
+    ("seeds/run", -1, "seeds"),
+    ("wall_clock/total", 1e300, "total"),
+    ("feasible_q/high", 1e300, "high"),
     ("wall_clock/total", -1.0, "total"),
     ("base_policy/base_success", 1.5, "base_success"),
     ("base_policy/content_hash", "abc", "content_hash"),

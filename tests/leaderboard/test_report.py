@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 import subprocess
 import sys
@@ -14,8 +15,11 @@ import pytest
 from record_factory import LEARNING, make_curve, make_evaluation, make_record
 
 from leaderboard.__main__ import main
+from leaderboard.figures import render_figures
+from leaderboard.findings import analyse
 from leaderboard.records import read_record, write_record
 from leaderboard.report import DEFAULT_RECORDS, generate, slug
+from leaderboard.summary import Run, summarize
 from leaderboard.text import code, compact, count, number, relative_link
 
 REPOSITORY = Path(__file__).parents[2]
@@ -347,3 +351,40 @@ def test_committed_records_are_valid_and_name_no_machine() -> None:
         read_record(path)
         found = re.search(r"/(home|root|tmp|work|Users|mnt)/", path.read_text())
         assert found is None, f"{path.name} names a folder of a machine"
+
+
+def test_the_largest_numbers_are_drawn(tmp_path: Path) -> None:
+    """What a record may hold at most, so that no record can keep the page from being made."""
+    extremes = {"q_mean": 3.4e38, "q_min": -1e39, "q_max": 1e39, "q_abs_max": 1e39}
+    for seed in range(2):
+        curve = [
+            make_evaluation([1, 0], steps, steps == 2**53, q_bias=-1e39, **extremes)
+            for steps in (0, 2**52, 2**53)
+        ]
+        record = make_record(curve, seed=seed, env_steps=2**53)
+        record.parameters.actor = record.parameters.total = 2**53
+        record.wall_clock.total = float(2**53)
+        write_record(record, tmp_path / "runs" / str(seed) / "record.json")
+    assert main([str(tmp_path / "runs"), "--out", str(tmp_path / "board")]) == 0
+
+
+def test_a_cross_marks_a_q_that_is_not_finite_and_no_missing_bias() -> None:
+    def crosses(**diagnostics: float) -> int:
+        curve = [make_evaluation([1, 0], 25_000, False, q_mean=-5.0, q_max=-4.0)]
+        curve.append(make_evaluation([1, 0], 50_000, q_mean=-5.0, **diagnostics))
+        summary = summarize([Run(Path("a.json"), make_record(curve))])
+        (drawing,) = (d for d in render_figures(summary, analyse(summary, {})) if d.kind == "q")
+        lines = [line for ax in drawing.figure.axes for line in ax.lines]
+        return sum(line.get_marker() == "x" for line in lines)
+
+    assert crosses(q_max=math.inf) == 1
+    assert crosses(q_max=-4.0, q_bias=math.nan) == 0
+
+
+def test_a_formula_stays_text_in_the_csv(tmp_path: Path) -> None:
+    for index, agent in enumerate(("=1+1", "\t=1+1", " @SUM(1)")):
+        write_record(make_record(agent=agent), tmp_path / "runs" / str(index) / "record.json")
+    generate([tmp_path / "runs"], tmp_path / "board")
+    with open(tmp_path / "board" / "leaderboard.csv", newline="") as file:
+        agents = [row["agent"] for row in csv.DictReader(file)]
+    assert sorted(agents) == ["'\t=1+1", "' @SUM(1)", "'=1+1"]

@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from leaderboard.statistics import (
+    Array,
     Interval,
     Sample,
     area_under_curve,
     area_weights,
     censored_median,
+    crossed_bootstrap,
     deepest_dip,
+    episode_weights,
     iqm,
     mean,
     newcombe,
     paired_differences,
     performance_profile,
     probability_of_improvement,
+    small_sample_factor,
     steps_to_threshold,
     stratified_bootstrap,
     success_interval,
-    two_stage_bootstrap,
     wilson,
 )
 
@@ -43,79 +47,140 @@ def test_wilson_has_its_textbook_values() -> None:
     assert wilson(81, 263) == pytest.approx((0.25527, 0.36621), abs=1e-4)
 
 
+def of(values: Iterable[float], first_seed: int = 0) -> Sample:
+    """A run's episodes with the seeds `first_seed`, `first_seed` + 1, ..."""
+    return Sample.pooled(enumerate(map(float, values), first_seed))
+
+
+def width(interval: Interval) -> float:
+    return interval.high - interval.low
+
+
 def test_one_seed_gives_the_interval_of_its_episodes() -> None:
-    episodes = np.repeat([0.0, 1.0], [40, 60])
-    interval = two_stage_bootstrap([episodes])
+    interval = crossed_bootstrap([of(np.repeat([0.0, 1.0], [40, 60]))])
     assert interval.value == 0.6
-    # The bootstrap of one Bernoulli sample is a binomial count divided by n.
-    normal = 1.96 * np.sqrt(0.6 * 0.4 / 100)
-    assert interval.low == pytest.approx(0.6 - normal, abs=0.015)
-    assert interval.high == pytest.approx(0.6 + normal, abs=0.015)
+    # The Bayesian bootstrap of one Bernoulli sample is a Beta distribution.
+    low, high = stats.beta(60, 40).ppf((0.025, 0.975))
+    assert (interval.low, interval.high) == (
+        pytest.approx(low, abs=0.01),
+        pytest.approx(high, abs=0.01),
+    )
 
 
-def test_the_bootstrap_equals_its_enumeration() -> None:
-    """Two seeds of two episodes have 4 x 4 resamples of seeds and episodes that can be listed."""
-    samples = [[0.0, 1.0], [1.0, 2.0]]
-    outcomes = []
-    for first, second in itertools.product(samples, repeat=2):
-        means = [np.mean(draw) for draw in itertools.product(first, repeat=2)]
-        others = [np.mean(draw) for draw in itertools.product(second, repeat=2)]
-        outcomes += [(m + n) / 2 for m, n in itertools.product(means, others)]
-    low, high = np.quantile(outcomes, (0.025, 0.975))
-    interval = two_stage_bootstrap(samples, mean, resamples=200_000)
-    assert interval.value == 1.0
-    assert (interval.low, interval.high) == (pytest.approx(low), pytest.approx(high))
+def test_drawing_runs_equals_its_enumeration() -> None:
+    """Numbers without episodes: 3^3 resamples of three runs can be listed."""
+    values = np.array([0.0, 1.0, 5.0])
+    drawn = np.array([np.mean(draw) for draw in itertools.product(values, repeat=3)])
+    widened = 2 + small_sample_factor(3, 2) * (drawn - 2)
+    expected = np.quantile(widened, (0.025, 0.975), method="inverted_cdf")
+    interval = crossed_bootstrap([Sample.constant(v) for v in values], mean, resamples=200_000)
+    assert interval.value == 2.0
+    assert (interval.low, interval.high) == pytest.approx(tuple(expected))
 
 
-def test_the_interval_covers_the_truth_at_least_as_often_as_it_says() -> None:
-    generator = np.random.default_rng(3)
-    covered = 0
-    for trial in range(200):
-        rates = np.clip(generator.normal(0.5, 0.08, size=5), 0, 1)
-        samples = [generator.random(60) < rate for rate in rates]
-        interval = two_stage_bootstrap(samples, resamples=400, seed=trial)
-        covered += interval.low <= 0.5 <= interval.high
-    assert covered >= 0.93 * 200
+def test_five_runs_without_episodes_get_students_interval() -> None:
+    """The mean of normal numbers is where the exact interval is known."""
+    generator = np.random.default_rng(0)
+    ratios = []
+    for seed in range(40):
+        values = generator.standard_normal(5)
+        exact = stats.t(4, values.mean(), stats.sem(values)).interval(0.95)
+        found = crossed_bootstrap([Sample.constant(v) for v in values], mean, seed=seed)
+        ratios.append(width(found) / (exact[1] - exact[0]))
+    assert np.mean(ratios) == pytest.approx(1, abs=0.03)
+
+
+def test_an_episode_weighs_the_same_for_all_runs() -> None:
+    """Five copies of one evaluation say no more than one of them; other episodes would."""
+    outcomes = np.repeat([0.0, 1.0], 50)
+    one = crossed_bootstrap([of(outcomes)])
+    copies = crossed_bootstrap([of(outcomes)] * 5)
+    assert (copies.low, copies.high) == pytest.approx((one.low, one.high))
+    apart = crossed_bootstrap([of(outcomes, 1000 * run) for run in range(5)])
+    assert width(apart) < 0.85 * width(copies)
+    # The same episodes in two evaluations of one run say no more, either.
+    twice = crossed_bootstrap([Sample.pooled([*enumerate(outcomes), *enumerate(outcomes)])])
+    assert (twice.low, twice.high) == pytest.approx((one.low, one.high))
+
+
+def test_a_shared_difficulty_cancels_in_differences() -> None:
+    """Episode weights are common, so that only what differs between two agents varies."""
+    generator = np.random.default_rng(4)
+    hard = generator.random(100)
+    runs = [of(hard + 0.1 + 0.001 * generator.standard_normal(100)) for _ in range(5)]
+    assert width(crossed_bootstrap(runs)) > 0.05
+    differences = [of(block.totals - hard) for sample in runs for block in sample.blocks]
+    assert width(crossed_bootstrap(differences)) < 0.001
+
+
+@pytest.mark.parametrize("statistic", [mean, iqm])
+@pytest.mark.parametrize("seeds", [0.0, 0.06, 0.2])
+@pytest.mark.parametrize("episodes", [0.0, 0.3])
+def test_the_interval_misses_the_truth_in_at_most_one_of_twenty(
+    statistic: Callable[..., Array], seeds: float, episodes: float
+) -> None:
+    """Differences of two agents over 5 seeds and 100 shared episodes, with no true effect.
+
+    The standard deviations span those of the committed runs: over seeds, over episodes (initial
+    states that suit one of the agents), and what is left.
+    """
+    generator = np.random.default_rng(1)
+    trials, missed = 300, 0
+    for trial in range(trials):
+        table = seeds * generator.standard_normal((5, 1)) + 0.4 * generator.standard_normal(
+            (5, 100)
+        )
+        table += episodes * generator.standard_normal(100)
+        samples = [of(row, 100 * trial) for row in table]
+        missed += crossed_bootstrap(samples, statistic, resamples=400, seed=trial).sign != 0
+    # Up to 0.05 + three standard errors of such a share.
+    assert missed <= stats.binom(trials, 0.05).ppf(0.999)
 
 
 def test_spread_over_seeds_widens_the_interval() -> None:
-    same = [np.repeat([0.0, 1.0], 50)] * 4
-    apart = [np.repeat([0.0, 1.0], [100 - k, k]) for k in (10, 40, 60, 90)]
-    narrow, wide = two_stage_bootstrap(same), two_stage_bootstrap(apart)
+    same = [of(np.repeat([0.0, 1.0], 50))] * 4
+    apart = [of(np.repeat([0.0, 1.0], [100 - k, k])) for k in (10, 40, 60, 90)]
+    narrow, wide = crossed_bootstrap(same), crossed_bootstrap(apart)
     assert narrow.value == wide.value == 0.5
-    assert wide.high - wide.low > 2 * (narrow.high - narrow.low)
+    assert width(wide) > 2 * width(narrow)
 
 
 def test_the_bootstrap_is_seeded_and_needs_samples() -> None:
-    samples = [np.random.default_rng(i).random(30) for i in range(3)]
-    assert two_stage_bootstrap(samples) == two_stage_bootstrap(samples)
-    assert two_stage_bootstrap(samples) != two_stage_bootstrap(samples, seed=1)
-    for bad in ([], [[]], [[1.0], []]):
+    samples = [of(np.random.default_rng(i).random(30)) for i in range(3)]
+    assert crossed_bootstrap(samples) == crossed_bootstrap(samples)
+    assert crossed_bootstrap(samples) != crossed_bootstrap(samples, seed=1)
+    for bad in ([], [of([])], [of([1.0]), of([])]):
         with pytest.raises(ValueError, match="episode"):
-            two_stage_bootstrap(bad)
+            crossed_bootstrap(bad)
 
 
 def test_unanimous_episodes_get_wilsons_interval() -> None:
-    interval = success_interval([[1.0] * 50, [1.0] * 50])
-    assert (interval.low, interval.high) == wilson(100, 100)
+    interval = success_interval([of([1.0] * 50), of([1.0] * 50)])
+    assert (interval.low, interval.high) == wilson(50, 50)
     assert interval.value == 1.0
-    assert interval.low < 0.97
+    assert success_interval([of([0.0] * 50)]) == Interval(0.0, *wilson(0, 50))
+
+
+def test_success_stays_a_share() -> None:
+    rates = (100, 100, 99, 98, 60)
+    interval = success_interval([of(np.repeat([0.0, 1.0], [100 - k, k])) for k in rates])
+    assert 0 < interval.low < interval.value < interval.high == 1
 
 
 def test_paired_differences_use_common_seeds_only() -> None:
     first, second = {3: 1.0, 1: 1.0, 2: 0.0, 9: 1.0}, {1: 0.0, 2: 1.0, 3: 1.0, 7: 1.0}
-    assert sorted(paired_differences(first, second)) == [-1.0, 0.0, 1.0]
-    assert paired_differences(first, {}).size == 0
+    assert paired_differences(first, second) == {1: 1.0, 2: -1.0, 3: 0.0}
+    assert paired_differences(first, {}) == {}
 
 
 def test_pairing_narrows_the_interval() -> None:
     generator = np.random.default_rng(0)
     easy = generator.random(200) < 0.5
     better = easy | (generator.random(200) < 0.1)
-    paired = two_stage_bootstrap([better.astype(float) - easy])
-    unpaired = two_stage_bootstrap([better.astype(float) - generator.permutation(easy)])
+    paired = crossed_bootstrap([of(better.astype(float) - easy)])
+    unpaired = crossed_bootstrap([of(better.astype(float) - generator.permutation(easy))])
     assert paired.sign == 1
-    assert paired.high - paired.low < 0.6 * (unpaired.high - unpaired.low)
+    assert width(paired) < 0.6 * width(unpaired)
 
 
 def test_signs_say_whether_zero_is_excluded() -> None:
@@ -173,27 +238,49 @@ def test_area_weights_give_the_area() -> None:
 
 
 def test_a_sample_weighs_its_blocks() -> None:
-    sample = Sample((np.array([0.0, 1.0]), np.array([1.0, 1.0, 0.0, 0.0])), (0.25, 0.75))
-    assert sample.value == pytest.approx(0.5)
-    draws = sample.draw(200_000, np.random.default_rng(0))
+    first, second = of([0.0, 1.0]).blocks[0], of([1.0, 1.0, 0.0, 0.0], 10).blocks[0]
+    sample = Sample((first, second), (0.25, 0.75))
+    assert sample.value == pytest.approx(0.25 * 0.5 + 0.75 * 0.5)
+    assert sample.negated().value == -sample.value
+    draws = sample.draw(200_000)
     assert draws.mean() == pytest.approx(0.5, abs=2e-3)
-    expected = 0.25**2 * 0.25 / 2 + 0.75**2 * 0.25 / 4
+    # Dirichlet weights: p (1 - p) / (n + 1).
+    expected = 0.25**2 * 0.25 / 3 + 0.75**2 * 0.25 / 5
     assert draws.var() == pytest.approx(expected, rel=0.02)
-    split = Sample((np.array([0.0, 1.0]), np.array([0.0, 1.0])), (0.5, 0.5))
-    one = two_stage_bootstrap([split, split], resamples=20_000)
-    whole = two_stage_bootstrap([[0.0, 0.0, 1.0, 1.0]] * 2, resamples=20_000)
-    assert one.high - one.low == pytest.approx(whole.high - whole.low, abs=0.03)
+    # Blocks of the same episodes move together: half of each is one of them.
+    split = Sample((first, first), (0.5, 0.5))
+    np.testing.assert_allclose(split.draw(1000), of([0.0, 1.0]).draw(1000))
+
+
+def test_a_block_pools_the_evaluations_of_an_episode() -> None:
+    sample = Sample.pooled([(7, 1.0), (8, 0.0), (7, 0.0), (7, 1.0)])
+    block = sample.blocks[0]
+    assert (block.seeds, block.totals.tolist(), block.counts.tolist()) == ((7, 8), [2, 0], [3, 1])
+    assert sample.value == 0.5
+    weights = [episode_weights(seed, 10) for seed in block.seeds]
+    expected = 2 * weights[0] / (3 * weights[0] + weights[1])
+    np.testing.assert_allclose(sample.draw(10), expected)
 
 
 def test_cells_are_averaged_and_not_drawn() -> None:
     """Two cells without any spread of their own, far apart: the mean has no width."""
-    apart = stratified_bootstrap([[[1.0, 1.0]] * 5, [[0.0, 0.0]] * 3])
-    assert apart == Interval(0.5, 0.5, 0.5)
+    apart = stratified_bootstrap([[of([1.0, 1.0])] * 5, [of([0.0, 0.0])] * 3])
+    assert (apart.value, apart.low, apart.high) == pytest.approx((0.5, 0.5, 0.5))
     generator = np.random.default_rng(1)
-    cells = [[(generator.random(50) < 0.5).astype(float) for _ in range(5)] for _ in range(4)]
-    one, four = stratified_bootstrap(cells[:1]), stratified_bootstrap(cells)
-    assert four.high - four.low == pytest.approx((one.high - one.low) / 2, rel=0.35)
-    assert four.value == pytest.approx(np.mean(cells))
+
+    def cell(first_seed: int) -> list[Sample]:
+        return [of(generator.random(50) < 0.5, first_seed) for _ in range(5)]
+
+    cells = [cell(100 * k) for k in range(4)]
+    ones = [width(stratified_bootstrap([c])) for c in cells]
+    four = stratified_bootstrap(cells)
+    # Twice as narrow, and more so because twenty runs know their spread better than five.
+    factors = small_sample_factor(5, 16) / small_sample_factor(5, 4)
+    assert factors / 2 * np.mean(ones) * 0.8 < width(four) < np.mean(ones) / 2 * 1.15
+    assert four.value == pytest.approx(np.mean([sample.value for c in cells for sample in c]))
+    # The same episodes in every cell are drawn once: they do not average out.
+    shared = stratified_bootstrap([[of(np.repeat([0.0, 1.0], 25))] * 5] * 4)
+    assert width(shared) == pytest.approx(width(crossed_bootstrap([of(np.repeat([0.0, 1.0], 25))])))
     with pytest.raises(ValueError, match="cell"):
         stratified_bootstrap([])
 
@@ -261,9 +348,11 @@ def test_statistics_agree_with_rliable() -> None:
 
     column = first[:, [0]]
     value, ends = intervals(column, lambda x: np.array([metrics.aggregate_iqm(x)]))
-    ours = two_stage_bootstrap([[run] for run in column[:, 0]], iqm, resamples=10_000)
+    ours = crossed_bootstrap([Sample.constant(run) for run in column[:, 0]], iqm, resamples=10_000)
     assert ours.value == pytest.approx(value)
-    assert (ours.low, ours.high) == pytest.approx(ends, abs=0.015)
+    # Theirs without the widening for five runs.
+    narrow = [value + (end - value) / small_sample_factor(5, 4) for end in (ours.low, ours.high)]
+    assert narrow == pytest.approx(ends, abs=0.015)
 
     value, ends = intervals((first, second), metrics.probability_of_improvement)
     ours = probability_of_improvement(list(zip(first.T, second.T, strict=True)))

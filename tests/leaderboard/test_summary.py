@@ -15,7 +15,9 @@ from leaderboard.errors import RecordError
 from leaderboard.findings import analyse
 from leaderboard.page import render_page
 from leaderboard.records import Evaluation, RunRecord, config_hash, write_record
+from leaderboard.statistics import Sample
 from leaderboard.summary import (
+    Pair,
     Row,
     Run,
     Summary,
@@ -222,11 +224,11 @@ def test_the_rise_compares_the_last_two_fifths_on_the_same_episodes() -> None:
         (29_999, [1, 1, 1]), (30_000, [0, 0]), (39_999, [1, 0]), (40_000, [1, 1]), (50_000, [1] * 4)
     )
     learner = run(make_record(curve))
-    assert sorted(learner.rise) == [0.5, 1.0]
+    assert learner.rise == {100: 0.5, 101: 1.0}
     standard = row(summarize([learner]), "standard")
     assert standard.rise is not None
     assert standard.rise.value == pytest.approx(0.75)
-    assert not run(make_record(curve, "interrupted")).rise.size
+    assert not run(make_record(curve, "interrupted")).rise
     without = points((0, [0, 0]), (50_000, [1, 1]))
     assert row(summarize([run(make_record(without))]), "standard").rise is None
     assert row(summarize([run(make_record(curve, agent="zero"))]), "zero").rise is None
@@ -251,17 +253,25 @@ def test_learners_are_paired_by_step_and_episode_references_by_episode() -> None
     second = make_record(points((40_000, [0, 0]), (50_000, [0, 1, 1])), agent="standard")
     base = make_record(points((0, [1, 0, 0])), agent="base")
     rows = {r.agent: r for r in summarize(list(map(run, (first, second, base)))).tables[0].rows}
-    learners = success_pairs(rows["equivariant"], rows["standard"])[0]
-    assert sorted(learners.blocks[0]) == [0, 0, 1, 1]
-    against = success_pairs(rows["equivariant"], rows["base"])[0]
-    assert sorted(against.blocks[0]) == [0, 0, 0, 1]
-    reverse = success_pairs(rows["base"], rows["equivariant"])[0]
-    assert sorted(reverse.blocks[0]) == [-1, 0, 0, 0]
-    area = area_pairs(rows["equivariant"], rows["standard"], 50_000)[0]
+
+    def differences(pairs: dict[Pair, Sample]) -> dict[int, tuple[float, float]]:
+        """By episode seed, their sum and how many evaluations it is over."""
+        (sample,) = pairs.values()
+        (block,) = sample.blocks
+        sums = sample.weights[0] * block.totals
+        return dict(zip(block.seeds, zip(sums, block.counts, strict=True), strict=True))
+
+    learners = success_pairs(rows["equivariant"], rows["standard"])
+    assert differences(learners) == {100: (2, 2), 101: (0, 2)}
+    against = success_pairs(rows["equivariant"], rows["base"])
+    assert differences(against) == {100: (0, 2), 101: (1, 2)}
+    reverse = success_pairs(rows["base"], rows["equivariant"])
+    assert differences(reverse) == {100: (0, 2), 101: (-1, 2)}
+    (area,) = area_pairs(rows["equivariant"], rows["standard"], 50_000).values()
     # The first value is held back to 0: 0.5 for 40,000 steps, then to 0.5 (the last one counts the
     # two common episodes alone).
     assert area.value == pytest.approx(0.5)
-    assert [block.size for block in area.blocks] == [2, 2]
+    assert [block.seeds for block in area.blocks] == [(100, 101), (100, 101)]
     other = make_record(points((30_000, [1, 0]), (49_000, [1, 1])), agent="approximate")
     approximate = row(summarize([run(other), run(second)]), "approximate")
     assert success_pairs(approximate, rows["standard"]) == {}
@@ -298,6 +308,16 @@ def test_ranks_have_ties_and_need_five_seeds() -> None:
     }
     few = summarize(five("standard", 0.5, 4) + five("approximate", 0.9, 4))
     assert not few.tables[0].is_ranked
+    # Five seeds each, of which they share four.
+    apart = five("standard", 0.5) + [of(0.9, agent="approximate", seed=s) for s in range(1, 6)]
+    assert not summarize(apart).tables[0].is_ranked
+
+
+def test_runs_on_base_policies_of_different_seeds_are_runs_of_one_row() -> None:
+    runs = [of(0.5, seed=1, policy_seed=policy) for policy in (0, 1, 1)]
+    summary = summarize([*runs, of(0.5, seed=2, policy_seed=0)])
+    configs = [r.record.config for r in row(summary, "standard").runs]
+    assert sorted((c["seed"], c["policy_seed"]) for c in configs) == [(1, 0), (1, 1), (2, 0)]
 
 
 def test_learners_on_different_base_policies_are_not_compared() -> None:
@@ -316,7 +336,7 @@ def test_learners_on_different_base_policies_are_not_compared() -> None:
     }
     # Where seeds agree on the policy only in part, those pairs count.
     others[3].record.base_policy.content_hash = first.runs[3].record.base_policy.content_hash
-    assert list(success_pairs(first, second)) == [3]
+    assert [seed for _, seed in success_pairs(first, second)] == [3]
 
 
 def test_a_second_attempt_replaces_the_first_in_plain_sight() -> None:
