@@ -10,7 +10,9 @@ import errno
 import importlib
 import inspect
 import os
+import re
 import shutil
+import signal
 import sys
 import textwrap
 import warnings
@@ -52,7 +54,8 @@ def run(
         out: Folder of the runs; demonstrations and base policies are kept in OUT/base.
         demos: Trajectory file (.h5 with .json) to train the base policy on, instead of the
             scripted expert's demonstrations.
-        base_policy: Saved base policy (policy.safetensors) to steer, instead of training one.
+        base_policy: Saved base policy (policy.safetensors) to steer, instead of training one; it
+            brings its settings and the demonstrations that it knows of.
         workers: Processes that share the simulation; the record is the same but for the clock.
         quiet: No progress bars.
     """
@@ -510,13 +513,17 @@ def main() -> int:
     warnings.filterwarnings("ignore", message=".*py3nj.*")
     warnings.filterwarnings("ignore", message="Failed to find system libvulkan.*")
     # The networks are small: more threads cost more than they give, above all beside other runs.
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    torch.set_num_threads(_threads(os.environ.get("OMP_NUM_THREADS", "")))
     try:
         return app.cli(prog="symsteer", description=ABOUT, sort_subcommands=False)
     except (UserError, RecordError) as error:
         return _complain(error, f"error: {error}", 2)
     except WorkerLostError as error:
         return _complain(error, f"error: {error}", 1)
+    except BrokenPipeError:
+        # Whoever read the output has seen enough; Python would complain once more at its exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except OSError as error:
         # A path that cannot be read or written; without one it is a fault of ours.
         if error.filename is None:
@@ -536,6 +543,12 @@ def main() -> int:
         )
     except KeyboardInterrupt as error:
         return _complain(error, "interrupted", 130)
+
+
+def _threads(wanted: str) -> int:
+    """The first number of OMP_NUM_THREADS (which may list one for each level), 1 without one."""
+    number = re.match(r"\s*0*([1-9]\d{0,3})\b", wanted)
+    return int(number[1]) if number else 1
 
 
 def _printable(text: str) -> str:

@@ -320,11 +320,15 @@ class Table:
     @property
     def feasible(self) -> tuple[float, float] | None:
         """The widest feasible Q bounds of the runs, entropy allowance included."""
-        bounds = [run.record.feasible_q for run in self.runs if run.record.feasible_q]
+        bounds = [
+            (bound, max([bound.entropy_allowance, *run.diagnostics("q_allowance")]))
+            for run in self.runs
+            if (bound := run.record.feasible_q)
+        ]
         if not bounds:
             return None
-        low = min(bound.low - bound.entropy_allowance for bound in bounds)
-        return low, max(bound.high + bound.entropy_allowance for bound in bounds)
+        low = min(bound.low - allowance for bound, allowance in bounds)
+        return low, max(bound.high + allowance for bound, allowance in bounds)
 
     @property
     def is_ranked(self) -> bool:

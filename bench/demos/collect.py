@@ -282,7 +282,7 @@ def _write(
         file.attrs[SEAL] = checksum(file, description)
     text = json.dumps(description, indent=2) + "\n"
     # Both or none: an earlier pair survives a disk that gets full on the way.
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         write_atomically(partial, buffer.getvalue())
         write_atomically(path.with_suffix(".json"), text.encode())

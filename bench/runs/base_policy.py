@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from bench.demos import FORMAT, MODES, Demonstrations, collect, load
-from bench.runs.config import RunConfig, content_key
+from bench.runs.config import DemonstrationConfig, RunConfig, content_key
 from bench.steering.evaluation import DRAWS, Steerability, steerability
 from bench.steering.latent_env import LatentNoiseEnv
 from bench.tasks import make, task_class
@@ -51,23 +51,64 @@ def prepare_base(
     task = task_class(config.task)
     layouts = (task.observation_layout, task.action_layout)
     if policy is not None:
-        base = load_policy(policy, *layouts)
-        if "steerability" not in base.report:
-            base.report["steerability"] = dataclasses.asdict(_measure(config, base, workers))
-        return base.to(config.device)
+        return _measured(config, load_policy(policy, *layouts), progress, workers)
     if demonstrations is None:
         demonstrations = demonstration_file(config, out, progress)
     demos = load(demonstrations, config.task, config.embodiment, config.demonstrations.count)
     folder = _policy_folder(config, out, demos)
     if policy_path(folder).is_file():
-        return load_policy(folder, *layouts).to(config.device)
+        return _measured(config, load_policy(folder, *layouts), progress, workers)
     base = _train(config, demos, progress)
-    report = _measure(config, base, workers)
-    if report.warning and progress:
-        tqdm.write(f"warning: {report.warning}")
-    base.report["steerability"] = dataclasses.asdict(report)
+    base.report["world"] = _world(config)
+    base = _measured(config, base, progress, workers)
     save_policy(base, folder)
-    return base.to(config.device)
+    return base
+
+
+def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
+    """A configuration that says what a saved base policy is, in place of one to be trained.
+
+    Args:
+        config: with the default settings of the base policy, or those of the file.
+        path: of the policy.
+
+    Raises:
+        UserError: if the policy is of another task or embodiment, or the configuration asks for
+            other settings than the policy has.
+    """
+    task = task_class(config.task)
+    base = load_policy(path, task.observation_layout, task.action_layout)
+    world = base.report.get("world", {})
+    for key in ("task", "embodiment"):
+        here, there = getattr(config, key), world.get(key, getattr(config, key))
+        if here != there:
+            raise UserError(
+                f"{path} was trained for {there}, and this run's {key} is {here}; name a policy of "
+                "the same task and embodiment"
+            )
+    if config.policy not in (RunConfig().policy, base.config):
+        raise UserError(
+            f"{path} has settings of its own; leave --policy.* out, or name no base policy to "
+            "train one with those settings"
+        )
+    if "demonstrations" not in world:
+        return dataclasses.replace(config, policy=base.config)
+    return dataclasses.replace(
+        config,
+        policy=base.config,
+        policy_seed=world["policy_seed"],
+        demonstrations=DemonstrationConfig(**world["demonstrations"]),
+    )
+
+
+def _world(config: RunConfig) -> dict[str, Any]:
+    """What a policy's file says of where it was trained."""
+    return {
+        "task": config.task,
+        "embodiment": config.embodiment,
+        "demonstrations": dataclasses.asdict(config.demonstrations),
+        "policy_seed": config.policy_seed,
+    }
 
 
 def find_base(config: RunConfig, out: Path) -> Path | None:
@@ -155,6 +196,17 @@ def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPol
             advance,
             config.device,
         )
+
+
+def _measured(config: RunConfig, base: ChunkPolicy, progress: bool, workers: int) -> ChunkPolicy:
+    """The policy on its device, with a report on as many states as the run asks for."""
+    found = base.report.get("steerability")
+    if found is None or found["states"] != config.evaluation.steerability_states:
+        report = _measure(config, base, workers)
+        if report.warning and progress:
+            tqdm.write(f"warning: {report.warning}")
+        base.report["steerability"] = dataclasses.asdict(report)
+    return base.to(config.device)
 
 
 def _measure(config: RunConfig, policy: ChunkPolicy, workers: int) -> Steerability:

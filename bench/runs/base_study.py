@@ -67,6 +67,8 @@ def study(
     Raises:
         UserError: if a number is not positive.
     """
+    if not counts or not names:
+        raise UserError("a study needs at least one number of demonstrations and one policy")
     if min(*counts, seeds, episodes, workers) < 1:
         raise UserError("numbers of demonstrations, seeds, episodes and workers must be positive")
     files = {}

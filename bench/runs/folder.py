@@ -135,7 +135,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
     try:
         data = json.loads(path.read_text())
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise UserError(
             f"{folder} is not the folder of a run: it has no {CONFIG}; name a folder that "
             "`symsteer run` or `symsteer sweep` wrote"

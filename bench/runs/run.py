@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from agents import AGENTS
-from bench.runs.base_policy import origin, prepare_base
+from bench.runs.base_policy import origin, prepare_base, with_policy_of
 from bench.runs.config import RunConfig, build_config
 from bench.runs.evaluator import Evaluator
 from bench.runs.folder import (
@@ -28,9 +28,10 @@ from bench.runs.folder import (
     write_json,
 )
 from bench.runs.loop import Loop, feasible_return, new_agent
+from bench.steering.search import rounds
 from bench.tasks import check_embodiment, task_class
 from bench.variants import evaluated, parse
-from leaderboard.records import Episodes, Evaluation, read_record
+from leaderboard.records import Episodes, Evaluation, canonical_variant, read_record
 from policies.base import ChunkPolicy, load_policy, policy_path, save_policy
 from policies.errors import UserError
 from policies.geometry import Group
@@ -41,14 +42,34 @@ def check(config: RunConfig) -> None:
 
     Raises:
         UserError: for an unknown task, embodiment, variant, agent or group, a strength out of
-            range, or a device that this machine lacks.
+            range, a budget in which nothing is learned, or a device that this machine lacks.
     """
     task_class(config.task)
     check_embodiment(config.embodiment)
     parse(config.variant)
     if config.agent not in AGENTS:
         raise UserError(f"there is no agent {config.agent!r}; valid: {', '.join(AGENTS)}")
+    if len(parse(config.variant)) != len(config.variant.split("+")) * (config.variant != "none"):
+        raise UserError(
+            f"the variant {config.variant} has a part of strength 0, which changes nothing: leave "
+            "it out (`none` is the unbroken task)"
+        )
     _ = Group.parse(config.sac.group).order
+    if AGENTS[config.agent].learns:
+        warm_up = config.sac.warmup * config.policy.execute
+        if config.env_steps <= warm_up:
+            raise UserError(
+                f"env_steps is {config.env_steps}, which ends within the warm-up of {warm_up} "
+                "environment steps, so that nothing would be learned; raise env_steps or lower "
+                "sac.warmup"
+            )
+        if config.sac.replay_capacity < config.num_envs:
+            raise UserError(
+                f"sac.replay_capacity is {config.sac.replay_capacity}, less than one decision of "
+                f"each of {config.num_envs} environments; raise it or lower num_envs"
+            )
+    if AGENTS[config.agent].searches:
+        rounds(config.num_envs, task_class(config.task).max_episode_steps, config.env_steps)
     for option, device in (("--device", config.device), ("--sim", config.sim)):
         if device == "cuda" and not torch.cuda.is_available():
             raise UserError(
@@ -73,7 +94,8 @@ def execute(
         config: what to run.
         out: folder of the runs.
         demonstrations: a trajectory file instead of the scripted expert's.
-        policy: a saved base policy instead of a trained one.
+        policy: a saved base policy instead of a trained one; the configuration takes over its
+            settings.
         progress: whether to show progress bars.
         workers: processes that share the environments. They are no part of the configuration:
             the record is the same but for the clock.
@@ -85,6 +107,10 @@ def execute(
         UserError: if the input is wrong, the run is finished already, or another process is
             working on it (:class:`bench.runs.folder.RunBusyError`).
     """
+    if policy is not None:
+        if demonstrations is not None:
+            raise UserError("a base policy of yours needs no demonstrations; leave one of them out")
+        config = with_policy_of(config, policy)
     _check_all(config, workers)
     files = origin(demonstrations, policy)
 
@@ -165,7 +191,8 @@ def evaluate(
     config, _ = _stored(folder)
     _check_all(config, workers)
     own = evaluated(config.variant)
-    parse(variant or own)
+    variant = own if variant is None else canonical_variant(variant)
+    parse(variant)
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}; it must be at least 1")
@@ -183,7 +210,7 @@ def evaluate(
     agent = new_agent(config.agent, config, base)
     agent.load_state_dict(state["agent"])
     evaluator = Evaluator(
-        config, base, feasible_return(config, base), agent.learns, variant or own, workers
+        config, base, feasible_return(config, base), agent.learns, variant, workers
     )
     begin = time.perf_counter()
     try:
@@ -200,10 +227,10 @@ def evaluate(
         diagnostics=diagnostics,
     )
     final = read_record(folder / RECORD).final if is_finished(folder) else None
-    comparable = final and (variant or own) == own and len(final.episodes.seed) == count
+    comparable = final and variant == own and len(final.episodes.seed) == count
     return Evaluated(
         run_id=folder.name,
-        variant=variant or own,
+        variant=variant,
         evaluation=evaluation,
         recorded=evaluation.episodes == final.episodes if final and comparable else None,
     )

@@ -144,7 +144,8 @@ def steerability(
     The thresholds of the warning come from pilot runs: bases under them gained nothing from SAC.
     """
     generator = torch.Generator().manual_seed(seed)
-    first = HELD_OUT_SEED // 2 + states * seed
+    span = HELD_OUT_SEED // 2
+    first = span + states * seed % (span - states)
     seeds = [first + i for i in range(states) for _ in range(draws)]
 
     def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:

@@ -55,7 +55,7 @@ def search_ticket(
     Raises:
         UserError: if the budget does not suffice for two candidates.
     """
-    sizes = _rounds(env, budget)
+    sizes = rounds(env.num_envs, env.max_episode_steps, budget)
     left = draw(sizes[0])
     batch = env.num_envs * env.max_episode_steps
     for number, size in enumerate(sizes):
@@ -78,18 +78,22 @@ def _constant(noise: torch.Tensor) -> Act:
     return lambda obs, rows: noise[rows]
 
 
-def _rounds(env: LatentNoiseEnv, budget: int) -> list[int]:
-    """Candidates of every round: as many as the budget can play once in each round."""
-    batch = env.num_envs * env.max_episode_steps
+def rounds(num_envs: int, max_episode_steps: int, budget: int) -> list[int]:
+    """Candidates of every round: as many as the budget can play once in each round.
+
+    Raises:
+        UserError: if the budget does not suffice for two candidates.
+    """
+    batch = num_envs * max_episode_steps
     candidates = MAX_CANDIDATES
     while candidates >= 2:
         sizes = [candidates >> i for i in range(int(math.log2(candidates)))]
         share = budget // len(sizes) // batch
-        if all(share >= -(-size // env.num_envs) for size in sizes):
+        if all(share >= -(-size // num_envs) for size in sizes):
             return sizes
         candidates //= 2
     raise UserError(
         f"env_steps is {budget}; a search of the best constant noise needs at least {batch}, one "
-        f"episode of {env.max_episode_steps} steps in each of {env.num_envs} environments: "
+        f"episode of {max_episode_steps} steps in each of {num_envs} environments: "
         "raise env_steps or lower num_envs"
     )

@@ -86,7 +86,9 @@ class Display(contextlib.AbstractContextManager):
     def write(self, status: str, text: str) -> None:
         """One line that stays."""
         # Not by the console, which folds lines.
-        print(f"{status:9s} {text}", file=self.console.file, flush=True)
+        # A sweep does not end because nobody reads its lines any more.
+        with contextlib.suppress(BrokenPipeError):
+            print(f"{status:9s} {text}", file=self.console.file, flush=True)
 
 
 class LiveDisplay(Display):

@@ -71,16 +71,24 @@ def read_status(folder: Path, suite: str | None = None) -> list[Status]:
             hint = f"there: {', '.join(close)}" if close else "no sweep was begun there"
             raise UserError(f"{folder} holds no sweep of a suite {suite!r}; {hint}")
         return [_of_sweep(folder, read_manifest(manifests[suite]))]
+    if (folder / CONFIG).is_file():
+        return [Status("run", _unlisted([folder]))]
     found = [_of_sweep(folder, read_manifest(path)) for path in manifests.values()]
     listed = {cell.run_id for status in found for cell in status.runs}
-    others = {}
-    for path in sorted(folder.glob(f"*/{CONFIG}")):
-        if path.parent.name not in listed:
-            config = read_config(path.parent)
-            if all(key in config for key in (*BASIC, "env_steps")):
-                others[Cell.of(config, path.parent.name)] = look(path.parent)
-    if others:
+    folders = [path.parent for path in sorted(folder.glob(f"*/{CONFIG}"))]
+    if others := _unlisted([run for run in folders if run.name not in listed]):
         found.append(Status("runs of no sweep" if found else "runs", others))
+    return found
+
+
+def _unlisted(folders: list[Path]) -> dict[Cell, Sighting]:
+    """Runs that no sweep lists, as far as they are runs of this program."""
+    found = {}
+    for folder in folders:
+        config = read_config(folder)
+        known = [config.get(key) for key in (*BASIC, "env_steps")]
+        if all(isinstance(value, str | int) for value in known):
+            found[Cell.of(config, folder.resolve().name)] = look(folder)
     return found
 
 

@@ -75,6 +75,8 @@ def load_suite(name_or_path: str) -> Suite:
         for cell in _cells(grid, path.name):
             config = build_config(_merge(shared, cell, path.name), path.name)
             runs[config] = None
+    if not runs:
+        raise UserError(f"{path.name} has no runs; give it a [grid] with lists of values")
     return Suite(path.stem, description, tuple(runs))
 
 
@@ -104,6 +106,8 @@ def _with_strength(variant: Any, strength: Any, source: str) -> str:
         raise UserError(f"{source}: grid.strength must list numbers in [0, 1], not {strength!r}")
     if variant == "none" or ":" in variant:
         return variant
+    if strength == 0:
+        return "none"
     return "+".join(f"{name}:{strength:g}" for name in variant.split("+"))
 
 

@@ -9,7 +9,7 @@ import h5py
 import pytest
 import torch
 
-from bench.cli import main
+from bench.cli import _threads, main
 from bench.demos import collect
 from bench.tasks import task_class
 from policies.base import ChunkPolicy, PolicyConfig, save_policy
@@ -187,3 +187,16 @@ def test_the_module_is_the_same_program():
     )
     assert done.returncode == 2
     assert done.stderr.startswith("error: there is no agent 'ppo'")
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    command = f"'{sys.executable}' -m bench list | head -1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode in (0, 141), done.stderr) == (True, "")
+
+
+@pytest.mark.parametrize(("wanted", "threads"), [("", 1), ("3", 3), ("2,1", 2), ("0", 1), ("x", 1)])
+def test_numbers_of_threads(wanted, threads):
+    assert _threads(wanted) == threads

@@ -25,6 +25,8 @@ run --num-envs many
 run --num-envs 99999999
 run --workers -1
 run --policy.steps 0
+run --variant action_gain:0
+run --env-steps 100
 sweep nowhere.toml
 sweep folder.toml
 sweep demoo

@@ -30,3 +30,6 @@ def test_the_table_gives_mean_and_range():
 def test_impossible_numbers_are_refused(tmp_path):
     with pytest.raises(UserError, match="positive"):
         study(tiny_config(), tmp_path, ("edp",), (0,), seeds=1, episodes=1, workers=1)
+    for names, counts in (((), (3,)), (("edp",), ())):
+        with pytest.raises(UserError, match="at least one"):
+            study(tiny_config(), tmp_path, names, counts, seeds=1, episodes=1, workers=1)

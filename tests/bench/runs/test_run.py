@@ -1,5 +1,6 @@
 """One run from demonstrations to the record: what it leaves, what it refuses, that it repeats."""
 
+import dataclasses
 import itertools
 import json
 import shutil
@@ -8,13 +9,16 @@ import pytest
 import torch
 
 from agents import make_agent
+from agents.sac import SacConfig
 from bench.runs import evaluator, loop
 from bench.runs.base_policy import prepare_base
+from bench.runs.config import DemonstrationConfig, RunConfig
 from bench.runs.folder import is_finished, load_checkpoint, run_id, state_of
-from bench.runs.run import execute
+from bench.runs.run import evaluate, execute
+from bench.steering import evaluation
 from bench.steering.evaluation import held_out_seeds
 from bench.tasks import task_class
-from leaderboard.records import read_record
+from leaderboard.records import HELD_OUT_SEED, read_record
 from policies.errors import UserError
 from tests.bench.tiny_run import tiny_config, without_clock
 
@@ -177,6 +181,11 @@ def test_a_failed_run_says_so_and_is_continued(place, finished, monkeypatch):
         ({"variant": "action_gian:0.5"}, "action_gain"),
         ({"variant": "action_gain:1.5"}, r"\[0, 1\]"),
         ({"agent": "ppo"}, "equivariant"),
+        ({"variant": "action_gain:0"}, "strength 0, which changes nothing"),
+        ({"variant": "wind:0+action_gain:0.5"}, "strength 0, which changes nothing"),
+        ({"env_steps": 64}, "within the warm-up of 64"),
+        ({"agent": "golden-ticket", "env_steps": 100}, "a search of the best constant noise needs"),
+        ({"sac": SacConfig(width=16, warmup=16, replay_capacity=3)}, "replay_capacity is 3"),
     ],
 )
 def test_mistakes_are_refused_before_anything_is_built(change, words, tmp_path):
@@ -215,3 +224,65 @@ def test_learner_on_cuda_with_physics_on_the_cpu(tmp_path):
         execute(tiny_config(device="cuda"), tmp_path, progress=False) / "record.json"
     )
     assert record.status == "finished"
+
+
+def test_a_base_policy_of_ones_own_decides_what_the_record_says(finished, tmp_path):
+    """The file's settings and demonstrations are the run's, whatever the defaults are."""
+    config, folder = finished
+    file = folder / "policy.safetensors"
+    plain = tiny_config(
+        agent="zero",
+        policy=RunConfig().policy,
+        demonstrations=DemonstrationConfig(count=50, seed=9),
+        policy_seed=4,
+    )
+    found = read_record(execute(plain, tmp_path, policy=file, progress=False) / "record.json")
+    said = found.config
+    assert said["policy"] == config.policy.to_json()
+    assert (said["demonstrations"]["count"], said["policy_seed"]) == (3, 0)
+    known = read_record(folder / "record.json").base_policy
+    assert found.base_policy == known
+    # Solvable states are counted on as many as this run asks for, not on those of the file.
+    more = dataclasses.replace(
+        plain, evaluation=dataclasses.replace(plain.evaluation, steerability_states=3)
+    )
+    found = read_record(execute(more, tmp_path, policy=file, progress=False) / "record.json")
+    assert (known.episodes, found.base_policy.episodes) == (32, 48)
+
+
+def test_a_base_policy_of_another_world_is_refused(finished, tmp_path):
+    config, folder = finished
+    panda = tiny_config(embodiment="panda")
+    with pytest.raises(UserError, match="trained for floating, and this run's embodiment is panda"):
+        execute(panda, tmp_path, policy=folder, progress=False)
+    other = tiny_config(policy=dataclasses.replace(config.policy, steps=21))
+    with pytest.raises(UserError, match=r"leave --policy\.\* out"):
+        execute(other, tmp_path, policy=folder, progress=False)
+    with pytest.raises(UserError, match="leave one of them out"):
+        execute(config, tmp_path, demonstrations=folder, policy=folder, progress=False)
+    assert not any(tmp_path.iterdir())
+
+
+def test_an_evaluation_in_the_runs_own_world_is_compared_however_it_is_spelled(broken):
+    folder = broken["zero"]
+    spelled = evaluate(folder, "action_gain:0.50")
+    assert (spelled.variant, spelled.recorded) == ("action_gain:0.5", True)
+    with pytest.raises(UserError, match="there is no variant ''"):
+        evaluate(folder, "")
+
+
+def test_steerability_stays_below_the_held_out_seeds(monkeypatch):
+    """However large the policy's seed is."""
+    seen = []
+
+    def note(env, act, seeds):
+        seen.extend(seeds)
+        raise StopIteration
+
+    monkeypatch.setattr(evaluation, "rollout", note)
+    for seed in (0, 1, 20_834, 2**32 - 1):
+        with pytest.raises(StopIteration):
+            evaluation.steerability(None, None, seed, 24)
+    assert min(seen) >= HELD_OUT_SEED // 2
+    assert max(seen) < HELD_OUT_SEED
+    assert seen[0] == HELD_OUT_SEED // 2

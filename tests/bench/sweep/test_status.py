@@ -122,6 +122,22 @@ def test_runs_of_no_sweep_are_reported_too(sweep, undisturbed, tmp_path):
         read_status(tmp_path)
 
 
+def test_the_status_of_a_run_by_its_own_folder(undisturbed):
+    text = to_text(read_status(undisturbed), undisturbed)
+    assert text.startswith("run (1 runs)")
+    assert "finished         1" in text
+
+
+def test_folders_of_something_else_are_left_alone(undisturbed, tmp_path):
+    for name, data in (("a", "[1]"), ("b", '{"task": ["PickCube-v1"]}')):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / CONFIG).write_text(data)
+    with pytest.raises(UserError, match="not the configuration of a run"):
+        read_status(tmp_path)
+    (tmp_path / "a" / CONFIG).unlink()
+    assert read_status(tmp_path) == []
+
+
 def test_mistakes_with_status(sweep, tmp_path):
     with pytest.raises(UserError, match="there is no folder"):
         read_status(tmp_path / "nowhere")

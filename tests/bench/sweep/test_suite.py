@@ -62,6 +62,7 @@ def test_every_suite_that_ships_can_be_read():
         ("[grid]\nseed = " + "[" * 5000, "cannot be read as TOML"),
         (f"[grid]\nseed = {list(range(1000))}\nnum_envs = {list(range(1000))}", "has 1000000 runs"),
         ("not toml", "cannot be read as TOML"),
+        ("grid = []", "has no runs"),
         ("colour = 'red'", "there is no key 'colour'"),
     ],
 )
@@ -73,3 +74,9 @@ def test_mistakes_in_a_suite(text, words, tmp_path):
 def test_an_unknown_suite_lists_the_known_ones():
     with pytest.raises(UserError, match="demo"):
         load_suite("dmeo")
+
+
+def test_a_dial_may_begin_at_zero(tmp_path):
+    text = "[grid]\nvariant = ['action_gain', 'wind']\nstrength = [0, 0.5]"
+    suite = load_suite(write(tmp_path, text))
+    assert [c.variant for c in suite.runs] == ["none", "action_gain:0.5", "wind:0.5"]

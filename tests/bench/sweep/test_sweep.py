@@ -14,7 +14,6 @@ import threading
 import psutil
 import pytest
 
-from agents.sac import SacConfig
 from bench.cli import main
 from bench.runs.base_policy import demonstration_path
 from bench.runs.config import DemonstrationConfig, RunConfig
@@ -62,9 +61,9 @@ def workers() -> list[int]:
 
 
 def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tmp_path):
-    # Both pass every check on the configuration. One fails inside the run, the other before it:
-    # something is in the way of its demonstrations.
-    bad = tiny_config(agent="standard", sac=SacConfig(width=16, replay_capacity=2))
+    # Both pass every check on the configuration, and something is in their way: of the run's own
+    # checkpoint, and of its demonstrations.
+    bad = tiny_config(agent="standard")
     baseless = tiny_config(
         agent="zero", variant="wind:1", demonstrations=DemonstrationConfig(count=3, seed=1)
     )
@@ -73,6 +72,7 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
     obstacle.mkdir(parents=True)
     plan = make_plan(Suite("mixed", "", (LONG, bad, tiny_config(agent="zero"), baseless)), out)
     folder = out / plan.cells[0].run_id
+    (out / plan.cells[1].run_id / CHECKPOINT).mkdir(parents=True)
     killed = []
 
     def kill() -> None:
@@ -95,7 +95,7 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
     # The killed run continued from its checkpoint, and nobody can tell.
     assert read_record(folder / "record.json").wall_clock.resumed == 1
     assert without_clock(folder) == without_clock(undisturbed)
-    assert "replay_capacity" in outcomes["standard none"].reason
+    assert CHECKPOINT in outcomes["standard none"].reason
     reason = outcomes["zero wind:1"].reason
     assert reason.startswith("its demonstrations failed: ")
     assert obstacle.name in reason
