@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from bench.demos import FORMAT, MODES, Demonstrations, collect, load
-from bench.runs.config import DemonstrationConfig, RunConfig, content_key
+from bench.runs.config import DemonstrationConfig, RunConfig, content_key, flat
 from bench.steering.evaluation import DRAWS, Steerability, steerability
 from bench.steering.latent_env import LatentNoiseEnv
 from bench.tasks import make, task_class
@@ -69,7 +69,8 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
     """A configuration that says what a saved base policy is, in place of one to be trained.
 
     Args:
-        config: with the default settings of the base policy, or those of the file.
+        config: with the default settings of the base policy and its demonstrations, or those of
+            the file.
         path: of the policy.
 
     Raises:
@@ -86,19 +87,19 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
                 f"{path} was trained for {there}, and this run's {key} is {here}; name a policy of "
                 "the same task and embodiment"
             )
-    if config.policy not in (RunConfig().policy, base.config):
-        raise UserError(
-            f"{path} has settings of its own; leave --policy.* out, or name no base policy to "
-            "train one with those settings"
-        )
-    if "demonstrations" not in world:
-        return dataclasses.replace(config, policy=base.config)
-    return dataclasses.replace(
-        config,
-        policy=base.config,
-        policy_seed=world["policy_seed"],
-        demonstrations=DemonstrationConfig(**world["demonstrations"]),
-    )
+    own: dict[str, Any] = {"policy": base.config}
+    if "demonstrations" in world:
+        own["demonstrations"] = DemonstrationConfig(**world["demonstrations"])
+        own["policy_seed"] = world["policy_seed"]
+    told = dataclasses.replace(config, **own)
+    default, asked, found = (flat(c.to_json()) for c in (RunConfig(), config, told))
+    for key, value in asked.items():
+        if value not in (default[key], found[key]):
+            raise UserError(
+                f"{path} was trained with {key} {found[key]}, and this run asks for {value}; leave "
+                f"--{key.replace('_', '-')} out, or name no base policy, to train one like that"
+            )
+    return told
 
 
 def _world(config: RunConfig) -> dict[str, Any]:

@@ -51,8 +51,8 @@ def check(config: RunConfig) -> None:
         raise UserError(f"there is no agent {config.agent!r}; valid: {', '.join(AGENTS)}")
     if len(parse(config.variant)) != len(config.variant.split("+")) * (config.variant != "none"):
         raise UserError(
-            f"the variant {config.variant} has a part of strength 0, which changes nothing: leave "
-            "it out (`none` is the unbroken task)"
+            f"the variant {config.variant} has a part of strength 0, which changes nothing; leave "
+            "it out, or use none, the unbroken task"
         )
     _ = Group.parse(config.sac.group).order
     if AGENTS[config.agent].learns:

@@ -233,13 +233,12 @@ def test_a_base_policy_of_ones_own_decides_what_the_record_says(finished, tmp_pa
     plain = tiny_config(
         agent="zero",
         policy=RunConfig().policy,
-        demonstrations=DemonstrationConfig(count=50, seed=9),
-        policy_seed=4,
+        demonstrations=DemonstrationConfig(),
     )
     found = read_record(execute(plain, tmp_path, policy=file, progress=False) / "record.json")
     said = found.config
     assert said["policy"] == config.policy.to_json()
-    assert (said["demonstrations"]["count"], said["policy_seed"]) == (3, 0)
+    assert said["demonstrations"]["count"] == 3
     known = read_record(folder / "record.json").base_policy
     assert found.base_policy == known
     # Solvable states are counted on as many as this run asks for, not on those of the file.
@@ -256,8 +255,11 @@ def test_a_base_policy_of_another_world_is_refused(finished, tmp_path):
     with pytest.raises(UserError, match="trained for floating, and this run's embodiment is panda"):
         execute(panda, tmp_path, policy=folder, progress=False)
     other = tiny_config(policy=dataclasses.replace(config.policy, steps=21))
-    with pytest.raises(UserError, match=r"leave --policy\.\* out"):
+    with pytest.raises(UserError, match=r"trained with policy\.steps 20, and this run asks for 21"):
         execute(other, tmp_path, policy=folder, progress=False)
+    for change in ({"policy_seed": 4}, {"demonstrations": DemonstrationConfig(count=3, seed=9)}):
+        with pytest.raises(UserError, match=rf"trained with {min(change)}\S* 0, and this run"):
+            execute(tiny_config(**change), tmp_path, policy=folder, progress=False)
     with pytest.raises(UserError, match="leave one of them out"):
         execute(config, tmp_path, demonstrations=folder, policy=folder, progress=False)
     assert not any(tmp_path.iterdir())
