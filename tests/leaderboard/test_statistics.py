@@ -131,7 +131,7 @@ def test_the_interval_misses_the_truth_in_at_most_one_of_twenty(
             (5, 100)
         )
         table += episodes * generator.standard_normal(100)
-        samples = [of(row, 100 * trial) for row in table]
+        samples = [of(row) for row in table]
         missed += crossed_bootstrap(samples, statistic, resamples=400, seed=trial).sign != 0
     # Up to 0.05 + three standard errors of such a share.
     assert missed <= stats.binom(trials, 0.05).ppf(0.999)
