@@ -23,8 +23,17 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
 from leaderboard.defects import BASELINE, COMPARED, MEASURES, DefectMap, Line, Panel
 from leaderboard.findings import Findings
-from leaderboard.statistics import Interval, Sample, iqm, success_interval
-from leaderboard.summary import MIN_SEEDS, REFERENCES, Row, Run, Summary, Table, episode_success
+from leaderboard.statistics import Interval, Sample, success_interval
+from leaderboard.summary import (
+    MIN_SEEDS,
+    REFERENCES,
+    Row,
+    Run,
+    Summary,
+    Table,
+    aligned,
+    episode_success,
+)
 
 Style = tuple[str, str, Any]
 """Color, marker and line style of an agent."""
@@ -140,7 +149,8 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
 
 def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
     color, marker, line = style
-    steps, curves = _common(row.finished)
+    points = _common(row.finished)
+    steps = _places(points)
     for run in row.runs:
         values = [evaluation.success_once for evaluation in run.curve.values()]
         if run.finished and (row.is_reference or not 1 < len(row.finished) < MIN_SEEDS):
@@ -153,10 +163,13 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
         return
     bands = [
         success_interval(
-            [Sample.pooled(episode_success(run.curve[step]).items()) for run in row.finished],
+            [
+                Sample.pooled(episode_success(run.curve[step]).items())
+                for run, step in zip(row.finished, point, strict=True)
+            ],
             BAND_RESAMPLES,
         )
-        for step in steps
+        for point in points
     ]
     low, high = [band.low for band in bands], [band.high for band in bands]
     if len(steps) == 1 and row.is_reference:
@@ -170,7 +183,7 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
     ax.fill_between(steps, low, high, color=color, alpha=0.14, linewidth=0)
     ax.plot(
         steps,
-        iqm(curves, axis=0),
+        [band.value for band in bands],
         color=color,
         linestyle=line,
         marker=marker,
@@ -204,15 +217,15 @@ def q_values(tables: Sequence[Table]) -> Figure:
                 extremes += values
                 if run.record.nonfinite_q:
                     ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7, clip_on=False)
-            steps, values = _mean_series(runs, "q_mean")
-            every = max(1, len(steps) // MAX_MARKERS)
+            places, means = _mean_series(runs, "q_mean")
+            every = max(1, len(places) // MAX_MARKERS)
             style: dict[str, Any] = {
                 "color": color,
                 "marker": marker,
                 "markersize": 4,
                 "markevery": every,
             }
-            ax.plot(steps, values, linestyle=line, linewidth=1.7, **style)
+            ax.plot(places, means, linestyle=line, linewidth=1.7, **style)
             returns = _mean_series(runs, "return_mean")
             ax.plot(*returns, linestyle="none", markerfacecolor="white", **style)
             extremes += returns[1]
@@ -469,12 +482,18 @@ def _style(agent: str) -> Style:
     return STYLES.get(agent) or OTHERS[sum(map(ord, agent)) % len(OTHERS)]
 
 
-def _common(runs: Sequence[Run]) -> tuple[list[int], np.ndarray]:
-    """The steps at which all runs were evaluated, and success there: [runs, steps]."""
+def _common(runs: Sequence[Run]) -> list[tuple[int, ...]]:
+    """The points of the curve at which all runs were evaluated: env_steps of each run there."""
     if not runs:
-        return [], np.empty((0, 0))
-    steps = sorted(set.intersection(*(set(run.curve) for run in runs)))
-    return steps, np.array([[run.curve[step].success_once for step in steps] for run in runs])
+        return []
+    twins = [aligned(runs[0], run) for run in runs]
+    steps = [step for step in runs[0].curve if all(step in twin for twin in twins)]
+    return [tuple(twin[step] for twin in twins) for step in steps]
+
+
+def _places(points: Sequence[tuple[int, ...]]) -> list[float]:
+    """Where points of several runs are drawn: at the median of their steps."""
+    return [float(np.median(point)) for point in points]
 
 
 def _series(run: Run, name: str) -> tuple[list[int], list[float]]:
@@ -486,10 +505,19 @@ def _series(run: Run, name: str) -> tuple[list[int], list[float]]:
     return [step for step, _ in pairs], [value for _, value in pairs]
 
 
-def _mean_series(runs: Sequence[Run], name: str) -> tuple[list[int], list[float]]:
+def _mean_series(runs: Sequence[Run], name: str) -> tuple[list[float], list[float]]:
+    """Mean of a diagnostic over runs, where all have measured it."""
     series = [dict(zip(*_series(run, name), strict=True)) for run in runs]
-    steps = sorted(set.intersection(*(set(one) for one in series)))
-    return steps, [float(np.mean([one[step] for one in series])) for step in steps]
+    points = [
+        point
+        for point in _common(runs)
+        if all(step in one for step, one in zip(point, series, strict=True))
+    ]
+    means = [
+        float(np.mean([one[step] for step, one in zip(point, series, strict=True)]))
+        for point in points
+    ]
+    return _places(points), means
 
 
 def _thousands(value: float, _position: int | None = None) -> str:

@@ -48,6 +48,10 @@ FINAL_WINDOW = 5
 THRESHOLD = 0.8
 """Steps are counted to this share of the best agent's final success."""
 
+SAME_POINT = 0.01
+"""Evaluations of two runs at most this share of the budget apart belong together: a run is
+evaluated after the decision that crosses the planned step, and decisions differ in length."""
+
 MACHINE = frozenset({"device", "threads", "torch_threads", "workers", "progress", "out"})
 """Configuration keys, at any depth, that may differ between runs of one row, as seeds may."""
 
@@ -523,8 +527,9 @@ def reference_success(run: Run, references: Sequence[Run]) -> dict[int, float]:
 def success_pairs(first: Row, second: Row) -> dict[Pair, Sample]:
     """Differences of final-window success, first minus second, by pair of runs.
 
-    Two learners are paired by run seed on the same base policy, then by (env_steps, episode seed);
-    with a reference, which is evaluated once, the episode seed alone pairs (`reference_success`).
+    Two learners are paired by run seed on the same base policy, then by evaluation (`aligned`) and
+    episode seed; with a reference, which is evaluated once, the episode seed alone pairs
+    (`reference_success`).
     """
     if first.is_reference and not second.is_reference:
         reverse = success_pairs(second, first)
@@ -536,7 +541,12 @@ def success_pairs(first: Row, second: Row) -> dict[Pair, Sample]:
             other = {key: reference[key[1]] for key in run.window if key[1] in reference}
         else:
             partner = _partner(run, second)
-            other = partner.window if partner else {}
+            points = aligned(run, partner) if partner else {}
+            other = {
+                (step, seed): partner.window[points[step], seed]
+                for step, seed in run.window
+                if partner and (points.get(step), seed) in partner.window
+            }
         if differences := paired_differences(run.window, other):
             pairs[run.pair] = _pooled(differences)
     return pairs
@@ -545,24 +555,36 @@ def success_pairs(first: Row, second: Row) -> dict[Pair, Sample]:
 def area_pairs(first: Row, second: Row, budget: int) -> dict[Pair, Sample]:
     """Differences of the area under the curve, first minus second, by pair of runs.
 
-    Over the evaluations (env_steps) that both runs have, on the episodes that both have there.
+    Over the evaluations that both runs have (`aligned`), on the episodes that both have there.
     """
     pairs = {}
     for run in first.finished:
         partner = _partner(run, second)
-        other = partner.curve if partner else {}
+        if partner is None:
+            continue
         blocks: dict[int, Block] = {}
-        for step, evaluation in run.curve.items():
-            if step in other:
-                found = paired_differences(
-                    episode_success(evaluation), episode_success(other[step])
-                )
-                if found:
-                    blocks[step] = Sample.pooled(found.items()).blocks[0]
+        for step, twin in aligned(run, partner).items():
+            mine, theirs = run.curve[step], partner.curve[twin]
+            if found := paired_differences(episode_success(mine), episode_success(theirs)):
+                blocks[step] = Sample.pooled(found.items()).blocks[0]
         if blocks:
             weights = area_weights(list(blocks), budget)
             pairs[run.pair] = Sample(tuple(blocks.values()), weights)
     return pairs
+
+
+def aligned(run: Run, other: Run) -> dict[int, int]:
+    """env_steps of `run`'s evaluations -> of those of `other` that belong to them.
+
+    That is the nearest one, if it is at most `SAME_POINT` of the budget away.
+    """
+    reach = SAME_POINT * run.record.cell.env_steps
+    found = {}
+    for step in run.curve:
+        twin = min(other.curve, key=lambda there: (abs(there - step), there), default=None)
+        if twin is not None and abs(twin - step) <= reach:
+            found[step] = twin
+    return found
 
 
 def _partner(run: Run, row: Row) -> Run | None:

@@ -272,6 +272,13 @@ def test_learners_are_paired_by_step_and_episode_references_by_episode() -> None
     # two common episodes alone).
     assert area.value == pytest.approx(0.5)
     assert [block.seeds for block in area.blocks] == [(100, 101), (100, 101)]
+    near = make_record(points((39_600, [1, 0]), (50_400, [1, 1])), agent="approximate")
+    approximate = row(summarize([run(near), run(second)]), "approximate")
+    # Up to 1 % of the budget apart, evaluations belong together.
+    (sample,) = success_pairs(approximate, rows["standard"]).values()
+    assert sample.value == pytest.approx(0.5)
+    (sample,) = area_pairs(approximate, rows["standard"], 50_000).values()
+    assert len(sample.blocks) == 2
     other = make_record(points((30_000, [1, 0]), (49_000, [1, 1])), agent="approximate")
     approximate = row(summarize([run(other), run(second)]), "approximate")
     assert success_pairs(approximate, rows["standard"]) == {}
