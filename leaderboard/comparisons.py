@@ -18,7 +18,7 @@ from leaderboard.statistics import (
     performance_profile,
     probability_of_improvement,
 )
-from leaderboard.summary import REFERENCES, Row, Summary, Table, reference_success
+from leaderboard.summary import REFERENCES, Row, Run, Summary, Table, reference_success
 
 GROUPS = ("unbroken", "broken")
 THRESHOLDS = np.linspace(-0.5, 1.0, 151)
@@ -111,21 +111,31 @@ def profiles(tables: Sequence[Table], agents: Sequence[str]) -> list[Profile]:
     return found
 
 
+def _policy(run: Run) -> str:
+    return run.record.base_policy.content_hash
+
+
+def _policies(row: Row) -> set[str]:
+    return {_policy(run) for run in row.finished}
+
+
 def improvements(tables: Sequence[Table], agents: Sequence[str]) -> list[Improvement]:
-    """Every pair of learning agents, the later one of the page's order first."""
+    """Every pair of learning agents, the later one of the page's order first.
+
+    In each table, over the runs on base policies that both agents steered.
+    """
     found = []
     learning = [agent for agent in agents if agent not in REFERENCES]
     for second, first in combinations(learning, 2):
         cells = []
         for table in tables:
             rows = table.row_of(first), table.row_of(second)
-            if rows[0] and rows[1]:
-                cells.append(
-                    (
-                        [run.success for run in rows[0].finished],
-                        [run.success for run in rows[1].finished],
-                    )
+            if rows[0] and rows[1] and (policies := _policies(rows[0]) & _policies(rows[1])):
+                mine, theirs = (
+                    [run.success for run in row.finished if _policy(run) in policies]
+                    for row in (rows[0], rows[1])
                 )
+                cells.append((mine, theirs))
         if cells:
             runs = sum(len(x) for x, _ in cells), sum(len(y) for _, y in cells)
             probability = probability_of_improvement(cells)

@@ -110,7 +110,8 @@ PROFILES = (
 )
 IMPROVEMENT = (
     "Probability of improvement: how likely a run of X beats a run of Y in the same cell (ties "
-    "count half), mean over cells, with 95 % intervals from drawing runs within each cell. "
+    "count half), mean over cells, with 95 % intervals from drawing runs within each cell; runs on "
+    "base policies that only one of the two steered are left out. "
     "Where every run of one beats every run of the other, the interval has no width: with few runs "
     "that claims too much."
 )
@@ -182,11 +183,11 @@ def _glance(row: Row) -> str:
 
 
 def _beaten(summary: Summary) -> str:
-    """In how many cells with enough seeds each learner clearly beats the best reference."""
+    """In how many cells with enough pairs each learner clearly beats the best reference."""
     texts = []
     for agent in summary.agents:
         rows = [t.row_of(agent) for t in summary.tables if t.best_reference]
-        enough = [row for row in rows if row and len(row.finished) >= MIN_SEEDS]
+        enough = [row for row in rows if row and row.pairs_with_best >= MIN_SEEDS]
         signs = [row.against_best.sign for row in enough if row.against_best]
         if signs:
             above, below = signs.count(1), signs.count(-1)

@@ -241,6 +241,7 @@ class Row:
     last: Interval | None = None
     difference: Interval | None = None
     against_best: Interval | None = None
+    pairs_with_best: int = 0
     rise: Interval | None = None
     area: float | None = None
     threshold_steps: list[int | None] = field(default_factory=list)
@@ -456,7 +457,9 @@ def _table(key: Key, groups: Mapping[tuple[str, str], list[Run]], agents: set[st
     )
     if table.best_reference:
         for row in table.learners:
-            row.against_best = compare(row, table.best_reference)
+            pairs = success_pairs(row, table.best_reference)
+            row.pairs_with_best = len(pairs)
+            row.against_best = crossed_bootstrap(list(pairs.values())) if pairs else None
     _rank(rows)
     return table
 

@@ -58,6 +58,19 @@ def test_profiles_and_pairs_by_group() -> None:
     assert (pair.probability.value, pair.cells) == (0.0, 1)
 
 
+def test_runs_on_policies_that_only_one_agent_steered_are_left_out() -> None:
+    standard, equivariant = (
+        make_cell({agent: rate}) for agent, rate in (("standard", 0.5), ("equivariant", 0.25))
+    )
+    for record in standard[2:]:
+        record.base_policy.content_hash = "f" * 64
+    (pair,) = compare_agents(summary_of(standard + equivariant)).improvements["unbroken"]
+    assert (pair.runs, pair.probability.value) == ((5, 2), 0.0)
+    for record in standard:
+        record.base_policy.content_hash = "f" * 64
+    assert compare_agents(summary_of(standard + equivariant)).improvements["unbroken"] == []
+
+
 def test_ties_and_unfinished_runs() -> None:
     records = make_cell({"standard": 0.5, "equivariant": 0.5})
     records.append(make_record([make_evaluation([1] * 40)], "failed", seed=9))

@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from record_factory import make_cell, make_evaluation, make_record
 
+from leaderboard.findings import analyse
+from leaderboard.page import render_page
 from leaderboard.records import RunRecord, write_record
 from leaderboard.report import generate
+from leaderboard.summary import Run, summarize
 
 DEFECTS = {"none": 0.002, "wind:0.25": 0.1, "wind:0.5": 0.2, "wind:1": 0.4}
 HOSTILE = "x`</td><img src=x onerror=alert(1)>`|$a$\n# H [l](javascript:alert(1))"
@@ -62,6 +65,13 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write(folder, records)
     generate([folder / "results"], folder, audit(folder))
     return folder
+
+
+def page_of(records: list[RunRecord]) -> str:
+    """The page without figures and links."""
+    runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(records)]
+    summary = summarize(runs)
+    return render_page(summary, analyse(summary, {}), {}, {run.path: None for run in runs})
 
 
 def text_of(board: Path) -> str:
@@ -121,6 +131,14 @@ def test_learners_are_held_against_the_best_reference(board: Path) -> None:
     text = text_of(board)
     assert "Best reference: `golden-ticket`, 0.45. Against it: `equivariant` +0.35 [" in text
     assert "`approximate` clearly above in 5, clearly below in 0 of 5" in text
+
+
+def test_the_best_reference_counts_where_five_runs_steer_its_policy() -> None:
+    records = make_cell({"base": 0.25, "standard": 0.75})
+    text = page_of(records)
+    assert "`standard` clearly above in 1, clearly below in 0 of 1" in text
+    records[-1].base_policy.content_hash = "f" * 64
+    assert "clearly above in" not in page_of(records)
 
 
 def test_the_second_table_shows_q_cost_and_device(board: Path) -> None:
