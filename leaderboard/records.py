@@ -39,7 +39,7 @@ from pydantic import (
 
 from leaderboard.errors import RecordError
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 MAX_BYTES = 64 * 2**20
 """A record of this project has some ten to a few hundred kilobytes; larger files are not ours."""
 
@@ -330,12 +330,11 @@ class BasePolicy(_Measured):
 class FeasibleQ(_Block):
     """Bounds of the discounted return that the task's reward allows, per decision.
 
-    A soft critic may exceed them by `entropy_allowance` on either side (0 for a hard target).
+    A soft critic may exceed them on either side by the diagnostic `q_allowance`.
     """
 
     low: Finite
     high: Finite
-    entropy_allowance: Annotated[Finite, Field(ge=0)] = 0.0
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -391,19 +390,6 @@ class Evaluation(_Measured):
         return sum(self.episodes.success_once) / len(self.episodes.success_once)
 
 
-class Training(_Measured):
-    """Optional summary of training: `columns` of numbers, each as long as `env_steps`."""
-
-    env_steps: list[Count]
-    columns: dict[MetricName, list[Finite | None]]
-
-    @model_validator(mode="after")
-    def _columns_agree(self) -> Self:
-        if any(len(column) != len(self.env_steps) for column in self.columns.values()):
-            raise ValueError("the columns must be as long as env_steps")
-        return self
-
-
 def _from_1(data: dict[str, Any]) -> dict[str, Any]:
     """Version 2 added `continued` and `wall_clock.resumed`: a run of version 1 never was."""
     for name, block in (("continued", data), ("resumed", data.get("wall_clock"))):
@@ -412,14 +398,26 @@ def _from_1(data: dict[str, Any]) -> dict[str, Any]:
     return {**data, "schema_version": 2}
 
 
-MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {1: _from_1}
+def _from_2(data: dict[str, Any]) -> dict[str, Any]:
+    """Version 3 left out `training` and `feasible_q.entropy_allowance`, which held nothing."""
+    data = {**data, "schema_version": 3}
+    if data.pop("training", None) is not None:
+        raise ValueError("training must be null in schema_version 2")
+    if isinstance(bounds := data.get("feasible_q"), dict):
+        data["feasible_q"] = bounds = dict(bounds)
+        if bounds.pop("entropy_allowance", 0) != 0:
+            raise ValueError("feasible_q.entropy_allowance must be 0 in schema_version 2")
+    return data
+
+
+MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {1: _from_1, 2: _from_2}
 """From each older version of the schema to the next one; applied when a record is read."""
 
 
 class RunRecord(_Block):
     """Everything the leaderboard may know about one run."""
 
-    schema_version: Literal[2] = 2
+    schema_version: Literal[3] = 3
     run_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+=:,@-]{0,199}$")]
     config: dict[str, JsonValue]
     config_hash: str = ""
@@ -437,7 +435,6 @@ class RunRecord(_Block):
     base_policy: BasePolicy
     feasible_q: FeasibleQ | None
     evaluations: list[Evaluation] = Field(default_factory=list)
-    training: Training | None = None
 
     @field_validator("config")
     @classmethod

@@ -326,7 +326,7 @@ class Table:
     def feasible(self) -> tuple[float, float] | None:
         """The widest feasible Q bounds of the runs, entropy allowance included."""
         bounds = [
-            (bound, max([bound.entropy_allowance, *run.diagnostics("q_allowance")]))
+            (bound, max(run.diagnostics("q_allowance"), default=0.0))
             for run in self.runs
             if (bound := run.record.feasible_q)
         ]

@@ -46,6 +46,49 @@ def test_round_trip_keeps_everything(tmp_path: Path) -> None:
     assert sorted(p.name for p in path.parent.iterdir()) == ["record.json"]
 
 
+def older(tmp_path: Path, version: int) -> tuple[RunRecord, Path, dict[str, Any]]:
+    """A record and its file as a program of an older schema version would have written it."""
+    record = make_record([make_evaluation([1, 0, 1, 1], q_mean=-3.25)])
+    data = json.loads(dump_record(record))
+    data["schema_version"] = version
+    data["training"] = None
+    data["feasible_q"]["entropy_allowance"] = 0.0
+    if version == 1:
+        del data["continued"], data["wall_clock"]["resumed"]
+    path = tmp_path / "record.json"
+    path.write_text(json.dumps(data))
+    return record, path, data
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_older_records_are_read_as_new_ones(tmp_path: Path, version: int) -> None:
+    record, path, _ = older(tmp_path, version)
+    assert read_record(path) == record
+
+
+@pytest.mark.parametrize(
+    ("version", "where", "value", "words"),
+    [
+        (1, "continued", [], "continued does not belong"),
+        (1, "wall_clock/resumed", 0, "resumed does not belong"),
+        (2, "training", {"env_steps": [], "columns": {}}, "training must be null"),
+        (2, "feasible_q/entropy_allowance", 1.0, "entropy_allowance must be 0"),
+        (3, "training", None, "training"),
+        (3, "feasible_q/entropy_allowance", 0.0, "entropy_allowance"),
+    ],
+)
+def test_what_an_older_version_did_not_have_is_refused(
+    tmp_path: Path, version: int, where: str, value: Any, words: str
+) -> None:
+    _, path, data = older(tmp_path, version)
+    if version == 3:
+        del data["training"], data["feasible_q"]["entropy_allowance"]
+    change(data, where, value)
+    path.write_text(json.dumps(data))
+    with pytest.raises(RecordError, match=words):
+        read_record(path)
+
+
 def test_arrays_and_tensors_are_stored_as_numbers(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     evaluation = make_evaluation([1, 0], q_mean=np.float32(0.5), alpha=torch.tensor(0.25))
@@ -267,7 +310,7 @@ def change(data: dict[str, Any], where: str, value: Any) -> None:
 
 
 EDITS: list[tuple[str, Any, str]] = [
-    ("schema_version", 3, "schema_version"),
+    ("schema_version", 4, "schema_version"),
     ("schema_version", 0, "schema_version"),
     ("schema_version", "1", "schema_version"),
     ("schema_version", True, "schema_version"),
