@@ -195,8 +195,12 @@ def status(
     """
     from bench.sweep.status import read_status, to_text
 
-    print(_printable(to_text(read_status(folder, suite), folder)))
-    return 0
+    overview = read_status(folder, suite)
+    if overview.found or not overview.damage:
+        print(_printable(to_text(overview.found, folder)))
+    for error in overview.damage:
+        _complain(error, f"error: {error}", 2)
+    return 2 if overview.damage else 0
 
 
 @app.command

@@ -50,7 +50,16 @@ class Status:
         return estimate.left(todo, progress, len(running) or self.workers or 1)
 
 
-def read_status(folder: Path, suite: str | None = None) -> list[Status]:
+@dataclass(frozen=True)
+class Overview:
+    """What a folder holds: its sweeps and runs, and what of it cannot be read."""
+
+    found: list[Status]
+    damage: list[UserError] = field(default_factory=list)
+    """One for each file that cannot be read."""
+
+
+def read_status(folder: Path, suite: str | None = None) -> Overview:
     """The sweeps of a folder, and the runs that belong to none.
 
     Args:
@@ -58,7 +67,7 @@ def read_status(folder: Path, suite: str | None = None) -> list[Status]:
         suite: look at the sweep of this suite only.
 
     Raises:
-        UserError: if there is no such folder or sweep, or its list is damaged.
+        UserError: if there is no such folder or sweep, or the one that was named is damaged.
     """
     if not folder.is_dir():
         raise UserError(f"there is no folder {folder}; name the --out of a sweep or a run")
@@ -70,30 +79,39 @@ def read_status(folder: Path, suite: str | None = None) -> list[Status]:
             close = difflib.get_close_matches(suite, manifests, n=1) or list(manifests)
             hint = f"there: {', '.join(close)}" if close else "no sweep was begun there"
             raise UserError(f"{folder} holds no sweep of a suite {suite!r}; {hint}")
-        return [_of_sweep(folder, read_manifest(manifests[suite]))]
+        return Overview([_of_sweep(folder, read_manifest(manifests[suite]))])
     if (folder / CONFIG).is_file():
-        return [Status("run", _unlisted([folder]))]
-    found = [_of_sweep(folder, read_manifest(path)) for path in manifests.values()]
+        return Overview([Status("run", _unlisted(folder))])
+    found: list[Status] = []
+    damage: list[UserError] = []
+    for path in manifests.values():
+        try:
+            found.append(_of_sweep(folder, read_manifest(path)))
+        except UserError as error:
+            damage.append(error)
     listed = {cell.run_id for status in found for cell in status.runs}
-    folders = [path.parent for path in sorted(folder.glob(f"*/{CONFIG}"))]
-    if others := _unlisted([run for run in folders if run.name not in listed]):
+    others: dict[Cell, Sighting] = {}
+    for run in [path.parent for path in sorted(folder.glob(f"*/{CONFIG}"))]:
+        if run.name not in listed:
+            try:
+                others |= _unlisted(run)
+            except UserError as error:
+                damage.append(error)
+    if others:
         found.append(Status("runs of no sweep" if found else "runs", others))
-    return found
+    return Overview(found, damage)
 
 
-def _unlisted(folders: list[Path]) -> dict[Cell, Sighting]:
-    """Runs that no sweep lists, as far as they are runs of this program."""
-    found = {}
-    for folder in folders:
-        config = read_config(folder)
-        known = [config.get(key) for key in (*BASIC, "env_steps")]
-        if all(isinstance(value, str | int) for value in known):
-            found[Cell.of(config, folder.resolve().name)] = look(folder)
-    return found
+def _unlisted(folder: Path) -> dict[Cell, Sighting]:
+    """A run that no sweep lists, if it is one of this program."""
+    config = read_config(folder)
+    if all(isinstance(config.get(key), str | int) for key in (*BASIC, "env_steps")):
+        return {Cell.of(config, folder.resolve().name): look(folder)}
+    return {}
 
 
 def to_text(found: list[Status], folder: Path) -> str:
-    """What :func:`read_status` found, for reading."""
+    """The :attr:`Overview.found` of a folder, for reading."""
     if not found:
         return (
             f"there are no runs in {folder} yet; `symsteer sweep SUITE --out {folder}` begins some"

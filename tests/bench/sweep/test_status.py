@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -90,7 +91,7 @@ def sweep(undisturbed, tmp_path):
 
 
 def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
-    [status] = read_status(sweep.out)
+    [status] = read_status(sweep.out).found
     assert [status.state(one) for one in sweep.cells] == [
         "finished",
         "running",
@@ -112,18 +113,31 @@ def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
 def test_runs_of_no_sweep_are_reported_too(sweep, undisturbed, tmp_path):
     other = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0"
     shutil.copytree(undisturbed, other)
-    assert [len(status.runs) for status in read_status(tmp_path)] == [5, 1]
+    assert [len(status.runs) for status in read_status(tmp_path).found] == [5, 1]
     manifest_path(tmp_path, "tiny").unlink()
-    [status] = read_status(tmp_path)
+    [status] = read_status(tmp_path).found
     # The two that never began have left nothing.
     assert len(status.runs) == 4
+
+
+def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, capsys, monkeypatch):
+    other, list_ = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0", tmp_path / "sweeps"
+    shutil.copytree(undisturbed, other)
     (other / CONFIG).write_text("{")
+    (list_ / "older.json").write_text("[]")
+    monkeypatch.setattr("sys.argv", ["symsteer", "status", str(tmp_path)])
+    assert main() == 2
+    out, errors = capsys.readouterr()
+    assert out.startswith("tiny: five (5 runs)\n  finished         1\n")
+    one, two = errors.splitlines()
+    assert re.match(r"error: \S+older.json is not the list of a sweep; run the sweep again", one)
+    assert re.match(r"error: \S+config.json cannot be read .*; restore it", two)
     with pytest.raises(UserError, match=CONFIG):
-        read_status(tmp_path)
+        read_status(other)
 
 
 def test_the_status_of_a_run_by_its_own_folder(undisturbed):
-    text = to_text(read_status(undisturbed), undisturbed)
+    text = to_text(read_status(undisturbed).found, undisturbed)
     assert text.startswith("run (1 runs)")
     assert "finished         1" in text
 
@@ -132,10 +146,10 @@ def test_folders_of_something_else_are_left_alone(undisturbed, tmp_path):
     for name, data in (("a", "[1]"), ("b", '{"task": ["PickCube-v1"]}')):
         (tmp_path / name).mkdir()
         (tmp_path / name / CONFIG).write_text(data)
-    with pytest.raises(UserError, match="not the configuration of a run"):
-        read_status(tmp_path)
-    (tmp_path / "a" / CONFIG).unlink()
-    assert read_status(tmp_path) == []
+    overview = read_status(tmp_path)
+    assert overview.found == []
+    assert len(overview.damage) == 1
+    assert "not the configuration of a run" in str(overview.damage[0])
 
 
 def test_mistakes_with_status(sweep, tmp_path):
@@ -144,12 +158,14 @@ def test_mistakes_with_status(sweep, tmp_path):
     with pytest.raises(UserError, match=r"no sweep of a suite 'tin'; there: tiny"):
         read_status(tmp_path, "tin")
     (tmp_path / "empty").mkdir()
-    assert to_text(read_status(tmp_path / "empty"), tmp_path).startswith("there are no runs in")
+    assert to_text(read_status(tmp_path / "empty").found, tmp_path).startswith(
+        "there are no runs in"
+    )
     path = manifest_path(tmp_path, "tiny")
     for damage in (path.read_text()[:-9], "[]", '{"suite": 3}', "\x00"):
         path.write_text(damage)
         with pytest.raises(UserError, match="run the sweep again to write it anew"):
-            read_status(tmp_path)
+            read_status(tmp_path, "tiny")
 
 
 def screen(sweep, width: int) -> list[str]:

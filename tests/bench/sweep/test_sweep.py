@@ -161,7 +161,7 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
     try:
         wait_for(lambda: (folder / CHECKPOINT).is_file() or sweep.poll() is not None)
         assert state_of(folder) == "running"
-        [status] = read_status(out)
+        [status] = read_status(out).found
         assert [len(status.cells(state)) for state in ("running", "missing")] == [1, 1]
         if end == signal.SIGINT:
             os.killpg(sweep.pid, end)
@@ -178,7 +178,7 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
             "the same command goes on where this one stopped",
         ]
         assert output == ""
-    text = to_text(read_status(out), out)
+    text = to_text(read_status(out).found, out)
     assert "interrupted      1" in text
     assert "missing          1" in text
 
