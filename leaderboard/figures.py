@@ -158,7 +158,7 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
         dotted: dict[str, Any] = {} if run.finished else {"linestyle": ":"}
         ax.plot(list(run.curve), values, color=color, linewidth=0.7, alpha=0.35, **dotted)
         if not run.finished and values:
-            ax.plot(list(run.curve)[-1], values[-1], "x", color=color, markersize=5, clip_on=False)
+            ax.plot(list(run.curve)[-1], values[-1], "x", color=color, markersize=5)
     if not steps:
         return
     bands = [
@@ -190,7 +190,6 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
         markersize=4,
         markevery=max(1, len(steps) // MAX_MARKERS),
         linewidth=1.7,
-        clip_on=False,
     )
 
 
@@ -216,7 +215,7 @@ def q_values(tables: Sequence[Table]) -> Figure:
                 ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
                 extremes += values
                 if run.record.nonfinite_q:
-                    ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7, clip_on=False)
+                    ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7)
             places, means = _mean_series(runs, "q_mean")
             every = max(1, len(places) // MAX_MARKERS)
             style: dict[str, Any] = {

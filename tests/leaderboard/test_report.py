@@ -368,6 +368,15 @@ def test_the_largest_numbers_are_drawn(tmp_path: Path) -> None:
     assert main([str(tmp_path / "runs"), "--out", str(tmp_path / "board")]) == 0
 
 
+@pytest.mark.filterwarnings("error")
+def test_points_far_beyond_the_budget_do_not_spoil_the_figures(tmp_path: Path) -> None:
+    curve = [make_evaluation([1, 0], q_mean=math.inf), make_evaluation([1, 0], 2**31, q_mean=-1.0)]
+    curve[0].final = False
+    for record in (make_record(curve), make_record(curve, "failed", seed=1)):
+        write_record(record, tmp_path / "runs" / record.run_id / "record.json")
+    assert main([str(tmp_path / "runs"), "--out", str(tmp_path / "board")]) == 0
+
+
 def test_a_cross_marks_a_q_that_is_not_finite_and_no_missing_bias() -> None:
     def crosses(**diagnostics: float) -> int:
         curve = [make_evaluation([1, 0], 25_000, False, q_mean=-5.0, q_max=-4.0)]
