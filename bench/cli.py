@@ -162,7 +162,7 @@ def sweep(
 
     plan = make_plan(load_suite(suite), out, elsewhere=ray is not None)
     if dry_run:
-        print(preview(plan, workers))
+        print(preview(plan, workers, ray))
         return 0
     outcomes = run_plan(plan, workers, ray)
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]

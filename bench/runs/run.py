@@ -46,10 +46,10 @@ def check(config: RunConfig) -> None:
     """
     task_class(config.task)
     check_embodiment(config.embodiment)
-    parse(config.variant)
+    variants = parse(config.variant)
     if config.agent not in AGENTS:
         raise UserError(f"there is no agent {config.agent!r}; valid: {', '.join(AGENTS)}")
-    if len(parse(config.variant)) != len(config.variant.split("+")) * (config.variant != "none"):
+    if config.variant != "none" and len(variants) < len(config.variant.split("+")):
         raise UserError(
             f"the variant {config.variant} has a part of strength 0, which changes nothing; leave "
             "it out, or use none, the unbroken task"

@@ -87,10 +87,19 @@ class RayCluster:
         self._ray.shutdown()
 
 
-def _connect(address: str) -> Any:
-    """The ray module, connected."""
+def check_address(address: str) -> None:
+    """Refuse what cannot be the address of a cluster; whether one answers there is not asked.
+
+    Raises:
+        UserError: if it is neither ``auto`` nor ``host:port``.
+    """
     if not ADDRESS.fullmatch(address):
         raise UserError(f"--ray {address} is no address; use auto or the host:port of a Ray head")
+
+
+def _connect(address: str) -> Any:
+    """The ray module, connected."""
+    check_address(address)
     # Before the import, which reads it.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     try:

@@ -111,13 +111,18 @@ def look_at(plan: Plan) -> dict[Cell, Sighting]:
     return {cell: look(plan.out / cell.run_id) for cell in plan.cells}
 
 
-def preview(plan: Plan, workers: int = 0) -> str:
-    """What a sweep would do, in words; nothing is run or written.
+def preview(plan: Plan, workers: int = 0, ray: str | None = None) -> str:
+    """What a sweep would do, in words; nothing is run or written, and no cluster is asked.
 
     Raises:
-        UserError: if ``workers`` is negative.
+        UserError: if ``workers`` is negative, or ``ray`` can be no cluster's address.
     """
-    number = number_of_workers(workers, list(plan.configs.values()))
+    number: int | None = number_of_workers(workers, list(plan.configs.values()))
+    if ray is not None:
+        from bench.sweep.cluster import check_address
+
+        check_address(ray)
+        number = workers or None
     seen = look_at(plan)
     lines = [plan.title, "", *_counts(seen), ""]
     todo = [cell for cell in plan.cells if seen[cell].state != "finished"]
@@ -132,9 +137,11 @@ def preview(plan: Plan, workers: int = 0) -> str:
     return "\n".join(lines)
 
 
-def _time(estimate: Estimate, todo: list[Cell], workers: int, bases: bool) -> str:
+def _time(estimate: Estimate, todo: list[Cell], workers: int | None, bases: bool) -> str:
     if not todo:
         return "none, all runs are finished"
+    if workers is None:
+        return "depends on what the cluster has room for; --workers N says it for N runs at once"
     left = estimate.left(todo, {}, workers)
     if left is None:
         return "unknown, no such runs are finished yet"

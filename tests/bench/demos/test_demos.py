@@ -1,7 +1,10 @@
 """Demonstrations: collected, read back, read by ManiSkill's tools, refused when they are wrong."""
 
+import importlib
 import json
 import shutil
+import subprocess
+import sys
 
 import gymnasium as gym
 import h5py
@@ -14,9 +17,11 @@ from mani_skill.trajectory.utils import dict_to_list_of_dicts
 from bench.demos import Diversity, collect, load
 from bench.sim import make_env_class
 from bench.tasks import make, task_class
+from leaderboard.records import write_atomically
 from policies.errors import UserError
 
 TASK = "PickCube-v1"
+collecting = importlib.import_module("bench.demos.collect")
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +88,28 @@ def test_the_same_arguments_give_the_same_demonstrations(tmp_path):
         path = collect(TASK, "floating", 3, "diverse", seed, tmp_path / f"{name}.h5", num_envs=2)
         hashes.append(load(path, TASK, "floating").content_hash)
     assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_two_processes_may_write_the_same_demonstrations(tmp_path, monkeypatch):
+    """The other one comes in the middle of this one's writing."""
+    path = tmp_path / "demos.h5"
+    arguments = (TASK, "floating", 2, "diverse", 7)
+    code = (
+        "from pathlib import Path; from bench.demos import collect; "
+        f"collect(*{arguments!r}, Path({str(path)!r}))"
+    )
+    written = []
+
+    def write(*file):
+        write_atomically(*file)
+        if not written:
+            written.append(subprocess.run([sys.executable, "-W", "ignore", "-c", code]).returncode)
+
+    monkeypatch.setattr(collecting, "write_atomically", write)
+    collect(*arguments, path)
+    assert written == [0]
+    assert len(load(path, TASK, "floating")) == 2
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["demos.h5", "demos.json"]
 
 
 def test_diverse_demonstrations_carry_noise(tmp_path, clean):

@@ -207,6 +207,11 @@ def test_the_command_line(undisturbed, monkeypatch, capsys, tmp_path):
     assert re.search(r"env_steps +480 +1 +1 +0 +0 +0\n +481 +1 +0 +0 +0 +1\n", text)
     assert "base policies to build: 1\n  edp for PickCube-v1 floating, 3 diverse" in text
     assert "judged by 1 finished run" in text
+    cluster = ("sweep", path, "--out", out, "--dry-run", "--ray", "no-such-head:6379")
+    assert symsteer(monkeypatch, *cluster) == 0
+    assert "time: depends on what the cluster has room for" in capsys.readouterr().out
+    assert symsteer(monkeypatch, *cluster, "--workers", 7) == 0
+    assert "with 7 workers, judged by 1 finished run" in capsys.readouterr().out
     assert sorted(out.rglob("*")) == before
     record = (out / undisturbed.name / "record.json").stat().st_mtime_ns
     shutil.copytree(undisturbed.parent / "base", out / "base")
@@ -233,6 +238,7 @@ def test_the_command_line(undisturbed, monkeypatch, capsys, tmp_path):
         ("", ["--workers", "-1"], "--workers is -1"),
         ("", ["--workers", "-1", "--dry-run"], "--workers is -1"),
         ("", ["--ray", "here"], "--ray here is no address"),
+        ("", ["--ray", "here", "--dry-run"], "--ray here is no address"),
     ],
 )
 def test_what_cannot_run_is_refused_before_anything_happens(
