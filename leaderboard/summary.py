@@ -326,7 +326,7 @@ class Table:
     def feasible(self) -> tuple[float, float] | None:
         """The widest feasible Q bounds of the runs, entropy allowance included."""
         bounds = [
-            (bound, max(run.diagnostics("q_allowance"), default=0.0))
+            (bound, max([0.0, *run.diagnostics("q_allowance")]))
             for run in self.runs
             if (bound := run.record.feasible_q)
         ]

@@ -284,6 +284,21 @@ def test_learners_are_paired_by_step_and_episode_references_by_episode() -> None
     assert success_pairs(approximate, rows["standard"]) == {}
 
 
+@pytest.mark.parametrize(
+    ("allowances", "expected"),
+    [((), (-20.0, 0.0)), ((0.5, 2.0, 1.0), (-22.0, 2.0)), ((-3.0,), (-20.0, 0.0))],
+)
+def test_the_feasible_band_is_widened_by_the_largest_allowance(
+    allowances: tuple[float, ...], expected: tuple[float, float]
+) -> None:
+    curve = [
+        make_evaluation([1, 0], 10_000 * i, i == len(allowances) - 1, q_allowance=value)
+        for i, value in enumerate(allowances)
+    ]
+    records = [make_record(agent="standard"), make_record(curve or None, agent="equivariant")]
+    assert summarize([run(record) for record in records]).tables[0].feasible == expected
+
+
 def test_learners_are_compared_with_the_best_reference() -> None:
     runs = [of(rate, agent=agent) for agent, rate in (("base", 0.3), ("zero", 0.6))]
     summary = summarize([*runs, of(0.95), of(0.61, agent="equivariant")])
