@@ -43,6 +43,8 @@ def test_an_address_that_does_not_answer(monkeypatch, tmp_path):
 def cluster():
     """A head without processors and two machines with one each, all on this one."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    # Ray's workers give way to all other processes, so that beside other tests they stand still.
+    os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112 (the name that Ray reads)
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(
@@ -94,6 +96,8 @@ def test_a_machine_dies_and_nothing_is_lost(cluster, undisturbed, tmp_path, caps
     run = out / plan.cells[0].run_id
 
     def kill() -> None:
+        # To look for its process takes long; before that, there are demonstrations and a policy.
+        wait_for((run / LOCK).is_file)
         wait_for(lambda: machine_of(run, cluster.worker_nodes))
         machine = machine_of(run, cluster.worker_nodes)
         raylet = psutil.Process(machine.all_processes["raylet"][0].process.pid)
