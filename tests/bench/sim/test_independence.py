@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import gc
-import resource
 from itertools import pairwise
-from pathlib import Path
 
+import psutil
 import pytest
 import torch
 
@@ -116,7 +115,7 @@ def test_memory_stays(kit):
             env.reset(seed=1, options={"reconfigure": True})
             kit.batched("PickCube", 2).close()
         gc.collect()
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+        return psutil.Process().memory_info().rss
 
     bytes_after_use()
     rounds = [bytes_after_use() for _ in range(5)]

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
@@ -121,10 +122,10 @@ def test_runs_of_no_sweep_are_reported_too(sweep, undisturbed, tmp_path):
 
 
 def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, capsys, monkeypatch):
-    other, list_ = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0", tmp_path / "sweeps"
+    other = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0"
     shutil.copytree(undisturbed, other)
     (other / CONFIG).write_text("{")
-    (list_ / "older.json").write_text("[]")
+    manifest_path(tmp_path, "older").write_text("[]")
     monkeypatch.setattr("sys.argv", ["symsteer", "status", str(tmp_path)])
     assert main() == 2
     out, errors = capsys.readouterr()
@@ -208,6 +209,17 @@ def test_a_pipe_gets_one_plain_line_a_run_that_ended(sweep):
     assert stream.getvalue() == (
         "failed    [2/5] PickCube-v1 floating none standard seed 0          " + "why " * 30 + "\n"
     )
+
+
+def test_a_sweep_goes_on_when_nobody_reads_its_lines_any_more(sweep):
+    reading, writing = os.pipe()
+    os.close(reading)
+    output = os.fdopen(writing, "w")
+    display = Display(sweep, sweep.cells, Estimate(), 2, Console(file=output))
+    display.ended(Outcome(sweep.cells[0], "finished"))
+    assert display.counts["finished"] == 1
+    with pytest.raises(BrokenPipeError):
+        output.close()
 
 
 def test_a_reason_is_one_line_of_bounded_length():
