@@ -17,11 +17,11 @@ from typing import Any, Protocol, TypeAlias, cast
 
 import torch
 
-from agents.references import BaseAgent
-from agents.replay import Batch, ReplayBuffer
-from agents.sac import Normalize, SacAgent, SacConfig
-from policies.errors import UserError
-from policies.geometry import Layout
+from symsteer.agents.references import BaseAgent
+from symsteer.agents.replay import Batch, ReplayBuffer
+from symsteer.agents.sac import Normalize, SacAgent, SacConfig
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Layout
 
 __all__ = [
     "AGENTS",
@@ -161,7 +161,7 @@ def make_agent(
     normalize_obs: Normalize | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> SacAgent | BaseAgent:
-    """Build an agent by name; arguments as in :class:`agents.sac.SacAgent`.
+    """Build an agent by name; arguments as in :class:`symsteer.agents.sac.SacAgent`.
 
     Raises:
         UserError: if there is no agent of that name.

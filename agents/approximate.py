@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from agents.equivariant import EquivariantAgent
-from agents.networks import Dense, dense, shrink_
-from agents.replay import Batch
+from symsteer.agents.equivariant import EquivariantAgent
+from symsteer.agents.networks import Dense, dense, shrink_
+from symsteer.agents.replay import Batch
 
 
 class ResidualPathway(nn.Module):

@@ -1,7 +1,7 @@
 """Is the critic right, and does the agent keep its symmetry? Every scalar with its formula.
 
 All values are in the environment's reward units, per decision. ``q`` arrays hold all critics,
-``[critics, B]``, as :meth:`agents.sac.SacAgent.q_values` returns them.
+``[critics, B]``, as :meth:`symsteer.agents.sac.SacAgent.q_values` returns them.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import math
 
 import torch
 
-from agents.sac import SacAgent
-from policies.errors import UserError
-from policies.geometry import Group
+from symsteer.agents.sac import SacAgent
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Group
 
 Scalars = dict[str, float]
 

@@ -23,8 +23,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from policies.errors import UserError
-from policies.geometry import Layout
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Layout
 
 # Below this |u|^2, functions of |u| are evaluated by their power series in |u|^2, whose first
 # dropped terms are below 1e-14 there.

@@ -13,10 +13,10 @@ import math
 import torch
 from torch import nn
 
-from agents.networks import shrink_
-from agents.sac import SacAgent, SacConfig
-from policies.equivariant import Lift, Project, RegularLinear
-from policies.geometry import Field, Group, Layout
+from symsteer.agents.networks import shrink_
+from symsteer.agents.sac import SacAgent, SacConfig
+from symsteer.policies.equivariant import Lift, Project, RegularLinear
+from symsteer.policies.geometry import Field, Group, Layout
 
 VALUE = Layout([Field("value", 0)])
 

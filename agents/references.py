@@ -6,9 +6,9 @@ from typing import Any, ClassVar
 
 import torch
 
-from agents.replay import Batch
-from agents.sac import Normalize, SacConfig, check_description
-from policies.geometry import Layout
+from symsteer.agents.replay import Batch
+from symsteer.agents.sac import Normalize, SacConfig, check_description
+from symsteer.policies.geometry import Layout
 
 
 class BaseAgent:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 
-from policies.errors import UserError
+from symsteer.errors import UserError
 
 
 class Batch(NamedTuple):

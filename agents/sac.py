@@ -23,11 +23,11 @@ from typing import Any, ClassVar
 import torch
 from torch import nn
 
-from agents.distributions import SquashedGaussian
-from agents.networks import Ensemble, Weights, count, detached
-from agents.replay import Batch
-from policies.errors import UserError
-from policies.geometry import Field, Layout
+from symsteer.agents.distributions import SquashedGaussian
+from symsteer.agents.networks import Ensemble, Weights, count, detached
+from symsteer.agents.replay import Batch
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Field, Layout
 
 Normalize = Callable[[torch.Tensor], torch.Tensor]
 

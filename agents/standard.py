@@ -6,9 +6,9 @@ import itertools
 
 from torch import nn
 
-from agents.equivariant import equivariant_actor_layers, equivariant_critic_layers
-from agents.networks import Dense, count, shrink_
-from agents.sac import SacAgent
+from symsteer.agents.equivariant import equivariant_actor_layers, equivariant_critic_layers
+from symsteer.agents.networks import Dense, count, shrink_
+from symsteer.agents.sac import SacAgent
 
 
 class StandardAgent(SacAgent):

@@ -31,12 +31,12 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
-from bench.sim import create, prepare_headless
-from bench.sim.environment import MAX_SCENES
-from bench.sim.shards.messages import divide
-from bench.sim.shards.server import WorkerProcess
-from bench.tasks import task_class
-from policies.errors import UserError
+from symsteer.bench.sim import create, prepare_headless
+from symsteer.bench.sim.environment import MAX_SCENES
+from symsteer.bench.sim.shards.messages import divide
+from symsteer.bench.sim.shards.server import WorkerProcess
+from symsteer.bench.tasks import task_class
+from symsteer.errors import UserError
 
 EPISODE = 50
 """Control steps between two resets."""

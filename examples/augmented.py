@@ -13,9 +13,9 @@ import math
 
 import torch
 
-from agents.replay import Batch
-from agents.standard import StandardAgent
-from policies.geometry import Group
+from symsteer.agents.replay import Batch
+from symsteer.agents.standard import StandardAgent
+from symsteer.policies.geometry import Group
 
 
 class AugmentedAgent(StandardAgent):

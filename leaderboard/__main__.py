@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
-from leaderboard.admission import check
-from leaderboard.errors import RecordError
-from leaderboard.report import DEFAULT_OUT, DEFAULT_RECORDS, generate, verify
-from leaderboard.verification import other_versions
+from symsteer.leaderboard.admission import check
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.report import DEFAULT_OUT, DEFAULT_RECORDS, generate, verify
+from symsteer.leaderboard.verification import other_versions
 
 FEW = 10
 """Of more records than these, `--check` names only those that it has something to say about."""

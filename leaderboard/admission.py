@@ -17,16 +17,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from leaderboard.errors import RecordError
-from leaderboard.paths import record_files
-from leaderboard.records import (
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.paths import record_files
+from symsteer.leaderboard.records import (
     HELD_OUT_SEED,
     RunRecord,
     canonical_json,
     portable,
     read_record,
 )
-from leaderboard.summary import MIN_SEEDS, REFERENCES, Key, recipe_of, seeds_of
+from symsteer.leaderboard.summary import MIN_SEEDS, REFERENCES, Key, recipe_of, seeds_of
 
 MIN_EPISODES = 100
 """Held-out episodes of an admissible record's final evaluation."""

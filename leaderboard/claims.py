@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from leaderboard.defects import (
+from symsteer.leaderboard.defects import (
     MIN_CELLS,
     Audit,
     DefectMap,
@@ -22,7 +22,7 @@ from leaderboard.defects import (
     advantage,
     defect_of,
 )
-from leaderboard.statistics import (
+from symsteer.leaderboard.statistics import (
     Interval,
     Sample,
     censored_median,
@@ -31,7 +31,7 @@ from leaderboard.statistics import (
     stratified_bootstrap,
     stratified_draws,
 )
-from leaderboard.summary import MIN_SEEDS, Key, Pair, Summary, Table
+from symsteer.leaderboard.summary import MIN_SEEDS, Key, Pair, Summary, Table
 
 NEARLY_SYMMETRIC = 0.05
 """Cells with an audited defect up to this are where the paper expects symmetry to help."""

@@ -12,13 +12,13 @@ from itertools import combinations
 
 import numpy as np
 
-from leaderboard.statistics import (
+from symsteer.leaderboard.statistics import (
     Array,
     Interval,
     performance_profile,
     probability_of_improvement,
 )
-from leaderboard.summary import REFERENCES, Row, Run, Summary, Table, reference_success
+from symsteer.leaderboard.summary import REFERENCES, Row, Run, Summary, Table, reference_success
 
 GROUPS = ("unbroken", "broken")
 THRESHOLDS = np.linspace(-0.5, 1.0, 151)

@@ -17,9 +17,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from leaderboard.errors import RecordError
-from leaderboard.records import canonical_json, canonical_variant
-from leaderboard.statistics import (
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.records import canonical_json, canonical_variant
+from symsteer.leaderboard.statistics import (
     RESAMPLES,
     Array,
     Interval,
@@ -28,7 +28,15 @@ from leaderboard.statistics import (
     percentile,
     stratified_draws,
 )
-from leaderboard.summary import MIN_SEEDS, Key, Pair, Summary, Table, area_pairs, success_pairs
+from symsteer.leaderboard.summary import (
+    MIN_SEEDS,
+    Key,
+    Pair,
+    Summary,
+    Table,
+    area_pairs,
+    success_pairs,
+)
 
 DEFAULT_AUDIT = Path(__file__).resolve().parents[1] / "docs" / "audit" / "summary.json"
 

@@ -20,11 +20,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
-from leaderboard.defects import BASELINE, COMPARED, MEASURES, DefectMap, Line, Panel
-from leaderboard.findings import Findings
-from leaderboard.statistics import Interval, Sample, success_interval
-from leaderboard.summary import (
+from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
+from symsteer.leaderboard.defects import BASELINE, COMPARED, MEASURES, DefectMap, Line, Panel
+from symsteer.leaderboard.findings import Findings
+from symsteer.leaderboard.statistics import Interval, Sample, success_interval
+from symsteer.leaderboard.summary import (
     MIN_SEEDS,
     REFERENCES,
     Row,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from leaderboard.claims import Claim, claims
-from leaderboard.comparisons import Comparisons, compare_agents
-from leaderboard.defects import Audit, DefectMap, defect_map, fingerprint
-from leaderboard.summary import Summary
+from symsteer.leaderboard.claims import Claim, claims
+from symsteer.leaderboard.comparisons import Comparisons, compare_agents
+from symsteer.leaderboard.defects import Audit, DefectMap, defect_map, fingerprint
+from symsteer.leaderboard.summary import Summary
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from leaderboard.claims import NEARLY_SYMMETRIC, STRONGLY_BROKEN, Claim
-from leaderboard.comparisons import Comparisons
-from leaderboard.defects import (
+from symsteer.leaderboard.claims import NEARLY_SYMMETRIC, STRONGLY_BROKEN, Claim
+from symsteer.leaderboard.comparisons import Comparisons
+from symsteer.leaderboard.defects import (
     BASELINE,
     COMPARED,
     COMPONENTS,
@@ -20,11 +20,11 @@ from leaderboard.defects import (
     Panel,
     audit_commands,
 )
-from leaderboard.findings import Findings
-from leaderboard.records import DIVERGED_EVALUATIONS, DIVERGED_SHARE, Provenance
-from leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
-from leaderboard.tables import Links, cell_name, section, status
-from leaderboard.text import (
+from symsteer.leaderboard.findings import Findings
+from symsteer.leaderboard.records import DIVERGED_EVALUATIONS, DIVERGED_SHARE, Provenance
+from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
+from symsteer.leaderboard.tables import Links, cell_name, section, status
+from symsteer.leaderboard.text import (
     MARKS,
     NOTHING,
     SPACE,
@@ -229,7 +229,8 @@ def _map(summary: Summary, found: DefectMap, figures: Mapping[str, tuple[str, st
             measured = ", ".join(code(command, 1000) for command in commands)
             text += (
                 f" To measure them: {measured}; then "
-                "`python -m bench.audit.page docs/audit/summary.json runs/audit/summary.json`."
+                "`python -m symsteer.bench.audit.page docs/audit/summary.json "
+                "runs/audit/summary.json`."
             )
         parts.append(text)
     return parts

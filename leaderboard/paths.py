@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterable
 from pathlib import Path
 
-from leaderboard.errors import RecordError
+from symsteer.leaderboard.errors import RecordError
 
 RECORD = "record.json"
 """The record's name in a run folder; committed records are called by their run_id."""

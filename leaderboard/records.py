@@ -37,7 +37,7 @@ from pydantic import (
     model_validator,
 )
 
-from leaderboard.errors import RecordError
+from symsteer.leaderboard.errors import RecordError
 
 SCHEMA_VERSION = 3
 MAX_BYTES = 64 * 2**20

@@ -11,15 +11,15 @@ import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from leaderboard.defects import Audit, read_audit
-from leaderboard.errors import RecordError
-from leaderboard.figures import render_figures, to_svg
-from leaderboard.findings import analyse
-from leaderboard.page import render_page
-from leaderboard.summary import Run, load_runs, summarize
-from leaderboard.tables import render_csv
-from leaderboard.text import relative_link
-from leaderboard.verification import Verification, differences
+from symsteer.leaderboard.defects import Audit, read_audit
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.figures import render_figures, to_svg
+from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.page import render_page
+from symsteer.leaderboard.summary import Run, load_runs, summarize
+from symsteer.leaderboard.tables import render_csv
+from symsteer.leaderboard.text import relative_link
+from symsteer.leaderboard.verification import Verification, differences
 
 DEFAULT_OUT = Path(__file__).resolve().parent
 DEFAULT_RECORDS = DEFAULT_OUT / "results"

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from leaderboard.paths import record_files
-from leaderboard.records import Evaluation, Provenance, RunRecord, config_hash, read_record
-from leaderboard.statistics import (
+from symsteer.leaderboard.paths import record_files
+from symsteer.leaderboard.records import Evaluation, Provenance, RunRecord, config_hash, read_record
+from symsteer.leaderboard.statistics import (
     Block,
     Interval,
     Sample,

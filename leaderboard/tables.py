@@ -7,8 +7,8 @@ import io
 from collections.abc import Mapping
 from pathlib import Path
 
-from leaderboard.summary import ARM, THRESHOLD, Key, Row, Summary, Table
-from leaderboard.text import (
+from symsteer.leaderboard.summary import ARM, THRESHOLD, Key, Row, Summary, Table
+from symsteer.leaderboard.text import (
     MARKS,
     NOTHING,
     SPACE,

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from leaderboard.statistics import Interval
+from symsteer.leaderboard.statistics import Interval
 
 NOTHING = "\u2013"
 MINUS = "\u2212"

@@ -30,7 +30,7 @@ def differences(files: Mapping[str, bytes], stale: list[str], out: Path) -> list
     """One line for every file of the folder `out` that is not as the records give it.
 
     Args:
-        files: what the records give, by path relative to `out` (`leaderboard.report.render`).
+        files: what the records give, by path relative to `out` (`report.render`).
         stale: files of `out` that belong to an older leaderboard, relative to `out`.
     """
     lines = []

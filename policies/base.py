@@ -16,12 +16,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import nn
 
-from policies.diffusion import Diffusion, Prediction
-from policies.edp import Denoiser, parameter_count
-from policies.errors import UserError
-from policies.geometry import Group, Layout
-from policies.normalizer import Normalizer, clip_blocks
-from policies.plain import matched_size
+from symsteer.errors import UserError
+from symsteer.policies.diffusion import Diffusion, Prediction
+from symsteer.policies.edp import Denoiser, parameter_count
+from symsteer.policies.geometry import Group, Layout
+from symsteer.policies.normalizer import Normalizer, clip_blocks
+from symsteer.policies.plain import matched_size
 
 PolicyName = Literal["edp", "plain", "plain-augmented"]
 Network = Literal["mlp", "unet"]

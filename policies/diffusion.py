@@ -15,7 +15,7 @@ from typing import Literal
 
 import torch
 
-from policies.errors import UserError
+from symsteer.errors import UserError
 
 Prediction = Literal["sample", "epsilon"]
 Bound = Callable[[torch.Tensor], torch.Tensor]

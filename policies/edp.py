@@ -19,9 +19,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from policies.equivariant import Lift, Project, RegularLinear
-from policies.geometry import Group, Layout
-from policies.unet import ResidualMLP, TemporalUNet
+from symsteer.policies.equivariant import Lift, Project, RegularLinear
+from symsteer.policies.geometry import Group, Layout
+from symsteer.policies.unet import ResidualMLP, TemporalUNet
 
 TIME_FEATURES = 64
 

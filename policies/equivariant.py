@@ -17,7 +17,7 @@ import math
 import torch
 from torch import nn
 
-from policies.geometry import Group, Layout
+from symsteer.policies.geometry import Group, Layout
 
 
 class Lift(nn.Module):

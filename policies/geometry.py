@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 
-from policies.errors import UserError
+from symsteer.errors import UserError
 
 if TYPE_CHECKING:
     import escnn.group

@@ -13,8 +13,8 @@ import functools
 import torch
 from torch import nn
 
-from policies.errors import UserError
-from policies.geometry import Layout
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Layout
 
 MINIMUM_RANGE = 1e-2
 """Half-ranges below this count as constant (1 cm, or 0.6 degrees in a rotation column): dividing

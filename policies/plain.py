@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import torch
 
-from policies.edp import Denoiser, parameter_count
-from policies.geometry import Group, Layout
+from symsteer.policies.edp import Denoiser, parameter_count
+from symsteer.policies.geometry import Group, Layout
 
 
 def matched_size(

@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from policies.base import ChunkPolicy
-from policies.errors import UserError
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy
 
 DESIRED_ACTION_STD = 0.3
 """Below this spread of normalised actions steering gained little in pilot runs."""

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from policies.base import ChunkPolicy, PolicyConfig
-from policies.errors import UserError
-from policies.geometry import Group, Layout
-from policies.normalizer import Normalizer, clip_blocks
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy, PolicyConfig
+from symsteer.policies.geometry import Group, Layout
+from symsteer.policies.normalizer import Normalizer, clip_blocks
 
 Episode = tuple[torch.Tensor, torch.Tensor]
 Progress = Callable[[int, int, float], None]

@@ -1,6 +1,6 @@
 """Denoising networks for one slice of a chunk: a residual MLP and a temporal U-Net.
 
-They know nothing of symmetry: ``policies.edp`` runs the same network on every group element's
+They know nothing of symmetry: ``edp`` runs the same network on every group element's
 slice, with the group axis folded into the batch. Both take the chunk's features and one vector of
 conditioning numbers, which scale and shift the hidden features (FiLM, arXiv 1709.07871). The
 U-Net follows the conditional one of Diffusion Policy (arXiv 2303.04137), two levels deep.
@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from policies.errors import UserError
+from symsteer.errors import UserError
 
 
 class ResidualMLP(nn.Module):

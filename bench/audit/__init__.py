@@ -5,10 +5,10 @@
 - :func:`rotated_rollout_error`: whole episodes and their turned copies.
 """
 
-from bench.audit.cell import Cell, Defect, Settings
-from bench.audit.estimates import Estimate
-from bench.audit.rollout import RolloutError, rotated_rollout_error
-from bench.audit.study import run_cells
+from symsteer.bench.audit.cell import Cell, Defect, Settings
+from symsteer.bench.audit.estimates import Estimate
+from symsteer.bench.audit.rollout import RolloutError, rotated_rollout_error
+from symsteer.bench.audit.study import run_cells
 
 __all__ = [
     "Cell",

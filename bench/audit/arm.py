@@ -16,9 +16,9 @@ import pytorch_kinematics as pk
 import torch
 from mani_skill.agents.robots import Panda
 
-from bench.sim.kinematics import SerialChain
-from bench.tasks.base import SymmetricTask
-from bench.tasks.rotations import planar_matrix, transform_angular, wrap
+from symsteer.bench.sim.kinematics import SerialChain
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.rotations import planar_matrix, transform_angular, wrap
 
 ITERATIONS = 60
 DAMPING = 0.02

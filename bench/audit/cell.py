@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from bench.audit.estimates import (
+from symsteer.bench.audit.estimates import (
     Array,
     Estimate,
     bootstrap,
@@ -26,15 +26,15 @@ from bench.audit.estimates import (
     ratio,
     root_excess,
 )
-from bench.audit.measure import Bench, Copies, Resets, check_group
-from bench.audit.states import Visited, visit
-from bench.sim.environment import Simulator
-from bench.tasks import check_embodiment, make, task_class
-from bench.tasks.base import SymmetricTask
-from bench.variants import parse
-from policies.base import ChunkPolicy
-from policies.errors import UserError
-from policies.geometry import Field, Layout
+from symsteer.bench.audit.measure import Bench, Copies, Resets, check_group
+from symsteer.bench.audit.states import Visited, visit
+from symsteer.bench.sim.environment import Simulator
+from symsteer.bench.tasks import check_embodiment, make, task_class
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.variants import parse
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.geometry import Field, Layout
 
 VERSION = 1
 

@@ -16,18 +16,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from bench.audit.states import Element, Turner, Visited, join_trees, rows_of, seen_from, task_state
-from bench.sim.environment import Simulator
-from bench.tasks import make
-from bench.tasks.base import SymmetricTask
-from bench.tasks.rotations import planar_matrix, transform_quaternion
-from bench.variants import overriding
-from policies.errors import UserError
-from policies.geometry import Group
+from symsteer.bench.audit.states import (
+    Element,
+    Turner,
+    Visited,
+    join_trees,
+    rows_of,
+    seen_from,
+    task_state,
+)
+from symsteer.bench.sim.environment import Simulator
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.rotations import planar_matrix, transform_quaternion
+from symsteer.bench.variants import overriding
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Group
 
 SCENES = 320
-"""Scenes side by side: far below ``bench.sim.environment.MAX_SCENES``, since a rebuild holds the
-old and the new ones for a moment."""
+"""Scenes side by side: far below ``MAX_SCENES`` of ``symsteer.bench.sim.environment``, since a
+rebuild holds the old and the new ones for a moment."""
 
 DRAWS = 24
 """Observations of a state where the observation is random."""

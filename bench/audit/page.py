@@ -1,7 +1,7 @@
 """The tables of docs/audit.md and of the tasks' pages, from the committed summary of all cells.
 
-python -m bench.audit.page                      # from docs/audit/summary.json
-python -m bench.audit.page OUT/summary.json     # takes a new summary over first
+python -m symsteer.bench.audit.page                      # from docs/audit/summary.json
+python -m symsteer.bench.audit.page OUT/summary.json     # takes a new summary over first
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.audit.report import (
+from symsteer.bench.audit.report import (
     EXACT,
     SIGNIFICANT,
     percent,
@@ -21,7 +21,7 @@ from bench.audit.report import (
     summary_json,
     to_markdown,
 )
-from policies.errors import UserError
+from symsteer.errors import UserError
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "audit.md"

@@ -12,10 +12,10 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from bench.audit.cell import BIN, Cell, Defect, Settings
-from bench.audit.estimates import Estimate
-from leaderboard.records import write_atomically
-from policies.errors import UserError
+from symsteer.bench.audit.cell import BIN, Cell, Defect, Settings
+from symsteer.bench.audit.estimates import Estimate
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import write_atomically
 
 EXACT = 1e-3
 """Reward and observation defects below this are rounding."""

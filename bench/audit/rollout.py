@@ -15,13 +15,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
-from bench.tasks import make
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import Expert
-from bench.tasks.rotations import planar_matrix
-from policies.base import ChunkPolicy
-from policies.errors import UserError
-from policies.geometry import Group
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import Expert
+from symsteer.bench.tasks.rotations import planar_matrix
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.geometry import Group
 
 Actions = Literal["random", "expert", "policy"]
 
@@ -117,7 +117,7 @@ def rotated_rollout_error(
         seed: of the first episode.
         variant: symmetry-breaking variant that acts on all copies.
         batch: episodes that run side by side, each with one environment per group element.
-        env_options: further arguments of :func:`bench.tasks.make`.
+        env_options: further arguments of :func:`symsteer.bench.tasks.make`.
         policy: the base policy that ``policy`` needs.
 
     Raises:

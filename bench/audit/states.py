@@ -14,11 +14,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from bench.audit.arm import ArmTurner
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import Expert
-from bench.tasks.rotations import planar_matrix
-from policies.base import ChunkPolicy
+from symsteer.bench.audit.arm import ArmTurner
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import Expert
+from symsteer.bench.tasks.rotations import planar_matrix
+from symsteer.policies.base import ChunkPolicy
 
 Visitor = Literal["expert", "policy"]
 Element = tuple[float, bool]

@@ -7,14 +7,14 @@ import gc
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from bench.audit.cell import Cell, Settings, audit, reference_task, visit_all
-from bench.audit.report import read_cell, same_settings, write_cell
-from bench.runs.base_policy import prepare_base
-from bench.runs.config import RunConfig
-from bench.tasks import embodiments, task_class, task_names
-from bench.variants import describe, parse, variant_names
-from policies.base import ChunkPolicy, load_policy
-from policies.errors import UserError
+from symsteer.bench.audit.cell import Cell, Settings, audit, reference_task, visit_all
+from symsteer.bench.audit.report import read_cell, same_settings, write_cell
+from symsteer.bench.runs.base_policy import prepare_base
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.tasks import embodiments, task_class, task_names
+from symsteer.bench.variants import describe, parse, variant_names
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy, load_policy
 
 Progress = Callable[[Cell], None]
 
@@ -28,7 +28,7 @@ def variant_texts(variants: Sequence[str], strengths: Sequence[float]) -> list[s
         strengths: of the single names.
 
     Raises:
-        UserError: for what :func:`bench.variants.parse` refuses, or a strength that is for none.
+        UserError: for what ``parse`` of the variants refuses, or a strength that is for none.
     """
     names = [v for v in variants if v != "all"]
     if "all" in variants:

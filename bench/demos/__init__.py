@@ -4,8 +4,8 @@
 - `load(...)` reads such files, ours and ManiSkill's published ones.
 """
 
-from bench.demos.collect import CLEAN, DIVERSE, FORMAT, MODES, Diversity, collect
-from bench.demos.load import Demonstrations, load
+from symsteer.bench.demos.collect import CLEAN, DIVERSE, FORMAT, MODES, Diversity, collect
+from symsteer.bench.demos.load import Demonstrations, load
 
 __all__ = [
     "CLEAN",

@@ -21,13 +21,13 @@ import h5py
 import numpy as np
 import torch
 
-from bench.demos.seal import SEAL, checksum
-from bench.sim.environment import Simulator
-from bench.tasks import make
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import Expert
-from leaderboard.records import write_atomically
-from policies.errors import UserError
+from symsteer.bench.demos.seal import SEAL, checksum
+from symsteer.bench.sim.environment import Simulator
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import Expert
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import write_atomically
 
 FORMAT = 2
 """Of our files; 2 has a checksum."""

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
-from bench.demos.seal import SEAL, checksum
-from bench.tasks import check_embodiment, make, task_class
-from bench.tasks.embodiments import EMBODIMENTS
-from policies.errors import UserError
-from policies.geometry import Layout
+from symsteer.bench.demos.seal import SEAL, checksum
+from symsteer.bench.tasks import check_embodiment, make, task_class
+from symsteer.bench.tasks.embodiments import EMBODIMENTS
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Layout
 
 # Same joints and tool centre point as the Panda; ManiSkill records StackCube with it.
 _SAME_ROBOT = {"panda_wristcam": "panda"}

@@ -10,15 +10,15 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from bench.demos import FORMAT, MODES, Demonstrations, collect, load
-from bench.runs.config import DemonstrationConfig, RunConfig, content_key, flat
-from bench.steering.evaluation import DRAWS, Steerability, steerability
-from bench.steering.latent_env import LatentNoiseEnv
-from bench.tasks import make, task_class
-from leaderboard.records import BasePolicy
-from policies.base import ChunkPolicy, load_policy, policy_path, save_policy
-from policies.errors import UserError
-from policies.training import train_policy
+from symsteer.bench.demos import FORMAT, MODES, Demonstrations, collect, load
+from symsteer.bench.runs.config import DemonstrationConfig, RunConfig, content_key, flat
+from symsteer.bench.steering.evaluation import DRAWS, Steerability, steerability
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.tasks import make, task_class
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import BasePolicy
+from symsteer.policies.base import ChunkPolicy, load_policy, policy_path, save_policy
+from symsteer.policies.training import train_policy
 
 STEERABILITY_ENVS = 128
 """Parallel environments of the steerability report; fewer if it has fewer episodes."""

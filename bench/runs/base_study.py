@@ -14,16 +14,16 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from bench.demos import load
-from bench.runs.base_policy import demonstration_file
-from bench.runs.config import DemonstrationConfig, RunConfig
-from bench.runs.folder import write_json
-from bench.steering.evaluation import held_out_seeds, rollout
-from bench.steering.latent_env import LatentNoiseEnv
-from bench.tasks import make
-from policies.base import PolicyName
-from policies.errors import UserError
-from policies.training import train_policy
+from symsteer.bench.demos import load
+from symsteer.bench.runs.base_policy import demonstration_file
+from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+from symsteer.bench.runs.folder import write_json
+from symsteer.bench.steering.evaluation import held_out_seeds, rollout
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.tasks import make
+from symsteer.errors import UserError
+from symsteer.policies.base import PolicyName
+from symsteer.policies.training import train_policy
 
 EVALUATION_ENVS = 100
 

@@ -15,10 +15,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from agents.sac import SacConfig
-from leaderboard.records import canonical_variant
-from policies.base import PolicyConfig
-from policies.errors import UserError
+from symsteer.agents.sac import SacConfig
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import canonical_variant
+from symsteer.policies.base import PolicyConfig
 
 LARGEST_COUNT = 10**12
 LARGEST_BATCH = 100_000

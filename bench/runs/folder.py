@@ -21,10 +21,10 @@ from typing import Any, Literal
 import torch
 from filelock import FileLock, Timeout
 
-from bench.runs.config import RunConfig, content_key
-from leaderboard.errors import RecordError
-from leaderboard.records import read_record, write_atomically
-from policies.errors import UserError
+from symsteer.bench.runs.config import RunConfig, content_key
+from symsteer.errors import UserError
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.records import read_record, write_atomically
 
 State = Literal["missing", "running", "interrupted", "failed", "finished"]
 

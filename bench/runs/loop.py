@@ -18,27 +18,28 @@ from typing import Any, Literal
 import torch
 from tqdm import tqdm
 
-from agents import ReplayBuffer, make_agent
-from bench.runs.base_policy import describe_base
-from bench.runs.config import RunConfig, content_key, training_seeds
-from bench.runs.evaluator import Evaluator, make_env
-from bench.runs.folder import (
+from symsteer.agents import ReplayBuffer, make_agent
+from symsteer.bench.runs.base_policy import describe_base
+from symsteer.bench.runs.config import RunConfig, content_key, training_seeds
+from symsteer.bench.runs.evaluator import Evaluator, make_env
+from symsteer.bench.runs.folder import (
     CHECKPOINT,
     RECORD,
     Heartbeat,
     load_checkpoint,
     save_checkpoint,
 )
-from bench.runs.pictures import draw_paths, film
-from bench.runs.tensorboard import RunLog
-from bench.sim.headless import rendering_works
-from bench.steering.evaluation import HELD_OUT_SEED
-from bench.steering.latent_env import Clock
-from bench.steering.search import search_ticket
-from bench.tasks import task_class
-from bench.variants import evaluated, highest_cost, parse
-from leaderboard.errors import RecordError
-from leaderboard.records import (
+from symsteer.bench.runs.pictures import draw_paths, film
+from symsteer.bench.runs.tensorboard import RunLog
+from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.steering.evaluation import HELD_OUT_SEED
+from symsteer.bench.steering.latent_env import Clock
+from symsteer.bench.steering.search import search_ticket
+from symsteer.bench.tasks import task_class
+from symsteer.bench.variants import evaluated, highest_cost, parse
+from symsteer.errors import UserError
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.records import (
     Budget,
     Episodes,
     Evaluation,
@@ -51,8 +52,7 @@ from leaderboard.records import (
     read_record,
     write_record,
 )
-from policies.base import ChunkPolicy
-from policies.errors import UserError
+from symsteer.policies.base import ChunkPolicy
 
 LOG_EVERY = 10
 """Vectorised decisions between two writes of training scalars."""

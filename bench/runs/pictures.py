@@ -17,13 +17,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from bench.runs.config import RunConfig
-from bench.steering.evaluation import Rollout, held_out_seeds
-from bench.tasks import make
-from bench.tasks.picture import CAMERA, SIZE
-from bench.variants import evaluated
-from policies.base import ChunkPolicy
-from policies.geometry import Layout
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.steering.evaluation import Rollout, held_out_seeds
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.picture import CAMERA, SIZE
+from symsteer.bench.variants import evaluated
+from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.geometry import Layout
 
 EPISODES = 32
 """Episodes whose paths are drawn; more would hide one another."""

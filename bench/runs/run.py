@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 
-from agents import AGENTS
-from bench.runs.base_policy import origin, prepare_base, with_policy_of
-from bench.runs.config import RunConfig, build_config
-from bench.runs.evaluator import Evaluator
-from bench.runs.folder import (
+from symsteer.agents import AGENTS
+from symsteer.bench.runs.base_policy import origin, prepare_base, with_policy_of
+from symsteer.bench.runs.config import RunConfig, build_config
+from symsteer.bench.runs.evaluator import Evaluator
+from symsteer.bench.runs.folder import (
     CONFIG,
     RECORD,
     Heartbeat,
@@ -27,14 +27,14 @@ from bench.runs.folder import (
     run_id,
     write_json,
 )
-from bench.runs.loop import Loop, feasible_return, new_agent
-from bench.steering.search import rounds
-from bench.tasks import check_embodiment, task_class
-from bench.variants import evaluated, parse
-from leaderboard.records import Episodes, Evaluation, canonical_variant, read_record
-from policies.base import ChunkPolicy, load_policy, policy_path, save_policy
-from policies.errors import UserError
-from policies.geometry import Group
+from symsteer.bench.runs.loop import Loop, feasible_return, new_agent
+from symsteer.bench.steering.search import rounds
+from symsteer.bench.tasks import check_embodiment, task_class
+from symsteer.bench.variants import evaluated, parse
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import Episodes, Evaluation, canonical_variant, read_record
+from symsteer.policies.base import ChunkPolicy, load_policy, policy_path, save_policy
+from symsteer.policies.geometry import Group
 
 
 def check(config: RunConfig) -> None:
@@ -105,7 +105,7 @@ def execute(
 
     Raises:
         UserError: if the input is wrong, the run is finished already, or another process is
-            working on it (:class:`bench.runs.folder.RunBusyError`).
+            working on it (:class:`symsteer.bench.runs.folder.RunBusyError`).
     """
     if policy is not None:
         if demonstrations is not None:

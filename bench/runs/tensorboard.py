@@ -15,9 +15,9 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from torch.utils.tensorboard import SummaryWriter
 
-from bench.runs.config import flat
-from leaderboard.records import Provenance, RunRecord
-from policies.errors import UserError
+from symsteer.bench.runs.config import flat
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import Provenance, RunRecord
 
 # The tags of a Multiline chart are regular expressions; a Margin chart takes value, low, high.
 LAYOUT = {

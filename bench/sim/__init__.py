@@ -5,8 +5,8 @@
 - `BatchedCpuMixin`: what makes a task class run on batched CPU physics.
 - `prepare_headless()`: lets state-only environments run without a Vulkan driver.
 
-Names are imported when they are first used: `bench.sim.capabilities` must work where ManiSkill
-cannot be imported, to say why.
+Names are imported when they are first used: `capabilities` must work where ManiSkill cannot be
+imported, to say why.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bench.sim.environment import BatchedCpuMixin, create, make_env_class
-    from bench.sim.headless import prepare_headless, rendering_works
+    from symsteer.bench.sim.environment import BatchedCpuMixin, create, make_env_class
+    from symsteer.bench.sim.headless import prepare_headless, rendering_works
 
 __all__ = [
     "BatchedCpuMixin",
@@ -38,4 +38,4 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"bench.sim.{_HOME[name]}"), name)
+    return getattr(importlib.import_module(f"symsteer.bench.sim.{_HOME[name]}"), name)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from bench.sim.pins import PINNED
+from symsteer.bench.sim.pins import PINNED
 
 _RENDER_PROBE = (
     "import warnings; warnings.simplefilter('ignore'); import sapien; "
@@ -135,7 +135,7 @@ def _check_x11() -> Check:
 
 
 def _check_simulator() -> Check:
-    from bench.sim.headless import silence_import_noise
+    from symsteer.bench.sim.headless import silence_import_noise
 
     silence_import_noise()
     try:

@@ -18,10 +18,10 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.utils.structs import Actor
 
-from bench.sim import patches, rendering
-from bench.sim.headless import prepare_headless
-from bench.sim.scene import BatchedScene
-from policies.errors import UserError
+from symsteer.bench.sim import patches, rendering
+from symsteer.bench.sim.headless import prepare_headless
+from symsteer.bench.sim.scene import BatchedScene
+from symsteer.errors import UserError
 
 Simulator = Literal["cpu", "cuda"]
 
@@ -307,7 +307,7 @@ def create(
         num_envs: how many environments.
         sim: ``"cpu"`` or ``"cuda"``.
         render: whether ``env.render()`` must give pictures; needs a Vulkan driver.
-        workers: processes that share the environments; see `bench.sim.shards.ShardedEnv`, which
+        workers: processes that share the environments; see `ShardedEnv`, which
             is what is returned for more than one.
         kwargs: passed on to the class.
 
@@ -325,7 +325,7 @@ def create(
                 f"workers={workers} divides CPU physics among processes; the GPU simulates all "
                 "environments in one: leave workers out, or use sim='cpu'"
             )
-        from bench.sim.shards import ShardedEnv
+        from symsteer.bench.sim.shards import ShardedEnv
 
         return cast(BaseEnv, ShardedEnv(env_cls, num_envs, workers, **kwargs))
     return make_env_class(env_cls, sim)(num_envs=num_envs, **kwargs)  # type: ignore[arg-type]

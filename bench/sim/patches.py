@@ -13,9 +13,9 @@ from typing import Any
 
 import torch
 
-from bench.sim.kinematics import SerialChain
-from bench.sim.pins import PINNED
-from policies.errors import UserError
+from symsteer.bench.sim.kinematics import SerialChain
+from symsteer.bench.sim.pins import PINNED
+from symsteer.errors import UserError
 
 
 def check_versions() -> None:
@@ -23,7 +23,7 @@ def check_versions() -> None:
     for package, wanted in PINNED.items():
         if (found := version(package)) != wanted:
             raise UserError(
-                f"bench.sim is written against {package} {wanted}, but {found} is installed: "
+                f"SymSteer is written against {package} {wanted}, but {found} is installed: "
                 f'run "pip install {package}=={wanted}".'
             )
 

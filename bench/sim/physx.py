@@ -34,7 +34,7 @@ import sapien
 import sapien.physx as physx
 import torch
 
-from bench.sim.contacts import BodyImpulseQuery, ContactReader, PairImpulseQuery
+from symsteer.bench.sim.contacts import BodyImpulseQuery, ContactReader, PairImpulseQuery
 
 _POSE = slice(0, 7)
 _VELOCITY = slice(7, 13)

@@ -14,9 +14,9 @@ import sapien.render
 import torch
 from mani_skill.utils import common
 
-from bench.sim.headless import rendering_works
-from bench.sim.physx import BatchedPhysx
-from policies.errors import UserError
+from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.sim.physx import BatchedPhysx
+from symsteer.errors import UserError
 
 
 def find_device(name: str | None = None) -> sapien.Device:

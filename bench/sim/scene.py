@@ -9,8 +9,8 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.structs.render_camera import RenderCamera
 
-from bench.sim.physx import BatchedPhysx
-from bench.sim.rendering import RenderGroup
+from symsteer.bench.sim.physx import BatchedPhysx
+from symsteer.bench.sim.rendering import RenderGroup
 
 
 class BatchedScene(ManiSkillScene):

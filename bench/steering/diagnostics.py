@@ -1,7 +1,7 @@
 """What an evaluation measures beside success: Q against its bounds and fresh returns, symmetry.
 
 The names are those of the run record; docs/metrics.md defines each. Formulas and code of the
-single figures are in :mod:`agents.diagnostics`.
+single figures are in :mod:`symsteer.agents.diagnostics`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from agents.diagnostics import (
+from symsteer.agents.diagnostics import (
     bound_violation,
     critic_preference,
     equivariance_error,
@@ -18,10 +18,10 @@ from agents.diagnostics import (
     policy_statistics,
     q_bias,
 )
-from agents.sac import SacAgent, entropy_allowance
-from bench.steering.evaluation import Rollout
-from policies.base import ChunkPolicy
-from policies.geometry import Group
+from symsteer.agents.sac import SacAgent, entropy_allowance
+from symsteer.bench.steering.evaluation import Rollout
+from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.geometry import Group
 
 SYMMETRY_STATES = 64
 """States on which equivariance errors are measured."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import torch
 
-from bench.steering.latent_env import LatentNoiseEnv
-from leaderboard.records import HELD_OUT_SEED
-from policies.base import ChunkPolicy
-from policies.errors import UserError
-from policies.steerability import DESIRED_ACTION_STD, action_spread
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import HELD_OUT_SEED
+from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.steerability import DESIRED_ACTION_STD, action_spread
 
 
 def held_out_seeds(count: int) -> list[int]:
@@ -116,7 +116,7 @@ class Steerability:
         states: how many initial states.
         draws: noise draws a state.
         action_std: spread of the normalised actions over the noise on visited states; see
-            :func:`policies.steerability.action_spread`.
+            :func:`symsteer.policies.steerability.action_spread`.
         warning: why steering cannot work, or None.
     """
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from policies.base import ChunkPolicy
+from symsteer.policies.base import ChunkPolicy
 
 
 @dataclass
@@ -55,7 +55,7 @@ class LatentNoiseEnv:
     """N parallel environments whose action is the noise of an action chunk.
 
     Args:
-        env: parallel ManiSkill environments from :func:`bench.tasks.make`.
+        env: parallel ManiSkill environments from :func:`symsteer.bench.tasks.make`.
         policy: frozen decoder with the same layouts; its device is the device of everything that
             goes in and comes out, wherever physics runs.
         ignore_terminations: let episodes run to the time limit after a success, as ManiSkill's

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import torch
 
-from bench.steering.evaluation import Act, rollout
-from bench.steering.latent_env import LatentNoiseEnv
-from policies.errors import UserError
+from symsteer.bench.steering.evaluation import Act, rollout
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.errors import UserError
 
 MAX_CANDIDATES = 64
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import grpc
 
-from bench.runs.config import RunConfig
-from bench.sweep.work import Result
-from policies.errors import UserError
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.sweep.work import Result
+from symsteer.errors import UserError
 
 CONNECT_SECONDS = 10
 """An address that does not answer within this time is given up."""

@@ -8,14 +8,14 @@ import sys
 
 from rich.console import Console
 
-from bench.runs.config import RunConfig
-from bench.sweep.display import Display, LiveDisplay
-from bench.sweep.estimate import Estimate, duration
-from bench.sweep.plan import Cell, Plan, manifest_path, write_manifest
-from bench.sweep.pool import LocalPool
-from bench.sweep.schedule import Outcome, Workers, tasks_of, work_off
-from bench.sweep.survey import Sighting, look
-from policies.errors import UserError
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.sweep.display import Display, LiveDisplay
+from symsteer.bench.sweep.estimate import Estimate, duration
+from symsteer.bench.sweep.plan import Cell, Plan, manifest_path, write_manifest
+from symsteer.bench.sweep.pool import LocalPool
+from symsteer.bench.sweep.schedule import Outcome, Workers, tasks_of, work_off
+from symsteer.bench.sweep.survey import Sighting, look
+from symsteer.errors import UserError
 
 COLUMNS = ("runs", "finished", "running", "unfinished", "missing")
 
@@ -71,7 +71,7 @@ def run_plan(plan: Plan, workers: int = 0, ray: str | None = None) -> list[Outco
     with contextlib.ExitStack() as stack:
         pool: Workers | None = None
         if todo and ray is not None:
-            from bench.sweep.cluster import RayCluster
+            from symsteer.bench.sweep.cluster import RayCluster
 
             # Ray prints what becomes of its machines.
             stack.enter_context(contextlib.redirect_stdout(stack.enter_context(log.open("a"))))
@@ -119,7 +119,7 @@ def preview(plan: Plan, workers: int = 0, ray: str | None = None) -> str:
     """
     number: int | None = number_of_workers(workers, list(plan.configs.values()))
     if ray is not None:
-        from bench.sweep.cluster import check_address
+        from symsteer.bench.sweep.cluster import check_address
 
         check_address(ray)
         number = workers or None

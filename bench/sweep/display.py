@@ -15,12 +15,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from bench.runs.folder import read_progress
-from bench.sweep.estimate import Estimate, duration, share_done
-from bench.sweep.plan import Cell, Plan, short_labels
-from bench.sweep.schedule import Outcome, Task
-from bench.sweep.survey import look
-from bench.sweep.work import Result
+from symsteer.bench.runs.folder import read_progress
+from symsteer.bench.sweep.estimate import Estimate, duration, share_done
+from symsteer.bench.sweep.plan import Cell, Plan, short_labels
+from symsteer.bench.sweep.schedule import Outcome, Task
+from symsteer.bench.sweep.survey import look
+from symsteer.bench.sweep.work import Result
 
 BAR, NUMBERS = 20, (15, 4, 11, 6)
 """Columns of the bar, and of the numbers after it: steps, success, speed, time left."""

@@ -7,11 +7,11 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from agents import AGENTS
-from bench.sweep.plan import Cell
+from symsteer.agents import AGENTS
+from symsteer.bench.sweep.plan import Cell
 
 Progress = Mapping[str, Any]
-"""What a running run says of itself (``bench.runs.folder.read_progress``)."""
+"""What a running run says of itself (``symsteer.bench.runs.folder.read_progress``)."""
 
 
 class Estimate:

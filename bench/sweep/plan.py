@@ -11,11 +11,11 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from bench.runs.config import RunConfig, flat
-from bench.runs.folder import run_id, write_json
-from bench.runs.run import check
-from bench.sweep.suite import Suite
-from policies.errors import UserError
+from symsteer.bench.runs.config import RunConfig, flat
+from symsteer.bench.runs.folder import run_id, write_json
+from symsteer.bench.runs.run import check
+from symsteer.bench.sweep.suite import Suite
+from symsteer.errors import UserError
 
 BASIC = ("task", "embodiment", "variant", "agent", "seed")
 """The keys of a configuration that every table and line shows."""

@@ -1,7 +1,6 @@
 """Work off a plan: what cells share is built once, then the cells run, side by side.
 
-Where the work is done is not known here: on this machine (:mod:`bench.sweep.pool`) or on a cluster
-(:mod:`bench.sweep.cluster`).
+Where the work is done is not known here: on this machine (``pool``) or on a cluster (``cluster``).
 """
 
 from __future__ import annotations
@@ -13,9 +12,9 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from bench.runs.base_policy import demonstration_path, find_base
-from bench.sweep.plan import Cell, Plan
-from bench.sweep.work import Result, build_base, build_demonstrations, play
+from symsteer.bench.runs.base_policy import demonstration_path, find_base
+from symsteer.bench.sweep.plan import Cell, Plan
+from symsteer.bench.sweep.work import Result, build_base, build_demonstrations, play
 
 TRIES = 2
 """A failed task is tried once more; a run then continues from its checkpoint."""

@@ -7,11 +7,11 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.runs.folder import CONFIG, read_config
-from bench.sweep.estimate import Estimate, duration
-from bench.sweep.plan import BASIC, Cell, Manifest, manifest_path, read_manifest
-from bench.sweep.survey import Sighting, look
-from policies.errors import UserError
+from symsteer.bench.runs.folder import CONFIG, read_config
+from symsteer.bench.sweep.estimate import Estimate, duration
+from symsteer.bench.sweep.plan import BASIC, Cell, Manifest, manifest_path, read_manifest
+from symsteer.bench.sweep.survey import Sighting, look
+from symsteer.errors import UserError
 
 STATES = ("finished", "running", "interrupted", "failed", "missing")
 

@@ -1,6 +1,6 @@
 """A suite: grids of runs described in TOML.
 
-``[grid]`` lists values of keys of :class:`bench.runs.config.RunConfig`, nested ones with a dot
+``[grid]`` lists values of keys of ``RunConfig``, nested ones with a dot
 (``"demonstrations.count"``); their product is taken in the order written. ``strength`` lists
 strengths for the variants that are named without one. Several grids are written ``[[grid]]`` each.
 ``[run]`` sets everything that the runs share, nested as the configuration is.
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.runs.config import RunConfig, build_config, check_keys
-from policies.errors import UserError
+from symsteer.bench.runs.config import RunConfig, build_config, check_keys
+from symsteer.errors import UserError
 
 SUITES = Path(__file__).parent.parent / "suites"
 

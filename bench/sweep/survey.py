@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.runs.folder import RECORD, State, read_progress, state_of
-from leaderboard.errors import RecordError
-from leaderboard.records import RunRecord, read_record
+from symsteer.bench.runs.folder import RECORD, State, read_progress, state_of
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.records import RunRecord, read_record
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Sighting:
     state: State
     record: RunRecord | None = None
     progress: Mapping[str, Any] | None = None
-    """Of a running run: what :func:`bench.runs.folder.read_progress` says."""
+    """Of a running run: what :func:`symsteer.bench.runs.folder.read_progress` says."""
 
     @property
     def seconds(self) -> float:

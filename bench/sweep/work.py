@@ -16,12 +16,12 @@ from typing import Literal
 
 import torch
 
-from bench.runs.base_policy import demonstration_file, find_base, prepare_base
-from bench.runs.config import RunConfig
-from bench.runs.folder import RunBusyError, is_finished, run_id
-from bench.runs.run import execute
-from leaderboard.errors import RecordError
-from policies.errors import UserError
+from symsteer.bench.runs.base_policy import demonstration_file, find_base, prepare_base
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.folder import RunBusyError, is_finished, run_id
+from symsteer.bench.runs.run import execute
+from symsteer.errors import UserError
+from symsteer.leaderboard.errors import RecordError
 
 POLL_SECONDS = 0.5
 

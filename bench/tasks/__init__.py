@@ -16,21 +16,21 @@ from typing import Any
 import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
 import torch
 
-from bench.sim import create
-from bench.sim.environment import Simulator
-from bench.tasks.base import SymmetricTask
-from bench.tasks.embodiments import EMBODIMENTS
-from bench.tasks.lift_peg_upright import LiftPegUpright
-from bench.tasks.pick_cube import PickCube
-from bench.tasks.place_sphere import PlaceSphere
-from bench.tasks.poke_cube import PokeCube
-from bench.tasks.pull_cube import PullCube
-from bench.tasks.push_cube import PushCube
-from bench.tasks.push_t import PushT
-from bench.tasks.registration import make_batched, make_single, register
-from bench.tasks.stack_cube import StackCube
-from bench.variants import Strength, parse
-from policies.errors import UserError
+from symsteer.bench.sim import create
+from symsteer.bench.sim.environment import Simulator
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.embodiments import EMBODIMENTS
+from symsteer.bench.tasks.lift_peg_upright import LiftPegUpright
+from symsteer.bench.tasks.pick_cube import PickCube
+from symsteer.bench.tasks.place_sphere import PlaceSphere
+from symsteer.bench.tasks.poke_cube import PokeCube
+from symsteer.bench.tasks.pull_cube import PullCube
+from symsteer.bench.tasks.push_cube import PushCube
+from symsteer.bench.tasks.push_t import PushT
+from symsteer.bench.tasks.registration import make_batched, make_single, register
+from symsteer.bench.tasks.stack_cube import StackCube
+from symsteer.bench.variants import Strength, parse
+from symsteer.errors import UserError
 
 __all__ = [
     "SymmetricTask",

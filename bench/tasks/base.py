@@ -20,20 +20,20 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils import common
 from mani_skill.utils.structs import Actor, Pose
 
-from bench.tasks.embodiments import EMBODIMENTS, Embodiment
-from bench.tasks.experts import Intent
-from bench.tasks.floating import ACTION_LAYOUT
-from bench.tasks.gym_env import GymEnv
-from bench.tasks.rotations import (
+from symsteer.bench.tasks.embodiments import EMBODIMENTS, Embodiment
+from symsteer.bench.tasks.experts import Intent
+from symsteer.bench.tasks.floating import ACTION_LAYOUT
+from symsteer.bench.tasks.gym_env import GymEnv
+from symsteer.bench.tasks.rotations import (
     planar_matrix,
     quaternion_to_matrix,
     transform_angular,
     transform_quaternion,
 )
-from bench.variants import Role, Strength, overriding, parse
-from bench.variants.friction import Frictions
-from policies.errors import UserError
-from policies.geometry import Field, Layout
+from symsteer.bench.variants import Role, Strength, overriding, parse
+from symsteer.bench.variants.friction import Frictions
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Field, Layout
 
 GRIPPER_FIELDS = (
     Field("tcp_xy", 1),
@@ -475,7 +475,7 @@ class SymmetricTask(GymEnv):
             gamma: discount per decision, in [0, 1].
             steps_per_decision: executed steps of an action chunk.
             bootstrap_truncation: values bootstrap through time-outs, so that N is infinite.
-            step_cost: the largest cost of a step, see :func:`bench.variants.highest_cost`.
+            step_cost: the largest cost of a step, see :func:`symsteer.bench.variants.highest_cost`.
 
         Returns:
             (lowest, highest).

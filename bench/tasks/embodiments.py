@@ -14,21 +14,21 @@ import numpy as np
 import torch
 from mani_skill.agents.robots import Panda
 
-from bench.tasks.floating import (
+from symsteer.bench.tasks.floating import (
     ACTION_LAYOUT,
     TCP_OFFSET,
     FloatingGripper,
     PlanarPoseControllerConfig,
     bound_blocks,
 )
-from bench.tasks.rotations import (
+from symsteer.bench.tasks.rotations import (
     euler_rates_matrix,
     euler_to_matrix,
     matrix_to_euler_facing_down,
     planar_matrix,
     transform_angular,
 )
-from policies.errors import UserError
+from symsteer.errors import UserError
 
 
 @dataclass(frozen=True)

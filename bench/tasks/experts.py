@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from bench.tasks.features import fourfold_yaw
-from bench.tasks.rotations import quaternion_to_matrix, wrap
+from symsteer.bench.tasks.features import fourfold_yaw
+from symsteer.bench.tasks.rotations import quaternion_to_matrix, wrap
 
 if TYPE_CHECKING:
-    from bench.tasks.base import SymmetricTask
+    from symsteer.bench.tasks.base import SymmetricTask
 
 OPEN, CLOSED = 1.0, -1.0
 HOVER = 0.07
@@ -45,7 +45,7 @@ class Expert:
     """Solves a task from its privileged state.
 
     Args:
-        env: a task made by :func:`bench.tasks.make`, any embodiment; its ``intent`` decides.
+        env: a task made by ``symsteer.make``, any embodiment; its ``intent`` decides.
     """
 
     def __init__(self, env: SymmetricTask):

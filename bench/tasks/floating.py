@@ -22,12 +22,12 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots import FloatingPandaGripper, Panda
 
-from bench.tasks.rotations import (
+from symsteer.bench.tasks.rotations import (
     euler_to_matrix,
     matrix_to_euler_facing_down,
     rotation_vector_to_matrix,
 )
-from policies.geometry import Field, Layout
+from symsteer.policies.geometry import Field, Layout
 
 ACTION_LAYOUT = Layout(
     [

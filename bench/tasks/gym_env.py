@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from bench.sim import rendering_works
-from policies.errors import UserError
+from symsteer.bench.sim import rendering_works
+from symsteer.errors import UserError
 
 
 class GymEnv(BaseEnv):

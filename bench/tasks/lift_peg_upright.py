@@ -11,11 +11,19 @@ import torch
 from mani_skill.envs.tasks.tabletop.lift_peg_upright import LiftPegUprightEnv
 from mani_skill.utils.structs import Actor
 
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import CLOSED, OPEN, Intent, choose, finger_width, grasp_at, yaw_along
-from bench.tasks.features import bar_grasp_yaw, disc, flat_pose, twofold_yaw
-from bench.tasks.rotations import quaternion_to_matrix
-from policies.geometry import Field
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import (
+    CLOSED,
+    OPEN,
+    Intent,
+    choose,
+    finger_width,
+    grasp_at,
+    yaw_along,
+)
+from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose, twofold_yaw
+from symsteer.bench.tasks.rotations import quaternion_to_matrix
+from symsteer.policies.geometry import Field
 
 
 class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from mani_skill.utils.structs import Actor
 
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import CLOSED, HOVER, Intent, funnel
-from bench.tasks.features import disc, flat_pose, fourfold_yaw, goal_disc_pose
-from bench.tasks.rotations import quaternion_to_matrix
-from policies.geometry import Field
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import CLOSED, HOVER, Intent, funnel
+from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, goal_disc_pose
+from symsteer.bench.tasks.rotations import quaternion_to_matrix
+from symsteer.policies.geometry import Field
 
 
 class MoveCube(SymmetricTask):

@@ -9,10 +9,10 @@ import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 from mani_skill.utils.structs import Actor, Pose
 
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import CLOSED, Intent, choose, funnel, grasp
-from bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
-from policies.geometry import Field
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import CLOSED, Intent, choose, funnel, grasp
+from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
+from symsteer.policies.geometry import Field
 
 
 class PickCube(SymmetricTask, PickCubeEnv):

@@ -1,7 +1,7 @@
 """Pictures of the tasks, with both embodiments, for the documentation.
 
-- ``python -m bench.tasks.picture docs/tasks.png``: all tasks in one picture.
-- ``python -m bench.tasks.picture docs/tasks/pull-cube.png PullCube-v1``: one task.
+- ``python -m symsteer.bench.tasks.picture docs/tasks.png``: all tasks in one picture.
+- ``python -m symsteer.bench.tasks.picture docs/tasks/pull-cube.png PullCube-v1``: one task.
 
 Needs a Vulkan driver; ``symsteer doctor`` says whether there is one.
 """
@@ -15,9 +15,9 @@ import numpy as np
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image
 
-from bench.tasks import embodiments, make, task_names
-from bench.tasks.experts import Expert
-from policies.errors import UserError
+from symsteer.bench.tasks import embodiments, make, task_names
+from symsteer.bench.tasks.experts import Expert
+from symsteer.errors import UserError
 
 SIZE = 320
 CAMERA = {
@@ -70,7 +70,7 @@ def contact_sheet() -> np.ndarray:
 def main() -> int:
     """Write the picture to the path given on the command line."""
     if len(sys.argv) not in (2, 3):
-        print("usage: python -m bench.tasks.picture FILE.png [TASK]", file=sys.stderr)
+        print("usage: python -m symsteer.bench.tasks.picture FILE.png [TASK]", file=sys.stderr)
         return 2
     try:
         picture = task_picture(sys.argv[2]) if len(sys.argv) == 3 else contact_sheet()

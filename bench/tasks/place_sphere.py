@@ -9,10 +9,18 @@ import torch
 from mani_skill.envs.tasks.tabletop.place_sphere import PlaceSphereEnv
 from mani_skill.utils.structs import Actor
 
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import CLOSED, OPEN, Intent, choose, finger_width, funnel, grasp_at
-from bench.tasks.features import disc, flat_pose, fourfold_yaw
-from policies.geometry import Field
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import (
+    CLOSED,
+    OPEN,
+    Intent,
+    choose,
+    finger_width,
+    funnel,
+    grasp_at,
+)
+from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw
+from symsteer.policies.geometry import Field
 
 
 class PlaceSphere(SymmetricTask, PlaceSphereEnv):

@@ -10,9 +10,9 @@ import torch
 from mani_skill.envs.tasks.tabletop.poke_cube import PokeCubeEnv
 from mani_skill.utils.structs import Actor
 
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import CLOSED, OPEN, Intent, choose, funnel, grasp_at, yaw_along
-from bench.tasks.features import (
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import CLOSED, OPEN, Intent, choose, funnel, grasp_at, yaw_along
+from symsteer.bench.tasks.features import (
     bar_grasp_yaw,
     disc,
     flat_pose,
@@ -20,8 +20,8 @@ from bench.tasks.features import (
     goal_disc_pose,
     twofold_yaw,
 )
-from bench.tasks.rotations import quaternion_to_matrix, wrap
-from policies.geometry import Field
+from symsteer.bench.tasks.rotations import quaternion_to_matrix, wrap
+from symsteer.policies.geometry import Field
 
 
 class PokeCube(SymmetricTask, PokeCubeEnv):

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from mani_skill.envs.tasks.tabletop.pull_cube import PullCubeEnv
 
-from bench.tasks.move_cube import MoveCube
+from symsteer.bench.tasks.move_cube import MoveCube
 
 
 class PullCube(MoveCube, PullCubeEnv):

@@ -10,11 +10,11 @@ import torch
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.utils.structs import Actor, Pose
 
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import CLOSED, Intent, choose, grasp_at, yaw_along
-from bench.tasks.features import bar_grasp_yaw, disc, flat_pose
-from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
-from policies.geometry import Field
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import CLOSED, Intent, choose, grasp_at, yaw_along
+from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose
+from symsteer.bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
+from symsteer.policies.geometry import Field
 
 
 class PushT(SymmetricTask, PushTEnv):

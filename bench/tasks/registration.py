@@ -18,12 +18,12 @@ from mani_skill import logger
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
-from bench.sim import rendering_works
-from bench.tasks.embodiments import EMBODIMENTS
-from policies.errors import UserError
+from symsteer.bench.sim import rendering_works
+from symsteer.bench.tasks.embodiments import EMBODIMENTS
+from symsteer.errors import UserError
 
 if TYPE_CHECKING:
-    from bench.tasks.base import SymmetricTask
+    from symsteer.bench.tasks.base import SymmetricTask
 
 
 _SIMULATORS = {
@@ -76,16 +76,16 @@ class EpisodeLimit(gym.Wrapper, gym.utils.RecordConstructorArgs):
 def make_batched(task: str, num_envs: int = 1, **kwargs: Any) -> SymmetricTask:
     """Entry point of ``gym.make("SymSteer/PickCube-v1", num_envs=N, ...)``.
 
-    Takes the options of :func:`bench.tasks.make`, where ``None`` means that an option is not
+    Takes the options of :func:`symsteer.make`, where ``None`` means that an option is not
     given, and ManiSkill's ways of naming simulator and robot. As in ManiSkill, whose tools always
     name one, a render mode on a machine that cannot render is no error until something is
     rendered.
 
     Raises:
-        UserError: as :func:`bench.tasks.make`, and for an option that neither it nor the task
+        UserError: as :func:`symsteer.make`, and for an option that neither it nor the task
             has, or whose value they do not know.
     """
-    from bench.tasks import make
+    from symsteer.bench.tasks import make
 
     options = {name: value for name, value in kwargs.items() if value is not None}
     _check(task, num_envs, options)
@@ -108,12 +108,12 @@ def make_single(task: str, **kwargs: Any) -> gym.Env:
 
     Also serves ids of your own, which fix a variant for software that knows no options::
 
-        gym.register("Lab/WeakPick-v1", "bench.tasks:make_single", max_episode_steps=50,
+        gym.register("Lab/WeakPick-v1", "symsteer.bench.tasks:make_single", max_episode_steps=50,
                      kwargs={"task": "PickCube-v1", "variant": "action_gain:0.5"})
 
     Args:
-        task: one of :func:`bench.tasks.task_names`.
-        kwargs: options of :func:`bench.tasks.make` but for ``num_envs``.
+        task: one of :func:`symsteer.bench.tasks.task_names`.
+        kwargs: options of :func:`symsteer.bench.tasks.make` but for ``num_envs``.
 
     Returns:
         The environment in ManiSkill's ``CPUGymWrapper``; whoever makes it limits its episodes.
@@ -139,21 +139,21 @@ def register(tasks: Mapping[str, type[SymmetricTask]]) -> None:
         stem, _, version = name.rpartition("-v")
         gym.register(
             f"SymSteer/{name}",
-            entry_point="bench.tasks:make_batched",
+            entry_point="symsteer.bench.tasks:make_batched",
             # Makes gym.make_vec refuse, which would else put batches of one into a batch.
-            vector_entry_point="bench.tasks:make_batched",
+            vector_entry_point="symsteer.bench.tasks:make_batched",
             max_episode_steps=task.max_episode_steps,
             # Batched torch observations and rewards are not what gymnasium's checker expects.
             disable_env_checker=True,
             order_enforce=False,
             kwargs={"task": name},
             additional_wrappers=(
-                WrapperSpec("EpisodeLimit", "bench.tasks.registration:EpisodeLimit", {}),
+                WrapperSpec("EpisodeLimit", "symsteer.bench.tasks.registration:EpisodeLimit", {}),
             ),
         )
         gym.register(
             f"SymSteer/{stem}-single-v{version}",
-            entry_point="bench.tasks:make_single",
+            entry_point="symsteer.bench.tasks:make_single",
             max_episode_steps=task.max_episode_steps,
             kwargs={"task": name},
         )
@@ -161,7 +161,7 @@ def register(tasks: Mapping[str, type[SymmetricTask]]) -> None:
 
 def _check(task: str, num_envs: Any, options: dict[str, Any]) -> None:
     """Refuse options that would fail far from their cause, or be ignored."""
-    from bench.tasks import make, task_class, unknown_name
+    from symsteer.bench.tasks import make, task_class, unknown_name
 
     env_class = task_class(task)
     constructors = [vars(c)["__init__"] for c in env_class.__mro__ if "__init__" in vars(c)]

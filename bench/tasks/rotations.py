@@ -1,7 +1,7 @@
 """Rotations as this project needs them: small batched functions on torch tensors.
 
 Quaternions are (w, x, y, z) and unit length, as in SAPIEN. A planar symmetry is the pair
-``(angle, reflect)`` of :mod:`policies.geometry`: first (x, y) -> (x, -y) if ``reflect``, then a
+``(angle, reflect)`` of ``policies.geometry``: first (x, y) -> (x, -y) if ``reflect``, then a
 rotation by ``angle`` about the vertical axis. A body is mirrored together with its own frame,
 R -> M R M with M = diag(1, -1, 1), so that rotations stay rotations; bodies that are their own
 mirror image across their x-z plane (cubes, two-fingered grippers) look as mirrored bodies should.

@@ -9,10 +9,10 @@ import torch
 from mani_skill.envs.tasks.tabletop.stack_cube import StackCubeEnv
 from mani_skill.utils.structs import Actor
 
-from bench.tasks.base import SymmetricTask
-from bench.tasks.experts import CLOSED, OPEN, Intent, choose, finger_width, funnel, grasp
-from bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
-from policies.geometry import Field
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.experts import CLOSED, OPEN, Intent, choose, finger_width, funnel, grasp
+from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
+from symsteer.policies.geometry import Field
 
 
 class StackCube(SymmetricTask, StackCubeEnv):

@@ -1,6 +1,6 @@
-"""Ways to break the symmetry, each with one dial; see :mod:`bench.variants.base`."""
+"""Ways to break the symmetry, each with one dial; see :mod:`symsteer.bench.variants.base`."""
 
-from bench.variants.base import (
+from symsteer.bench.variants.base import (
     Role,
     Strength,
     Variant,

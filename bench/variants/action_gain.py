@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from bench.tasks.floating import ACTION_LAYOUT
-from bench.variants.base import Variant
+from symsteer.bench.tasks.floating import ACTION_LAYOUT
+from symsteer.bench.variants.base import Variant
 
 
 class ActionGain(Variant):

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
-from policies.errors import UserError
-from policies.geometry import Layout
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Layout
 
 if TYPE_CHECKING:
     from mani_skill.utils.structs import Actor, Pose
 
-    from bench.tasks.base import SymmetricTask
+    from symsteer.bench.tasks.base import SymmetricTask
 
 Strength = float | torch.Tensor
 """One strength for all environments, or one each as a tensor ``[N]``; in [0, 1]."""
@@ -156,18 +156,18 @@ def overriding(variants: Iterable[Variant], hook: str) -> list[Variant]:
 
 def registry() -> dict[str, type[Variant]]:
     """All variants by name."""
-    from bench.variants.action_gain import ActionGain
-    from bench.variants.actuator_offset import ActuatorOffset
-    from bench.variants.directional_reward import DirectionalReward
-    from bench.variants.frame_offset import FrameOffset
-    from bench.variants.frame_rotation import FrameRotation
-    from bench.variants.friction_patch import FrictionPatch
-    from bench.variants.gravity_tilt import GravityTilt
-    from bench.variants.observation_noise import ObservationNoise
-    from bench.variants.obstacle import Obstacle
-    from bench.variants.perception_bias import PerceptionBias
-    from bench.variants.spawn_sector import SpawnSector
-    from bench.variants.wind import Wind
+    from symsteer.bench.variants.action_gain import ActionGain
+    from symsteer.bench.variants.actuator_offset import ActuatorOffset
+    from symsteer.bench.variants.directional_reward import DirectionalReward
+    from symsteer.bench.variants.frame_offset import FrameOffset
+    from symsteer.bench.variants.frame_rotation import FrameRotation
+    from symsteer.bench.variants.friction_patch import FrictionPatch
+    from symsteer.bench.variants.gravity_tilt import GravityTilt
+    from symsteer.bench.variants.observation_noise import ObservationNoise
+    from symsteer.bench.variants.obstacle import Obstacle
+    from symsteer.bench.variants.perception_bias import PerceptionBias
+    from symsteer.bench.variants.spawn_sector import SpawnSector
+    from symsteer.bench.variants.wind import Wind
 
     variants = (
         GravityTilt,

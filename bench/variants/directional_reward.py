@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from bench.variants.base import Variant
+from symsteer.bench.variants.base import Variant
 
 
 class DirectionalReward(Variant):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from mani_skill.utils.structs import Pose
 
-from bench.variants.base import Role, Variant
+from symsteer.bench.variants.base import Role, Variant
 
 
 class FrameOffset(Variant):

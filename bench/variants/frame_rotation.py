@@ -6,8 +6,8 @@ import math
 
 import torch
 
-from bench.variants.base import Variant
-from policies.geometry import Layout
+from symsteer.bench.variants.base import Variant
+from symsteer.policies.geometry import Layout
 
 
 class FrameRotation(Variant):

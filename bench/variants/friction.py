@@ -16,8 +16,8 @@ import torch
 from mani_skill.utils.structs import Actor
 
 if TYPE_CHECKING:
-    from bench.tasks.base import SymmetricTask
-    from bench.variants.base import Variant
+    from symsteer.bench.tasks.base import SymmetricTask
+    from symsteer.bench.variants.base import Variant
 
 
 @dataclass

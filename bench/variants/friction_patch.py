@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from mani_skill.utils.structs import Actor
 
-from bench.variants.base import Variant
+from symsteer.bench.variants.base import Variant
 
 CENTER = (0.1, 0.0)
 RADIUS = 0.1

@@ -7,8 +7,8 @@ import math
 import torch
 from mani_skill.utils.structs import Actor
 
-from bench.variants.base import Variant
-from bench.variants.bodies import masses, prepare_for_force
+from symsteer.bench.variants.base import Variant
+from symsteer.bench.variants.bodies import masses, prepare_for_force
 
 MAX_TILT = math.radians(30)
 

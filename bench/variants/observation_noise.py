@@ -7,7 +7,7 @@ import math
 import torch
 from mani_skill.utils.structs import Pose
 
-from bench.variants.base import Role, Variant
+from symsteer.bench.variants.base import Role, Variant
 
 STD_X, STD_Y = 0.01, 0.0025
 

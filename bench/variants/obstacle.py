@@ -5,7 +5,7 @@ from __future__ import annotations
 import sapien
 import torch
 
-from bench.variants.base import Variant
+from symsteer.bench.variants.base import Variant
 
 HALF_WIDTH, HEIGHT = 0.04, 0.2
 GAP = 0.005

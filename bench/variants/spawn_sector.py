@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from mani_skill.utils.structs import Pose
 
-from bench.tasks.rotations import quaternion_multiply, yaw_quaternion
-from bench.variants.base import Variant
+from symsteer.bench.tasks.rotations import quaternion_multiply, yaw_quaternion
+from symsteer.bench.variants.base import Variant
 
 
 class SpawnSector(Variant):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from mani_skill.utils.structs import Actor
 
-from bench.variants.base import Variant
-from bench.variants.bodies import friction_of, masses, prepare_for_force
+from symsteer.bench.variants.base import Variant
+from symsteer.bench.variants.bodies import friction_of, masses, prepare_for_force
 
 
 class Wind(Variant):

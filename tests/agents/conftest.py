@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from agents import Batch, ReplayBuffer, SacConfig, make_agent
-from policies.geometry import Field, Layout
+from symsteer.agents import Batch, ReplayBuffer, SacConfig, make_agent
+from symsteer.policies.geometry import Field, Layout
 
 OBS = Layout(
     [

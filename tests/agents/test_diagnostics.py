@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from agents import diagnostics
-from policies.errors import UserError
-from policies.geometry import Group
+from symsteer.agents import diagnostics
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Group
 
 GAMMA = 0.9
 C8 = Group.parse("C8")

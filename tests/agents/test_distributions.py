@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from agents.distributions import SMALL, SquashedGaussian
-from policies.errors import UserError
-from policies.geometry import Field, Group, Layout
+from symsteer.agents.distributions import SMALL, SquashedGaussian
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Field, Group, Layout
 
 LAYOUT = Layout([Field("xy", 1), Field("z", 0), Field("tilt", 1, odd=True), Field("rod", 2)])
 # The same seven numbers with the vectors forgotten: a tanh for each number by itself.

@@ -8,7 +8,7 @@ import dataclasses
 import pytest
 import torch
 
-from policies.geometry import Field, Group, Layout
+from symsteer.policies.geometry import Field, Group, Layout
 
 GROUPS = ["C8", "C4", "D4"]
 DTYPES = [(torch.float32, 1e-5), (torch.float64, 1e-10)]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from policies.errors import UserError
+from symsteer.errors import UserError
 
 
 def test_base_is_seeded_standard_noise(problem):

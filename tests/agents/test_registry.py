@@ -5,15 +5,15 @@ import sys
 import pytest
 import torch
 
-import agents
-from agents import make_agent, registry
-from agents.sac import SacAgent
-from policies.errors import UserError
+import symsteer.agents
+from symsteer.agents import make_agent, registry
+from symsteer.agents.sac import SacAgent
+from symsteer.errors import UserError
 
 MINE = '''
 """A file as a user would write it."""
-from agents.equivariant import equivariant_critic_layers
-from agents.standard import StandardAgent
+from symsteer.agents.equivariant import equivariant_critic_layers
+from symsteer.agents.standard import StandardAgent
 
 class _Helper(StandardAgent):
     name = "standard"
@@ -32,7 +32,7 @@ class AlsoMine(Mine):
 @pytest.fixture
 def add(monkeypatch, tmp_path):
     """Puts files into the package of agents, for the length of a test."""
-    monkeypatch.setattr(agents, "__path__", [*agents.__path__, str(tmp_path)])
+    monkeypatch.setattr(symsteer.agents, "__path__", [*symsteer.agents.__path__, str(tmp_path)])
     before = set(sys.modules)
 
     def write(name, text):
@@ -41,27 +41,27 @@ def add(monkeypatch, tmp_path):
 
     yield write
     for name in set(sys.modules) - before:
-        if name.startswith("agents."):
+        if name.startswith("symsteer.agents."):
             del sys.modules[name]
-            vars(agents).pop(name.removeprefix("agents."), None)
+            vars(symsteer.agents).pop(name.removeprefix("symsteer.agents."), None)
     registry.cache_clear()
 
 
 def test_the_order_is_that_of_a_comparison():
-    names = list(agents.AGENTS)
+    names = list(symsteer.agents.AGENTS)
     assert names[:4] == ["standard", "standard-matched", "equivariant", "approximate"]
-    learners = [name for name in names if agents.AGENTS[name].learns]
+    learners = [name for name in names if symsteer.agents.AGENTS[name].learns]
     assert names[: len(learners)] == learners
     assert names[len(learners) :][:2] == ["base", "zero"]
-    assert all(agents.AGENTS[name].name == name for name in names)
+    assert all(symsteer.agents.AGENTS[name].name == name for name in names)
 
 
 def test_a_new_file_is_a_new_agent(add, problem):
     add("mine.py", MINE)
-    assert list(agents.AGENTS)[4:7] == ["also-mine", "mine", "base"]
+    assert list(symsteer.agents.AGENTS)[4:7] == ["also-mine", "mine", "base"]
     agent = make_agent("mine", problem.obs_layout, problem.act_layout, problem.horizon)
     assert isinstance(agent, SacAgent)
-    assert type(agent).__module__ == "agents.mine"
+    assert type(agent).__module__ == "symsteer.agents.mine"
     batch = problem.batch()
     turned = agent.obs_layout.transform(batch.obs, torch.pi / 4)
     noise = agent.act_layout.transform(batch.noise, torch.pi / 4)
@@ -88,7 +88,7 @@ def test_a_new_file_is_a_new_agent(add, problem):
 def test_what_cannot_be_an_agent_is_named(add, text, sentence):
     add("mine.py", text)
     with pytest.raises(UserError, match=sentence):
-        _ = agents.AGENTS
+        _ = symsteer.agents.AGENTS
 
 
 def test_a_damaged_file_does_not_keep_the_package_from_being_imported(add):
@@ -98,4 +98,4 @@ def test_a_damaged_file_does_not_keep_the_package_from_being_imported(add):
     with pytest.raises(UserError, match="mend or remove it"):
         make_agent("zero", None, None, 1)
     with pytest.raises(AttributeError, match="no attribute 'AGENT'"):
-        _ = agents.AGENT
+        _ = symsteer.agents.AGENT

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from agents.replay import ReplayBuffer
-from policies.errors import UserError
+from symsteer.agents.replay import ReplayBuffer
+from symsteer.errors import UserError
 
 
 def numbered(start, count):

@@ -7,13 +7,13 @@ import io
 import pytest
 import torch
 
-from agents import ReplayBuffer, SacConfig
-from agents.approximate import paths
-from agents.diagnostics import equivariance_error
-from agents.networks import count
-from agents.sac import entropy_allowance
-from policies.errors import UserError
-from policies.geometry import Field, Group, Layout
+from symsteer.agents import ReplayBuffer, SacConfig
+from symsteer.agents.approximate import paths
+from symsteer.agents.diagnostics import equivariance_error
+from symsteer.agents.networks import count
+from symsteer.agents.sac import entropy_allowance
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Field, Group, Layout
 
 LEARNERS = ["standard", "standard-matched", "equivariant", "approximate"]
 SAC = ["standard", "equivariant", "approximate"]

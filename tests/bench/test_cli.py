@@ -9,11 +9,11 @@ from pathlib import Path
 import h5py
 import pytest
 import torch
+from symsteer.bench.cli import _threads, main
 
-from bench.cli import _threads, main
-from bench.demos import collect
-from bench.tasks import task_class
-from policies.base import ChunkPolicy, PolicyConfig, save_policy
+from symsteer.bench.demos import collect
+from symsteer.bench.tasks import task_class
+from symsteer.policies.base import ChunkPolicy, PolicyConfig, save_policy
 
 
 def symsteer(monkeypatch, *arguments) -> int:

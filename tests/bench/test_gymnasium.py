@@ -22,10 +22,10 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from stable_baselines3 import SAC
 
-from bench.sim import rendering_works
-from bench.tasks import make, task_class, task_names
-from bench.tasks.experts import Expert
-from policies.errors import UserError
+from symsteer.bench.sim import rendering_works
+from symsteer.bench.tasks import make, task_class, task_names
+from symsteer.bench.tasks.experts import Expert
+from symsteer.errors import UserError
 
 BATCHED = "SymSteer/PickCube-v1"
 SINGLE = "SymSteer/PickCube-single-v1"
@@ -174,8 +174,9 @@ def test_ids_name_their_module():
     """``module:id`` needs no import: what a script gets that knows nothing but ``--env-id``."""
     code = (
         "import gymnasium as gym; "
-        "print(gym.make('bench.tasks:SymSteer/PushCube-v1', num_envs=2).unwrapped.num_envs, "
-        "gym.make('bench.tasks:SymSteer/PushCube-single-v1').reset(seed=0)[0].shape)"
+        "env = gym.make('symsteer.bench.tasks:SymSteer/PushCube-v1', num_envs=2); "
+        "print(env.unwrapped.num_envs, "
+        "gym.make('symsteer.bench.tasks:SymSteer/PushCube-single-v1').reset(seed=0)[0].shape)"
     )
     result = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=300
@@ -222,7 +223,7 @@ def test_without_a_limit_nothing_is_truncated():
 def test_an_id_of_ones_own_fixes_a_variant():
     gym.register(
         "Lab/WeakPick-v1",
-        entry_point="bench.tasks:make_single",
+        entry_point="symsteer.bench.tasks:make_single",
         max_episode_steps=5,
         kwargs={"task": "PickCube-v1", "variant": "action_gain:0.5"},
     )

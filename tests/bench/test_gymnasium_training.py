@@ -16,7 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from torch import nn
 from torch.nn import functional
 
-import bench.tasks  # noqa: F401  (registers the ids)
+import symsteer.bench.tasks  # noqa: F401  (registers the ids)
 
 SINGLE = "SymSteer/PushCube-single-v1"
 OPTIONS = {"variant": "action_gain:0.5", "reward_mode": "normalized_dense"}
@@ -191,7 +191,7 @@ def test_a_single_file_ppo_trains_on_processes():
     """PPO's loop over environments in processes, which reset on the step after an end."""
     torch.manual_seed(0)
     n, steps = 2, 128
-    envs = AsyncVectorEnv([make_env(f"bench.tasks:{SINGLE}", OPTIONS) for _ in range(n)])
+    envs = AsyncVectorEnv([make_env(f"symsteer.bench.tasks:{SINGLE}", OPTIONS) for _ in range(n)])
     try:
         actor, value = Actor(envs), nn.Linear(envs.single_observation_space.shape[0], 1)
         before = weights(actor, value)

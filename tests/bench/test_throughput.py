@@ -8,9 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from bench import throughput
-from bench.throughput import Replay, Row, Turn, _Stopwatch
-from policies.errors import UserError
+from symsteer.bench import throughput
+from symsteer.bench.throughput import Replay, Row, Turn, _Stopwatch
+from symsteer.errors import UserError
 
 TASK = "PickCube-v1"
 

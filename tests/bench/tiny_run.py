@@ -2,9 +2,9 @@
 
 import json
 
-from agents.sac import SacConfig
-from bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
-from policies.base import PolicyConfig
+from symsteer.agents.sac import SacConfig
+from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
+from symsteer.policies.base import PolicyConfig
 
 
 def tiny_config(**changes) -> RunConfig:

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import torch
 
-from agents import ReplayBuffer, SacConfig, make_agent
-from agents.diagnostics import orbit_variance
-from bench.sweep.suite import load_suite
-from leaderboard.admission import check
-from leaderboard.records import read_record
-from policies.geometry import Field, Group, Layout
+from symsteer.agents import ReplayBuffer, SacConfig, make_agent
+from symsteer.agents.diagnostics import orbit_variance
+from symsteer.bench.sweep.suite import load_suite
+from symsteer.leaderboard.admission import check
+from symsteer.leaderboard.records import read_record
+from symsteer.policies.geometry import Field, Group, Layout
 
 REPOSITORY = Path(__file__).parents[2]
 EXAMPLE = REPOSITORY / "examples" / "augmented.py"

@@ -8,13 +8,13 @@ from unittest.mock import patch
 
 import pytest
 
-from bench.runs.config import RunConfig, flat
-from bench.runs.folder import load_checkpoint
-from bench.runs.loop import Loop
-from bench.runs.run import execute
-from bench.sweep.plan import make_plan, write_manifest
-from bench.sweep.suite import Suite
-from leaderboard.records import dump_record
+from symsteer.bench.runs.config import RunConfig, flat
+from symsteer.bench.runs.folder import load_checkpoint
+from symsteer.bench.runs.loop import Loop
+from symsteer.bench.runs.run import execute
+from symsteer.bench.sweep.plan import make_plan, write_manifest
+from symsteer.bench.sweep.suite import Suite
+from symsteer.leaderboard.records import dump_record
 from tests.bench.tiny_run import tiny_config
 from tests.fuzz.kinds import Workshop
 from tests.leaderboard.record_factory import make_record

@@ -31,16 +31,16 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from bench import cli
-from bench.runs import base_policy
-from bench.runs import run as run_module
-from bench.runs.config import RunConfig, flat
-from bench.runs.folder import load_checkpoint
-from bench.runs.loop import Loop
-from bench.sweep.suite import load_suite
-from bench.tasks import task_class
-from leaderboard.records import config_hash, read_record
-from policies.base import ChunkPolicy, PolicyConfig, save_policy
+from symsteer.bench import cli
+from symsteer.bench.runs import base_policy
+from symsteer.bench.runs import run as run_module
+from symsteer.bench.runs.config import RunConfig, flat
+from symsteer.bench.runs.folder import load_checkpoint
+from symsteer.bench.runs.loop import Loop
+from symsteer.bench.sweep.suite import load_suite
+from symsteer.bench.tasks import task_class
+from symsteer.leaderboard.records import config_hash, read_record
+from symsteer.policies.base import ChunkPolicy, PolicyConfig, save_policy
 from tests.fuzz.judge import BadEndingError, Ending, end_of, stopped_at
 from tests.fuzz.mutate import (
     POISON,

@@ -15,12 +15,12 @@ from unittest.mock import patch
 
 import pytest
 
-from bench import cli
-from bench.demos import load
-from bench.runs.folder import load_checkpoint, state_of
-from bench.runs.loop import Loop
-from bench.runs.run import execute, resume
-from leaderboard.records import read_record
+from symsteer.bench import cli
+from symsteer.bench.demos import load
+from symsteer.bench.runs.folder import load_checkpoint, state_of
+from symsteer.bench.runs.loop import Loop
+from symsteer.bench.runs.run import execute, resume
+from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import without_clock
 from tests.fuzz.conftest import CONFIG, options_of
 from tests.fuzz.judge import CURE, one_sentence

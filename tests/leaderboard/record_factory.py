@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from leaderboard.records import (
+from symsteer.leaderboard.records import (
     BasePolicy,
     Budget,
     Episodes,

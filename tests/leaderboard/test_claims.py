@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from record_factory import make_cell, make_evaluation, make_record
 
-from leaderboard.claims import Claim, claims
-from leaderboard.defects import Audit, Defect, defect_map
-from leaderboard.records import RunRecord
-from leaderboard.statistics import Interval
-from leaderboard.summary import Run, summarize
+from symsteer.leaderboard.claims import Claim, claims
+from symsteer.leaderboard.defects import Audit, Defect, defect_map
+from symsteer.leaderboard.records import RunRecord
+from symsteer.leaderboard.statistics import Interval
+from symsteer.leaderboard.summary import Run, summarize
 
 NAMES = (
     "faster than standard",

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from record_factory import make_cell, make_evaluation, make_record
 
-from leaderboard.comparisons import THRESHOLDS, compare_agents, gap_closed
-from leaderboard.records import RunRecord
-from leaderboard.summary import Run, Summary, summarize
+from symsteer.leaderboard.comparisons import THRESHOLDS, compare_agents, gap_closed
+from symsteer.leaderboard.records import RunRecord
+from symsteer.leaderboard.summary import Run, Summary, summarize
 
 
 def summary_of(records: list[RunRecord]) -> Summary:

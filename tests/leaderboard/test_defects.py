@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from record_factory import make_cell
 
-from leaderboard.defects import (
+from symsteer.leaderboard.defects import (
     DEFAULT_AUDIT,
     Audit,
     Defect,
@@ -23,10 +23,10 @@ from leaderboard.defects import (
     fit,
     read_audit,
 )
-from leaderboard.errors import RecordError
-from leaderboard.page import crossing_text
-from leaderboard.statistics import Interval, Sample
-from leaderboard.summary import Run, Summary, Table, summarize
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.page import crossing_text
+from symsteer.leaderboard.statistics import Interval, Sample
+from symsteer.leaderboard.summary import Run, Summary, Table, summarize
 
 CELL = {
     "task": "PickCube-v1",
@@ -105,7 +105,7 @@ def test_a_missing_audit_is_an_error_only_if_it_was_named(
         read_audit(tmp_path / "nowhere.json")
     with pytest.raises(RecordError, match=r"cannot be read"):
         read_audit(tmp_path)
-    monkeypatch.setattr("leaderboard.defects.DEFAULT_AUDIT", tmp_path / "nowhere.json")
+    monkeypatch.setattr("symsteer.leaderboard.defects.DEFAULT_AUDIT", tmp_path / "nowhere.json")
     assert read_audit() == {}
 
 

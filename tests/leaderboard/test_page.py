@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from record_factory import make_cell, make_evaluation, make_record
 
-from leaderboard.findings import analyse
-from leaderboard.page import render_page
-from leaderboard.records import RunRecord, write_record
-from leaderboard.report import generate
-from leaderboard.summary import Run, summarize
+from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.page import render_page
+from symsteer.leaderboard.records import RunRecord, write_record
+from symsteer.leaderboard.report import generate
+from symsteer.leaderboard.summary import Run, summarize
 
 DEFECTS = {"none": 0.002, "wind:0.25": 0.1, "wind:0.5": 0.2, "wind:1": 0.4}
 HOSTILE = "x`</td><img src=x onerror=alert(1)>`|$a$\n# H [l](javascript:alert(1))"

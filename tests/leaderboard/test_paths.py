@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from record_factory import make_record
 
-from leaderboard.__main__ import main
-from leaderboard.errors import RecordError
-from leaderboard.paths import record_files
-from leaderboard.records import MAX_BYTES, write_record
-from leaderboard.report import generate, slug
+from symsteer.leaderboard.__main__ import main
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.paths import record_files
+from symsteer.leaderboard.records import MAX_BYTES, write_record
+from symsteer.leaderboard.report import generate, slug
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-from leaderboard.records import Provenance
+from symsteer.leaderboard.records import Provenance
 
 
 def test_code_that_git_does_not_know_counts_as_a_local_change(tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ import pytest
 from pydantic import ValidationError
 from record_factory import START, make_config, make_evaluation, make_record
 
-from leaderboard.errors import RecordError
-from leaderboard.records import (
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.records import (
     Evaluation,
     FeasibleQ,
     Provenance,

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from record_factory import LEARNING, make_curve, make_evaluation, make_record
 
-from leaderboard.__main__ import main
-from leaderboard.figures import render_figures
-from leaderboard.findings import analyse
-from leaderboard.records import read_record, write_record
-from leaderboard.report import DEFAULT_RECORDS, generate, slug
-from leaderboard.summary import Run, summarize
-from leaderboard.text import code, compact, count, number, relative_link
+from symsteer.leaderboard.__main__ import main
+from symsteer.leaderboard.figures import render_figures
+from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.records import read_record, write_record
+from symsteer.leaderboard.report import DEFAULT_RECORDS, generate, slug
+from symsteer.leaderboard.summary import Run, summarize
+from symsteer.leaderboard.text import code, compact, count, number, relative_link
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from leaderboard.statistics import (
+from symsteer.leaderboard.statistics import (
     Array,
     Interval,
     Sample,

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from record_factory import START, make_curve, make_evaluation, make_record
 
-from leaderboard.errors import RecordError
-from leaderboard.findings import analyse
-from leaderboard.page import render_page
-from leaderboard.records import Evaluation, RunRecord, config_hash, write_record
-from leaderboard.statistics import Sample
-from leaderboard.summary import (
+from symsteer.leaderboard.errors import RecordError
+from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.page import render_page
+from symsteer.leaderboard.records import Evaluation, RunRecord, config_hash, write_record
+from symsteer.leaderboard.statistics import Sample
+from symsteer.leaderboard.summary import (
     Pair,
     Row,
     Run,

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from record_factory import make_curve, make_evaluation, make_record
 
-from leaderboard.__main__ import main
-from leaderboard.records import write_record
-from leaderboard.report import DEFAULT_OUT, DEFAULT_RECORDS, generate, slug
-from leaderboard.verification import differences, other_versions
+from symsteer.leaderboard.__main__ import main
+from symsteer.leaderboard.records import write_record
+from symsteer.leaderboard.report import DEFAULT_OUT, DEFAULT_RECORDS, generate, slug
+from symsteer.leaderboard.verification import differences, other_versions
 
 REPOSITORY = Path(__file__).parents[2]
 

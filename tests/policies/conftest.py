@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from policies.base import PolicyConfig
-from policies.geometry import Field, Layout
-from policies.training import train_policy
+from symsteer.policies.base import PolicyConfig
+from symsteer.policies.geometry import Field, Layout
+from symsteer.policies.training import train_policy
 
 OBS = Layout(
     [

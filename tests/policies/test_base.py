@@ -10,9 +10,9 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from policies.base import PolicyConfig, load_policy, save_policy
-from policies.errors import UserError
-from policies.geometry import Field, Layout
+from symsteer.errors import UserError
+from symsteer.policies.base import PolicyConfig, load_policy, save_policy
+from symsteer.policies.geometry import Field, Layout
 
 
 def decode(policy, world):

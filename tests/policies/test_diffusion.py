@@ -4,8 +4,8 @@ import pytest
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
-from policies.diffusion import Diffusion
-from policies.errors import UserError
+from symsteer.errors import UserError
+from symsteer.policies.diffusion import Diffusion
 
 
 def reference(prediction, clip=False):

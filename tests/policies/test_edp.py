@@ -5,10 +5,9 @@ import math
 import pytest
 import torch
 
-import policies.base
-from policies.base import ChunkPolicy, PolicyConfig
-from policies.geometry import Field, Group, Layout
-from policies.normalizer import Normalizer
+from symsteer.policies.base import ChunkPolicy, PolicyConfig
+from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.policies.normalizer import Normalizer
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
@@ -146,7 +145,8 @@ def test_a_wrong_layout_shows(world, mistake):
 
 def test_a_per_axis_bound_shows(trained, world, monkeypatch):
     policy = trained(group="C8")
-    monkeypatch.setattr(policies.base, "clip_blocks", lambda x, layout, r: x.clamp(-r, r))
+    per_axis = "symsteer.policies.base.clip_blocks"
+    monkeypatch.setattr(per_axis, lambda x, layout, r: x.clamp(-r, r))
     assert equivariance_error(policy, world, policy.group, torch.float32) > 1e-2
 
 

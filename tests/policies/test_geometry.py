@@ -6,9 +6,9 @@ import escnn.nn
 import pytest
 import torch
 
-from policies.equivariant import Lift, Project, RegularLinear
-from policies.errors import UserError
-from policies.geometry import Field, Group, Layout
+from symsteer.errors import UserError
+from symsteer.policies.equivariant import Lift, Project, RegularLinear
+from symsteer.policies.geometry import Field, Group, Layout
 
 LAYOUT = Layout(
     [

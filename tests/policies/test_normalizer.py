@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from policies.errors import UserError
-from policies.geometry import Field, Layout
-from policies.normalizer import MINIMUM_RANGE, Normalizer, clip_blocks
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Field, Layout
+from symsteer.policies.normalizer import MINIMUM_RANGE, Normalizer, clip_blocks
 
 LAYOUT = Layout(
     [Field("xy", 1, 2), Field("z", 0), Field("yaw", 0, odd=True), Field("rod", 2, odd=True)]

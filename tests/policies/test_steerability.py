@@ -5,11 +5,11 @@ import json
 import pytest
 import torch
 
-from policies.base import PolicyConfig
-from policies.errors import UserError
-from policies.normalizer import clip_blocks
-from policies.steerability import action_spread
-from policies.training import make_chunks, train_policy
+from symsteer.errors import UserError
+from symsteer.policies.base import PolicyConfig
+from symsteer.policies.normalizer import clip_blocks
+from symsteer.policies.steerability import action_spread
+from symsteer.policies.training import make_chunks, train_policy
 
 
 def test_diverse_demonstrations_spread_more_than_clean_ones(world):

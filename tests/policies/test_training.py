@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from policies.base import ChunkPolicy, PolicyConfig
-from policies.edp import parameter_count
-from policies.errors import UserError
-from policies.geometry import Group
-from policies.training import Augmentation, make_chunks, train_policy
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy, PolicyConfig
+from symsteer.policies.edp import parameter_count
+from symsteer.policies.geometry import Group
+from symsteer.policies.training import Augmentation, make_chunks, train_policy
 
 
 def train(world, seed=0, progress=None, episodes=None, **fields):

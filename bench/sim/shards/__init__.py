@@ -5,6 +5,6 @@ user's side; `worker` what runs in each process; `block` the memory that they sh
 how processes are started.
 """
 
-from bench.sim.shards.env import ShardedEnv
+from symsteer.bench.sim.shards.env import ShardedEnv
 
 __all__ = ["ShardedEnv"]

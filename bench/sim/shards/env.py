@@ -15,11 +15,11 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from bench.sim.errors import WorkerError, WorkerLostError
-from bench.sim.shards.block import Field, SharedBlock, put_together, select
-from bench.sim.shards.messages import FAILURE, MISTAKE, SAME, Recipe, divide
-from bench.sim.shards.server import WorkerProcess
-from policies.errors import UserError
+from symsteer.bench.sim.errors import WorkerError, WorkerLostError
+from symsteer.bench.sim.shards.block import Field, SharedBlock, put_together, select
+from symsteer.bench.sim.shards.messages import FAILURE, MISTAKE, SAME, Recipe, divide
+from symsteer.bench.sim.shards.server import WorkerProcess
+from symsteer.errors import UserError
 
 _BYTES_PER_ENV = 2**16
 """Room for one environment's actions, and for its results; what is larger goes through a pipe."""
@@ -49,7 +49,7 @@ class ShardedEnv(gym.Env):
         workers: W, at most N; more than there are cores only costs time and memory.
         per_env: arguments of the class with one entry per environment.
         attributes: what the environment shall have besides, under these names.
-        kwargs: further arguments of `bench.sim.create`.
+        kwargs: further arguments of `symsteer.bench.sim.create`.
 
     Raises:
         UserError: the number of workers is out of range, an argument cannot be sent to another
@@ -333,7 +333,7 @@ class _Pool:
         self.connections: list[Connection] = []
         self.answers: list[dict[str, tuple]] = [{} for _ in recipes]
         WorkerProcess.preload(preload)
-        from bench.sim.shards.serve import serve
+        from symsteer.bench.sim.shards.serve import serve
 
         try:
             for i, recipe in enumerate(recipes):

@@ -20,7 +20,7 @@ class Recipe:
         start: index of the shard's first environment among all.
         count: how many environments it holds.
         seed: of the process's global random generators.
-        kwargs: further arguments of `bench.sim.create`.
+        kwargs: further arguments of `symsteer.bench.sim.create`.
     """
 
     env_cls: type

@@ -5,12 +5,12 @@ from __future__ import annotations
 import signal
 from multiprocessing.connection import Connection
 
-from bench.sim.shards.block import SharedBlock
+from symsteer.bench.sim.shards.block import SharedBlock
 
 
 def serve(connection: Connection, inbox: SharedBlock, outbox: SharedBlock) -> None:
     """Make environments and answer requests until the other side hangs up."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from bench.sim.shards.worker import Worker
+    from symsteer.bench.sim.shards.worker import Worker
 
     Worker(connection, inbox, outbox).run()

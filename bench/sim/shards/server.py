@@ -46,7 +46,7 @@ def _inherited_settings() -> Iterator[None]:
 class _Server(forkserver.ForkServer):
     def __init__(self) -> None:
         super().__init__()
-        self.modules = ["bench.sim.shards.worker"]
+        self.modules = ["symsteer.bench.sim.shards.worker"]
         self.set_forkserver_preload(self.modules)
 
     def ensure_running(self) -> None:

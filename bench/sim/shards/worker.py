@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from bench.sim.environment import create
-from bench.sim.shards.block import Field, SharedBlock, put_together, take_apart
-from bench.sim.shards.messages import FAILURE, MISTAKE, RESULT, SAME, Recipe
-from policies.errors import UserError
+from symsteer.bench.sim.environment import create
+from symsteer.bench.sim.shards.block import Field, SharedBlock, put_together, take_apart
+from symsteer.bench.sim.shards.messages import FAILURE, MISTAKE, RESULT, SAME, Recipe
+from symsteer.errors import UserError
 
 FACTS = (
     "single_observation_space",

@@ -6,11 +6,19 @@ import json
 import numpy as np
 import pytest
 
-from bench.audit.cell import Cell, Settings, audit, reference_task, visit_all
-from bench.audit.measure import Bench, check_group
-from bench.audit.report import EXACT, SIGNIFICANT, map_figure, summary, text, to_csv, to_markdown
-from bench.tasks import task_names
-from bench.variants import registry, variant_names
+from symsteer.bench.audit.cell import Cell, Settings, audit, reference_task, visit_all
+from symsteer.bench.audit.measure import Bench, check_group
+from symsteer.bench.audit.report import (
+    EXACT,
+    SIGNIFICANT,
+    map_figure,
+    summary,
+    text,
+    to_csv,
+    to_markdown,
+)
+from symsteer.bench.tasks import task_names
+from symsteer.bench.variants import registry, variant_names
 
 QUICK = Settings(task="PickCube-v1", states="expert", count=16, resets=64)
 

@@ -5,14 +5,14 @@ import sys
 
 import pytest
 import torch
+from symsteer.bench.cli import main
 
-from bench.audit import page
-from bench.audit.study import variant_texts
-from bench.cli import main
-from bench.tasks import task_class
-from bench.variants import variant_names
-from policies.base import ChunkPolicy, PolicyConfig, save_policy
-from policies.errors import UserError
+from symsteer.bench.audit import page
+from symsteer.bench.audit.study import variant_texts
+from symsteer.bench.tasks import task_class
+from symsteer.bench.variants import variant_names
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy, PolicyConfig, save_policy
 
 FAST = ("--count", 8, "--resets", 16)
 
@@ -111,7 +111,7 @@ def test_names_of_cells():
 
 
 def test_the_page_says_what_the_data_say():
-    """`python -m bench.audit.page` writes it."""
+    """`python -m symsteer.bench.audit.page` writes it."""
     rows = page.read_summary(page.SUMMARY)
     text = page.PAGE.read_text()
     assert text == page.generate(text, rows)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.audit.estimates import (
+from symsteer.bench.audit.estimates import (
     bootstrap,
     energy_distance,
     gaussian_distance_squared,

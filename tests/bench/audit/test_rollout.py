@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from bench.audit import rotated_rollout_error
-from bench.demos import collect, load
-from bench.tasks import task_class
-from policies.base import ChunkPolicy, PolicyConfig
-from policies.errors import UserError
-from policies.training import train_policy
+from symsteer.bench.audit import rotated_rollout_error
+from symsteer.bench.demos import collect, load
+from symsteer.bench.tasks import task_class
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy, PolicyConfig
+from symsteer.policies.training import train_policy
 
 TASKS = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
 

@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 
-from bench.audit.measure import check_group
-from bench.audit.states import Turner, visit
-from bench.tasks import make
-from bench.tasks.rotations import planar_matrix, transform_quaternion
-from policies.errors import UserError
-from policies.geometry import Group
+from symsteer.bench.audit.measure import check_group
+from symsteer.bench.audit.states import Turner, visit
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.rotations import planar_matrix, transform_quaternion
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Group
 
 
 @pytest.fixture(scope="module", params=["floating", "panda"])

@@ -14,14 +14,14 @@ import torch
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 from mani_skill.trajectory.utils import dict_to_list_of_dicts
 
-from bench.demos import Diversity, collect, load
-from bench.sim import make_env_class
-from bench.tasks import make, task_class
-from leaderboard.records import write_atomically
-from policies.errors import UserError
+from symsteer.bench.demos import Diversity, collect, load
+from symsteer.bench.sim import make_env_class
+from symsteer.bench.tasks import make, task_class
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import write_atomically
 
 TASK = "PickCube-v1"
-collecting = importlib.import_module("bench.demos.collect")
+collecting = importlib.import_module("symsteer.bench.demos.collect")
 
 
 @pytest.fixture(scope="module")

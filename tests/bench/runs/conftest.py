@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from bench.runs.config import RunConfig
+from symsteer.bench.runs.config import RunConfig
 from tests.bench.tiny_run import tiny_config
 
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory) -> tuple[RunConfig, Path]:
     """A finished run: its configuration and folder."""
-    from bench.runs.run import execute
+    from symsteer.bench.runs.run import execute
 
     config = tiny_config()
     return config, execute(config, tmp_path_factory.mktemp("runs"), progress=False)
@@ -20,8 +20,8 @@ def finished(tmp_path_factory) -> tuple[RunConfig, Path]:
 @pytest.fixture(scope="session")
 def broken(finished) -> dict[str, Path]:
     """A finished run of every agent where the symmetry is broken: the folders by agent."""
-    from agents import AGENTS
-    from bench.runs.run import execute
+    from symsteer.agents import AGENTS
+    from symsteer.bench.runs.run import execute
 
     _, folder = finished
     change = {"variant": "action_gain:0.5", "env_steps": 240}

@@ -2,8 +2,8 @@
 
 import pytest
 
-from bench.runs.base_study import study, table, write_study
-from policies.errors import UserError
+from symsteer.bench.runs.base_study import study, table, write_study
+from symsteer.errors import UserError
 from tests.bench.tiny_run import tiny_config
 
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from bench.runs.base_policy import prepare_base
-from bench.runs.loop import new_agent
-from bench.runs.pictures import FAILURE, FRAMES, SUCCESS, draw_paths, film, positions
-from bench.sim.headless import rendering_works
-from bench.steering.evaluation import Rollout
-from bench.tasks import task_class, task_names
+from symsteer.bench.runs.base_policy import prepare_base
+from symsteer.bench.runs.loop import new_agent
+from symsteer.bench.runs.pictures import FAILURE, FRAMES, SUCCESS, draw_paths, film, positions
+from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.steering.evaluation import Rollout
+from symsteer.bench.tasks import task_class, task_names
 from tests.bench.tiny_run import tiny_config
 
 LAYOUT = task_class("PushCube-v1").observation_layout

@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from bench.runs.folder import (
+from symsteer.bench.runs.folder import (
     CHECKPOINT,
     RunBusyError,
     claimed,
@@ -21,9 +21,9 @@ from bench.runs.folder import (
     read_progress,
     state_of,
 )
-from bench.runs.run import evaluate, execute, resume
-from leaderboard.records import read_record
-from policies.errors import UserError
+from symsteer.bench.runs.run import evaluate, execute, resume
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config, without_clock
 
 # Fresh processes that have their imports done: a kill then falls into the run, not into these.

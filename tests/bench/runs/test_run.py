@@ -8,18 +8,18 @@ import shutil
 import pytest
 import torch
 
-from agents import make_agent
-from agents.sac import SacConfig
-from bench.runs import evaluator, loop
-from bench.runs.base_policy import prepare_base
-from bench.runs.config import DemonstrationConfig, RunConfig
-from bench.runs.folder import is_finished, load_checkpoint, run_id, state_of
-from bench.runs.run import evaluate, execute
-from bench.steering import evaluation
-from bench.steering.evaluation import held_out_seeds
-from bench.tasks import task_class
-from leaderboard.records import HELD_OUT_SEED, read_record
-from policies.errors import UserError
+from symsteer.agents import make_agent
+from symsteer.agents.sac import SacConfig
+from symsteer.bench.runs import evaluator, loop
+from symsteer.bench.runs.base_policy import prepare_base
+from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+from symsteer.bench.runs.folder import is_finished, load_checkpoint, run_id, state_of
+from symsteer.bench.runs.run import evaluate, execute
+from symsteer.bench.steering import evaluation
+from symsteer.bench.steering.evaluation import held_out_seeds
+from symsteer.bench.tasks import task_class
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import HELD_OUT_SEED, read_record
 from tests.bench.tiny_run import tiny_config, without_clock
 
 REFERENCES = ("base", "zero", "golden-ticket")

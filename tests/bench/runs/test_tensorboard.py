@@ -13,14 +13,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from bench.runs import loop
-from bench.runs.folder import run_id, state_of
-from bench.runs.loop import Loop
-from bench.runs.run import execute, resume
-from bench.runs.tensorboard import FINAL_METRICS, IDENTITY, RunLog
-from bench.sim.headless import rendering_works
-from leaderboard.records import read_record
-from policies.errors import UserError
+from symsteer.bench.runs import loop
+from symsteer.bench.runs.folder import run_id, state_of
+from symsteer.bench.runs.loop import Loop
+from symsteer.bench.runs.run import execute, resume
+from symsteer.bench.runs.tensorboard import FINAL_METRICS, IDENTITY, RunLog
+from symsteer.bench.sim.headless import rendering_works
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config
 
 DOCUMENTATION = Path(__file__).parents[3] / "docs" / "metrics.md"

@@ -2,10 +2,10 @@
 
 import pytest
 
-from bench.runs import evaluator
-from bench.runs.run import execute
-from bench.tasks import make, task_class
-from leaderboard.records import read_record
+from symsteer.bench.runs import evaluator
+from symsteer.bench.runs.run import execute
+from symsteer.bench.tasks import make, task_class
+from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config
 
 

@@ -9,9 +9,9 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
-from bench.sim import create, prepare_headless
-from bench.tasks import task_names
-from bench.throughput import stock_class
+from symsteer.bench.sim import create, prepare_headless
+from symsteer.bench.tasks import task_names
+from symsteer.bench.throughput import stock_class
 
 
 class Kit:

@@ -14,8 +14,8 @@ from mani_skill.envs.tasks.tabletop.two_robot_pick_cube import TwoRobotPickCube
 from mani_skill.utils.building.ground import build_ground
 from mani_skill.utils.structs.actor import Actor
 
-from bench.sim import BatchedCpuMixin, create, make_env_class
-from bench.sim.kinematics import SerialChain
+from symsteer.bench.sim import BatchedCpuMixin, create, make_env_class
+from symsteer.bench.sim.kinematics import SerialChain
 
 
 class Playground(BaseEnv):

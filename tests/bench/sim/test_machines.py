@@ -11,10 +11,10 @@ import pytest
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
-from bench.sim import create, make_env_class, patches, rendering_works
-from bench.sim import environment as batched
-from bench.sim.capabilities import probe
-from policies.errors import UserError
+from symsteer.bench.sim import create, make_env_class, patches, rendering_works
+from symsteer.bench.sim import environment as batched
+from symsteer.bench.sim.capabilities import probe
+from symsteer.errors import UserError
 
 NO_VULKAN = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
 
@@ -33,8 +33,8 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
 def test_headless_without_vulkan():
     """With no driver: states work, stock ManiSkill too, nothing warns, cameras are refused."""
     code = """
-from bench.sim import create, prepare_headless, rendering_works
-from policies.errors import UserError
+from symsteer.bench.sim import create, prepare_headless, rendering_works
+from symsteer.errors import UserError
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 assert prepare_headless() is False and prepare_headless() is False
@@ -116,7 +116,7 @@ def test_more_scenes_than_a_process_can_hold(monkeypatch):
     """Closed environments make room; what does not fit is refused before PhysX ends the process."""
     gc.collect()
     before = batched._number_of_scenes()
-    monkeypatch.setattr("bench.sim.environment.MAX_SCENES", before + 12)
+    monkeypatch.setattr("symsteer.bench.sim.environment.MAX_SCENES", before + 12)
     for _ in range(4):
         env = create(PickCubeEnv, 5, obs_mode="state")
         env.reset(seed=0, options={"reconfigure": True})
@@ -180,7 +180,7 @@ class Missing:
         if name in ("sapien", "mani_skill", "torch"):
             raise ImportError("libX11.so.6: cannot open shared object file: No such file")
 sys.meta_path.insert(0, Missing())
-from bench.sim.capabilities import probe
+from symsteer.bench.sim.capabilities import probe
 for check in probe():
     print(check.name, check.ok, check.cure, sep="|")
 """

@@ -15,15 +15,15 @@ import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
-from bench.sim import create
-from bench.sim.errors import WorkerError, WorkerLostError
-from bench.sim.shards import ShardedEnv
-from bench.sim.shards.messages import divide
-from bench.steering.latent_env import LatentNoiseEnv
-from bench.tasks import make
-from bench.variants import variant_names
-from policies.base import ChunkPolicy, PolicyConfig
-from policies.errors import UserError
+from symsteer.bench.sim import create
+from symsteer.bench.sim.errors import WorkerError, WorkerLostError
+from symsteer.bench.sim.shards import ShardedEnv
+from symsteer.bench.sim.shards.messages import divide
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.tasks import make
+from symsteer.bench.variants import variant_names
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy, PolicyConfig
 from tests.bench.steering.test_latent_env import NoiseIsAction
 
 TASK = "PickCube-v1"
@@ -388,7 +388,7 @@ def test_nothing_is_left_behind():
 PROGRAM = f"""
 import signal
 import torch
-from bench.tasks import make
+from symsteer.bench.tasks import make
 # A test suite that runs in the background has its children ignore interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 env = make("{TASK}", num_envs=2, workers=2)

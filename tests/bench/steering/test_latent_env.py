@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from bench.steering.evaluation import HELD_OUT_SEED, held_out_seeds, rollout, steerability
-from bench.steering.latent_env import LatentNoiseEnv
-from bench.tasks import make, task_class
-from bench.tasks.experts import Expert
-from policies.base import ChunkPolicy, PolicyConfig
-from policies.errors import UserError
+from symsteer.bench.steering.evaluation import HELD_OUT_SEED, held_out_seeds, rollout, steerability
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.tasks import make, task_class
+from symsteer.bench.tasks.experts import Expert
+from symsteer.errors import UserError
+from symsteer.policies.base import ChunkPolicy, PolicyConfig
 
 TASK = "PickCube-v1"
 

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from bench.runs.config import FIRST_TRAINING_SEED, training_seeds
-from bench.steering.latent_env import LatentNoiseEnv
-from bench.steering.search import search_ticket
-from bench.tasks import make
-from policies.errors import UserError
+from symsteer.bench.runs.config import FIRST_TRAINING_SEED, training_seeds
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.steering.search import search_ticket
+from symsteer.bench.tasks import make
+from symsteer.errors import UserError
 from tests.bench.steering.test_latent_env import TASK, NoiseIsAction
 
 ENVS, LIMIT = 8, 50

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bench.runs.run import execute
+from symsteer.bench.runs.run import execute
 from tests.bench.sweep.cells import LONG
 
 

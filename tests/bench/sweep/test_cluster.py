@@ -10,15 +10,15 @@ import threading
 import psutil
 import pytest
 
-from bench.runs.folder import CHECKPOINT, LOCK
-from bench.runs.run import execute
-from bench.sweep import cluster as cluster_module
-from bench.sweep.cluster import RayCluster
-from bench.sweep.command import run_plan
-from bench.sweep.plan import make_plan
-from bench.sweep.suite import Suite
-from leaderboard.records import read_record
-from policies.errors import UserError
+from symsteer.bench.runs.folder import CHECKPOINT, LOCK
+from symsteer.bench.runs.run import execute
+from symsteer.bench.sweep import cluster as cluster_module
+from symsteer.bench.sweep.cluster import RayCluster
+from symsteer.bench.sweep.command import run_plan
+from symsteer.bench.sweep.plan import make_plan
+from symsteer.bench.sweep.suite import Suite
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.cells import LONG, wait_for
 from tests.bench.tiny_run import tiny_config, without_clock
 

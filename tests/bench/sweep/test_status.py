@@ -11,18 +11,18 @@ from datetime import UTC, datetime
 import pytest
 from filelock import FileLock
 from rich.console import Console
+from symsteer.bench.cli import main
 
-from bench.cli import main
-from bench.runs.folder import CONFIG, LOCK, PROGRESS, RECORD
-from bench.sweep.display import Display, LiveDisplay
-from bench.sweep.estimate import Estimate, duration
-from bench.sweep.plan import Cell, make_plan, manifest_path, write_manifest
-from bench.sweep.schedule import Outcome, Task, tasks_of
-from bench.sweep.status import read_status, to_text
-from bench.sweep.suite import Suite
-from bench.sweep.work import Result
-from leaderboard.records import read_record
-from policies.errors import UserError
+from symsteer.bench.runs.folder import CONFIG, LOCK, PROGRESS, RECORD
+from symsteer.bench.sweep.display import Display, LiveDisplay
+from symsteer.bench.sweep.estimate import Estimate, duration
+from symsteer.bench.sweep.plan import Cell, make_plan, manifest_path, write_manifest
+from symsteer.bench.sweep.schedule import Outcome, Task, tasks_of
+from symsteer.bench.sweep.status import read_status, to_text
+from symsteer.bench.sweep.suite import Suite
+from symsteer.bench.sweep.work import Result
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.cells import LONG
 from tests.bench.tiny_run import tiny_config
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from bench.runs.config import build_config
-from bench.sweep.suite import load_suite, suite_names
-from policies.errors import UserError
+from symsteer.bench.runs.config import build_config
+from symsteer.bench.sweep.suite import load_suite, suite_names
+from symsteer.errors import UserError
 
 
 def write(tmp_path, text: str) -> str:

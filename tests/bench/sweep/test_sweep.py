@@ -13,18 +13,18 @@ import threading
 
 import psutil
 import pytest
+from symsteer.bench.cli import main
 
-from bench.cli import main
-from bench.runs.base_policy import demonstration_path
-from bench.runs.config import DemonstrationConfig, RunConfig
-from bench.runs.folder import CHECKPOINT, state_of
-from bench.sweep.plan import Plan, make_plan
-from bench.sweep.pool import LocalPool
-from bench.sweep.schedule import Outcome, Task, work_off
-from bench.sweep.status import read_status, to_text
-from bench.sweep.suite import Suite, load_suite
-from bench.sweep.work import Result
-from leaderboard.records import read_record
+from symsteer.bench.runs.base_policy import demonstration_path
+from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+from symsteer.bench.runs.folder import CHECKPOINT, state_of
+from symsteer.bench.sweep.plan import Plan, make_plan
+from symsteer.bench.sweep.pool import LocalPool
+from symsteer.bench.sweep.schedule import Outcome, Task, work_off
+from symsteer.bench.sweep.status import read_status, to_text
+from symsteer.bench.sweep.suite import Suite, load_suite
+from symsteer.bench.sweep.work import Result
+from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.cells import LONG, wait_for
 from tests.bench.tiny_run import tiny_config, without_clock
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from bench.tasks import make, task_names
-from bench.tasks.experts import Expert
-from policies.geometry import Group
+from symsteer.bench.tasks import make, task_names
+from symsteer.bench.tasks.experts import Expert
+from symsteer.policies.geometry import Group
 
 TASKS = task_names()
 

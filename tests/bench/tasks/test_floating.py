@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from bench.tasks import make
-from bench.tasks.floating import ACTION_LAYOUT, PlanarPoseControllerConfig, bound_blocks
-from bench.tasks.rotations import (
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.floating import ACTION_LAYOUT, PlanarPoseControllerConfig, bound_blocks
+from symsteer.bench.tasks.rotations import (
     euler_rates_matrix,
     euler_to_matrix,
     matrix_to_euler_facing_down,
@@ -15,7 +15,7 @@ from bench.tasks.rotations import (
     rotation_vector_to_matrix,
     transform_quaternion,
 )
-from policies.geometry import Group
+from symsteer.policies.geometry import Group
 
 
 @pytest.fixture(scope="module")

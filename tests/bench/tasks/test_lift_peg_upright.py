@@ -7,10 +7,10 @@ import torch
 from mani_skill.envs.tasks.tabletop.lift_peg_upright import LiftPegUprightEnv
 from mani_skill.utils.structs import Pose
 
-from bench.tasks import make
-from bench.tasks.embodiments import EMBODIMENTS
-from bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix, yaw_quaternion
-from policies.geometry import Group
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.embodiments import EMBODIMENTS
+from symsteer.bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix, yaw_quaternion
+from symsteer.policies.geometry import Group
 
 COUNT = 64
 

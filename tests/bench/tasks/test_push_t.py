@@ -7,11 +7,11 @@ import torch
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.utils.structs import Pose
 
-from bench.sim import create
-from bench.tasks import make
-from bench.tasks.experts import Expert
-from bench.tasks.rotations import quaternion_to_matrix, yaw_quaternion
-from policies.geometry import Group
+from symsteer.bench.sim import create
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.experts import Expert
+from symsteer.bench.tasks.rotations import quaternion_to_matrix, yaw_quaternion
+from symsteer.policies.geometry import Group
 
 COUNT = 48
 PIXELS = 825

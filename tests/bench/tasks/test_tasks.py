@@ -14,9 +14,9 @@ from sapien.physx import (
     PhysxRigidBaseComponent,
 )
 
-from bench.tasks import embodiments, make, task_class, task_names
-from policies.errors import UserError
-from policies.geometry import Group
+from symsteer.bench.tasks import embodiments, make, task_class, task_names
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Group
 
 TASKS = task_names()
 # Stock evaluates these with Euler angles; their own tests compare.

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from bench.tasks import SymmetricTask, make
+from symsteer.bench.tasks import SymmetricTask, make
 
 G = 9.81
 CONTROL_STEP = 0.05

@@ -6,9 +6,9 @@ import pytest
 import sapien.physx as physx
 import torch
 
-from bench.tasks import make, task_class, task_names
-from bench.variants.friction_patch import CENTER
-from bench.variants.obstacle import GAP, HALF_WIDTH
+from symsteer.bench.tasks import make, task_class, task_names
+from symsteer.bench.variants.friction_patch import CENTER
+from symsteer.bench.variants.obstacle import GAP, HALF_WIDTH
 from tests.bench.variants.scenes import CONTROL_STEP, G, act, place, scene
 
 STRENGTHS = torch.tensor([0.0, 0.5, 1.0])

@@ -6,10 +6,17 @@ import gymnasium as gym
 import pytest
 import torch
 
-from bench.tasks import embodiments, make, task_names
-from bench.tasks.experts import Expert
-from bench.variants import describe, evaluated, highest_cost, parse, registry, variant_names
-from policies.errors import UserError
+from symsteer.bench.tasks import embodiments, make, task_names
+from symsteer.bench.tasks.experts import Expert
+from symsteer.bench.variants import (
+    describe,
+    evaluated,
+    highest_cost,
+    parse,
+    registry,
+    variant_names,
+)
+from symsteer.errors import UserError
 from tests.bench.variants.scenes import act, scene
 
 NAMES = [

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from bench.audit.states import Turner
-from bench.steering.latent_env import LatentNoiseEnv
-from bench.tasks import make, task_class
-from policies.geometry import Group
+from symsteer.bench.audit.states import Turner
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.tasks import make, task_class
+from symsteer.policies.geometry import Group
 from tests.bench.variants.scenes import act, fields, scene
 
 STRENGTHS = torch.tensor([0.0, 0.5, 1.0])

@@ -22,11 +22,11 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from bench.runs.config import DemonstrationConfig, RunConfig
-from bench.sim.errors import WorkerLostError
-from leaderboard.errors import RecordError
-from policies.base import PolicyName
-from policies.errors import UserError
+from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+from symsteer.bench.sim.errors import WorkerLostError
+from symsteer.errors import UserError
+from symsteer.leaderboard.errors import RecordError
+from symsteer.policies.base import PolicyName
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
@@ -59,7 +59,7 @@ def run(
         workers: Processes that share the simulation; the record is the same but for the clock.
         quiet: No progress bars.
     """
-    from bench.runs.run import execute
+    from symsteer.bench.runs.run import execute
 
     _tell(execute(config, out, demos, base_policy, progress=not quiet, workers=workers))
     return 0
@@ -74,7 +74,7 @@ def resume(folder: Path, /, workers: int = 1, quiet: bool = False) -> int:
         workers: Processes that share the simulation; the record is the same but for the clock.
         quiet: No progress bars.
     """
-    from bench.runs.run import resume
+    from symsteer.bench.runs.run import resume
 
     _tell(resume(folder, progress=not quiet, workers=workers))
     return 0
@@ -104,7 +104,7 @@ def evaluate(
 
     from scipy.stats import binomtest
 
-    from bench.runs.run import evaluate
+    from symsteer.bench.runs.run import evaluate
 
     found = evaluate(folder, variant, episodes, workers)
     if json:
@@ -132,7 +132,7 @@ def _tell(folder: Path) -> None:
     out = folder.parent
     print(f"record:      {folder / 'record.json'}")
     print(f"TensorBoard: tensorboard --logdir {out}")
-    print(f"leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
+    print(f"symsteer.leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
 
 
 @app.command
@@ -156,9 +156,9 @@ def sweep(
         ray: Address of a Ray cluster to run on: auto, or host:port of its head.
         dry_run: Say what there is to do and how long it may take, and do nothing.
     """
-    from bench.sweep.command import preview, run_plan
-    from bench.sweep.plan import make_plan, manifest_path
-    from bench.sweep.suite import load_suite
+    from symsteer.bench.sweep.command import preview, run_plan
+    from symsteer.bench.sweep.plan import make_plan, manifest_path
+    from symsteer.bench.sweep.suite import load_suite
 
     plan = make_plan(load_suite(suite), out, elsewhere=ray is not None)
     if dry_run:
@@ -193,7 +193,7 @@ def status(
         folder: Folder of the runs, the --out of a sweep.
         suite: Only the sweep of this suite.
     """
-    from bench.sweep.status import read_status, to_text
+    from symsteer.bench.sweep.status import read_status, to_text
 
     overview = read_status(folder, suite)
     if overview.found or not overview.damage:
@@ -242,17 +242,17 @@ def report(
     arguments = [text for name, value in options.items() if value for text in (name, str(value))]
     arguments += ["--verify"] * verify + ["--check"] * check + ["--", *map(str, records)]
     # By name, not by import: the bench writes records and draws nothing.
-    return importlib.import_module("leaderboard.__main__").main(arguments)
+    return importlib.import_module("symsteer.leaderboard.__main__").main(arguments)
 
 
 @app.command(name="list")
 def list_names() -> int:
     """Name the tasks, embodiments, variants, agents and suites."""
-    from agents import AGENTS
-    from bench.sweep.suite import load_suite, suite_names
-    from bench.tasks import task_class, task_names
-    from bench.tasks.embodiments import EMBODIMENTS
-    from bench.variants import registry
+    from symsteer.agents import AGENTS
+    from symsteer.bench.sweep.suite import load_suite, suite_names
+    from symsteer.bench.tasks import task_class, task_names
+    from symsteer.bench.tasks.embodiments import EMBODIMENTS
+    from symsteer.bench.variants import registry
 
     tasks = {name: sys.modules[task_class(name).__module__] for name in task_names()}
     suites = [load_suite(name) for name in suite_names()]
@@ -294,7 +294,7 @@ def demos(
     """
     from tqdm import tqdm
 
-    from bench.demos import collect, load
+    from symsteer.bench.demos import collect, load
 
     with tqdm(total=count, desc="demonstrations", disable=None) as bar:
 
@@ -332,8 +332,8 @@ def base(
         workers: Policies side by side; 0 means one a core.
         out: Folder for demonstrations and the table's data.
     """
-    from bench.runs.base_study import study, table, write_study
-    from bench.runs.run import check
+    from symsteer.bench.runs.base_study import study, table, write_study
+    from symsteer.bench.runs.run import check
 
     config = RunConfig(
         task=task, embodiment=embodiment, demonstrations=DemonstrationConfig(mode=mode)
@@ -392,9 +392,9 @@ def audit(
     """
     from json import dumps
 
-    from bench.audit.cell import Settings
-    from bench.audit.report import summary, text, to_markdown, write_table
-    from bench.audit.study import grid, run_cells
+    from symsteer.bench.audit.cell import Settings
+    from symsteer.bench.audit.report import summary, text, to_markdown, write_table
+    from symsteer.bench.audit.study import grid, run_cells
 
     template = Settings(
         group=group, states=states, count=count, chunk=chunk, resets=resets, seed=seed, sim=sim
@@ -442,7 +442,7 @@ def throughput(
         memory: Only watch the memory over 10,000 steps with resets.
         json: Machine-readable output.
     """
-    from bench import throughput as speed
+    from symsteer.bench import throughput as speed
 
     def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
@@ -468,7 +468,7 @@ def doctor(quiet: bool = False) -> int:
     Args:
         quiet: Only what is missing and needed.
     """
-    from bench.sim.capabilities import probe
+    from symsteer.bench.sim.capabilities import probe
 
     checks = probe()
     for check in checks:

@@ -1,0 +1,9 @@
+"""The one exception that means: the user can correct this."""
+
+
+class UserError(Exception):
+    """A mistake in the input: one sentence that says what is wrong and how to correct it.
+
+    The command line prints the sentence and exits with code 2. Any other exception is a bug in
+    SymSteer.
+    """

@@ -1,0 +1,70 @@
+"""Atomic writing: a file holds its old content or all of the new one, never a part."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from symsteer.errors import UserError
+
+
+def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:
+    """Write one file; see :func:`write_together`."""
+    write_together({path: data}, durable=durable)
+
+
+def write_together(
+    files: Mapping[Path, bytes], stale: Iterable[Path] = (), durable: bool = True
+) -> None:
+    """Write all files under temporary names, then rename them, then remove ``stale`` ones.
+
+    Args:
+        files: contents by path; missing folders are made.
+        stale: files to remove once all others are in place.
+        durable: wait until the data have reached the disk.
+
+    Raises:
+        UserError: if a folder cannot be written, a path is a folder, or the disk is full. The
+            files are then as they were; only a rename that fails, after all data have reached
+            the disk, can leave a mixture.
+    """
+    staged: list[tuple[Path, Path]] = []
+    path = Path()
+    try:
+        for path, data in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_dir():
+                raise UserError(f"{path} is a folder; remove it or choose another path")
+            temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+            staged.append((temporary, path))
+            with open(temporary, "wb") as file:
+                file.write(data)
+                if durable:
+                    file.flush()
+                    os.fsync(file.fileno())
+        for temporary, path in staged:
+            os.replace(temporary, path)
+        for path in stale:
+            path.unlink()
+        if durable:
+            for path in {path.parent for path in files}:
+                _sync_folder(path)
+    except OSError as error:
+        raise UserError(
+            f"{path} cannot be written: {error.strerror}; free space or choose another folder"
+        ) from error
+    finally:
+        for temporary, _ in staged:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring a folder's list of files to disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

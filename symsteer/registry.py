@@ -1,0 +1,256 @@
+"""One registry for agents, policies, variants and tasks, open to other packages.
+
+A name stands for a class. It comes from one of three places:
+
+- SymSteer's own table in the package that holds the kind (``symsteer.agents.BUILTIN``, ...);
+- an entry point of an installed distribution, in the group ``symsteer.agents``,
+  ``symsteer.policies``, ``symsteer.variants`` or ``symsteer.tasks``;
+- ``package.module:Class``, for trying a class that is not installed.
+
+Names and summaries are read without importing any of the classes: ``symsteer --help`` and
+``symsteer list`` must not wait for torch or ManiSkill.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from symsteer.errors import UserError
+from symsteer.names import unknown
+
+T = TypeVar("T")
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
+"""Names become part of run folders and records."""
+
+TARGET = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+
+
+@dataclass(frozen=True)
+class Extension:
+    """Code from outside SymSteer that a run used, so that others can look it up.
+
+    Attributes:
+        kind: agent, policy, variant or task.
+        name: as in the configuration.
+        target: ``package.module:Class``.
+        distribution, version: of the installed distribution; None for code that is not installed.
+        sha256: of all Python files of the top-level package, see :func:`code_hash`.
+    """
+
+    kind: str
+    name: str
+    target: str
+    distribution: str | None
+    version: str | None
+    sha256: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
+
+
+class Registry(Generic[T]):
+    """Classes of one kind by name.
+
+    Args:
+        kind: what the classes are, in one word, for messages.
+        group: of the entry points.
+        builtin: ``package.module:Class`` by name, in the order in which they are listed.
+        base: ``package.module:Class`` that every class must inherit from.
+    """
+
+    def __init__(self, kind: str, group: str, builtin: Mapping[str, str], base: str):
+        self.kind, self.group, self.builtin, self.base = kind, group, dict(builtin), base
+
+    def names(self) -> list[str]:
+        """SymSteer's own names in their order, then those of other distributions, sorted."""
+        return [*self.builtin, *sorted(set(self._entry_points()) - set(self.builtin))]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.builtin or name in self._entry_points()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names())
+
+    def target(self, name: str) -> str:
+        """``package.module:Class`` of a name.
+
+        Raises:
+            UserError: if there is no such name, or two distributions offer it.
+        """
+        if name in self.builtin:
+            self._refuse_twins(name)
+            return self.builtin[name]
+        if name in self._entry_points():
+            self._refuse_twins(name)
+            return self._entry_points()[name][0].value
+        if TARGET.fullmatch(name):
+            return name
+        raise unknown(self.kind, name, self.names())
+
+    def get(self, name: str) -> T:
+        """The class of a name, imported.
+
+        Raises:
+            UserError: if there is no such name, its module cannot be imported, or what it names
+                is not a class of this kind.
+        """
+        target = self.target(name)
+        if ":" not in name and not NAME.fullmatch(name):
+            raise UserError(
+                f"the {self.kind} name {name!r} of {target} cannot be part of file names; use at "
+                "most 60 letters, digits, dots, dashes and underscores"
+            )
+        found = _load(target, f"the {self.kind} {name!r}")
+        base = _load(self.base, f"the {self.kind} {name!r}")
+        if not (isinstance(found, type) and issubclass(found, base)):
+            module, _, attribute = self.base.partition(":")
+            raise UserError(
+                f"{target} is not a {self.kind}; it must be a class that inherits from "
+                f"{module}.{attribute}"
+            )
+        return found  # type: ignore[return-value]
+
+    def summary(self, name: str) -> str:
+        """First line of the docstring of a name's class, read without importing it."""
+        return _first_line(self.target(name))
+
+    def extension(self, name: str) -> Extension | None:
+        """What a record says of a name from outside SymSteer; None for SymSteer's own.
+
+        Raises:
+            UserError: as :meth:`get`.
+        """
+        if name in self.builtin:
+            return None
+        self.get(name)
+        target = self.target(name)
+        package = target.partition(":")[0].partition(".")[0]
+        found = [points[0].dist for n, points in self._entry_points().items() if n == name]
+        distribution = found[0] if found else _distribution_of(package)
+        return Extension(
+            self.kind,
+            name,
+            target,
+            distribution.name if distribution else None,
+            distribution.version if distribution else None,
+            code_hash(package),
+        )
+
+    def _entry_points(self) -> dict[str, list[metadata.EntryPoint]]:
+        return _entry_points(self.group)
+
+    def _refuse_twins(self, name: str) -> None:
+        points = self._entry_points().get(name, [])
+        owners = ["symsteer"] * (name in self.builtin)
+        owners += [point.dist.name if point.dist else point.value for point in points]
+        if len(owners) > 1:
+            raise UserError(
+                f"{' and '.join(owners)} both offer a {self.kind} {name!r}; uninstall one of them"
+            )
+
+
+def code_hash(package: str) -> str:
+    """SHA-256 over names and contents of all Python files of a top-level package or module.
+
+    Raises:
+        UserError: if the package cannot be found.
+    """
+    spec = importlib.util.find_spec(package)
+    if spec is None:
+        raise UserError(f"the package {package} cannot be found; install it")
+    digest = hashlib.sha256()
+    if not spec.submodule_search_locations:
+        digest.update(Path(str(spec.origin)).read_bytes())
+        return digest.hexdigest()
+    for folder in spec.submodule_search_locations:
+        files = [
+            Path(parent, file)
+            for parent, _, names in os.walk(folder, followlinks=True)
+            for file in names
+            if file.endswith(".py")
+        ]
+        for file in sorted(files):
+            digest.update(f"{file.relative_to(folder).as_posix()}\0".encode())
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+@functools.cache
+def _entry_points(group: str) -> dict[str, list[metadata.EntryPoint]]:
+    """The entry points of a group by name, each distribution once."""
+    found: dict[str, dict[str, metadata.EntryPoint]] = {}
+    for point in metadata.entry_points(group=group):
+        owner = point.dist.name if point.dist else point.value
+        found.setdefault(point.name, {}).setdefault(owner, point)
+    return {name: list(owners.values()) for name, owners in found.items()}
+
+
+def _distribution_of(package: str) -> metadata.Distribution | None:
+    names = metadata.packages_distributions().get(package, [])
+    return metadata.distribution(names[0]) if len(set(names)) == 1 else None
+
+
+def _load(target: str, what: str) -> Any:
+    module_name, _, attribute = target.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except UserError:
+        raise
+    # Whatever a file may raise while it is imported.
+    except Exception as error:
+        raise UserError(
+            f"{what} cannot be imported from {module_name} ({type(error).__name__}: "
+            f"{error}{_line(error, module_name)}); correct or remove it"
+        ) from error
+    if not hasattr(module, attribute):
+        raise UserError(f"{what} cannot be found: {module_name} has no {attribute}; check the name")
+    return getattr(module, attribute)
+
+
+def _line(error: Exception, module: str) -> str:
+    """Where in the named module an import failed."""
+    if isinstance(error, SyntaxError):  # its message names the line already
+        return ""
+    path = getattr(sys.modules.get(module), "__file__", None) or _file_of(module)
+    lines, trace = [], error.__traceback__
+    while trace:
+        if path and trace.tb_frame.f_code.co_filename == str(path):
+            lines.append(f", line {trace.tb_lineno}")
+        trace = trace.tb_next
+    return lines[-1] if lines else ""
+
+
+def _file_of(module: str) -> str | None:
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    return spec.origin if spec else None
+
+
+def _first_line(target: str) -> str:
+    """First line of a class's docstring, from its source."""
+    module, _, attribute = target.partition(":")
+    path = _file_of(module)
+    try:
+        tree = ast.parse(Path(str(path)).read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return ""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef) and node.name == attribute:
+            return (ast.get_docstring(node) or "").partition("\n")[0].replace("``", "")
+    return ""
