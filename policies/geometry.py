@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -363,3 +363,32 @@ def _escnn_representation(
     if name not in known:
         known[name] = Representation(fibergroup, name, irreps, basis)
     return known[name]
+
+
+@torch.no_grad()
+def equivariance_error(
+    function: Callable[..., torch.Tensor],
+    inputs: Sequence[torch.Tensor],
+    layouts: Sequence[Layout],
+    output_layout: Layout,
+    group: Group,
+) -> float:
+    """Relative equivariance error: max over g of rms ||f(g x) - g f(x)|| / rms ||f(x)||.
+
+    Args:
+        function: of all inputs.
+        inputs: each ``[..., dim]``.
+        layouts: of the inputs' last axes.
+        output_layout: of the output's last axis.
+        group: finite.
+    """
+    own = function(*inputs).double()
+    size = own.square().mean().sqrt().clamp(min=1e-30)
+    worst = 0.0
+    for angle, reflect in group.elements:
+        turned = [
+            layout.transform(x, angle, reflect) for x, layout in zip(inputs, layouts, strict=True)
+        ]
+        gap = function(*turned).double() - output_layout.transform(own, angle, reflect)
+        worst = max(worst, (gap.square().mean().sqrt() / size).item())
+    return worst

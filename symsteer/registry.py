@@ -119,7 +119,7 @@ class Registry(Generic[T]):
         if not (isinstance(found, type) and issubclass(found, base)):
             module, _, attribute = self.base.partition(":")
             raise UserError(
-                f"{target} is not a {self.kind}; it must be a class that inherits from "
+                f"{target} cannot be used as {self.kind}; it must be a class that inherits from "
                 f"{module}.{attribute}"
             )
         return found  # type: ignore[return-value]
@@ -159,7 +159,7 @@ class Registry(Generic[T]):
         owners += [point.dist.name if point.dist else point.value for point in points]
         if len(owners) > 1:
             raise UserError(
-                f"{' and '.join(owners)} both offer a {self.kind} {name!r}; uninstall one of them"
+                f"{' and '.join(owners)} both offer the {self.kind} {name!r}; uninstall one of them"
             )
 
 
