@@ -18,7 +18,9 @@ from pydantic import TypeAdapter, ValidationError
 from symsteer.agents.sac import SacConfig
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import canonical_variant
-from symsteer.policies.base import PolicyConfig
+from symsteer.policies import POLICIES
+from symsteer.policies.contract import PolicyOptions
+from symsteer.policies.symmetry.augmented import AugmentedOptions
 
 LARGEST_COUNT = 10**12
 LARGEST_BATCH = 100_000
@@ -54,6 +56,20 @@ class EvaluationConfig:
     """Stochastic on-policy episodes against whose returns Q is held at every evaluation."""
     steerability_states: int = 24
     """Initial states of the base policy's steerability report, each with 16 noise draws."""
+
+
+@dataclass(frozen=True)
+class PolicyConfig(AugmentedOptions):
+    """Which base policy, and the options of SymSteer's own ones."""
+
+    name: str = "edp"
+    """Base policy."""
+
+    @property
+    def options(self) -> PolicyOptions:
+        """Those options that the policy has."""
+        kind = POLICIES.get(self.name).Options
+        return kind(**{f.name: getattr(self, f.name) for f in dataclasses.fields(kind)})
 
 
 STEERING = SacConfig(
@@ -98,7 +114,7 @@ class RunConfig:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where networks run."""
     demonstrations: DemonstrationConfig = field(default_factory=DemonstrationConfig)
-    policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(execute=4, sampling_steps=4))
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
     policy_seed: int = 0
     """Seed of the base policy's training; runs that share it share the base policy."""
     sac: SacConfig = field(default_factory=lambda: STEERING)

@@ -12,7 +12,7 @@ from symsteer.bench.steering.diagnostics import OnPolicy, measure
 from symsteer.bench.steering.evaluation import HELD_OUT_SEED, Rollout, held_out_seeds, rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 
 DIAGNOSTIC_SEED = HELD_OUT_SEED + 500_000
 """On-policy episodes for the bias of Q start here: held out, and apart from the reported ones."""

@@ -52,7 +52,7 @@ from symsteer.leaderboard.records import (
     read_record,
     write_record,
 )
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 
 LOG_EVERY = 10
 """Vectorised decisions between two writes of training scalars."""

@@ -22,7 +22,7 @@ from symsteer.bench.steering.evaluation import Rollout, held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA, SIZE
 from symsteer.bench.variants import evaluated
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Layout
 
 EPISODES = 32

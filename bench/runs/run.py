@@ -33,7 +33,8 @@ from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import evaluated, parse
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, canonical_variant, read_record
-from symsteer.policies.base import ChunkPolicy, load_policy, policy_path, save_policy
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.files import load_policy, policy_path, save_policy
 from symsteer.policies.geometry import Group
 
 

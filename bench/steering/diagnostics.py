@@ -20,7 +20,7 @@ from symsteer.agents.diagnostics import (
 )
 from symsteer.agents.sac import SacAgent, entropy_allowance
 from symsteer.bench.steering.evaluation import Rollout
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
 
 SYMMETRY_STATES = 64

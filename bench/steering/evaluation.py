@@ -11,7 +11,7 @@ import torch
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import HELD_OUT_SEED
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.steerability import DESIRED_ACTION_STD, action_spread
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 
 
 @dataclass
