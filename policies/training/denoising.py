@@ -65,19 +65,16 @@ class DenoisingOptions(GradientOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_positive("channels", "width", "depth", "diffusion_steps", "sampling_steps")
-        for field, kind in (("network", Network), ("prediction", Prediction)):
-            if getattr(self, field) not in get_args(kind):
-                raise unknown(field, getattr(self, field), get_args(kind))
+        self.require_positive("channels", "width", "depth")
+        if self.network not in get_args(Network):
+            raise unknown("network", self.network, get_args(Network))
         if self.network == "unet" and self.horizon % 2:
             raise UserError(
                 f"the unet halves the chunk; choose an even horizon, not {self.horizon}"
             )
-        if self.sampling_steps > self.diffusion_steps:
-            raise UserError(
-                f"sampling_steps must be at most diffusion_steps, {self.diffusion_steps}, "
-                f"not {self.sampling_steps}"
-            )
+        Diffusion(self.diffusion_steps, self.prediction, self.snr_cap).timesteps(
+            self.sampling_steps
+        )
 
     def resolved(self, obs_layout: Layout, act_layout: Layout) -> Self:
         """Options in which everything that depends on the layouts is filled in."""

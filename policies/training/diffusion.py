@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 
 from symsteer.errors import UserError
+from symsteer.names import unknown
 
 Prediction = Literal["sample", "epsilon"]
 Bound = Callable[[torch.Tensor], torch.Tensor]
@@ -45,6 +46,8 @@ class Diffusion:
     def __init__(self, steps: int = 100, prediction: Prediction = "sample", snr_cap: float = 5.0):
         if steps < 2:
             raise UserError(f"diffusion needs at least 2 noise levels, not {steps}")
+        if prediction not in get_args(Prediction):
+            raise unknown("prediction", prediction, get_args(Prediction))
         if not snr_cap > 0:
             raise UserError(f"snr_cap must be positive, not {snr_cap}")
         self.steps = steps
