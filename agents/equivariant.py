@@ -15,8 +15,8 @@ from torch import nn
 
 from symsteer.agents.networks import shrink_
 from symsteer.agents.sac import SacAgent, SacOptions
-from symsteer.policies.equivariant import Lift, Project, RegularLinear
 from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
 
 VALUE = Layout([Field("value", 0)])
 

@@ -26,7 +26,6 @@ from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
 from symsteer.leaderboard.errors import RecordError
-from symsteer.policies.base import PolicyName
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
@@ -312,7 +311,7 @@ def base(
     task: str = "PickCube-v1",
     embodiment: str = "floating",
     mode: Literal["clean", "diverse"] = "diverse",
-    policies: tuple[PolicyName, ...] = ("edp", "plain", "plain-augmented"),
+    policies: tuple[str, ...] = ("edp", "plain", "plain-augmented"),
     demonstrations: tuple[int, ...] = (5, 10, 20, 50),
     seeds: int = 3,
     episodes: int = 200,
@@ -325,7 +324,7 @@ def base(
         task: Task; `symsteer list` names them.
         embodiment: floating or panda.
         mode: Kind of demonstrations.
-        policies: Which policies.
+        policies: Which policies; `symsteer list` names them.
         demonstrations: Numbers of demonstrations.
         seeds: Seeds a cell; each has its own demonstrations.
         episodes: Held-out episodes a policy.

@@ -33,7 +33,7 @@ from symsteer.bench.tasks import check_embodiment, make, task_class
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.variants import parse
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Field, Layout
 
 VERSION = 1

@@ -20,7 +20,7 @@ from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.tasks.rotations import planar_matrix
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
 
 Actions = Literal["random", "expert", "policy"]

@@ -14,7 +14,8 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.tasks import embodiments, task_class, task_names
 from symsteer.bench.variants import describe, parse, variant_names
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy, load_policy
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.files import load_policy
 
 Progress = Callable[[Cell], None]
 

@@ -109,7 +109,7 @@ class RecordWriter(Observe):
                 total=counts["total"],
                 width=counts["width"] or None,
             ),
-            base_policy=describe_base(run.config, run.base),
+            base_policy=describe_base(run.base),
             feasible_q=FeasibleQ(low=feasible[0], high=feasible[1]) if run.has_critic else None,
         )
 

@@ -12,7 +12,7 @@ from symsteer.agents.episodes import DECISION_FIELDS, Rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.errors import UserError
 from symsteer.bench.steering.seeds import steerability_seeds
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.steerability import DESIRED_ACTION_STD, action_spread
 
 

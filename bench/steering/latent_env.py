@@ -15,7 +15,7 @@ import torch
 
 from symsteer.agents.replay import Transition
 from symsteer.bench.steering.seeds import training_seeds
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 
 
 @dataclass

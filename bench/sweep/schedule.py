@@ -114,7 +114,7 @@ def tasks_of(plan: Plan, todo: list[Cell], patience: float = 0.0) -> list[Task]:
             if demos_key not in demonstrations:
                 demos = Task("demonstrations", words, build_demonstrations, args)
                 demonstrations[demos_key] = None if demonstration_path(*args).is_file() else demos
-            words = f"{config.policy.name} for {words} demonstrations"
+            words = f"{config.policy_name} for {words} demonstrations"
             bases[base_key] = Task("base policy", words, build_base, args)
             _join(demonstrations[demos_key], bases[base_key])
         cells.append(Task("cell", cell.label, play, (*args, patience), cell))

@@ -3,8 +3,12 @@
 import json
 
 from symsteer.agents.sac import SacConfig
-from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
-from symsteer.policies.base import PolicyConfig
+from symsteer.bench.runs.config import (
+    DemonstrationConfig,
+    EvaluationConfig,
+    PolicyConfig,
+    RunConfig,
+)
 
 
 def tiny_config(**changes) -> RunConfig:

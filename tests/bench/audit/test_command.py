@@ -12,7 +12,8 @@ from symsteer.bench.audit.study import variant_texts
 from symsteer.bench.tasks import task_class
 from symsteer.bench.variants import variant_names
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy, PolicyConfig, save_policy
+from symsteer.policies.files import save_policy
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 
 FAST = ("--count", 8, "--resets", 16)
 
@@ -65,8 +66,8 @@ def test_cuda_where_there_is_none(monkeypatch, capsys):
 
 def test_one_cell(monkeypatch, capsys, tmp_path):
     task = task_class("PickCube-v1")
-    config = PolicyConfig(channels=16, width=32, depth=1, execute=4, sampling_steps=4)
-    policy = ChunkPolicy(config, task.observation_layout, task.action_layout)
+    options = EquivariantOptions(channels=16, width=32, depth=1, execute=4, sampling_steps=4)
+    policy = EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
     path = save_policy(policy, tmp_path / "policy")
     arguments = ("--variant", "action_gain:1", "--group", "C4", "--base-policy", path, *FAST)
     assert symsteer(monkeypatch, *arguments, "--json", "--out", tmp_path / "out") == 0

@@ -23,7 +23,7 @@ from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make
 from symsteer.bench.variants import variant_names
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy, PolicyConfig
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 from tests.bench.steering.test_latent_env import NoiseIsAction
 
 TASK = "PickCube-v1"
@@ -216,8 +216,8 @@ def test_same_latent_noise_environment(solved):
 def test_same_with_a_policy():
     one, two = both(3, workers=3)
     torch.manual_seed(0)
-    config = PolicyConfig(channels=8, width=16, depth=1, execute=4, sampling_steps=2)
-    policy = ChunkPolicy(config, one.observation_layout, one.action_layout)
+    options = EquivariantOptions(channels=8, width=16, depth=1, execute=4, sampling_steps=2)
+    policy = EquivariantDiffusionPolicy(options, one.observation_layout, one.action_layout)
     envs = [LatentNoiseEnv(env, policy, ignore_terminations=True) for env in (one, two)]
     assert_same(*(env.reset([1, 2, 3]) for env in envs))
     for w in torch.randn(13, 3, policy.horizon, 7):

@@ -1,33 +1,36 @@
-"""Equivariant diffusion policy (EDP, arXiv 2407.01812) for any finite planar group.
+"""Symmetry by lifting: the Equivariant Diffusion Policy (EDP, arXiv 2407.01812).
 
     observation --Lift--> regular fields --group convolution--> one embedding per group element
     noisy chunk --Lift--> one slice per group element
     every slice: the same denoising network, conditioned on its embedding and the noise level
     slices --Project--> chunk
 
-Acting with the group on observation and chunk permutes the slices, the shared network keeps the
-permutation, and ``Project`` turns it back into the group's action: exact for any network in the
-middle. With the trivial group C1 there is one slice and this is an ordinary diffusion policy.
+Acting with the group on observation and chunk permutes the slices. The shared network keeps the
+permutation, and ``Project`` turns it back into the group's action. This is exact for any network
+in the middle. With the trivial group C1 there is one slice: an ordinary diffusion policy.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import nn
 from torch.nn import functional
 
-from symsteer.policies.equivariant import Lift, Project, RegularLinear
 from symsteer.policies.geometry import Group, Layout
-from symsteer.policies.unet import ResidualMLP, TemporalUNet
+from symsteer.policies.networks.denoiser import Denoiser
+from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
+from symsteer.policies.networks.slices import ResidualMLP, TemporalUNet
+from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
 
 TIME_FEATURES = 64
 
 
-class Denoiser(nn.Module):
-    """Predicts a clean chunk (or its noise) from a noisy one, commuting with ``group``.
+class LiftedDenoiser(Denoiser):
+    """A denoiser that commutes with a finite group.
 
     Args:
         obs_layout: geometry of one (normalised) observation.
@@ -81,10 +84,7 @@ class Denoiser(nn.Module):
         return self.time_out(functional.silu(self.time_in(features)))[:, None]
 
     def forward(self, x: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
-        """Predict; ``x [B, Tp, Da]``, ``condition [B, order, c]`` -> ``[B, Tp, Da]``.
-
-        ``condition`` is the sum of :meth:`encode` and :meth:`encode_time`.
-        """
+        """Predict; ``x [B, Tp, Da]``, ``condition [B, order, c]`` -> ``[B, Tp, Da]``."""
         batch, order = len(x), self.group.order
         if self.flat:
             slices = self.chunk_lift(x.flatten(1)).flatten(0, 1)
@@ -96,9 +96,9 @@ class Denoiser(nn.Module):
             return self.project(slices).view_as(x)
         return self.project(slices.transpose(1, 2))
 
-    def expanded(self) -> Denoiser:
+    def expanded(self) -> LiftedDenoiser:
         """A copy for inference whose equivariant layers hold their dense matrices ready."""
-        fast = copy.deepcopy(self).requires_grad_(False).eval()
+        fast = super().expanded()
         order = self.group.order
         fast.register_module("obs_lift", _Dense(self.obs_lift, 1, (order, self.obs_lift.channels)))
         fast.register_module("obs_mix", _Dense(self.obs_mix, 2, (order, self.obs_mix.out_channels)))
@@ -133,6 +133,43 @@ class _Dense(nn.Module):
         return out.unflatten(-1, self.out_shape)
 
 
-def parameter_count(module: nn.Module) -> int:
-    """Trainable numbers of a module."""
-    return sum(p.numel() for p in module.parameters())
+@dataclass(frozen=True)
+class EquivariantOptions(DenoisingOptions):
+    """Options of the equivariant diffusion policy."""
+
+    group: str = "C8"
+    """The finite symmetry group: C_n or D_n."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = Group.parse(self.group).order
+
+
+class EquivariantDiffusionPolicy(DiffusionPolicy):
+    """Equivariant Diffusion Policy (arXiv 2407.01812): symmetric by construction."""
+
+    name = "edp"
+    Options = EquivariantOptions
+    options: EquivariantOptions
+
+    def make_denoiser(self) -> LiftedDenoiser:
+        """The lifted network over the options' group."""
+        return lifted_denoiser(
+            self.options, self.obs_layout, self.act_layout, Group.parse(self.options.group)
+        )
+
+
+def lifted_denoiser(
+    options: DenoisingOptions, obs_layout: Layout, act_layout: Layout, group: Group
+) -> LiftedDenoiser:
+    """The network that the options describe, over ``group``."""
+    return LiftedDenoiser(
+        obs_layout,
+        act_layout,
+        options.horizon,
+        group,
+        options.network,
+        options.channels,
+        options.width,
+        options.depth,
+    )

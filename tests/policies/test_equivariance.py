@@ -5,41 +5,28 @@ import math
 import pytest
 import torch
 
-from symsteer.policies.base import ChunkPolicy, PolicyConfig
-from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
 from symsteer.policies.normalizer import Normalizer
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
 
-def equivariance_error(policy, world, group, dtype, obs_layout=None, act_layout=None):
-    """Largest relative error over the group's elements; transforms in float64.
+def decode_error(policy, world, group, dtype, obs_layout=None, act_layout=None):
+    """Relative equivariance error of decode; inputs are transformed in float64.
 
-    ``obs_layout`` and ``act_layout`` say how the world really turns; by default as the policy
-    believes.
+    ``obs_layout`` and ``act_layout`` say how the world turns; by default as the policy believes.
     """
     obs_layout, act_layout = obs_layout or policy.obs_layout, act_layout or policy.act_layout
     generator = torch.Generator().manual_seed(1)
-    obs = world.observations(16).double() * 1.5
-    noise = 1.5 * torch.randn(16, policy.horizon, act_layout.dim, generator=generator).double()
-    # Inputs rounded once, before they are turned, so that both sides see the same numbers.
-    obs, noise = obs.to(dtype).double(), noise.to(dtype).double()
-    out = policy.decode(obs.to(dtype), noise.to(dtype)).double()
-    worst = 0.0
-    for angle, reflect in group.elements:
-        turned = policy.decode(
-            obs_layout.transform(obs, angle, reflect).to(dtype),
-            act_layout.transform(noise, angle, reflect).to(dtype),
-        ).double()
-        expected = act_layout.transform(out, angle, reflect)
-        worst = max(worst, float((turned - expected).norm() / expected.norm()))
-    return worst
-
-
-def untrained(world, **fields):
-    torch.manual_seed(0)
-    return ChunkPolicy(
-        PolicyConfig(**{**world.small, **fields}), world.obs_layout, world.act_layout
+    obs = world.observations(16) * 1.5
+    noise = 1.5 * torch.randn(16, policy.horizon, act_layout.dim, generator=generator)
+    return equivariance_error(
+        lambda *inputs: policy.decode(*(x.to(dtype) for x in inputs)),
+        (obs.double(), noise.double()),
+        (obs_layout, act_layout),
+        act_layout,
+        group,
     )
 
 
@@ -48,15 +35,15 @@ def untrained(world, **fields):
 @pytest.mark.parametrize("name", ["C4", "C8", "D4"])
 class TestEquivariance:
     def test_at_initialization(self, world, name, network, dtype):
-        policy = untrained(world, group=name, network=network).to(dtype)
-        error = equivariance_error(policy, world, Group.parse(name), dtype)
+        policy = world.untrained(group=name, network=network).to(dtype)
+        error = decode_error(policy, world, Group.parse(name), dtype)
         assert error <= TOLERANCE[dtype]
 
     def test_after_training(self, trained, world, name, network, dtype):
         policy = trained(group=name, network=network)
         policy.to(dtype)
         try:
-            error = equivariance_error(policy, world, Group.parse(name), dtype)
+            error = decode_error(policy, world, Group.parse(name), dtype)
         finally:
             policy.float()
         assert error <= TOLERANCE[dtype]
@@ -78,10 +65,10 @@ def test_bounds_are_active_in_these_tests(trained, world, network):
 def test_epsilon_prediction_is_equivariant_too(trained, world):
     policy = trained(group="C8", prediction="epsilon")
     # sqrt(a_t) = 5e-4 at the first level divides the rounding errors.
-    assert equivariance_error(policy, world, policy.group, torch.float32) <= 5e-3
+    assert decode_error(policy, world, policy.group, torch.float32) <= 5e-3
     policy.double()
     try:
-        assert equivariance_error(policy, world, policy.group, torch.float64) <= 1e-10
+        assert decode_error(policy, world, policy.group, torch.float64) <= 1e-10
     finally:
         policy.float()
 
@@ -90,7 +77,7 @@ def test_epsilon_prediction_is_equivariant_too(trained, world):
 def test_other_angles_are_not_symmetries(trained, world, name):
     """The group is all that is built in; so the error of other angles is not zero."""
     policy = trained(group=name)
-    assert equivariance_error(policy, world, Group.parse("C5"), torch.float32) > 1e-3
+    assert decode_error(policy, world, Group.parse("C5"), torch.float32) > 1e-3
 
 
 def swapped_frequency(layout, name, frequency):
@@ -132,22 +119,23 @@ def test_a_wrong_layout_shows(world, mistake):
     layouts = {"obs": world.obs_layout, "act": world.act_layout}
     layouts[which] = wrong(layouts[which])
     torch.manual_seed(0)
-    policy = ChunkPolicy(PolicyConfig(**world.small, group="D4"), layouts["obs"], layouts["act"])
+    options = world.options(group="D4")
+    policy = EquivariantDiffusionPolicy(options, layouts["obs"], layouts["act"])
     # At initialisation outputs are small against what the noise could do: scale them up.
     policy.denoiser.project.weight.mul_(5)
     policy.freeze()
     right = {"obs_layout": world.obs_layout, "act_layout": world.act_layout}
-    error = equivariance_error(policy, world, policy.group, torch.float32, **right)
+    error = decode_error(policy, world, policy.group, torch.float32, **right)
     assert error > 1e-2
     # The very same measure vanishes for the layout that the policy believes.
-    assert equivariance_error(policy, world, policy.group, torch.float32) <= 1e-5
+    assert decode_error(policy, world, policy.group, torch.float32) <= 1e-5
 
 
 def test_a_per_axis_bound_shows(trained, world, monkeypatch):
     policy = trained(group="C8")
-    per_axis = "symsteer.policies.base.clip_blocks"
+    per_axis = "symsteer.policies.training.denoising.clip_blocks"
     monkeypatch.setattr(per_axis, lambda x, layout, r: x.clamp(-r, r))
-    assert equivariance_error(policy, world, policy.group, torch.float32) > 1e-2
+    assert decode_error(policy, world, policy.group, torch.float32) > 1e-2
 
 
 @pytest.mark.parametrize("which", ["obs", "act"])
@@ -161,7 +149,7 @@ def test_per_dimension_statistics_show(trained, world, which, statistic):
     broken[normalizer.layout.slice(name)] += torch.tensor([0.3, 0.0])
     setattr(normalizer, statistic, broken)
     try:
-        assert equivariance_error(policy, world, policy.group, torch.float32) > 1e-2
+        assert decode_error(policy, world, policy.group, torch.float32) > 1e-2
     finally:
         setattr(normalizer, statistic, before)
 
@@ -185,10 +173,10 @@ def test_expanded_layers_equal_the_originals(trained, network, world):
 
 def test_new_weights_reach_decode(world):
     """The matrices cached for decoding follow the weights."""
-    policy = untrained(world, group="C4")
+    policy = world.untrained(group="C4")
     obs, noise = world.observations(2), torch.randn(2, policy.horizon, 7)
     before = policy.decode(obs, noise)
-    other = untrained(world, group="C4")
+    other = world.untrained(group="C4")
     torch.manual_seed(3)
     for parameter in other.parameters():
         parameter.normal_(std=0.1)

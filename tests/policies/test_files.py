@@ -4,6 +4,8 @@ import errno
 import hashlib
 import json
 import os
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +13,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from symsteer.errors import UserError
-from symsteer.policies.base import PolicyConfig, load_policy, save_policy
+from symsteer.policies import POLICIES
+from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Field, Layout
 
 
@@ -26,8 +29,8 @@ def decode(policy, world):
     [
         {"group": "C8"},
         {"group": "D4", "network": "unet"},
-        {"name": "plain"},
-        {"name": "plain-augmented", "augmentation": "SO2"},
+        {"name": "plain", "network": "unet"},
+        {"name": "plain-augmented", "augmentation": "SO2", "hold": ("gripper", "z")},
     ],
 )
 def test_round_trip_is_bit_equal(trained, world, tmp_path, fields):
@@ -38,7 +41,8 @@ def test_round_trip_is_bit_equal(trained, world, tmp_path, fields):
     loaded = load_policy(tmp_path / "run", policy.obs_layout, policy.act_layout)
     assert torch.equal(decode(loaded, world), decode(policy, world))
     assert loaded.content_hash() == policy.content_hash()
-    assert loaded.config == policy.config
+    assert type(loaded) is type(policy)
+    assert loaded.options == policy.options
     assert loaded.report == {"success": 0.25, "note": [1, "two"]}
     assert loaded.training_record == json.loads(json.dumps(policy.training_record))
     assert not any(p.requires_grad for p in loaded.parameters())
@@ -130,10 +134,13 @@ def test_other_files(saved, tmp_path):
 
 def test_other_version(saved):
     rewrite(saved, {"version": "99"})
-    refuse(saved, "version 99", "version 2")
+    refuse(saved, "version 99", "up to 3")
 
 
-@pytest.mark.parametrize("description", ["{", "{}", "[]", '{"config": {"name": "edp"}}'])
+@pytest.mark.parametrize(
+    "description",
+    ["{", "{}", "[]", '{"config": {"name": "edp"}}', '{"name": "quantum", "extension": null}'],
+)
 def test_damaged_description(saved, description):
     digest = hashlib.sha256(description.encode()).hexdigest()
     rewrite(saved, {"policy": description, "policy_sha256": digest})
@@ -165,6 +172,58 @@ def test_other_layouts(saved, world):
     load_policy(saved, expect_obs_layout=world.obs_layout, expect_act_layout=world.act_layout)
 
 
-def test_configuration_round_trip():
-    config = PolicyConfig(name="plain-augmented", hold=("a", "b"), learning_rate=3e-4)
-    assert PolicyConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
+def test_a_file_of_version_2():
+    """Written by SymSteer 0.1 with this policy's tiny configuration."""
+    folder = Path(__file__).parent / "data"
+    expected = json.loads((folder / "version-2.json").read_text())
+    policy = load_policy(folder / "version-2.safetensors")
+    assert (policy.name, str(policy.group), policy.execute) == ("edp", "D4", 2)
+    assert policy.content_hash() == expected["content_hash"]
+    assert policy.report == {"steerability": {"success": 0.25}}
+    obs, noise, actions = (torch.tensor(expected[key]) for key in ("obs", "noise", "actions"))
+    assert torch.allclose(policy.decode(obs, noise), actions, atol=1e-5)
+
+
+STRANGER = """
+import torch
+from symsteer.policies.contract import ChunkPolicy, PolicyOptions
+
+
+class Echo(ChunkPolicy):
+    name = "echo"
+
+    @classmethod
+    def fit(cls, options, episodes, obs_layout, act_layout, seed=0, progress=None, device="cpu"):
+        return cls(options, obs_layout, act_layout).to(device).freeze()
+
+    def decode(self, obs, noise):
+        return noise.clamp(-1, 1)
+"""
+
+
+def test_a_policy_from_another_package(world, tmp_path, monkeypatch):
+    (tmp_path / "stranger.py").write_text(STRANGER)
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(tmp_path)
+        kind = POLICIES.get("stranger:Echo")
+        options = kind.Options(horizon=4, execute=1)
+        policy = kind.fit(options, world.episodes(1), world.obs_layout, world.act_layout)
+        path = save_policy(policy, tmp_path)
+        loaded = load_policy(path)
+        assert type(loaded) is kind
+        assert loaded.options == options
+        assert loaded.content_hash() == policy.content_hash()
+        other = kind(kind.Options(horizon=4, execute=2), world.obs_layout, world.act_layout)
+        assert other.content_hash() != policy.content_hash()
+        assert torch.equal(decode(loaded, world), decode(policy, world))
+    monkeypatch.delitem(sys.modules, "stranger")
+    refuse(path, "stranger", "not installed")
+
+
+def test_a_policy_that_no_other_program_can_import_is_not_saved(world, tmp_path):
+    class Local(type(world.untrained())):
+        pass
+
+    policy = Local(world.options(), world.obs_layout, world.act_layout)
+    with pytest.raises(UserError, match="Local cannot be found"):
+        save_policy(policy, tmp_path)

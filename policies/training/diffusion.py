@@ -4,25 +4,26 @@ Forward process q(x_t | x_0) = N(sqrt(a_t) x_0, (1 - a_t) I) with the squared-co
 (Nichol & Dhariwal, arXiv 2102.09672); sampling by DDIM with eta = 0 (Song et al., arXiv
 2010.02502), so that the initial noise alone decides which action chunk comes out. Schedule,
 time steps ("trailing") and step agree with diffusers' ``DDIMScheduler``
-(``tests/policies/test_diffusion.py``); diffusers itself is not needed at run time.
+(``tests/policies/test_diffusion.py``); diffusers is not needed at run time.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 
 from symsteer.errors import UserError
+from symsteer.names import unknown
 
 Prediction = Literal["sample", "epsilon"]
 Bound = Callable[[torch.Tensor], torch.Tensor]
 
 MINIMUM_WEIGHT = 0.05
-"""Loss weight of the noisiest levels before normalisation: without it they would not be learned,
-and the sampler starts there."""
+"""Least loss weight before normalisation. The sampler starts at the noisiest levels; without it
+they would not be learned."""
 
 
 class Diffusion:
@@ -35,8 +36,8 @@ class Diffusion:
             at the first sampling step: rounding errors grow by 1/sqrt(a_t).
         snr_cap: with ``sample``, noise level t weighs min(SNR_t, snr_cap) in the loss, SNR_t =
             a_t / (1 - a_t) (Min-SNR, Hang et al., arXiv 2303.09556), at least
-            ``MINIMUM_WEIGHT``, then scaled to a mean of 1. Equal weights blur the chunk: the
-            noise then decides less of it.
+            ``MINIMUM_WEIGHT``, then scaled to a mean of 1. With equal weights the chunk depends
+            less on the noise.
 
     Raises:
         UserError: if an argument is out of range.
@@ -45,8 +46,8 @@ class Diffusion:
     def __init__(self, steps: int = 100, prediction: Prediction = "sample", snr_cap: float = 5.0):
         if steps < 2:
             raise UserError(f"diffusion needs at least 2 noise levels, not {steps}")
-        if prediction not in ("sample", "epsilon"):
-            raise UserError(f"unknown prediction {prediction!r}; choose sample or epsilon")
+        if prediction not in get_args(Prediction):
+            raise unknown("prediction", prediction, get_args(Prediction))
         if not snr_cap > 0:
             raise UserError(f"snr_cap must be positive, not {snr_cap}")
         self.steps = steps

@@ -6,8 +6,8 @@ fields has one of the three forms below (group convolution; Cohen & Welling, arX
 the lift per group element follows EDP, arXiv 2407.01812). ``tests/policies`` compares their
 number of free parameters with escnn's basis.
 
-Every layer also gives itself as one ordinary matrix, ``dense()``, so that several uses of the
-same weights pay for their expansion once and several networks can be stacked into one product.
+Every layer can be written as one ordinary matrix, ``dense()``. Inference computes it once, and
+several networks can be stacked into one matrix product.
 """
 
 from __future__ import annotations
@@ -81,8 +81,7 @@ class RegularLinear(nn.Module):
 class Project(nn.Module):
     """Regular fields to a vector: y = mean_g rho(g) (V f(g) + b).
 
-    Shapes: ``[..., order, in] -> [..., dim]``. The mean keeps of the bias only what the group
-    leaves alone.
+    Shapes: ``[..., order, in] -> [..., dim]``. The mean keeps only the invariant part of the bias.
     """
 
     def __init__(self, group: Group, channels: int, layout: Layout):

@@ -1,9 +1,10 @@
-"""Denoising networks for one slice of a chunk: a residual MLP and a temporal U-Net.
+"""Networks for one slice of a chunk: a residual MLP and a temporal U-Net.
 
-They know nothing of symmetry: ``edp`` runs the same network on every group element's
-slice, with the group axis folded into the batch. Both take the chunk's features and one vector of
-conditioning numbers, which scale and shift the hidden features (FiLM, arXiv 1709.07871). The
-U-Net follows the conditional one of Diffusion Policy (arXiv 2303.04137), two levels deep.
+They have no symmetry of their own: :class:`symsteer.policies.symmetry.lifted.LiftedDenoiser` runs
+the same network on every group element's slice, with the group axis folded into the batch. Both
+take the chunk's features and one vector of conditioning numbers, which scale and shift the hidden
+features (FiLM, arXiv 1709.07871). The U-Net follows the conditional one of Diffusion Policy (arXiv
+2303.04137), two levels deep.
 """
 
 from __future__ import annotations
