@@ -30,7 +30,7 @@ from symsteer.bench.runs.folder import (
 from symsteer.bench.runs.loop import Loop, feasible_return, new_agent
 from symsteer.bench.steering.search import rounds
 from symsteer.bench.tasks import check_embodiment, task_class
-from symsteer.bench.variants import evaluated, parse
+from symsteer.bench.variants import evaluated, read
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, canonical_variant, read_record
 from symsteer.policies.base import ChunkPolicy, load_policy, policy_path, save_policy
@@ -46,10 +46,10 @@ def check(config: RunConfig) -> None:
     """
     task_class(config.task)
     check_embodiment(config.embodiment)
-    variants = parse(config.variant)
+    variants = read(config.variant)
     if config.agent not in AGENTS:
         raise UserError(f"there is no agent {config.agent!r}; valid: {', '.join(AGENTS)}")
-    if config.variant != "none" and len(variants) < len(config.variant.split("+")):
+    if any(spec.changes_nothing for spec in variants):
         raise UserError(
             f"the variant {config.variant} has a part of strength 0, which changes nothing; leave "
             "it out, or use none, the unbroken task"
@@ -192,7 +192,7 @@ def evaluate(
     _check_all(config, workers)
     own = evaluated(config.variant)
     variant = own if variant is None else canonical_variant(variant)
-    parse(variant)
+    read(variant)
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}; it must be at least 1")
