@@ -249,19 +249,15 @@ def list_names() -> int:
     """Name the tasks, embodiments, variants, agents and suites."""
     from symsteer.agents import AGENTS
     from symsteer.bench.sweep.suite import load_suite, suite_names
-    from symsteer.bench.tasks import task_class, task_names
-    from symsteer.bench.tasks.embodiments import EMBODIMENTS
-    from symsteer.bench.variants import registry
+    from symsteer.bench.tasks import EMBODIMENTS, TASKS
+    from symsteer.bench.variants import VARIANTS
 
-    tasks = {name: sys.modules[task_class(name).__module__] for name in task_names()}
     suites = [load_suite(name) for name in suite_names()]
-    _print_names("tasks (--task)", {name: _summary(task) for name, task in tasks.items()})
-    _print_names(
-        "embodiments (--embodiment)", {name: _summary(e) for name, e in EMBODIMENTS.items()}
-    )
+    _print_names("tasks (--task)", {name: TASKS.summary(name) for name in TASKS})
+    _print_names("embodiments (--embodiment)", EMBODIMENTS)
     _print_names(
         "variants (--variant NAME:STRENGTH, strength in [0, 1]; several joined by +; or none)",
-        {name: _summary(variant) for name, variant in registry().items()},
+        {name: VARIANTS.summary(name) for name in VARIANTS},
     )
     _print_names("agents (--agent)", {name: _summary(agent) for name, agent in AGENTS.items()})
     _print_names(

@@ -28,12 +28,12 @@ from symsteer.bench.runs.observers import ProgressFile, observers_of
 from symsteer.bench.runs.stored import named, restored, stored_config, stored_policy
 from symsteer.bench.runs.trainer import Trainer, budget_of, feasible_return
 from symsteer.bench.tasks import check_embodiment, task_class
-from symsteer.bench.variants import build, evaluated
+from symsteer.bench.variants import evaluated, read
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, read_record
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import save_policy
-from symsteer.variant import parse_variant, variant_text
+from symsteer.variant import variant_text
 
 
 def check(config: RunConfig) -> None:
@@ -45,7 +45,7 @@ def check(config: RunConfig) -> None:
     """
     task_class(config.task)
     check_embodiment(config.embodiment)
-    build(config.variants)
+    read(config.variants)
     if any(spec.changes_nothing for spec in config.variants):
         raise UserError(
             f"the variant {config.variant} has a part of strength 0, which changes nothing; leave "
@@ -173,8 +173,7 @@ def evaluate(
     config, folder = run.config, run.folder
     _check_all(config, workers)
     own = evaluated(config.variant)
-    variant = own if variant is None else variant_text(parse_variant(variant))
-    build(parse_variant(variant))
+    variant = own if variant is None else variant_text(read(variant))
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}; it must be at least 1")

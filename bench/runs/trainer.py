@@ -25,7 +25,7 @@ from symsteer.bench.runs.evaluator import Evaluator, make_env
 from symsteer.bench.runs.folder import CHECKPOINT
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import task_class
-from symsteer.bench.variants import evaluated, highest_cost
+from symsteer.bench.variants import build, evaluated, highest_cost
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation
 from symsteer.policies.contract import ChunkPolicy
@@ -62,7 +62,7 @@ def feasible_return(config: RunConfig, agent: Agent, base: ChunkPolicy) -> tuple
     The discount is the agent's; 0 for an agent without one.
     """
     return task_class(config.task).feasible_return(
-        getattr(agent.options, "gamma", 0.0), base.execute, step_cost=highest_cost(config.variants)
+        getattr(agent.options, "gamma", 0.0), base.execute, step_cost=highest_cost(build(config.variants))
     )
 
 

@@ -10,7 +10,7 @@ from symsteer.bench.cli import main
 from symsteer.bench.audit import page
 from symsteer.bench.audit.study import variant_texts
 from symsteer.bench.tasks import task_class
-from symsteer.bench.variants import variant_names
+from symsteer.bench.variants import VARIANTS
 from symsteer.errors import UserError
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
@@ -103,7 +103,7 @@ def test_a_table_of_cells(monkeypatch, capsys, tmp_path):
 
 def test_names_of_cells():
     assert variant_texts(["all"], [1.0])[0] == "none"
-    assert len(variant_texts(["all"], [0.5, 1.0])) == 1 + 2 * len(variant_names())
+    assert len(variant_texts(["all"], [0.5, 1.0])) == 1 + 2 * len(VARIANTS.names())
     both = "action_gain:0.5+perception_bias:1"
     assert variant_texts([both, "action_gain", both], [0.5]) == [both, "action_gain:0.5"]
     assert variant_texts(["action_gain"], [0.0]) == ["none"]

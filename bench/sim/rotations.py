@@ -1,10 +1,14 @@
-"""Rotations as this project needs them: small batched functions on torch tensors.
+"""Batched rotations on torch tensors: quaternions, matrices, Euler angles, planar symmetries.
 
 Quaternions are (w, x, y, z) and unit length, as in SAPIEN. A planar symmetry is the pair
-``(angle, reflect)`` of ``policies.geometry``: first (x, y) -> (x, -y) if ``reflect``, then a
-rotation by ``angle`` about the vertical axis. A body is mirrored together with its own frame,
+``(angle, reflect)`` of ``symsteer.policies.geometry``: first (x, y) -> (x, -y) if ``reflect``, then
+a rotation by ``angle`` about the vertical axis. A body is mirrored together with its own frame,
 R -> M R M with M = diag(1, -1, 1), so that rotations stay rotations; bodies that are their own
 mirror image across their x-z plane (cubes, two-fingered grippers) look as mirrored bodies should.
+
+The product of quaternions is ManiSkill's. Its conversions to matrices are not used: those of
+quaternions and rotation vectors normalise again and round differently, which would change
+results, and the one of Euler angles multiplies three matrices, whose rounding depends on the BLAS.
 """
 
 from __future__ import annotations
@@ -12,21 +16,24 @@ from __future__ import annotations
 import math
 
 import torch
+from mani_skill.utils.geometry.rotation_conversions import (
+    quaternion_raw_multiply as quaternion_multiply,
+)
 
-
-def quaternion_multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Hamilton product of ``[..., 4]`` and ``[..., 4]``."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
-    )
+__all__ = [
+    "euler_rates_matrix",
+    "euler_to_matrix",
+    "matrix_to_euler_facing_down",
+    "planar_matrix",
+    "quaternion_multiply",
+    "quaternion_to_matrix",
+    "rotation_vector_to_matrix",
+    "transform_angular",
+    "transform_quaternion",
+    "unwrap",
+    "wrap",
+    "yaw_quaternion",
+]
 
 
 def quaternion_to_matrix(q: torch.Tensor) -> torch.Tensor:
