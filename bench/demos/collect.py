@@ -27,7 +27,7 @@ from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import write_atomically
+from symsteer.files import write_atomically
 
 FORMAT = 2
 """Of our files; 2 has a checksum."""
@@ -109,7 +109,7 @@ def collect(
 
     Raises:
         UserError: for a bad argument, or if the expert fails too often.
-        RecordError: if the files cannot be written; earlier ones stay as they were.
+        UserError: if the files cannot be written; earlier ones stay as they were.
     """
     path = Path(out_path)
     if path.suffix != ".h5":

@@ -17,8 +17,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from symsteer.agents.sac import SacConfig
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import canonical_variant
 from symsteer.policies.base import PolicyConfig
+from symsteer.variant import parse_variant, variant_text
 
 LARGEST_COUNT = 10**12
 LARGEST_BATCH = 100_000
@@ -130,7 +130,7 @@ class RunConfig:
                 f"not have more than {LONGEST_VARIANT}, so join fewer of them"
             )
         # The variant is a part of the run's identity, however its strengths were written.
-        object.__setattr__(self, "variant", canonical_variant(self.variant))
+        object.__setattr__(self, "variant", variant_text(parse_variant(self.variant)))
 
     def to_json(self) -> dict[str, Any]:
         """Nested plain data."""

@@ -23,8 +23,8 @@ from filelock import FileLock, Timeout
 
 from symsteer.bench.runs.config import RunConfig, content_key
 from symsteer.errors import UserError
-from symsteer.leaderboard.errors import RecordError
-from symsteer.leaderboard.records import read_record, write_atomically
+from symsteer.files import write_atomically
+from symsteer.leaderboard.records import read_record
 
 State = Literal["missing", "running", "interrupted", "failed", "finished"]
 
@@ -56,7 +56,7 @@ def is_finished(folder: Path) -> bool:
     """Whether the folder holds the record of a finished run."""
     try:
         return read_record(folder / RECORD).status == "finished"
-    except RecordError:
+    except UserError:
         return False
 
 
@@ -74,7 +74,7 @@ def state_of(folder: Path) -> State:
         return "running"
     try:
         return "failed" if read_record(folder / RECORD).status == "failed" else "interrupted"
-    except RecordError:
+    except UserError:
         return "interrupted"
 
 

@@ -38,7 +38,6 @@ from symsteer.bench.steering.search import search_ticket
 from symsteer.bench.tasks import task_class
 from symsteer.bench.variants import evaluated, highest_cost, parse
 from symsteer.errors import UserError
-from symsteer.leaderboard.errors import RecordError
 from symsteer.leaderboard.records import (
     Budget,
     Episodes,
@@ -163,7 +162,7 @@ class Loop:
         )
         try:
             self._close("interrupted" if interrupted else "failed")
-        except RecordError:
+        except UserError:
             # The folder cannot be written, which is most likely what stopped the run.
             return
         finally:
@@ -357,7 +356,6 @@ class Loop:
         provenance = Provenance.collect(
             device=_device_name(self.device),
             torch_threads=torch.get_num_threads(),
-            root=Path(__file__).parents[2],
         )
         if checkpoint:
             record = read_record(self.folder / RECORD)
@@ -379,6 +377,7 @@ class Loop:
         return RunRecord(
             run_id=self.folder.name,
             config=resolved,
+            role="learner" if self.agent.learns else "reference",
             provenance=provenance,
             seeds={
                 "run": config.seed,

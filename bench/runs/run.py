@@ -32,9 +32,10 @@ from symsteer.bench.steering.search import rounds
 from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import evaluated, parse
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import Episodes, Evaluation, canonical_variant, read_record
+from symsteer.leaderboard.records import Episodes, Evaluation, read_record
 from symsteer.policies.base import ChunkPolicy, load_policy, policy_path, save_policy
 from symsteer.policies.geometry import Group
+from symsteer.variant import parse_variant, variant_text
 
 
 def check(config: RunConfig) -> None:
@@ -191,7 +192,7 @@ def evaluate(
     config, _ = _stored(folder)
     _check_all(config, workers)
     own = evaluated(config.variant)
-    variant = own if variant is None else canonical_variant(variant)
+    variant = own if variant is None else variant_text(parse_variant(variant))
     parse(variant)
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from record_factory import LEARNING, make_curve, make_evaluation, make_record
+from symsteer.leaderboard.errors import RecordError
 
 from symsteer.leaderboard import __main__ as command
 from symsteer.leaderboard.admission import RULES, Verdict, check
-from symsteer.leaderboard.errors import RecordError
 from symsteer.leaderboard.records import HELD_OUT_SEED, RunRecord, config_hash, write_record
 
 REPOSITORY = Path(__file__).parents[2]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from record_factory import make_cell
+from symsteer.leaderboard.errors import RecordError
 
 from symsteer.leaderboard.defects import (
     DEFAULT_AUDIT,
@@ -23,7 +24,6 @@ from symsteer.leaderboard.defects import (
     fit,
     read_audit,
 )
-from symsteer.leaderboard.errors import RecordError
 from symsteer.leaderboard.page import crossing_text
 from symsteer.leaderboard.statistics import Interval, Sample
 from symsteer.leaderboard.summary import Run, Summary, Table, summarize

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 from record_factory import make_record
-
 from symsteer.leaderboard.__main__ import main
 from symsteer.leaderboard.errors import RecordError
+
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import MAX_BYTES, write_record
 from symsteer.leaderboard.report import generate, slug

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from record_factory import START, make_config, make_evaluation, make_record
-
 from symsteer.leaderboard.errors import RecordError
+
 from symsteer.leaderboard.records import (
     Evaluation,
     FeasibleQ,

@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from record_factory import LEARNING, make_curve, make_evaluation, make_record
-
 from symsteer.leaderboard.__main__ import main
+
 from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.records import read_record, write_record

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from record_factory import START, make_curve, make_evaluation, make_record
-
 from symsteer.leaderboard.errors import RecordError
+
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.page import render_page
 from symsteer.leaderboard.records import Evaluation, RunRecord, config_hash, write_record

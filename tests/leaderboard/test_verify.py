@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from record_factory import make_curve, make_evaluation, make_record
-
 from symsteer.leaderboard.__main__ import main
+
 from symsteer.leaderboard.records import write_record
 from symsteer.leaderboard.report import DEFAULT_OUT, DEFAULT_RECORDS, generate, slug
 from symsteer.leaderboard.verification import differences, other_versions
