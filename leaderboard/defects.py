@@ -258,7 +258,7 @@ class DefectMap:
 
 
 def defect_map(summary: Summary, audit: Audit) -> DefectMap:
-    """Advantage of `WITH_SYMMETRY` over `STANDARD` in all audited tables, with lines and crossings."""
+    """Advantage of `WITH_SYMMETRY` over `STANDARD` in audited tables, with lines and crossings."""
     panels = {}
     for agent in WITH_SYMMETRY:
         for measure in MEASURES:

@@ -284,9 +284,8 @@ def advantage_map(found: DefectMap) -> Figure:
     its band over the audited range, the diamond is where it falls through zero, with its interval.
     """
     figure = Figure(figsize=(9.0, 6.9), layout="constrained")
-    grid = figure.subplots(
-        len(WITH_SYMMETRY), len(MEASURES), sharex=True, sharey=True, squeeze=False
-    )
+    shape = len(WITH_SYMMETRY), len(MEASURES)
+    grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
     points = [point for panel in found.panels.values() for point in panel.points]
     places = sorted({(p.table.key.task, p.table.key.embodiment) for p in points})
     markers = {p: PLACE_MARKERS[i % len(PLACE_MARKERS)] for i, p in enumerate(places)}
@@ -308,8 +307,8 @@ def advantage_map(found: DefectMap) -> Figure:
         for place, marker in markers.items()
     }
     if any(panel.line and panel.line.crossing.value is not None for panel in found.panels.values()):
-        shape: dict[str, Any] = {"marker": "d", "linestyle": "-", "markersize": 7}
-        handles["falls through 0, 95 %"] = Line2D([], [], color="black", **shape)
+        diamond: dict[str, Any] = {"marker": "d", "linestyle": "-", "markersize": 7}
+        handles["falls through 0, 95 %"] = Line2D([], [], color="black", **diamond)
     _legend(figure, handles, columns=4)
     return figure
 

@@ -36,12 +36,8 @@ def _from_3(data: Data) -> Data:
     config = data.get("config")
     agent = config.get("agent") if isinstance(config, dict) else None
     role = "reference" if agent in REFERENCES_BEFORE_4 else "learner"
-    data = {
-        **data,
-        "schema_version": 4,
-        "role": role,
-        "provenance": _part_from_3(data.get("provenance")),
-    }
+    data = {**data, "schema_version": 4, "role": role}
+    data["provenance"] = _part_from_3(data.get("provenance"))
     if isinstance(parts := data.get("continued"), list):
         data["continued"] = [_part_from_3(part) for part in parts]
     return data

@@ -12,9 +12,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-import symsteer
+from symsteer import registry
 from symsteer.leaderboard.records.values import Block, Count, Name, Sha256
-from symsteer.registry import Extension, code_hash
 
 CODE = ("agents", "bench", "leaderboard", "policies", "symsteer")
 """Folders of a checkout that hold code; those in `symsteer/` are links to the others."""
@@ -59,7 +58,7 @@ class Provenance(Block):
 
     @classmethod
     def collect(
-        cls, device: str, torch_threads: int, extensions: Iterable[Extension] = ()
+        cls, device: str, torch_threads: int, extensions: Iterable[registry.Extension] = ()
     ) -> Provenance:
         """Describe this machine and the code that runs on it."""
         root = checkout()
@@ -68,7 +67,7 @@ class Provenance(Block):
             commit=commit,
             dirty=dirty,
             version=_version("symsteer"),
-            sha256=None if commit else code_hash("symsteer"),
+            sha256=None if commit else registry.code_hash("symsteer"),
             extensions=[RecordedExtension(**extension.to_json()) for extension in extensions],
             packages={name: found for name in PACKAGES if (found := _version(name))},
             python=platform.python_version(),
@@ -81,18 +80,17 @@ class Provenance(Block):
 @functools.cache
 def checkout() -> Path | None:
     """The top folder of the git checkout that this code runs from; None for an installed copy."""
-    return _checkout_of(Path(str(symsteer.__file__)).resolve())
+    return _checkout_of(Path(str(registry.__file__)).resolve())
 
 
 def _checkout_of(code: Path) -> Path | None:
     # An installed copy may lie inside of a checkout, in its virtual environment, but git does not
     # track it there.
+    root = code.parent.parent
     top = git(code.parent, "rev-parse", "--show-toplevel")
-    if top is None or Path(top).resolve() != code.parent.parent:
+    if top is None or Path(top).resolve() != root:
         return None
-    return (
-        code.parent.parent if git(code.parent, "ls-files", "--error-unmatch", code.name) else None
-    )
+    return root if git(code.parent, "ls-files", "--error-unmatch", code.name) else None
 
 
 def commit_of(root: Path) -> tuple[str | None, bool | None]:

@@ -208,7 +208,7 @@ class RunRecord(Block):
     role: Role
     provenance: Provenance
     continued: list[Provenance] = Field(default_factory=list)
-    """Later parts of a continued run, where their provenance differs from that of the first part."""
+    """Later parts of a continued run, where it differs from what was before."""
     seeds: dict[Name, Count]
     started: Moment
     ended: Moment | None = None
