@@ -7,7 +7,6 @@ machine where the simulator does not.
 from __future__ import annotations
 
 import errno
-import importlib
 import inspect
 import os
 import re
@@ -25,7 +24,6 @@ import tyro
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
-from symsteer.leaderboard.errors import RecordError
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
@@ -131,7 +129,7 @@ def _tell(folder: Path) -> None:
     out = folder.parent
     print(f"record:      {folder / 'record.json'}")
     print(f"TensorBoard: tensorboard --logdir {out}")
-    print(f"symsteer.leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
+    print(f"leaderboard: symsteer report {out}")
 
 
 @app.command
@@ -210,7 +208,7 @@ def demo(out: Path = Path("runs/demo")) -> int:
         out: Folder of the runs and of their leaderboard.
     """
     exit_code = sweep("demo", out=out)
-    report((out,), out=out / "leaderboard")
+    report((out,))
     page = out / "leaderboard" / "LEADERBOARD.md"
     print(
         f"\nOpen the leaderboard:  {page}"
@@ -228,20 +226,19 @@ def report(
     verify: bool = False,
     check: bool = False,
 ) -> int:
-    """Write the leaderboard (markdown, CSV, figures) from run records; `python -m leaderboard`.
+    """Write the leaderboard (markdown, CSV, figures) from run records.
 
     Args:
         records: Record files, run folders or folders of runs; default: the committed records.
-        out: Where to write; default: the leaderboard folder of this repository.
+        out: Where to write; default: RECORDS/leaderboard, in the first folder that is named; of
+            the committed records: the committed leaderboard.
         audit: The summary.json of an audit, for the map; default: the committed one.
         verify: Write nothing; fail if OUT is not, byte for byte, what the records give.
         check: Write nothing; say of each record whether the leaderboard admits it, and why not.
     """
-    options = {"--out": out, "--audit": audit}
-    arguments = [text for name, value in options.items() if value for text in (name, str(value))]
-    arguments += ["--verify"] * verify + ["--check"] * check + ["--", *map(str, records)]
-    # By name, not by import: the bench writes records and draws nothing.
-    return importlib.import_module("symsteer.leaderboard.__main__").main(arguments)
+    from symsteer.leaderboard.command import report
+
+    return report(records, out, audit, verify, check)
 
 
 @app.command(name="list")
@@ -515,7 +512,7 @@ def main() -> int:
     torch.set_num_threads(_threads(os.environ.get("OMP_NUM_THREADS", "")))
     try:
         return app.cli(prog="symsteer", description=ABOUT, sort_subcommands=False)
-    except (UserError, RecordError) as error:
+    except UserError as error:
         return _complain(error, f"error: {error}", 2)
     except WorkerLostError as error:
         return _complain(error, f"error: {error}", 1)

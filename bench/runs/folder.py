@@ -18,7 +18,6 @@ from filelock import FileLock, Timeout
 from symsteer.bench.runs.config import RunConfig, content_key
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
-from symsteer.leaderboard.errors import RecordError
 from symsteer.leaderboard.records import read_record
 
 State = Literal["missing", "running", "interrupted", "failed", "finished"]
@@ -48,7 +47,7 @@ def is_finished(folder: Path) -> bool:
     """Whether the folder holds the record of a finished run."""
     try:
         return read_record(folder / RECORD).status == "finished"
-    except RecordError:
+    except UserError:
         return False
 
 
@@ -66,7 +65,7 @@ def state_of(folder: Path) -> State:
         return "running"
     try:
         return "failed" if read_record(folder / RECORD).status == "failed" else "interrupted"
-    except RecordError:
+    except UserError:
         return "interrupted"
 
 

@@ -148,7 +148,7 @@ def write_manifest(plan: Plan, workers: int, failures: Mapping[str, str]) -> Non
     """Write the list of a sweep atomically.
 
     Raises:
-        RecordError: if it cannot be written.
+        UserError: if it cannot be written.
     """
     manifest = Manifest(
         plan.name,

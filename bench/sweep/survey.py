@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from symsteer.bench.runs.folder import RECORD, State, read_progress, state_of
-from symsteer.leaderboard.errors import RecordError
+from symsteer.errors import UserError
 from symsteer.leaderboard.records import RunRecord, read_record
 
 
@@ -39,7 +39,7 @@ def look(folder: Path) -> Sighting:
     """Read the folder of a run."""
     try:
         record = read_record(folder / RECORD)
-    except RecordError:
+    except UserError:
         record = None
     if record and record.status == "finished":
         return Sighting("finished", record)

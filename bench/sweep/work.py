@@ -21,7 +21,6 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import RunBusyError, is_finished, run_id
 from symsteer.bench.runs.run import execute
 from symsteer.errors import UserError
-from symsteer.leaderboard.errors import RecordError
 
 POLL_SECONDS = 0.5
 
@@ -90,7 +89,7 @@ def _guarded(action: Callable[[], object]) -> Result:
         action()
     except RunBusyError:
         raise
-    except (UserError, RecordError) as error:
+    except UserError as error:
         return Result("failed", str(error))
     except Exception as error:
         return Result("failed", f"{type(error).__name__}: {error}", traceback.format_exc())

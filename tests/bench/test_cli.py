@@ -123,7 +123,7 @@ def test_report_checks_and_verifies_from_any_folder(monkeypatch, capsys, tmp_pat
     shown = capsys.readouterr().out
     assert shown.count("NOT ADMISSIBLE") == 2
     assert "0 of 2 records are admissible" in shown
-    committed = Path(__file__).parents[2] / "leaderboard" / "results"
+    committed = Path(__file__).parents[2] / "leaderboard" / "results" / "records"
     record = next(committed.rglob("*.json"))
     assert symsteer(monkeypatch, "report", record, "--verify", "--out", tmp_path / "page") == 1
     assert "LEADERBOARD.md: missing" in capsys.readouterr().out
