@@ -9,24 +9,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from symsteer.agents.presets import preset_options
 
 from symsteer.agents import AGENTS
-from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
-from symsteer.policies import POLICIES
 
 ABOUT = """Steer a base policy with one agent on one task, and record the results.
 
 The options --agent.X are those of the agent that --agent names, the options --policy.X those of
 the policy that --policy.name names.
 """
-
-SOURCE = "the command line"
 
 
 @dataclass(frozen=True)
@@ -55,45 +52,34 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunConfig, Execution]:
         SystemExit: with code 0 after ``--help``, with 2 for an unknown option or a value that
             cannot be read; tyro has printed the help or the mistake.
     """
-    defaults = RunConfig().to_json()
-    agent = last_value(arguments, "--agent") or defaults["agent"]
-    policy = last_value(arguments, "--policy.name") or defaults["policy"]["name"]
-    agent_class, policy_class = AGENTS.get(agent), POLICIES.get(policy)
+    agent = last_value(arguments, "--agent") or RunConfig.agent
+    policy = last_value(arguments, "--policy.name") or RunConfig.policy_name
     preset = last_value(arguments, "--agent.preset")
-    start = {"agent": agent, "policy": {"name": policy}}
+    defaults = RunConfig(agent=agent, policy_name=policy)
     if preset is not None:
-        start["agent_options"] = preset_options(preset, agent, agent_class.Options)
-    given, execution = parse(arguments, build_config(start, SOURCE), agent, policy)
-    return build_config(given, SOURCE), execution
+        options = preset_options(preset, agent, AGENTS.get(agent).Options)
+        start = {"agent": agent, "agent_options": options, "policy": {"name": policy}}
+        defaults = build_config(start, f"preset {preset}")
+    return parse(arguments, defaults)
 
 
-def parse(
-    arguments: Sequence[str], defaults: RunConfig, agent: str, policy: str
-) -> tuple[dict[str, Any], Execution]:
-    """Parse the arguments for one agent and one policy.
+def parse(arguments: Sequence[str], defaults: RunConfig) -> tuple[RunConfig, Execution]:
+    """Parse the arguments for the agent and the policy of ``defaults``.
 
     Args:
         arguments: of ``symsteer run``.
-        defaults: values of the options that are not given; it holds the options of the agent and
-            of the policy.
-        agent: name of the agent.
-        policy: name of the policy.
-
-    Returns:
-        The configuration as plain data, and the rest.
+        defaults: values of the options that are not given.
     """
-    interface = _interface(defaults, agent, policy)
+    interface = _interface(defaults)
     found = tyro.cli(interface, prog="symsteer run", description=ABOUT, args=arguments)
-    own = {
-        field.name: _plain(getattr(found.config, field.name))
-        for field in dataclasses.fields(RunConfig)
+    values = {field.name: getattr(found.config, field.name) for field in fields(RunConfig)}
+    values |= {
+        "agent": defaults.agent,
+        "agent_options": found.config.agent.options,
+        "policy_name": defaults.policy_name,
+        "policy": found.config.policy.options,
     }
-    given = own | {
-        "agent": agent,
-        "agent_options": _plain(found.config.agent.options),
-        "policy": {"name": policy, **_plain(found.config.policy.options)},
-    }
-    return given, found.execution
+    return RunConfig(**values), found.execution
 
 
 def last_value(arguments: Sequence[str], option: str) -> str | None:
@@ -107,7 +93,7 @@ def last_value(arguments: Sequence[str], option: str) -> str | None:
     return value
 
 
-def _interface(defaults: RunConfig, agent: str, policy: str) -> type:
+def _interface(defaults: RunConfig) -> type:
     """A dataclass from whose fields tyro makes the options.
 
     It inherits from RunConfig, where tyro finds the help of the fields. A field whose name tyro
@@ -116,7 +102,7 @@ def _interface(defaults: RunConfig, agent: str, policy: str) -> type:
     """
     agent_part = _dataclass(
         "AgentArguments",
-        ("name", _help(str, "Agent; `symsteer list` names them.", name=""), agent),
+        ("name", _help(str, "Agent; `symsteer list` names them.", name=""), defaults.agent),
         (
             "preset",
             _help(str | None, "Preset that replaces the defaults of these options.", "NAME"),
@@ -126,7 +112,7 @@ def _interface(defaults: RunConfig, agent: str, policy: str) -> type:
     )
     policy_part = _dataclass(
         "PolicyArguments",
-        ("name", _help(str, "Policy; `symsteer list` names them."), policy),
+        ("name", _help(str, "Policy; `symsteer list` names them."), defaults.policy_name),
         _without_name("options", defaults.policy),
     )
     config = dataclasses.make_dataclass(
@@ -135,10 +121,11 @@ def _interface(defaults: RunConfig, agent: str, policy: str) -> type:
             ("agent", agent_part, agent_part()),
             ("policy", policy_part, policy_part()),
             ("agent_options", tyro.conf.Suppress[Any], None),
+            ("policy_name", tyro.conf.Suppress[Any], None),
         ],
         bases=(RunConfig,),
         frozen=True,
-        # The values are checked when the RunConfig is built from them.
+        # The values are checked when a RunConfig is built from them.
         namespace={"__post_init__": lambda self: None},
     )
     return _dataclass(
@@ -146,8 +133,8 @@ def _interface(defaults: RunConfig, agent: str, policy: str) -> type:
     )
 
 
-def _dataclass(name: str, *fields: tuple[str, Any, Any]) -> type:
-    return dataclasses.make_dataclass(name, fields, frozen=True)
+def _dataclass(name: str, *members: tuple[str, Any, Any]) -> type:
+    return dataclasses.make_dataclass(name, members, frozen=True)
 
 
 def _help(kind: Any, text: str, metavar: str | None = None, name: str | None = None) -> Any:
@@ -158,7 +145,3 @@ def _help(kind: Any, text: str, metavar: str | None = None, name: str | None = N
 def _without_name(name: str, default: Any) -> tuple[str, Any, Any]:
     """A field that is a dataclass whose options do not begin with the field's name."""
     return name, Annotated[type(default), tyro.conf.arg(name="")], default
-
-
-def _plain(value: Any) -> Any:
-    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value

@@ -9,16 +9,13 @@ works in the same way, without presets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from symsteer.agents import AGENTS
-from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.sweep.grid import SuiteData, read_suite
 from symsteer.errors import UserError
-from symsteer.names import unknown
 from symsteer.policies import POLICIES
 from symsteer.registry import Registry
 
