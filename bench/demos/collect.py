@@ -22,7 +22,6 @@ from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
-from symsteer.files import write_atomically
 from symsteer.names import unknown
 
 

@@ -1,4 +1,4 @@
-"""A Ray cluster that does the tasks of a sweep, in a folder that all its machines share."""
+"""Execute the tasks of a sweep on a Ray cluster whose machines share a folder."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from symsteer.bench.sweep.work import Result
 from symsteer.errors import UserError
 
 CONNECT_SECONDS = 10
-"""An address that does not answer within this time is given up."""
+"""How long to wait for an answer from an address."""
 
 ADDRESS = re.compile(r"auto|(\[[0-9a-fA-F:]+\]|[^:/\s]+):[0-9]{1,5}")
 
@@ -30,13 +30,13 @@ class RayCluster:
         address: ``auto`` for the cluster that this machine belongs to, or ``host:port`` of its
             head.
         out: folder of the runs; every machine must see it under the same path.
-        capacity: how many tasks at once at most; None for as many as the cluster has room for.
+        capacity: most tasks at the same time; None: as many as fit on the cluster.
 
     Raises:
         UserError: if Ray is not installed, no cluster answers, or a machine does not see ``out``.
     """
 
-    # A file server may take this long to see that a machine is gone and holds a run no more.
+    # A file server may take this long to release the lock of a machine that was lost.
     patience = 120.0
 
     def __init__(self, address: str, out: Path, capacity: int | None):
@@ -52,9 +52,9 @@ class RayCluster:
             raise
 
     def submit(self, function: Callable[..., Result], *args: Any) -> Future:
-        """Begin a task."""
+        """Start a task."""
         cuda = any(isinstance(a, RunConfig) and "cuda" in (a.sim, a.device) for a in args)
-        # The other machines know the folder by its full path only.
+        # The other machines need the full path of the folder.
         args = tuple(self._out if isinstance(a, Path) else a for a in args)
         if (function, cuda) not in self._functions:
             options = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)
@@ -65,7 +65,7 @@ class RayCluster:
         return future
 
     def result(self, future: Future) -> Result:
-        """How a task ended, whatever became of its machine."""
+        """The result of a task that has ended, also if its machine was lost."""
         del self._references[future]
         errors = self._ray.exceptions
         try:
@@ -88,38 +88,40 @@ class RayCluster:
 
 
 def check_address(address: str) -> None:
-    """Refuse what cannot be the address of a cluster; whether one answers there is not asked.
+    """Refuse what cannot be the address of a cluster, without connecting to it.
 
     Raises:
         UserError: if it is neither ``auto`` nor ``host:port``.
     """
     if not ADDRESS.fullmatch(address):
-        raise UserError(f"--ray {address} is no address; use auto or the host:port of a Ray head")
+        raise UserError(
+            f"--ray {address} is not an address; use auto or the host:port of a Ray head"
+        )
 
 
 def _connect(address: str) -> Any:
     """The ray module, connected."""
     check_address(address)
-    # Before the import, which reads it.
+    # Ray reads it when it is imported.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     try:
         import ray
     except ImportError as error:
         raise UserError('--ray needs Ray; install it with: pip install "symsteer[ray]"') from error
     if address != "auto" and not os.environ.get("RAY_USE_TLS"):
-        _knock(address)
+        _wait_for_answer(address)
     try:
         ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise UserError(
-            f"no Ray cluster can be joined at {address} ({_first_line(error)}); start one with "
+            f"the Ray cluster at {address} cannot be joined ({_first_line(error)}); start one with "
             "`ray start --head`"
         ) from error
     return ray
 
 
-def _knock(address: str) -> None:
-    """Give up soon where no Ray head answers: Ray itself would wait for minutes."""
+def _wait_for_answer(address: str) -> None:
+    """Fail after seconds if no Ray head answers; Ray itself would wait for minutes."""
     channel = grpc.insecure_channel(address)
     try:
         grpc.channel_ready_future(channel).result(timeout=CONNECT_SECONDS)
@@ -133,7 +135,7 @@ def _knock(address: str) -> None:
 
 
 def _check_shared(ray: Any, out: Path) -> None:
-    """Refuse a folder that a machine with processors does not see as this one does."""
+    """Refuse a folder in which a machine of the cluster does not see the files of this one."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     token = out / f".token-{uuid.uuid4().hex}"
@@ -173,7 +175,7 @@ def _check_shared(ray: Any, out: Path) -> None:
 
 
 def _answer(token: Path, node: str) -> bool:
-    """On another machine: whether the token is there and an answer can be laid beside it."""
+    """On another machine: whether the token is there and a file can be written beside it."""
     try:
         if token.read_text() != token.name:
             return False

@@ -1,4 +1,4 @@
-"""What a sweep has to do: its cells, and the list of them that ``symsteer status`` reads."""
+"""The plan of a sweep: its runs, and the manifest of them that ``symsteer status`` reads."""
 
 from __future__ import annotations
 
@@ -18,12 +18,15 @@ from symsteer.bench.sweep.suite import Suite
 from symsteer.errors import UserError
 
 BASIC = ("task", "embodiment", "variant", "agent", "seed")
-"""The keys of a configuration that every table and line shows."""
+"""Keys of a configuration that every table and line shows."""
+
+OWNERS = {"agent": "agent", "policy": "policy.name"}
+"""The key that says whose options ``agent.X`` and ``policy.X`` are."""
 
 
 @dataclass(frozen=True)
-class Cell:
-    """What one needs to know of a run to show it and to guess how long it takes."""
+class PlannedRun:
+    """What identifies a run in lines and tables, and its budget."""
 
     run_id: str
     task: str
@@ -33,53 +36,53 @@ class Cell:
     seed: int
     env_steps: int
     extra: dict[str, Any] = field(default_factory=dict, hash=False)
-    """What else tells the cells of a suite apart: ``{"demonstrations.count": 5}``."""
+    """Other settings in which the runs of a suite differ: ``{"demonstrations.count": 5}``."""
 
     @classmethod
-    def of(cls, config: Mapping[str, Any], name: str, extra: Iterable[str] = ()) -> Cell:
-        """The cell of a configuration as nested plain data."""
-        settings = flat(config)
+    def of(cls, config: Mapping[str, Any], name: str, extra: Iterable[str] = ()) -> PlannedRun:
+        """The run of a configuration given as nested plain data."""
+        settings = _settings(config)
         values = {key: config[key] for key in (*BASIC, "env_steps")}
-        return cls(name, **values, extra={key: settings[key] for key in extra})
+        return cls(name, **values, extra={k: settings[k] for k in extra if k in settings})
 
     @property
     def keys(self) -> dict[str, Any]:
-        """What tells the cell apart, in the order in which it is shown."""
+        """The settings that identify the run, in the order in which they are shown."""
         return {key: getattr(self, key) for key in BASIC} | self.extra
 
     @property
     def label(self) -> str:
-        """The cell in words."""
+        """One line that names the run."""
         extra = "".join(f" {key.rpartition('.')[2]} {value}" for key, value in self.extra.items())
         return f"{self.task} {self.embodiment} {self.variant} {self.agent}{extra} seed {self.seed}"
 
 
-def short_labels(cells: Sequence[Cell], everything: bool) -> dict[Cell, str]:
-    """The cells in as few words as tell them apart, agent first.
+def short_labels(runs: Sequence[PlannedRun], everything: bool) -> dict[PlannedRun, str]:
+    """Short labels: only the settings in which the runs differ, agent first.
 
     Args:
-        cells: of one sweep.
-        everything: name task and variant even where all cells share them.
+        runs: of one sweep.
+        everything: show task and variant even if all runs share them.
     """
-    shared = {key for key in BASIC if len({cell.keys[key] for cell in cells}) == 1}
+    shared = {key for key in BASIC if len({run.keys[key] for run in runs}) == 1}
     shared -= {"agent", "seed"} | ({"task", "variant"} if everything else set())
     labels = {}
-    for cell in cells:
+    for run in runs:
         order = ("agent", "task", "embodiment", "variant")
-        words = [str(cell.keys[key]) for key in order if key not in shared]
-        words += [f"{key.rpartition('.')[2]}={value}" for key, value in cell.extra.items()]
-        labels[cell] = f"{' '.join(words)} s{cell.seed}"
+        words = [str(run.keys[key]) for key in order if key not in shared]
+        words += [f"{key.rpartition('.')[2]}={value}" for key, value in run.extra.items()]
+        labels[run] = f"{' '.join(words)} s{run.seed}"
     return labels
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The cells of a suite, in its order, and the folder of their runs."""
+    """The runs of a suite, in its order, and the folder that they are written to."""
 
     name: str
     description: str
     out: Path
-    configs: dict[Cell, RunConfig]
+    configs: dict[PlannedRun, RunConfig]
 
     @property
     def title(self) -> str:
@@ -87,24 +90,24 @@ class Plan:
         return _title(self.name, self.description)
 
     @property
-    def cells(self) -> list[Cell]:
-        """The cells, in the order of the suite."""
+    def runs(self) -> list[PlannedRun]:
+        """The runs, in the order of the suite."""
         return list(self.configs)
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """The resolved list of a sweep, ``OUT/sweeps/<suite>.json``."""
+    """The list of runs of a sweep, ``OUT/sweeps/<suite>.json``."""
 
     suite: str
     description: str
     workers: int
-    """Runs side by side; 0 if the cluster decides."""
+    """Number of runs at the same time; 0 if the cluster decides."""
     updated: str
-    runs: tuple[Cell, ...]
+    runs: tuple[PlannedRun, ...]
     failures: dict[str, str] = field(default_factory=dict)
-    """Why runs failed in the last sweep, by run id. A run whose process was killed cannot say so
-    in its own record."""
+    """Why runs failed in the last sweep, by run id. The record of a run whose process was killed
+    cannot hold it."""
 
     @property
     def title(self) -> str:
@@ -113,15 +116,15 @@ class Manifest:
 
 
 def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
-    """Resolve a suite, and refuse what cannot run before anything is built.
+    """Check every run of a suite before anything is built.
 
     Args:
         suite: what to run.
         out: folder of the runs.
-        elsewhere: whether other machines run it, whose devices this one does not know.
+        elsewhere: whether other machines run it; then devices are not checked.
 
     Raises:
-        UserError: if a cell names what does not exist.
+        UserError: if a run cannot be started, e.g. because its task does not exist.
     """
     settings = []
     for config in suite.runs:
@@ -129,23 +132,46 @@ def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
             check(replace(config, sim="cpu", device="cpu") if elsewhere else config)
         except UserError as error:
             raise UserError(f"{suite.name}: {error}") from error
-        settings.append(flat(config.to_json()))
-    extra = [
+        settings.append(_settings(config.to_json()))
+    extra = _differing(settings)
+    runs = {
+        PlannedRun.of(config.to_json(), run_id(config, {}), extra): config for config in suite.runs
+    }
+    return Plan(suite.name, suite.description, out, runs)
+
+
+def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration as one flat table, with the options of the agent as ``agent.X``."""
+    options = flat(config.get("agent_options", {}), "agent.")
+    return flat({key: config[key] for key in config if key != "agent_options"}) | options
+
+
+def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Keys, other than those of BASIC, whose values differ.
+
+    The options of an agent are compared among runs of this agent only: other agents have other
+    options and other defaults. The same holds for policies.
+    """
+    values: dict[str, dict[Any, set[str]]] = {}
+    for one in settings:
+        for key, value in one.items():
+            owner_key = OWNERS.get(key.partition(".")[0])
+            owner = one[owner_key] if owner_key and owner_key != key else None
+            values.setdefault(key, {}).setdefault(owner, set()).add(repr(value))
+    return [
         key
-        for key, value in settings[0].items()
-        if key not in BASIC and any(one[key] != value for one in settings)
+        for key, found in values.items()
+        if key not in BASIC and any(len(texts) > 1 for texts in found.values())
     ]
-    cells = {Cell.of(config.to_json(), run_id(config, {}), extra): config for config in suite.runs}
-    return Plan(suite.name, suite.description, out, cells)
 
 
 def manifest_path(out: Path, suite: str) -> Path:
-    """Where the list of a sweep lies."""
+    """The file with the list of a sweep's runs."""
     return out / "sweeps" / f"{suite}.json"
 
 
 def write_manifest(plan: Plan, workers: int, failures: Mapping[str, str]) -> None:
-    """Write the list of a sweep atomically.
+    """Write the list of a sweep's runs atomically.
 
     Raises:
         UserError: if it cannot be written.
@@ -155,23 +181,23 @@ def write_manifest(plan: Plan, workers: int, failures: Mapping[str, str]) -> Non
         plan.description,
         workers,
         datetime.now(UTC).isoformat(timespec="seconds"),
-        tuple(plan.cells),
+        tuple(plan.runs),
         dict(failures),
     )
     write_json(manifest_path(plan.out, plan.name), asdict(manifest))
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Read the list of a sweep.
+    """Read the list of a sweep's runs.
 
     Raises:
-        UserError: if the file is no such list.
+        UserError: if the file is not such a list.
     """
     try:
         return TypeAdapter(Manifest).validate_python(json.loads(path.read_text()))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
-            f"{path} is not the list of a sweep; run the sweep again to write it anew"
+            f"{path} is not the list of a sweep; run the sweep again to replace it"
         ) from error
 
 

@@ -21,14 +21,14 @@ THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 class LocalPool:
-    """Processes that are kept from task to task, since importing all that they need takes seconds.
+    """Processes that are kept for many tasks, because their imports take seconds.
 
-    Each has a pool of its own: a pool of several gives up as a whole when one of them dies while
-    none has a task yet, as during its imports.
+    Each process is a pool of its own: a pool of several processes breaks as a whole when one of
+    them dies during its imports.
 
     Args:
-        workers: how many processes; each is started when it is first needed.
-        log: file to which they write what they have to say.
+        workers: number of processes; each is started when it is first needed.
+        log: file that receives their output.
     """
 
     patience = 10.0
@@ -42,10 +42,10 @@ class LocalPool:
         self._busy: dict[Future, ProcessPool] = {}
 
     def submit(self, function: Callable[..., Result], *args: Any) -> Future:
-        """Begin a task; there must be fewer than ``capacity``."""
+        """Start a task; fewer than ``capacity`` may be running."""
         pool = self._idle.pop()
-        # Whoever starts a process hands its signal mask on: Ctrl-C is for the sweep, which ends its
-        # processes itself, and not for one that is busy with its imports.
+        # A process inherits the signal mask. Ctrl-C is for the sweep, which ends its processes
+        # itself; it must not reach a process during its imports.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             future = pool.schedule(function, args)
@@ -55,7 +55,7 @@ class LocalPool:
         return future
 
     def result(self, future: Future) -> Result:
-        """How a task ended; a process that died is replaced."""
+        """The result of a task; a process that died is replaced."""
         pool = self._busy.pop(future)
         try:
             result = future.result()
@@ -68,7 +68,7 @@ class LocalPool:
         return result
 
     def stop(self) -> None:
-        """End all processes, whatever they are doing."""
+        """End all processes at once."""
         pools = [*self._busy.values(), *self._idle]
         for pool in pools:
             pool.stop()
@@ -76,7 +76,7 @@ class LocalPool:
             pool.join()
 
     def _start(self) -> ProcessPool:
-        # Spawned, because forking a process that has used torch's threads can deadlock.
+        # Spawned: a fork of a process that has used torch's threads can deadlock.
         return ProcessPool(
             max_workers=1,
             initializer=_begin,
@@ -88,19 +88,18 @@ class LocalPool:
 def _begin(log: str) -> None:
     """Prepare a new process."""
     one_thread()
-    # Warnings of libraries and the last words of a crash must not tear the display.
+    # Warnings of libraries and the output of a crash must not damage the display.
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     for stream in (1, 2):
         os.dup2(file, stream)
     os.close(file)
-    # The usual lock of progress bars is a semaphore of the system, which a process that is ended
-    # can leave behind.
+    # tqdm's usual lock is a semaphore of the system, which a process that is killed leaves behind.
     tqdm.set_lock(threading.RLock())
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End when the sweep does, even if that was killed: a run continues from its checkpoint."""
+    """End when the sweep ends, also if it was killed; its runs continue from their checkpoints."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -108,11 +107,11 @@ def _end_with_parent() -> None:
 
 
 def _death(code: int | None) -> str:
-    """What the exit code of a process says."""
+    """What the exit code of a process means."""
     if code is None:
-        return "its process ended before it began to work"
+        return "its process ended before it started to work"
     if code >= 0:
         return f"its process ended with exit code {code}"
     name = signal.Signals(-code).name
-    why = "; the system does so when memory runs out" if -code == signal.SIGKILL else ""
+    why = "; the system does this when memory runs out" if -code == signal.SIGKILL else ""
     return f"its process was killed by {name}{why}"

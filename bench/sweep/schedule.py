@@ -1,6 +1,6 @@
-"""Work off a plan: what cells share is built once, then the cells run, side by side.
+"""Execute a plan: what runs share is built once and first; then the runs, several at a time.
 
-Where the work is done is not known here: on this machine (``pool``) or on a cluster (``cluster``).
+The workers are processes of this machine (``pool``) or of a cluster (``cluster``).
 """
 
 from __future__ import annotations
@@ -13,99 +13,99 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from symsteer.bench.runs.base_policy import demonstration_path, find_base
-from symsteer.bench.sweep.plan import Cell, Plan
+from symsteer.bench.sweep.plan import Plan, PlannedRun
 from symsteer.bench.sweep.work import Result, build_base, build_demonstrations, play
 
 TRIES = 2
-"""A failed task is tried once more; a run then continues from its checkpoint."""
+"""A task that failed is tried once more; a run then continues from its checkpoint."""
 
 LOST_TRIES = 10
-"""A task whose machine went away is tried this often: that is no fault of its own."""
+"""Tries of a task whose machine was lost, which is not the task's fault."""
 
 REFRESH_SECONDS = 0.5
 
 
 class Workers(Protocol):
-    """Where tasks are done."""
+    """Executes tasks."""
 
     capacity: int | None
-    """How many tasks are done side by side; None if it decides itself."""
+    """Number of tasks at the same time; None if it decides itself."""
     patience: float
     """Seconds to wait for a run that another process seems to hold."""
 
     def submit(self, function: Callable[..., Result], *args: Any) -> Future:
-        """Begin a task."""
+        """Start a task."""
 
     def result(self, future: Future) -> Result:
-        """How a task ended that is done, whatever became of its process."""
+        """The result of a task that has ended, also if its process died."""
 
     def stop(self) -> None:
-        """End all processes, whatever they are doing."""
+        """End all processes at once."""
 
 
 @dataclass
 class Outcome:
-    """What became of a cell."""
+    """How a run ended."""
 
-    cell: Cell
+    run: PlannedRun
     status: Literal["finished", "skipped", "failed", "elsewhere"]
-    """``skipped``: it was finished before. ``elsewhere``: another process is working on it."""
+    """``skipped``: it was finished before. ``elsewhere``: another process works on it."""
     reason: str = ""
     trace: str = ""
 
 
 class Watcher(Protocol):
-    """Who wants to know how a sweep gets on."""
+    """Is told about the progress of a sweep."""
 
     def started(self, task: Task) -> None:
-        """A task was handed to a worker."""
+        """A task began."""
 
     def retried(self, task: Task, result: Result) -> None:
         """A task failed and will be tried again."""
 
     def refresh(self, running: list[Task]) -> None:
-        """Some time has passed."""
+        """Half a second has passed, or a task has ended."""
 
 
 @dataclass(eq=False)
 class Task:
-    """A piece of work: demonstrations, a base policy, or a cell."""
+    """Something to do: collect demonstrations, train a base policy, or execute a run."""
 
-    kind: Literal["demonstrations", "base policy", "cell"]
+    kind: Literal["demonstrations", "base policy", "run"]
     label: str
     function: Callable[..., Result]
     args: tuple
-    cell: Cell | None = None
+    run: PlannedRun | None = None
     then: list[Task] = field(default_factory=list)
-    """Tasks that need this one."""
+    """Tasks that need the result of this one."""
     waits: bool = False
-    """Whether it needs another one."""
+    """Whether it needs the result of another one."""
     tries: int = 0
     losses: int = 0
 
     @property
-    def cells(self) -> list[Cell]:
-        """The cells that come to nothing without this task."""
-        own = [self.cell] if self.cell else []
-        return own + [cell for task in self.then for cell in task.cells]
+    def runs(self) -> list[PlannedRun]:
+        """The runs that cannot be executed if this task fails."""
+        own = [self.run] if self.run else []
+        return own + [run for task in self.then for run in task.runs]
 
 
-def tasks_of(plan: Plan, todo: list[Cell], patience: float = 0.0) -> list[Task]:
-    """The cells, and before them what they share and is not there yet, each once.
+def tasks_of(plan: Plan, todo: list[PlannedRun], patience: float = 0.0) -> list[Task]:
+    """Tasks for what the runs share and does not exist yet, each once, then for the runs.
 
     Args:
-        plan: which holds the cells.
-        todo: the cells that are to run.
+        plan: of the sweep.
+        todo: the runs to execute.
         patience: seconds to wait for a run that another process seems to hold.
     """
     demonstrations: dict[tuple, Task | None] = {}
     bases: dict[tuple, Task | None] = {}
-    cells = []
-    for cell in todo:
-        config = plan.configs[cell]
+    runs = []
+    for run in todo:
+        config = plan.configs[run]
         wanted = config.demonstrations
         demos_key = (config.task, config.embodiment, wanted)
-        base_key = (*demos_key, config.policy, config.policy_seed)
+        base_key = (*demos_key, config.policy_name, config.policy, config.policy_seed)
         words = f"{config.task} {config.embodiment}, {wanted.count} {wanted.mode}"
         args = (config, plan.out)
         if base_key not in bases and find_base(*args):
@@ -117,22 +117,24 @@ def tasks_of(plan: Plan, todo: list[Cell], patience: float = 0.0) -> list[Task]:
             words = f"{config.policy_name} for {words} demonstrations"
             bases[base_key] = Task("base policy", words, build_base, args)
             _join(demonstrations[demos_key], bases[base_key])
-        cells.append(Task("cell", cell.label, play, (*args, patience), cell))
-        _join(bases[base_key], cells[-1])
-    return [task for task in (*demonstrations.values(), *bases.values(), *cells) if task]
+        runs.append(Task("run", run.label, play, (*args, patience), run))
+        _join(bases[base_key], runs[-1])
+    return [task for task in (*demonstrations.values(), *bases.values(), *runs) if task]
 
 
-def work_off(plan: Plan, todo: list[Cell], workers: Workers, watcher: Watcher) -> Iterator[Outcome]:
-    """Run cells of a plan; one that fails does not stop the others. Yields each as it ends.
+def execute_plan(
+    plan: Plan, todo: list[PlannedRun], workers: Workers, watcher: Watcher
+) -> Iterator[Outcome]:
+    """Execute runs of a plan, and yield the outcome of each when it ends.
 
-    Tasks that others wait for come first, then the cells in the order of the suite, and last what
-    failed before.
+    A run that fails does not stop the others. Tasks that others wait for come first, then the runs
+    in the order of the suite, and last what failed before.
     """
     order = itertools.count()
     ready: list[tuple[int, int, Task]] = []
 
     def offer(task: Task) -> None:
-        rank = 2 if task.tries else 1 if task.kind == "cell" else 0
+        rank = 2 if task.tries else 1 if task.kind == "run" else 0
         heapq.heappush(ready, (rank, next(order), task))
 
     for task in tasks_of(plan, todo, workers.patience):
@@ -151,19 +153,19 @@ def work_off(plan: Plan, todo: list[Cell], workers: Workers, watcher: Watcher) -
             if result.status == "done":
                 for follower in task.then:
                     offer(follower)
-                if task.cell:
-                    yield Outcome(task.cell, "finished")
+                if task.run:
+                    yield Outcome(task.run, "finished")
             elif _again(task, result):
                 watcher.retried(task, result)
                 offer(task)
             else:
-                for cell in task.cells:
-                    yield _failure(cell, task, result)
+                for run in task.runs:
+                    yield _failure(run, task, result)
         watcher.refresh(list(running.values()))
 
 
 def _again(task: Task, result: Result) -> bool:
-    """Whether a task that did not succeed is tried again; counts the attempt."""
+    """Whether to try a task again that did not succeed; counts the attempt."""
     if result.status == "lost":
         task.losses += 1
         return task.losses < LOST_TRIES
@@ -171,12 +173,12 @@ def _again(task: Task, result: Result) -> bool:
     return result.status == "failed" and task.tries < TRIES
 
 
-def _failure(cell: Cell, task: Task, result: Result) -> Outcome:
+def _failure(run: PlannedRun, task: Task, result: Result) -> Outcome:
     if result.status == "busy":
-        return Outcome(cell, "elsewhere", result.reason)
-    if task.cell:
-        return Outcome(cell, "failed", result.reason, result.trace)
-    return Outcome(cell, "failed", f"its {task.kind} failed: {result.reason}", result.trace)
+        return Outcome(run, "elsewhere", result.reason)
+    if task.run:
+        return Outcome(run, "failed", result.reason, result.trace)
+    return Outcome(run, "failed", f"its {task.kind} failed: {result.reason}", result.trace)
 
 
 def _join(first: Task | None, then: Task | None) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from symsteer.bench.runs.folder import CONFIG, read_config
 from symsteer.bench.sweep.estimate import Estimate, duration
-from symsteer.bench.sweep.plan import BASIC, Cell, Manifest, manifest_path, read_manifest
+from symsteer.bench.sweep.plan import BASIC, Manifest, PlannedRun, manifest_path, read_manifest
 from symsteer.bench.sweep.survey import Sighting, look
 from symsteer.errors import UserError
 
@@ -21,32 +21,32 @@ class Status:
     """The runs of a sweep, or those of a folder that belong to none."""
 
     title: str
-    runs: dict[Cell, Sighting]
+    runs: dict[PlannedRun, Sighting]
     reasons: dict[str, str] = field(default_factory=dict)
     """Why runs failed, by run id."""
     workers: int = 0
     """Runs that the last sweep had side by side; 0 if that is not known."""
 
-    def state(self, cell: Cell) -> str:
+    def state(self, run: PlannedRun) -> str:
         """One of :data:`STATES`."""
-        state = self.runs[cell].state
+        state = self.runs[run].state
         # A run that was killed could not write it down; the sweep that saw it did.
-        if state in ("interrupted", "missing") and cell.run_id in self.reasons:
+        if state in ("interrupted", "missing") and run.run_id in self.reasons:
             return "failed"
         return state
 
-    def cells(self, state: str) -> list[Cell]:
-        """The cells in a state."""
-        return [cell for cell in self.runs if self.state(cell) == state]
+    def runs(self, state: str) -> list[PlannedRun]:
+        """The runs in a state."""
+        return [run for run in self.runs if self.state(run) == state]
 
     def seconds_left(self) -> float | None:
         """Until all is finished, by as many workers as run now; None where nothing is known."""
         estimate = Estimate()
-        for cell in self.cells("finished"):
-            estimate.add(cell, self.runs[cell].seconds)
-        running = self.cells("running")
-        todo = [cell for cell in self.runs if self.state(cell) not in ("finished", "running")]
-        progress = {cell: self.runs[cell].progress for cell in running}
+        for run in self.runs("finished"):
+            estimate.add(run, self.runs[run].seconds)
+        running = self.runs("running")
+        todo = [run for run in self.runs if self.state(run) not in ("finished", "running")]
+        progress = {run: self.runs[run].progress for run in running}
         return estimate.left(todo, progress, len(running) or self.workers or 1)
 
 
@@ -89,8 +89,8 @@ def read_status(folder: Path, suite: str | None = None) -> Overview:
             found.append(_of_sweep(folder, read_manifest(path)))
         except UserError as error:
             damage.append(error)
-    listed = {cell.run_id for status in found for cell in status.runs}
-    others: dict[Cell, Sighting] = {}
+    listed = {run.run_id for status in found for run in status.runs}
+    others: dict[PlannedRun, Sighting] = {}
     for run in [path.parent for path in sorted(folder.glob(f"*/{CONFIG}"))]:
         if run.name not in listed:
             try:
@@ -102,11 +102,11 @@ def read_status(folder: Path, suite: str | None = None) -> Overview:
     return Overview(found, damage)
 
 
-def _unlisted(folder: Path) -> dict[Cell, Sighting]:
+def _unlisted(folder: Path) -> dict[PlannedRun, Sighting]:
     """A run that no sweep lists, if it is one of this program."""
     config = read_config(folder)
     if all(isinstance(config.get(key), str | int) for key in (*BASIC, "env_steps")):
-        return {Cell.of(config, folder.resolve().name): look(folder)}
+        return {PlannedRun.of(config, folder.resolve().name): look(folder)}
     return {}
 
 
@@ -122,7 +122,7 @@ def to_text(found: list[Status], folder: Path) -> str:
 def _of_sweep(folder: Path, manifest: Manifest) -> Status:
     return Status(
         manifest.title,
-        {cell: look(folder / cell.run_id) for cell in manifest.runs},
+        {run: look(folder / run.run_id) for run in manifest.runs},
         manifest.failures,
         manifest.workers,
     )
@@ -130,12 +130,12 @@ def _of_sweep(folder: Path, manifest: Manifest) -> Status:
 
 def _text(status: Status) -> str:
     lines = [f"{status.title} ({len(status.runs)} runs)"]
-    counts = Counter(status.state(cell) for cell in status.runs)
+    counts = Counter(status.state(run) for run in status.runs)
     lines += [f"  {state:12s}{counts[state]:6d}" for state in STATES]
     for state in ("running", "interrupted", "failed"):
-        if cells := status.cells(state):
+        if runs := status.runs(state):
             lines.append(f"{state}:")
-            lines += [f"  {cell.label}: {_detail(status, cell)}" for cell in cells]
+            lines += [f"  {run.label}: {_detail(status, run)}" for run in runs]
     if counts["finished"] < len(status.runs):
         left = status.seconds_left()
         workers = counts["running"] or status.workers or 1
@@ -149,16 +149,16 @@ def _text(status: Status) -> str:
     return "\n".join(lines)
 
 
-def _detail(status: Status, cell: Cell) -> str:
+def _detail(status: Status, run: PlannedRun) -> str:
     """What there is to say of a run that is not finished."""
-    seen = status.runs[cell]
-    state = status.state(cell)
+    seen = status.runs[run]
+    state = status.state(run)
     if state == "failed":
         own = seen.record.failure if seen.record else None
-        return status.reasons.get(cell.run_id) or own or "it does not say why"
+        return status.reasons.get(run.run_id) or own or "it does not say why"
     if state == "interrupted":
         done = seen.record.budget.env_steps if seen.record else 0
-        return f"after {done:,} of {cell.env_steps:,} steps; it continues from its last checkpoint"
+        return f"after {done:,} of {run.env_steps:,} steps; it continues from its last checkpoint"
     progress = seen.progress
     if not progress:
         return "starting"

@@ -1,28 +1,23 @@
-"""A suite: grids of runs described in TOML.
+"""A suite: the runs that the grids of a TOML file describe (``symsteer.bench.sweep.grid``).
 
-``[grid]`` lists values of keys of ``RunConfig``, nested ones with a dot
-(``"demonstrations.count"``); their product is taken in the order written. ``strength`` lists
-strengths for the variants that are named without one. Several grids are written ``[[grid]]`` each.
-``[run]`` sets everything that the runs share, nested as the configuration is.
+``[run.agent]`` sets options of the agents, and the name of the agent if no grid lists agents. An
+option applies to those agents of a grid that have it. ``[run.agent.NAME]`` sets options of one
+agent only. ``preset = "NAME"`` replaces the defaults of all options by those of a preset. In a grid
+the same keys are ``"agent.OPTION"``, ``"agent.NAME.OPTION"`` and ``"agent.preset"``. ``[run.policy]``
+works in the same way, without presets.
 """
 
 from __future__ import annotations
 
-import copy
-import itertools
-import math
-import tomllib
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from symsteer.bench.runs.config import RunConfig, build_config, check_keys
+from symsteer.agents import AGENTS
+from symsteer.bench.runs.config import RunConfig, build_config
+from symsteer.bench.sweep.grid import SuiteData, read_suite
 from symsteer.errors import UserError
-
-SUITES = Path(__file__).parent.parent / "suites"
-
-LARGEST_GRID = 100_000
+from symsteer.policies import POLICIES
+from symsteer.registry import Registry
 
 
 @dataclass(frozen=True)
@@ -34,92 +29,56 @@ class Suite:
     runs: tuple[RunConfig, ...]
 
 
-def suite_names() -> list[str]:
-    """The suites that come with SymSteer."""
-    return sorted(path.stem for path in SUITES.glob("*.toml"))
-
-
 def load_suite(name_or_path: str) -> Suite:
     """Read a suite by name or from a TOML file.
 
     Raises:
-        UserError: if there is no such suite, or the file says something that a run cannot be.
+        UserError: if there is no such suite, or a run in it has a value or option that does not
+            exist.
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml":
-        path = SUITES / f"{name_or_path}.toml"
-    try:
-        data = tomllib.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise UserError(
-            f"no suite {name_or_path!r}; use one of {', '.join(suite_names())} or the path of a "
-            ".toml file"
-        ) from error
-    except OSError as error:
-        raise UserError(
-            f"the suite {path} cannot be read: {error.strerror}; name another file"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(
-            f"the suite {path.name} cannot be read as TOML: {error}; correct it there"
-        ) from error
-    check_keys(data, {"description", "grid", "run"}, path.name)
-    shared, description = data.get("run", {}), data.get("description", "")
-    if not isinstance(shared, dict):
-        raise UserError(f"{path.name}: run must be a table, [run]")
-    if not isinstance(description, str):
-        raise UserError(f"{path.name}: description must be a text in quotes")
-    grids = data.get("grid", {})
+    data = read_suite(name_or_path)
+    defaults = RunConfig().to_json()
+    agents = _Options("agent", AGENTS, defaults["agent"], data)
+    policies = _Options("policy", POLICIES, defaults["policy"]["name"], data)
     runs: dict[RunConfig, None] = {}
-    for grid in grids if isinstance(grids, list) else [grids]:
-        for cell in _cells(grid, path.name):
-            config = build_config(_merge(shared, cell, path.name), path.name)
-            runs[config] = None
+    for table in data.runs:
+        agent, agent_options = agents.of(table["agent"])
+        policy, policy_options = policies.of(table["policy"])
+        plain = {
+            **table,
+            "agent": agent,
+            "agent_options": agent_options,
+            "policy": {"name": policy, **policy_options},
+        }
+        runs[build_config(plain, data.source)] = None
     if not runs:
-        raise UserError(f"{path.name} has no runs; give it a [grid] with lists of values")
-    return Suite(path.stem, description, tuple(runs))
+        raise UserError(f"{data.source} has no runs; give it a [grid] with lists of values")
+    return Suite(data.name, data.description, tuple(runs))
 
 
-def _cells(grid: Any, source: str) -> Iterator[dict[str, Any]]:
-    """Every combination of a grid's values, strengths joined to their variants."""
-    if not isinstance(grid, dict):
-        raise UserError(f"{source}: grid must be a table, [grid], or several, each [[grid]]")
-    for key, values in grid.items():
-        if not isinstance(values, list) or not values:
-            raise UserError(f"{source}: grid.{key} must be a list with at least one value")
-    if (count := math.prod(map(len, grid.values()))) > LARGEST_GRID:
-        raise UserError(
-            f"{source}: a grid has {count} runs; it must not have more than {LARGEST_GRID}, so "
-            "shorten its lists"
-        )
-    for chosen in itertools.product(*grid.values()):
-        cell = dict(zip(grid, chosen, strict=True))
-        if "strength" in cell:
-            cell["variant"] = _with_strength(cell.get("variant"), cell.pop("strength"), source)
-        yield cell
+class _Options:
+    """The options of the agents, or policies, of a suite.
 
+    Args:
+        kind: ``agent`` or ``policy``, the key of the tables.
+        registry: of the agents or policies.
+        default: the name where none is given.
+        data: the suite.
 
-def _with_strength(variant: Any, strength: Any, source: str) -> str:
-    if not isinstance(variant, str):
-        raise UserError(f"{source}: grid.strength needs grid.variant, a list of names")
-    if isinstance(strength, bool) or not isinstance(strength, int | float):
-        raise UserError(f"{source}: grid.strength must list numbers in [0, 1], not {strength!r}")
-    if variant == "none" or ":" in variant:
-        return variant
-    if strength == 0:
-        return "none"
-    return "+".join(f"{name}:{strength:g}" for name in variant.split("+"))
+    Raises:
+        UserError: if an option belongs to none of a grid's agents, or an agent does not exist.
+    """
 
-
-def _merge(shared: dict[str, Any], cell: dict[str, Any], source: str) -> dict[str, Any]:
-    """The shared settings with a cell's values in their places."""
-    merged = copy.deepcopy(shared)
-    for key, value in cell.items():
-        place = merged
-        *path, last = key.split(".")
-        for part in path:
-            place = place.setdefault(part, {})
-            if not isinstance(place, dict):
-                raise UserError(f"{source}: run.{part} must be a table, so that {key} has a place")
-        place[last] = value
-    return merged
+    def __init__(self, kind: str, registry: Registry[Any], default: str, data: SuiteData):
+        self.kind, self.default, self.source = kind, default, data.source
+        self.classes: dict[str, Any] = {}
+        for grid in data.grids:
+            for table in grid:
+                name = self._name(table[kind])
+                if name not in self.classes:
+                    self.classes[name] = registry.get(name).Options
+        everywhere = list(self.classes)
+        for grid in data.grids:
+            present = list(dict.fromkeys(self._name(table[kind]) for table in grid))
+            for table in {repr(table[kind]): table[kind] for table in grid}.values():
+                self._check(table, present, everywhere)

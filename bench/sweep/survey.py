@@ -1,4 +1,4 @@
-"""What has become of runs, as their folders tell."""
+"""The state of a run, read from its folder."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from symsteer.leaderboard.records import RunRecord, read_record
 
 @dataclass(frozen=True)
 class Sighting:
-    """A run as its folder shows it."""
+    """The state of a run, and its record if it has a readable one."""
 
     state: State
     record: RunRecord | None = None
     progress: Mapping[str, Any] | None = None
-    """Of a running run: what :func:`symsteer.bench.runs.folder.read_progress` says."""
+    """Of a running run: what :func:`symsteer.bench.runs.folder.read_progress` returns."""
 
     @property
     def seconds(self) -> float:
-        """Seconds that the run took, all its parts together."""
+        """Wall-clock seconds that the run took."""
         return self.record.wall_clock.total if self.record else 0.0
 
     @property
     def success(self) -> str:
-        """Success of the last evaluation in words."""
+        """Success of the last evaluation, as text."""
         if not self.record or not self.record.evaluations:
             return "no evaluation"
         last = self.record.evaluations[-1]

@@ -1,7 +1,7 @@
-"""What the processes of a sweep do, on this machine or on a cluster: build a base, play a cell.
+"""The tasks that the processes of a sweep execute, on this machine or on a cluster.
 
-These functions return what went wrong instead of raising it, so that an error never has to be
-rebuilt in another process.
+They return an error as text instead of raising it: not every exception survives the way to another
+process.
 """
 
 from __future__ import annotations
@@ -32,41 +32,41 @@ class Result:
     """How a task ended."""
 
     status: Literal["done", "failed", "busy", "lost"]
-    """``busy``: another process works on the run. ``lost``: the machine went away, which is no
-    fault of the task."""
+    """``busy``: another process works on the run. ``lost``: the machine was lost, which is not the
+    task's fault."""
     reason: str = ""
     trace: str = ""
-    """Where it went wrong, if that is a surprise."""
+    """The traceback of an unexpected error."""
 
     def __post_init__(self) -> None:
-        # A message of whatever library failed becomes one line of bounded length.
+        # The message of any library becomes one line of limited length.
         line = "".join(c if c.isprintable() else "?" for c in " ".join(self.reason.split()))
         object.__setattr__(self, "reason", line[:LONGEST_REASON])
 
 
 def one_thread() -> None:
-    """Let this process compute with one thread: the runs share the cores as processes."""
+    """Limit torch to one thread: the cores are shared by processes."""
     torch.set_num_threads(1)
 
 
 def build_demonstrations(config: RunConfig, out: Path) -> Result:
-    """Collect the demonstrations of a cell, if they are not there."""
+    """Collect the demonstrations of a run, if they do not exist."""
     return _guarded(lambda: demonstration_file(config, out, progress=False))
 
 
 def build_base(config: RunConfig, out: Path) -> Result:
-    """Train the base policy of a cell, if it is not there."""
+    """Train the base policy of a run, if it does not exist."""
     return _guarded(lambda: prepare_base(config, out, progress=False))
 
 
 def play(config: RunConfig, out: Path, patience: float) -> Result:
-    """Run a cell, or continue it.
+    """Execute a run, or continue it.
 
     Args:
         config: of the run.
         out: folder of the runs.
-        patience: seconds to wait for what another machine has done to show here: a base policy
-            that it has built, or that it is gone and holds the run no more.
+        patience: seconds to wait until the files of another machine show here: a base policy that
+            it has trained, or that it no longer holds the run.
     """
     folder = out / run_id(config, {})
     deadline = time.monotonic() + patience
@@ -94,6 +94,6 @@ def _guarded(action: Callable[[], object]) -> Result:
     except Exception as error:
         return Result("failed", f"{type(error).__name__}: {error}", traceback.format_exc())
     finally:
-        # A run that failed leaves simulations behind, of which one process holds so many.
+        # A run that failed leaves simulations behind, and a process can hold only a few.
         gc.collect()
     return Result("done")

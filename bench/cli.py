@@ -1,0 +1,429 @@
+"""The verbs that work with the simulator; ``symsteer.cli`` calls them.
+
+Each function is one verb: its signature and docstring are its options and help. Heavy modules are
+imported inside the functions, so that help, ``list`` and ``doctor`` do not wait for them.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from symsteer.terminal import complain, printable
+
+if TYPE_CHECKING:
+    from symsteer.registry import Registry
+
+
+def run(arguments: list[str]) -> int:
+    """Steer a base policy with one agent on one task; parses its own arguments.
+
+    Its options depend on the agent and the policy that they name.
+    """
+    from symsteer.bench.runs.arguments import parse_run
+    from symsteer.bench.runs.run import execute
+
+    config, options = parse_run(arguments)
+    folder = execute(
+        config,
+        options.out,
+        options.demos,
+        options.base_policy,
+        progress=not options.quiet,
+        workers=options.workers,
+    )
+    _print_places(folder)
+    return 0
+
+
+def resume(folder: Path, /, workers: int = 1, quiet: bool = False) -> int:
+    """Continue a run that was stopped, from its last checkpoint.
+
+    On the CPU the record is that of a run that was never stopped, except for times.
+
+    Args:
+        folder: The run's folder (it holds config.json).
+        workers: Processes that share the simulation; they change nothing in the record but times.
+        quiet: No progress bars.
+    """
+    from symsteer.bench.runs.run import resume
+
+    _print_places(resume(folder, progress=not quiet, workers=workers))
+    return 0
+
+
+def evaluate(
+    folder: Path,
+    /,
+    variant: str | None = None,
+    episodes: int | None = None,
+    workers: int = 1,
+    json: bool = False,
+) -> int:
+    """Play held-out episodes with the last checkpoint of a run, in its own variant or another.
+
+    With the run's own variant and number of episodes, it compares them with the record.
+
+    Args:
+        folder: The run's folder; nothing in it changes.
+        variant: How the symmetry is broken, e.g. action_gain:0.5, or none; default: as in the run.
+        episodes: Number of held-out episodes; default: as many as the record's final ones.
+        workers: Processes that share the simulation.
+        json: Print only JSON, with every episode and diagnostic.
+    """
+    from json import dumps
+
+    from scipy.stats import binomtest
+
+    from symsteer.bench.runs.run import evaluate
+
+    found = evaluate(folder, variant, episodes, workers)
+    if json:
+        print(dumps(found.to_json()))
+        return 0
+    columns = found.evaluation.episodes
+    count, successes = len(columns.seed), sum(columns.success_once)
+    sure = binomtest(successes, count).proportion_ci(method="wilson")
+    print(f"run           {found.run_id}, checkpoint at {found.evaluation.env_steps} steps")
+    print(f"variant       {found.variant}")
+    print(
+        f"success_once  {successes / count:.2f} [{sure.low:.2f}, {sure.high:.2f}] "
+        f"({successes} of {count} held-out episodes; 95 % Wilson interval)"
+    )
+    print(f"at the end    {sum(columns.success_at_end) / count:.2f}")
+    print(f"mean length   {sum(columns.episode_len) / count:.1f} steps")
+    if found.recorded is not None:
+        same = "the same episodes as in" if found.recorded else "NOT the episodes of"
+        print(f"record        {same} the final evaluation")
+    return 0 if found.recorded is not False else 1
+
+
+def sweep(
+    suite: Annotated[str, tyro.conf.arg(metavar="SUITE")],
+    /,
+    out: Path = Path("runs"),
+    workers: int = 0,
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> int:
+    """Run all runs of a suite; the same command continues a sweep that was stopped.
+
+    Finished runs are skipped, unfinished runs continue. A run that fails is tried once more, and
+    listed at the end if it fails again.
+
+    Args:
+        suite: Name of a suite (see `symsteer list`) or path of a .toml file.
+        out: Folder of the runs; a sweep on a cluster needs one that all its machines share.
+        workers: Number of runs at the same time; 0: one per core, or as many as fit on the cluster.
+        ray: Address of a Ray cluster to run on: auto, or host:port of its head.
+        dry_run: Only show which runs are left and how long they may take.
+    """
+    from symsteer.bench.sweep.command import preview, run_plan
+    from symsteer.bench.sweep.plan import make_plan, manifest_path
+    from symsteer.bench.sweep.suite import load_suite
+
+    plan = make_plan(load_suite(suite), out, elsewhere=ray is not None)
+    if dry_run:
+        print(preview(plan, workers, ray))
+        return 0
+    outcomes = run_plan(plan, workers, ray)
+    failed = [outcome for outcome in outcomes if outcome.status == "failed"]
+    for outcome in failed:
+        print(f"failed: {outcome.run.label}: {outcome.reason}", file=sys.stderr)
+    if any(outcome.trace for outcome in failed):
+        log = manifest_path(out, plan.name).with_suffix(".log")
+        print(f"tracebacks: {log}", file=sys.stderr)
+    elsewhere = sum(outcome.status == "elsewhere" for outcome in outcomes)
+    if elsewhere:
+        print(
+            f"another process works on {elsewhere} of the runs; `symsteer status {out}` shows "
+            "when they are finished",
+            file=sys.stderr,
+        )
+    return 1 if failed or elsewhere else 0
+
+
+def status(
+    folder: Annotated[Path, tyro.conf.arg(metavar="[FOLDER]")] = Path("runs"),
+    /,
+    suite: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
+) -> int:
+    """Show how far the sweeps and runs below a folder are: states, failures, time left.
+
+    Args:
+        folder: Folder of runs, at any depth, or the folder of one run.
+        suite: Only the sweeps of this suite.
+    """
+    from symsteer.bench.sweep.status import read_status, to_text
+
+    overview = read_status(folder, suite)
+    if overview.found or not overview.damage:
+        print(printable(to_text(overview.found, folder)))
+    for error in overview.damage:
+        complain(error, f"error: {error}", 2)
+    return 2 if overview.damage else 0
+
+
+def list_names() -> int:
+    """Name the tasks, embodiments, variants, agents, policies and suites."""
+    from symsteer.agents import AGENTS
+    from symsteer.bench.sweep.grid import read_suite, suite_names
+    from symsteer.bench.tasks import EMBODIMENTS, TASKS
+    from symsteer.bench.variants import VARIANTS
+    from symsteer.policies import POLICIES
+
+    _print_names("tasks (--task)", _summaries(TASKS))
+    _print_names("embodiments (--embodiment)", EMBODIMENTS.items())
+    _print_names(
+        "variants (--variant NAME:STRENGTH, strength in [0, 1]; several joined by +; or none)",
+        _summaries(VARIANTS),
+    )
+    _print_names("agents (--agent)", _summaries(AGENTS))
+    _print_names("policies (--policy.name)", _summaries(POLICIES))
+    suites = [read_suite(name) for name in suite_names()]
+    _print_names(
+        "suites (symsteer sweep SUITE)",
+        ((suite.name, f"{suite.description} ({len(suite.runs)} runs)") for suite in suites),
+    )
+    return 0
+
+
+def demos(
+    path: Path,
+    /,
+    task: str = "PickCube-v1",
+    embodiment: str = "floating",
+    count: int = 50,
+    mode: Literal["clean", "diverse"] = "diverse",
+    seed: int = 0,
+) -> int:
+    """Write demonstrations of the scripted expert as a ManiSkill trajectory (.h5 and .json).
+
+    Args:
+        path: The .h5 file to write.
+        task: Task; `symsteer list` names them.
+        embodiment: floating or panda.
+        count: Number of successful demonstrations.
+        mode: clean, or diverse (correlated noise and offsets: what steering needs).
+        seed: Seed of the collection.
+    """
+    from tqdm import tqdm
+
+    from symsteer.bench.demos import collect, load
+
+    with tqdm(total=count, desc="demonstrations", disable=None) as bar:
+
+        def advance(done: int, total: int) -> None:
+            bar.update(done - bar.n)
+
+        collect(task, embodiment, count, mode, seed, path, progress=advance)
+    steps = load(path, task, embodiment).meta["steps"]
+    print(f"wrote {count} demonstrations, {steps} steps, to {path}")
+    return 0
+
+
+def base(
+    task: str = "PickCube-v1",
+    embodiment: str = "floating",
+    mode: Literal["clean", "diverse"] = "diverse",
+    policies: tuple[str, ...] = ("edp", "plain", "plain-augmented"),
+    demonstrations: tuple[int, ...] = (5, 10, 20, 50),
+    seeds: int = 3,
+    episodes: int = 200,
+    workers: int = 0,
+    out: Path = Path("runs"),
+) -> int:
+    """Train base policies from few demonstrations and compare their success.
+
+    Args:
+        task: Task; `symsteer list` names them.
+        embodiment: floating or panda.
+        mode: Kind of demonstrations.
+        policies: Policies; `symsteer list` names them.
+        demonstrations: Numbers of demonstrations.
+        seeds: Seeds per policy and number of demonstrations; each seed has its own demonstrations.
+        episodes: Held-out episodes per policy.
+        workers: Number of policies trained at the same time; 0: one per core.
+        out: Folder for demonstrations and the table's data.
+    """
+    from symsteer.bench.runs.base_study import study, table, write_study
+    from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+    from symsteer.bench.runs.run import check
+    from symsteer.policies import POLICIES
+
+    config = RunConfig(
+        task=task, embodiment=embodiment, demonstrations=DemonstrationConfig(mode=mode)
+    )
+    check(config)
+    for name in policies:
+        POLICIES.get(name)
+    workers = workers or os.cpu_count() or 1
+    rows = study(config, out, policies, demonstrations, seeds, episodes, workers)
+    path = out / "base" / f"study-{task}-{embodiment}-{mode}.json"
+    write_study(path, config, rows)
+    print(table(rows))
+    print(f"wrote {path}")
+    return 0
+
+
+def audit(
+    task: tuple[str, ...] = ("PickCube-v1",),
+    embodiment: tuple[str, ...] = ("floating",),
+    variant: tuple[str, ...] = ("none",),
+    strength: tuple[float, ...] = (),
+    group: str = "C8",
+    states: Literal["both", "expert", "policy"] = "both",
+    count: int = 32,
+    chunk: int = 4,
+    resets: int = 256,
+    seed: int = 0,
+    sim: Literal["cpu", "cuda"] = "cpu",
+    base_policy: Path | None = None,
+    runs: Path = Path("runs"),
+    out: Path | None = None,
+    resume: bool = False,
+    json: bool = False,
+) -> int:
+    """Measure how broken the symmetry of a task is, in simulation (docs/audit.md).
+
+    Several tasks, embodiments, variants or strengths give a table with one cell for each
+    combination.
+
+    Args:
+        task: Tasks, or all; `symsteer list` names them.
+        embodiment: floating, panda, or all.
+        variant: none, names, name:strength, several of these joined with +, or all.
+        strength: Strengths of the variants that are named without one.
+        group: Symmetry group, e.g. C8, D4 (with reflections).
+        states: Whose states: those of the scripted expert, of the base policy with random noise,
+            or both.
+        count: Number of states of each, every one from a different episode.
+        chunk: Control steps of an action chunk.
+        resets: Number of initial states that are compared with as many rotated ones.
+        seed: Seed of states, draws and intervals.
+        sim: Where physics runs.
+        base_policy: Saved base policy; default: the one that `symsteer run` would train.
+        runs: Folder of the runs; demonstrations and base policies are kept in RUNS/base.
+        out: Folder for audit.json, map.csv and map.png; of several cells, each has its own folder
+            there, beside table.csv, table.md and summary.json.
+        resume: Do not measure again what OUT holds with the same settings.
+        json: Print only JSON.
+    """
+    from json import dumps
+
+    from symsteer.bench.audit.cell import Settings
+    from symsteer.bench.audit.report import summary, text, to_markdown, write_table
+    from symsteer.bench.audit.study import grid, run_cells
+
+    template = Settings(
+        group=group, states=states, count=count, chunk=chunk, resets=resets, seed=seed, sim=sim
+    )
+    cells = grid(task, embodiment, variant, strength, template)
+    several = len(cells) > 1
+
+    def done(cell: Any) -> None:
+        if several:
+            print(f"{cell.settings.name}: {cell.seconds:.1f} s", file=sys.stderr, flush=True)
+
+    found = run_cells(cells, runs, base_policy, out, resume, progress=not json, done=done)
+    if several and out is not None:
+        write_table(found, out)
+    if json:
+        plain = [cell.to_json() for cell in found]
+        print(dumps(plain if several else plain[0]))
+    elif several:
+        print(to_markdown([summary(cell) for cell in found]), end="")
+    else:
+        print(text(found[0]))
+    if out is not None and not json:
+        print(f"wrote {out}")
+    return 0
+
+
+def throughput(
+    task: str = "PickCube-v1",
+    num_envs: tuple[int, ...] = (1, 4, 16, 64, 256),
+    repeats: int = 5,
+    seconds: float = 0.7,
+    cores: int = 0,
+    memory: bool = False,
+    json: bool = False,
+) -> int:
+    """Compare the speed of simulation with stock ManiSkill and with PhysX alone, in minutes.
+
+    Args:
+        task: Task; `symsteer list` names them. ManiSkill's stock class and controller are used.
+        num_envs: Numbers of environments.
+        repeats: Measurements of each backend.
+        seconds: Minimum length of a measurement.
+        cores: Processes in the measurement on all cores; 0: one per core.
+        memory: Only measure how memory grows over 10,000 steps with resets.
+        json: Print only JSON.
+    """
+    from symsteer.bench import throughput as speed
+
+    def report(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    if memory:
+        growth = speed.memory_growth(task, report=report)
+        print(
+            speed.dump(growth)
+            if json
+            else f"memory grew by {growth['growth_kib']:.0f} KiB from step {growth['steps'][1]} to "
+            f"{growth['steps'][-1]} of {growth['num_envs']} environments"
+        )
+        return 0
+    data = speed.measure(task, num_envs, repeats, seconds, cores or None, report)
+    print(speed.dump(data) if json else speed.table(data))
+    return 0
+
+
+def doctor(quiet: bool = False) -> int:
+    """Show what this machine can do, and what to install for more.
+
+    Args:
+        quiet: Show only what is required and missing.
+    """
+    from symsteer.bench.sim.capabilities import probe
+
+    checks = probe()
+    for check in checks:
+        if check.ok and quiet:
+            continue
+        if not check.ok and quiet and not check.required:
+            continue
+        mark = "ok     " if check.ok else "MISSING" if check.required else "absent "
+        print(f"{mark} {check.name:18s} {check.detail}")
+        if not check.ok and check.cure:
+            print(f"{'':26s} -> {check.cure}")
+    return 0 if all(check.ok or not check.required for check in checks) else 1
+
+
+def _print_places(folder: Path) -> None:
+    """Print where the results of a finished run are."""
+    out = folder.parent
+    print(f"record:      {folder / 'record.json'}")
+    print(f"TensorBoard: tensorboard --logdir {out}")
+    print(f"leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
+
+
+def _summaries(registry: Registry[Any]) -> list[tuple[str, str]]:
+    return [(name, registry.summary(name)) for name in registry.names()]
+
+
+def _print_names(title: str, names: Iterable[tuple[str, str]]) -> None:
+    """Print names with their summaries, folded to the width of the terminal."""
+    print(title)
+    columns = max(60, shutil.get_terminal_size().columns)
+    for name, text in names:
+        head = f"  {name:18s} "
+        print(textwrap.fill(text, columns, initial_indent=head, subsequent_indent=" " * len(head)))
+    print()

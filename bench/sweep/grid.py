@@ -1,0 +1,158 @@
+"""Suites as plain data: TOML files with grids of runs. Light to import.
+
+``[grid]`` lists values of keys of a run's configuration, nested keys with a dot
+(``"demonstrations.count"``); the runs are the product of the lists, in the order written.
+``strength`` lists strengths for the variants that are named without one. Several grids are written
+``[[grid]]`` each. ``[run]`` sets what all runs share, nested as the configuration is. Options of
+agents and policies are described in ``symsteer.bench.sweep.suite``.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from symsteer.errors import UserError
+from symsteer.names import nearest, unknown
+
+SUITES = Path(__file__).parent.parent / "suites"
+
+LARGEST_GRID = 100_000
+
+NAMED = ("agent", "policy")
+"""Keys that hold a name (``agent = "base"``) or a table with ``name`` and options."""
+
+
+@dataclass(frozen=True)
+class SuiteData:
+    """A suite as its file describes it.
+
+    Attributes:
+        name: of the file, without its ending.
+        source: file name, to begin messages with.
+        description: what the suite is for.
+        grids: for each grid, the tables of its runs: nested plain data, shared settings included.
+    """
+
+    name: str
+    source: str
+    description: str
+    grids: tuple[tuple[dict[str, Any], ...], ...]
+
+    @property
+    def runs(self) -> list[dict[str, Any]]:
+        """The tables of all runs, each once."""
+        return list({repr(run): run for grid in self.grids for run in grid}.values())
+
+
+def suite_names() -> list[str]:
+    """The suites that come with SymSteer."""
+    return sorted(path.stem for path in SUITES.glob("*.toml"))
+
+
+def read_suite(name_or_path: str) -> SuiteData:
+    """Read a suite by name or from a TOML file.
+
+    Raises:
+        UserError: if there is no such suite, or the file is not a suite.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        path = SUITES / f"{name_or_path}.toml"
+    try:
+        data = tomllib.loads(path.read_text())
+    except FileNotFoundError as error:
+        close = nearest(name_or_path, suite_names())
+        hint = f"did you mean {close!r}? " if close else ""
+        raise UserError(
+            f"there is no suite {name_or_path!r}; {hint}use one of {', '.join(suite_names())} or "
+            "the path of a .toml file"
+        ) from error
+    except OSError as error:
+        raise UserError(
+            f"the suite {path} cannot be read: {error.strerror}; name another file"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(
+            f"the suite {path.name} cannot be read as TOML: {error}; correct it there"
+        ) from error
+    source = path.name
+    valid = ("description", "grid", "run")
+    for key in data:
+        if key not in valid:
+            raise unknown("key", key, valid, source)
+    shared, description = data.get("run", {}), data.get("description", "")
+    if not isinstance(shared, dict):
+        raise UserError(f"{source}: run must be a table, [run]")
+    if not isinstance(description, str):
+        raise UserError(f"{source}: description must be a text in quotes")
+    shared = _with_tables(shared, source)
+    grids = data.get("grid", {})
+    runs = tuple(
+        tuple(_merge(shared, cell, source) for cell in _cells(grid, source))
+        for grid in (grids if isinstance(grids, list) else [grids])
+    )
+    return SuiteData(path.stem, source, description, runs)
+
+
+def _cells(grid: Any, source: str) -> Iterator[dict[str, Any]]:
+    """Every combination of a grid's values, strengths joined to their variants."""
+    if not isinstance(grid, dict):
+        raise UserError(f"{source}: grid must be a table, [grid], or several, each [[grid]]")
+    for key, values in grid.items():
+        if not isinstance(values, list) or not values:
+            raise UserError(f"{source}: grid.{key} must be a list with at least one value")
+    if (count := math.prod(map(len, grid.values()))) > LARGEST_GRID:
+        raise UserError(
+            f"{source}: a grid has {count} runs; it must not have more than {LARGEST_GRID}, so "
+            "shorten its lists"
+        )
+    for chosen in itertools.product(*grid.values()):
+        cell = dict(zip(grid, chosen, strict=True))
+        if "strength" in cell:
+            cell["variant"] = _with_strength(cell.get("variant"), cell.pop("strength"), source)
+        yield cell
+
+
+def _with_strength(variant: Any, strength: Any, source: str) -> str:
+    if not isinstance(variant, str):
+        raise UserError(f"{source}: grid.strength needs grid.variant, a list of names")
+    if isinstance(strength, bool) or not isinstance(strength, int | float):
+        raise UserError(f"{source}: grid.strength must list numbers in [0, 1], not {strength!r}")
+    if variant == "none" or ":" in variant:
+        return variant
+    if strength == 0:
+        return "none"
+    return "+".join(f"{name}:{strength:g}" for name in variant.split("+"))
+
+
+def _with_tables(shared: dict[str, Any], source: str) -> dict[str, Any]:
+    """The shared settings, with ``agent = NAME`` written as a table."""
+    shared = dict(shared)
+    for key in NAMED:
+        value = shared.setdefault(key, {})
+        if isinstance(value, str):
+            shared[key] = {"name": value}
+        elif not isinstance(value, dict):
+            raise UserError(f"{source}: run.{key} must be a name or a table, not {value!r}")
+    return shared
+
+
+def _merge(shared: dict[str, Any], cell: dict[str, Any], source: str) -> dict[str, Any]:
+    """The shared settings with a cell's values in their places."""
+    merged = copy.deepcopy(shared)
+    for key, value in cell.items():
+        place = merged
+        *path, last = [key, "name"] if key in NAMED else key.split(".")
+        for part in path:
+            place = place.setdefault(part, {})
+            if not isinstance(place, dict):
+                raise UserError(f"{source}: run.{part} must be a table, so that {key} has a place")
+        place[last] = value
+    return merged

@@ -1,0 +1,30 @@
+"""What is printed: plain lines without control characters."""
+
+from __future__ import annotations
+
+import sys
+
+LONGEST_LINE = 900
+"""Characters of an error message; the middle of a longer one is left out."""
+
+
+def printable(text: str) -> str:
+    """Text whose control characters, line breaks excepted, are replaced by ``?``.
+
+    Files and arguments can bring such characters into a message.
+    """
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
+
+
+def complain(error: BaseException, text: str, code: int) -> int:
+    """Print one line on stderr, then the notes of the error, each on its own line.
+
+    Returns:
+        ``code``, the exit code.
+    """
+    line = printable(" ".join(text.split()))
+    if len(line) > LONGEST_LINE:
+        half = LONGEST_LINE // 2
+        line = f"{line[:half]} ... {line[-half:]}"
+    print(line, *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
+    return code
