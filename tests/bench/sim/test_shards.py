@@ -1,4 +1,4 @@
-"""Environments in several processes against the same in one, and what becomes of the processes."""
+"""Environments in several processes equal those in one process; how the processes end."""
 
 from __future__ import annotations
 
@@ -252,10 +252,10 @@ def test_stock_tasks_do_not_repeat_themselves():
     env.close()
 
 
-def test_what_lives_elsewhere(pair):
+def test_attributes_that_only_workers_have(pair):
     two = pair[1]
     for name in ("agent", "scene", "cube", "step_nothing"):
-        with pytest.raises(UserError, match=rf"env\.{name} lives in .* workers=1"):
+        with pytest.raises(UserError, match=rf"env\.{name} exists in .* workers=1"):
             getattr(two, name)
         assert not hasattr(two, name)
 
@@ -326,7 +326,7 @@ def test_local_classes_are_refused():
     class Mine(PickCubeEnv):
         pass
 
-    with pytest.raises(UserError, match="by its name"):
+    with pytest.raises(UserError, match="import the task class"):
         create(Mine, 2, workers=2)
 
 
