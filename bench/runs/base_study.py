@@ -18,8 +18,9 @@ from symsteer.bench.demos import load
 from symsteer.bench.runs.base_policy import demonstration_file
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
 from symsteer.bench.runs.folder import write_json
-from symsteer.bench.steering.evaluation import held_out_seeds, rollout
+from symsteer.bench.steering.evaluation import rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES

@@ -75,12 +75,13 @@ class Evaluator:
         agent, seeds = self.agent, held_out_seeds(count)
         state = agent.generator.get_state()
         try:
+            on_policy: Rollout | None = None
+            log_prob: torch.Tensor | None = None
             if isinstance(agent, HasCritic):
                 agent.generator.manual_seed(DIAGNOSTIC_SEED + self.config.seed)
                 greedy, on_policy, log_prob = self._with_on_policy(agent, seeds)
             else:
                 greedy = rollout(self.env, lambda obs, rows: agent.act(obs, True), seeds)
-                on_policy = log_prob = None
             generator = torch.Generator(agent.device).manual_seed(self.config.seed)
             played = Played(greedy, on_policy, log_prob, self.feasible, generator)
             self.played = greedy

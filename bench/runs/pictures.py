@@ -17,9 +17,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from symsteer.bench.runs.config import RunConfig
 from symsteer.agents.agent import Agent
 from symsteer.agents.episodes import Rollout
+from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA, SIZE

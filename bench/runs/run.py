@@ -188,7 +188,7 @@ def evaluate(
         **{key: run.state[key] for key in ("env_steps", "decisions", "updates", "final")},
         wall_clock=time.perf_counter() - begin,
         episodes=Episodes.model_validate(columns),
-        diagnostics=diagnostics,
+        diagnostics=dict(diagnostics),
     )
     final = read_record(folder / RECORD).final if is_finished(folder) else None
     comparable = final and variant == own and len(final.episodes.seed) == count

@@ -78,8 +78,13 @@ class Trained:
             raise UserError(
                 "this policy file does not name its task; make the environments with symsteer.make"
             )
-        world = {**self.world, **({} if variant is None else {"variant": variant})}
-        return make(world.pop("task"), num_envs=num_envs, **world, **options)
+        return make(
+            self.world["task"],
+            num_envs=num_envs,
+            embodiment=self.world["embodiment"],
+            variant=self.world["variant"] if variant is None else variant,
+            **options,
+        )
 
 
 def load(path: str | Path, device: str = "cpu") -> Trained:

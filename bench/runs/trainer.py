@@ -62,7 +62,9 @@ def feasible_return(config: RunConfig, agent: Agent, base: ChunkPolicy) -> tuple
     The discount is the agent's; 0 for an agent without one.
     """
     return task_class(config.task).feasible_return(
-        getattr(agent.options, "gamma", 0.0), base.execute, step_cost=highest_cost(build(config.variants))
+        getattr(agent.options, "gamma", 0.0),
+        base.execute,
+        step_cost=highest_cost(build(config.variants)),
     )
 
 
@@ -197,7 +199,7 @@ class Trainer:
             wall_clock=time.perf_counter() - self.start,
             final=final,
             episodes=Episodes.model_validate(columns),
-            diagnostics=diagnostics,
+            diagnostics=dict(diagnostics),
         )
         for observer in self.observers:
             observer.evaluated(self, evaluation)

@@ -10,11 +10,10 @@ import torch
 
 from symsteer.agents.episodes import DECISION_FIELDS, Rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
-from symsteer.errors import UserError
 from symsteer.bench.steering.seeds import steerability_seeds
+from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.steerability import DESIRED_ACTION_STD, action_spread
-
 
 Act = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """``(obs [N, obs_dim], rows [N]) -> noise [N, Tp, Da]``; ``rows`` index the list of seeds."""
