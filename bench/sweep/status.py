@@ -1,50 +1,51 @@
-"""``symsteer status``: how far the sweeps of a folder are."""
+"""``symsteer status``: how far the sweeps and runs below a folder are."""
 
 from __future__ import annotations
 
-import difflib
+import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from symsteer.bench.runs.folder import CONFIG, read_config
-from symsteer.bench.sweep.estimate import Estimate, duration
-from symsteer.bench.sweep.plan import BASIC, Manifest, PlannedRun, manifest_path, read_manifest
+from symsteer.bench.sweep.estimate import Estimate, duration, steps_done
+from symsteer.bench.sweep.plan import BASIC, PlannedRun, manifest_path, read_manifest
 from symsteer.bench.sweep.survey import Sighting, look
 from symsteer.errors import UserError
+from symsteer.names import unknown
 
 STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 
 @dataclass(frozen=True)
 class Status:
-    """The runs of a sweep, or those of a folder that belong to none."""
+    """The state of a sweep, or of runs that belong to none."""
 
     title: str
     runs: dict[PlannedRun, Sighting]
     reasons: dict[str, str] = field(default_factory=dict)
     """Why runs failed, by run id."""
     workers: int = 0
-    """Runs that the last sweep had side by side; 0 if that is not known."""
+    """Number of runs at the same time in the last sweep; 0 if unknown."""
 
     def state(self, run: PlannedRun) -> str:
         """One of :data:`STATES`."""
         state = self.runs[run].state
-        # A run that was killed could not write it down; the sweep that saw it did.
+        # A run whose process was killed could not write that it failed; its sweep did.
         if state in ("interrupted", "missing") and run.run_id in self.reasons:
             return "failed"
         return state
 
-    def runs(self, state: str) -> list[PlannedRun]:
+    def in_state(self, state: str) -> list[PlannedRun]:
         """The runs in a state."""
         return [run for run in self.runs if self.state(run) == state]
 
     def seconds_left(self) -> float | None:
-        """Until all is finished, by as many workers as run now; None where nothing is known."""
+        """Seconds until all runs are finished, at the present number of workers; None if unknown."""
         estimate = Estimate()
-        for run in self.runs("finished"):
+        for run in self.in_state("finished"):
             estimate.add(run, self.runs[run].seconds)
-        running = self.runs("running")
+        running = self.in_state("running")
         todo = [run for run in self.runs if self.state(run) not in ("finished", "running")]
         progress = {run: self.runs[run].progress for run in running}
         return estimate.left(todo, progress, len(running) or self.workers or 1)
@@ -52,7 +53,7 @@ class Status:
 
 @dataclass(frozen=True)
 class Overview:
-    """What a folder holds: its sweeps and runs, and what of it cannot be read."""
+    """The sweeps and runs below a folder, and the files that cannot be read."""
 
     found: list[Status]
     damage: list[UserError] = field(default_factory=list)
@@ -60,41 +61,41 @@ class Overview:
 
 
 def read_status(folder: Path, suite: str | None = None) -> Overview:
-    """The sweeps of a folder, and the runs that belong to none.
+    """The sweeps below a folder, at any depth, and the runs that belong to none.
 
     Args:
-        folder: of the runs.
-        suite: look at the sweep of this suite only.
+        folder: of runs or of folders of runs, or of one run.
+        suite: read only the sweeps of this suite.
 
     Raises:
-        UserError: if there is no such folder or sweep, or the one that was named is damaged.
+        UserError: if there is no such folder or sweep, or a sweep that was named is damaged.
     """
     if not folder.is_dir():
         raise UserError(f"there is no folder {folder}; name the --out of a sweep or a run")
-    manifests = {
-        path.stem: path for path in sorted(manifest_path(folder, "*").parent.glob("*.json"))
-    }
-    if suite is not None:
-        if suite not in manifests:
-            close = difflib.get_close_matches(suite, manifests, n=1) or list(manifests)
-            hint = f"there: {', '.join(close)}" if close else "no sweep was begun there"
-            raise UserError(f"{folder} holds no sweep of a suite {suite!r}; {hint}")
-        return Overview([_of_sweep(folder, read_manifest(manifests[suite]))])
     if (folder / CONFIG).is_file():
         return Overview([Status("run", _unlisted(folder))])
+    runs, manifests = _search(folder)
+    if suite is not None:
+        named = [path for path in manifests if path.stem == suite]
+        if not named:
+            names = dict.fromkeys(path.stem for path in manifests)
+            if not names:
+                raise UserError(f"there is no sweep in {folder}; name the --out of a sweep")
+            raise unknown("sweep of a suite", suite, names, str(folder))
+        return Overview([_of_sweep(folder, path) for path in named])
     found: list[Status] = []
     damage: list[UserError] = []
-    for path in manifests.values():
+    for path in manifests:
         try:
-            found.append(_of_sweep(folder, read_manifest(path)))
+            found.append(_of_sweep(folder, path))
         except UserError as error:
             damage.append(error)
     listed = {run.run_id for status in found for run in status.runs}
     others: dict[PlannedRun, Sighting] = {}
-    for run in [path.parent for path in sorted(folder.glob(f"*/{CONFIG}"))]:
-        if run.name not in listed:
+    for path in runs:
+        if path.name not in listed:
             try:
-                others |= _unlisted(run)
+                others |= _unlisted(path)
             except UserError as error:
                 damage.append(error)
     if others:
@@ -102,8 +103,21 @@ def read_status(folder: Path, suite: str | None = None) -> Overview:
     return Overview(found, damage)
 
 
+def _search(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Folders of runs and manifests of sweeps below a folder; hidden folders are left out."""
+    runs, manifests = [], []
+    for parent, names, files in os.walk(folder):
+        names[:] = sorted(name for name in names if not name.startswith("."))
+        path = Path(parent)
+        if CONFIG in files:
+            runs.append(path)
+            names.clear()
+        manifests += sorted(manifest_path(path, "*").parent.glob("*.json"))
+    return runs, manifests
+
+
 def _unlisted(folder: Path) -> dict[PlannedRun, Sighting]:
-    """A run that no sweep lists, if it is one of this program."""
+    """A run that no sweep lists; nothing if the configuration is not one of SymSteer."""
     config = read_config(folder)
     if all(isinstance(config.get(key), str | int) for key in (*BASIC, "env_steps")):
         return {PlannedRun.of(config, folder.resolve().name): look(folder)}
@@ -111,18 +125,18 @@ def _unlisted(folder: Path) -> dict[PlannedRun, Sighting]:
 
 
 def to_text(found: list[Status], folder: Path) -> str:
-    """The :attr:`Overview.found` of a folder, for reading."""
+    """:attr:`Overview.found` as text."""
     if not found:
-        return (
-            f"there are no runs in {folder} yet; `symsteer sweep SUITE --out {folder}` begins some"
-        )
+        return f"there are no runs in {folder} yet; start some: symsteer sweep SUITE --out {folder}"
     return "\n\n".join(_text(status) for status in found)
 
 
-def _of_sweep(folder: Path, manifest: Manifest) -> Status:
+def _of_sweep(folder: Path, path: Path) -> Status:
+    """The sweep of a manifest; its title says where it is, if that is not ``folder`` itself."""
+    manifest, out = read_manifest(path), path.parent.parent
     return Status(
-        manifest.title,
-        {run: look(folder / run.run_id) for run in manifest.runs},
+        manifest.title if out == folder else f"{out.relative_to(folder)}: {manifest.title}",
+        {run: look(out / run.run_id) for run in manifest.runs},
         manifest.failures,
         manifest.workers,
     )
@@ -133,36 +147,35 @@ def _text(status: Status) -> str:
     counts = Counter(status.state(run) for run in status.runs)
     lines += [f"  {state:12s}{counts[state]:6d}" for state in STATES]
     for state in ("running", "interrupted", "failed"):
-        if runs := status.runs(state):
+        if runs := status.in_state(state):
             lines.append(f"{state}:")
             lines += [f"  {run.label}: {_detail(status, run)}" for run in runs]
     if counts["finished"] < len(status.runs):
         left = status.seconds_left()
         workers = counts["running"] or status.workers or 1
         lines.append(
-            "time left: unknown, no such runs are finished yet"
+            "time left: unknown, no similar run is finished yet"
             if left is None
             else f"time left: about {duration(left)} with {workers} "
-            f"worker{'s' if workers > 1 else ''}"
-            + ("" if counts["running"] else ", once they run: none does now")
+            f"worker{'s' if workers > 1 else ''}" + ("" if counts["running"] else "; none runs now")
         )
     return "\n".join(lines)
 
 
 def _detail(status: Status, run: PlannedRun) -> str:
-    """What there is to say of a run that is not finished."""
+    """Details of a run that is not finished."""
     seen = status.runs[run]
     state = status.state(run)
     if state == "failed":
         own = seen.record.failure if seen.record else None
-        return status.reasons.get(run.run_id) or own or "it does not say why"
+        return status.reasons.get(run.run_id) or own or "no reason is recorded"
     if state == "interrupted":
-        done = seen.record.budget.env_steps if seen.record else 0
+        done = min(seen.record.budget.env_steps, run.env_steps) if seen.record else 0
         return f"after {done:,} of {run.env_steps:,} steps; it continues from its last checkpoint"
     progress = seen.progress
     if not progress:
         return "starting"
-    words = [f"{progress['env_steps']:,} of {progress['budget']:,} steps"]
+    words = [f"{steps_done(progress):,} of {progress['budget']:,} steps"]
     if progress.get("success") is not None:
         words.append(f"success {progress['success']:.0%}")
     if progress.get("steps_per_second"):

@@ -1,10 +1,10 @@
 """A suite: the runs that the grids of a TOML file describe (``symsteer.bench.sweep.grid``).
 
-``[run.agent]`` sets options of the agents, and the name of the agent if no grid lists agents. An
-option applies to those agents of a grid that have it. ``[run.agent.NAME]`` sets options of one
-agent only. ``preset = "NAME"`` replaces the defaults of all options by those of a preset. In a grid
-the same keys are ``"agent.OPTION"``, ``"agent.NAME.OPTION"`` and ``"agent.preset"``. ``[run.policy]``
-works in the same way, without presets.
+``[run.agent]`` sets options of the agents, and the agent's name if no grid lists agents. An option
+applies to those agents of a grid that have it. ``[run.agent.NAME]`` sets options of one agent only.
+``preset = "NAME"`` replaces the defaults of all options by those of a preset. In a grid, the same
+keys are ``"agent.OPTION"``, ``"agent.NAME.OPTION"`` and ``"agent.preset"``. ``[run.policy]`` works
+in the same way, without presets.
 """
 
 from __future__ import annotations
