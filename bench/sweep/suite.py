@@ -9,13 +9,16 @@ in the same way, without presets.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
 from symsteer.agents import AGENTS
+from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.sweep.grid import SuiteData, read_suite
 from symsteer.errors import UserError
+from symsteer.names import unknown
 from symsteer.policies import POLICIES
 from symsteer.registry import Registry
 
@@ -71,14 +74,52 @@ class _Options:
 
     def __init__(self, kind: str, registry: Registry[Any], default: str, data: SuiteData):
         self.kind, self.default, self.source = kind, default, data.source
-        self.classes: dict[str, Any] = {}
-        for grid in data.grids:
-            for table in grid:
-                name = self._name(table[kind])
-                if name not in self.classes:
-                    self.classes[name] = registry.get(name).Options
-        everywhere = list(self.classes)
-        for grid in data.grids:
-            present = list(dict.fromkeys(self._name(table[kind]) for table in grid))
-            for table in {repr(table[kind]): table[kind] for table in grid}.values():
-                self._check(table, present, everywhere)
+        tables = {repr(run[kind]): run[kind] for run in data.runs}.values()
+        names = dict.fromkeys(self._name(table) for table in tables)
+        self.classes = {name: registry.get(name).Options for name in names}
+        for table in tables:
+            self._check(table)
+
+    def of(self, table: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+        """Name and options of one run; options that its agent does not have are left out."""
+        name = self._name(table)
+        valid = _fields(self.classes[name])
+        options: dict[str, Any] = {}
+        if self.kind == "agent" and "preset" in table:
+            options = preset_options(table["preset"], name, self.classes[name])
+        options |= {key: value for key, value in table.items() if key in valid}
+        return name, options | table.get(name, {})
+
+    def _name(self, table: dict[str, Any]) -> str:
+        name = table.get("name", self.default)
+        if not isinstance(name, str):
+            raise UserError(f"{self.source}: {self.kind} must be a text in quotes, not {name!r}")
+        return name
+
+    def _check(self, table: dict[str, Any]) -> None:
+        """Refuse options that no agent of the suite has, and tables of agents that it lacks."""
+        for key, value in table.items():
+            if key == "name":
+                continue
+            if key == "preset" and self.kind == "agent":
+                if not isinstance(value, str):
+                    raise UserError(
+                        f"{self.source}: agent.preset must be a text in quotes, not {value!r}"
+                    )
+            elif isinstance(value, dict):
+                if key not in self.classes:
+                    raise unknown(self.kind, key, self.classes, self.source)
+                for option in value:
+                    self._check_option(option, [key])
+            else:
+                self._check_option(key, list(self.classes))
+
+    def _check_option(self, option: str, names: list[str]) -> None:
+        valid = dict.fromkeys(key for name in names for key in _fields(self.classes[name]))
+        if option not in valid:
+            where = f"{self.source} ({self.kind} {', '.join(names)})"
+            raise unknown("option", option, valid, where)
+
+
+def _fields(options: type) -> list[str]:
+    return [field.name for field in dataclasses.fields(options)]
