@@ -9,8 +9,8 @@ from pathlib import Path
 import h5py
 import pytest
 import torch
-from symsteer.bench.cli import _threads, main
 
+from symsteer.bench.cli import _threads, main
 from symsteer.bench.demos import collect
 from symsteer.bench.tasks import task_class
 from symsteer.policies.files import save_policy
