@@ -110,7 +110,7 @@ def _visit_batch(
                 noise = torch.randn(
                     env.num_envs, policy.horizon, policy.act_layout.dim, generator=generator
                 )
-                device = next(policy.parameters()).device
+                device = policy.device
                 chunk = policy.decode(obs.to(device), noise.to(device)).to(env.device)
             action = chunk[:, step % policy.execute]
         obs, _, _, _, info = env.step(action)

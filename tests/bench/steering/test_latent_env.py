@@ -9,7 +9,7 @@ from symsteer.bench.steering.seeds import HELD_OUT_SEED, held_out_seeds
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
-from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy, PolicyOptions
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 
 TASK = "PickCube-v1"
@@ -22,15 +22,17 @@ def untrained_policy(execute: int = 4) -> ChunkPolicy:
     return EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
 
 
-class NoiseIsAction(torch.nn.Module):
+class NoiseIsAction(ChunkPolicy):
     """A decoder that plays its noise, so that a test decides every action."""
 
     def __init__(self, execute: int):
-        super().__init__()
         task = task_class(TASK)
-        self.obs_layout, self.act_layout = task.observation_layout, task.action_layout
-        self.horizon = self.execute = execute
-        self.nothing = torch.nn.Parameter(torch.zeros(1))
+        options = PolicyOptions(horizon=execute, execute=execute)
+        super().__init__(options, task.observation_layout, task.action_layout)
+
+    @classmethod
+    def fit(cls, *_):
+        raise NotImplementedError
 
     def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         return noise
