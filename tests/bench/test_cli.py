@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import pytest
 import torch
-from symsteer.bench.cli import _threads, main
+from symsteer.cli import _threads, main
 
 from symsteer.bench.demos import collect
 from symsteer.bench.tasks import task_class
@@ -180,7 +180,7 @@ def test_doctor_names_what_there_is(monkeypatch, capsys):
 
 def test_the_module_is_the_same_program():
     done = subprocess.run(
-        [sys.executable, "-m", "bench", "run", "--agent", "ppo"],
+        [sys.executable, "-m", "symsteer", "run", "--agent", "ppo"],
         capture_output=True,
         text=True,
         timeout=120,
@@ -195,7 +195,7 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     os.close(reading)
     with open(writing, "wb") as output:
         done = subprocess.run(
-            [sys.executable, "-m", "bench", "list"],
+            [sys.executable, "-m", "symsteer", "list"],
             stdout=output,
             stderr=subprocess.PIPE,
             text=True,

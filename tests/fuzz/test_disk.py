@@ -15,7 +15,7 @@ from unittest.mock import patch
 
 import pytest
 
-from symsteer.bench import cli
+from symsteer import cli
 from symsteer.bench.demos import load
 from symsteer.bench.runs.folder import load_checkpoint, state_of
 from symsteer.bench.runs.loop import Loop
