@@ -7,6 +7,7 @@ equivariant one; where the world breaks the symmetry, the data can pay for leavi
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,6 +16,30 @@ from torch import nn
 from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.agents.networks import Dense, dense, shrink_
 from symsteer.agents.replay import Batch
+from symsteer.agents.sac import SacOptions
+from symsteer.errors import UserError
+
+
+@dataclass(frozen=True)
+class ApproximateOptions(SacOptions):
+    """Options of the approximately equivariant agent."""
+
+    free_penalty: float = 0.1
+    """Weight of the squared free path, per network (w_b)."""
+    equivariant_penalty: float = 0.0
+    """Weight of the squared equivariant path (w_e, at most w_b)."""
+    free_init: float = 0.01
+    """Factor on the free path at initialisation."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.free_init >= 0:
+            raise UserError(f"agent option free_init must not be negative, not {self.free_init}")
+        if not 0 <= self.equivariant_penalty <= self.free_penalty:
+            raise UserError(
+                "agent options need 0 <= equivariant_penalty <= free_penalty, not "
+                f"{self.equivariant_penalty} and {self.free_penalty}"
+            )
 
 
 class ResidualPathway(nn.Module):
@@ -37,23 +62,26 @@ class ApproximateAgent(EquivariantAgent):
     """The equivariant agent with a penalised free path beside every layer."""
 
     name = "approximate"
+    Options = ApproximateOptions
+    options: ApproximateOptions
 
     def actor_layers(self) -> list[nn.Module]:
-        return [ResidualPathway(layer, self.config.free_init) for layer in super().actor_layers()]
+        return [ResidualPathway(layer, self.options.free_init) for layer in super().actor_layers()]
 
     def critic_layers(self) -> list[nn.Module]:
-        return [ResidualPathway(layer, self.config.free_init) for layer in super().critic_layers()]
+        return [ResidualPathway(layer, self.options.free_init) for layer in super().critic_layers()]
 
     def parameter_groups(self, network: nn.Module) -> list[dict[str, Any]]:
         # Adam adds weight_decay * W to the gradient: that of w |W|^2 for weight_decay = 2 w.
         free, equivariant = paths(network)
         return [
-            {"params": free, "weight_decay": 2 * self.config.free_penalty},
-            {"params": equivariant, "weight_decay": 2 * self.config.equivariant_penalty},
+            {"params": free, "weight_decay": 2 * self.options.free_penalty},
+            {"params": equivariant, "weight_decay": 2 * self.options.equivariant_penalty},
         ]
 
-    def update(self, batch: Batch) -> dict[str, torch.Tensor]:
-        scalars = super().update(batch)
+    def after_update(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """Norm of the free path over that of the equivariant one, by network."""
+        scalars = {}
         for name, network in (("actor", self.actor), ("critic", self.critic)):
             free, equivariant = (
                 torch.stack(torch._foreach_norm([p.detach() for p in path])).norm()

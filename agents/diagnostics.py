@@ -7,14 +7,140 @@ All values are in the environment's reward units, per decision. ``q`` arrays hol
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 
-from symsteer.agents.sac import SacAgent
+from symsteer.agents.episodes import Played
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Group
+from symsteer.policies.geometry import Group, equivariance_error
+
+if TYPE_CHECKING:
+    from symsteer.agents.sac import SacAgent
 
 Scalars = dict[str, float]
+
+SYMMETRY_STATES = 64
+"""States on which equivariance errors are measured."""
+
+
+def critic_diagnostics(agent: SacAgent, played: Played) -> Scalars:
+    """All diagnostics of a learner at one evaluation, by their names in the record.
+
+    docs/metrics.md defines each.
+    """
+    assert played.on_policy is not None
+    options, greedy = agent.options, played.greedy
+    low, high = played.feasible
+    obs, noise = greedy.obs[greedy.running], greedy.noise[greedy.running]
+    statistics = policy_statistics(agent, obs)
+    alpha = statistics["alpha"] / options.reward_scale
+    allowance = 0.0
+    if options.soft_backup:
+        allowance = entropy_allowance(options.gamma, alpha, statistics["entropy"])
+    q = agent.q_values(obs, noise)
+    bounds = bound_violation(q, low - allowance, high + allowance)
+    smallest = q.amin(0)
+    bias = _bias_on_policy(agent, played, alpha)
+    few = torch.randperm(len(obs), generator=torch.Generator().manual_seed(0))[:SYMMETRY_STATES]
+    few = few.to(obs.device)
+    obs, noise = obs[few], noise[few]
+    group = Group.parse(options.group)
+    orbit = orbit_variance(agent, obs, noise, group)
+    size = agent.q_values(obs, noise).double().square().mean().sqrt().item()
+    context = agent.context
+    return {
+        "q_mean": smallest.mean().item(),
+        "q_min": smallest.min().item(),
+        "q_max": smallest.max().item(),
+        "q_abs_max": bounds["max_abs_q"],
+        "q_violation": bounds["violation_share"],
+        "q_low": low,
+        "q_high": high,
+        "q_allowance": allowance,
+        **bias,
+        "q_preference": critic_preference(agent, obs, played.generator)["critic_preference"],
+        "alpha": statistics["alpha"],
+        "entropy": statistics["entropy"],
+        "noise_norm": statistics["noise_norm"],
+        "mode_norm": statistics["mode_norm"],
+        "saturated": statistics["saturated_share"],
+        "orbit_variance": orbit["orbit_variance"],
+        "equivariance_actor": actor_equivariance_error(agent, obs, group),
+        "equivariance_critic": orbit["orbit_variance"] ** 0.5 / max(size, 1e-30),
+        "equivariance_decode": equivariance_error(
+            context.decode,
+            (obs, noise),
+            (context.obs_layout, context.act_layout),
+            context.act_layout,
+            group,
+        ),
+    }
+
+
+def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -> float:
+    """Error of the deterministic actor: max over g of rms ||mu(gs) - g mu(s)|| / rms ||mu(s)||.
+
+    Args:
+        obs: ``[B, obs_dim]``.
+    """
+    return equivariance_error(
+        lambda x: agent.act(x, deterministic=True),
+        (obs,),
+        (agent.obs_layout,),
+        agent.act_layout,
+        group,
+    )
+
+
+def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float:
+    """Room that soft Q may need: ``alpha * gamma / (1 - gamma) * |log pi|``.
+
+    The bonus of a decision's own noise is not part of its Q value, hence the leading gamma.
+
+    Args:
+        gamma: discount per decision.
+        alpha: entropy weight.
+        log_prob_size: typical magnitude of log pi, e.g. its largest mean over evaluations.
+    """
+    return abs(alpha) * gamma / (1 - gamma) * abs(log_prob_size)
+
+
+def _bias_on_policy(agent: SacAgent, played: Played, alpha: float) -> Scalars:
+    """Bias of Q on the stochastic episodes, up to the first success of each."""
+    run, log_prob = played.on_policy, played.log_prob
+    assert run is not None
+    assert log_prob is not None
+    # One column: the decisions of each episode up to its first success, episode after episode.
+    rows = run.running.T
+    truncated = torch.zeros_like(run.running)
+    truncated[-1] = run.running[-1] & ~run.terminal[-1]
+
+    def column(x: torch.Tensor) -> torch.Tensor:
+        return x.transpose(0, 1)[rows]
+
+    values = agent.q_values(column(run.obs), column(run.noise)).mean(0)
+    result = q_bias(
+        values[:, None],
+        column(run.reward)[:, None],
+        column(run.terminal)[:, None],
+        column(truncated)[:, None],
+        agent.options.gamma,
+        played.feasible,
+        column(log_prob)[:, None],
+        alpha,
+    )
+    # The return that the critics are trained towards: soft only with the soft backup.
+    kind = "soft_bias" if agent.options.soft_backup else "bias"
+    return {
+        "q_bias": result[f"{kind}_mean"],
+        "q_bias_std": result[f"{kind}_std"],
+        "q_bias_hard": result["bias_mean"],
+        "q_bias_low": result["bias_low"],
+        "q_bias_high": result["bias_high"],
+        "q_bias_covered": result["covered_share"],
+        "return_mean": result["return_mean"],
+    }
 
 
 def bound_violation(q: torch.Tensor, low: float, high: float) -> Scalars:
@@ -157,7 +283,7 @@ def policy_statistics(agent: SacAgent, obs: torch.Tensor) -> Scalars:
     noise, log_prob = agent.sample(obs)
     mode = agent.act(obs, deterministic=True)
     return {
-        "alpha": agent.log_alpha.detach().exp().item(),
+        "alpha": agent.alpha.item(),
         "entropy": -log_prob.mean().item(),
         "noise_norm": noise.flatten(1).norm(dim=1).mean().item(),
         "mode_norm": mode.flatten(1).norm(dim=1).mean().item(),
@@ -189,19 +315,3 @@ def orbit_variance(
     within = q.var(dim=0, unbiased=False).mean().item()
     total = q.transpose(0, 1).flatten(1).var(dim=1, unbiased=False).mean().item()
     return {"orbit_variance": within, "orbit_share": within / total if total > 0 else 0.0}
-
-
-@torch.no_grad()
-def equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -> Scalars:
-    """Relative error of the deterministic actor under the group.
-
-    ``actor_equivariance_error`` = max over g of rms_s ||mu(gs) - g mu(s)|| / rms_s ||mu(s)||.
-    """
-    own = agent.act(obs, deterministic=True)
-    size = own.double().square().mean().sqrt()
-    worst = 0.0
-    for angle, reflect in group.elements:
-        moved = agent.act(agent.obs_layout.transform(obs, angle, reflect), deterministic=True)
-        gap = moved.double() - agent.act_layout.transform(own.double(), angle, reflect)
-        worst = max(worst, (gap.square().mean().sqrt() / size.clamp(min=1e-30)).item())
-    return {"actor_equivariance_error": worst}

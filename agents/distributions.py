@@ -78,32 +78,9 @@ class SquashedGaussian(nn.Module):
         """The squashed mean, ``[..., dim]``: what a deterministic policy plays."""
         return self._squash(mean)[0]
 
-    def log_prob(
-        self, mean: torch.Tensor, log_scale: torch.Tensor, noise: torch.Tensor
-    ) -> torch.Tensor:
-        """Log-density ``[...]`` of given noise; blocks on or beyond the bound count as on it."""
-        q2 = noise.square() @ self.membership / self.bound**2
-        small = q2 < SMALL
-        limit = 1 - 4 * torch.finfo(noise.dtype).eps
-        q = torch.where(small, 0.5, q2).sqrt().clamp(max=limit)
-        series = 1 + q2 * (1 / 3 + q2 * (1 / 5 + q2 / 7))
-        stretch = torch.where(small, series, torch.atanh(q) / q)
-        # A block beyond the bound is first brought back to it.
-        inside = torch.where(small, 1.0, q / q2.clamp(min=SMALL).sqrt())
-        u = noise / self.bound * self._spread(stretch * inside)
-        eps = (u - mean) / self._spread(log_scale.exp())
-        return self._gaussian(eps, log_scale) - self._squash(u)[1]
-
     def saturated(self, noise: torch.Tensor, share: float = 0.95) -> torch.Tensor:
         """Which blocks' norms exceed ``share`` of the bound, ``[..., blocks]`` bool."""
         return noise.square() @ self.membership > (share * self.bound) ** 2
-
-    @property
-    def log_volume(self) -> float:
-        """Log-volume of the support: the largest entropy that any policy can have."""
-        size_one = math.log(2 * self.bound)
-        size_two = math.log(math.pi * self.bound**2)
-        return sum(size_one if size == 1 else size_two for size in self.sizes.tolist())
 
     def _spread(self, per_block: torch.Tensor) -> torch.Tensor:
         """``[..., blocks]`` to ``[..., dim]``: each number gets its block's value."""

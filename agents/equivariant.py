@@ -1,5 +1,5 @@
-"""The equivariant agent: every linear map commutes with the group, so the policy turns with the
-scene and the critics do not notice that it turned.
+"""The equivariant agent: every linear map commutes with the group. If the scene turns, the policy's
+noise turns with it, and the critics' values stay the same.
 
 Actor: lift, group convolutions, projection to the chunk's irreps (means) and to one scalar per
 irrep block (scales). Critics: the same trunk over observation and noise, pooled over the group
@@ -14,9 +14,9 @@ import torch
 from torch import nn
 
 from symsteer.agents.networks import shrink_
-from symsteer.agents.sac import SacAgent, SacConfig
-from symsteer.policies.equivariant import Lift, Project, RegularLinear
+from symsteer.agents.sac import SacAgent, SacOptions
 from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
 
 VALUE = Layout([Field("value", 0)])
 
@@ -42,7 +42,7 @@ class Pool(Project):
 
 
 class EquivariantAgent(SacAgent):
-    """Equivariant actor, invariant critics, exact for every element of ``config.group``."""
+    """Equivariant actor, invariant critics, exact for every element of ``group``."""
 
     name = "equivariant"
 
@@ -55,22 +55,22 @@ class EquivariantAgent(SacAgent):
 
 def equivariant_actor_layers(agent: SacAgent) -> list[nn.Module]:
     """From observation to means and scales; the output layer starts small."""
-    layers = equivariant_layers(agent.obs_layout, agent.actor_layout, agent.config)
-    shrink_(layers[-1], agent.config.initial_output)
+    layers = equivariant_layers(agent.obs_layout, agent.actor_layout, agent.options)
+    shrink_(layers[-1], agent.options.initial_output)
     return layers
 
 
 def equivariant_critic_layers(agent: SacAgent) -> list[nn.Module]:
     """From observation and noise to an invariant value."""
-    return equivariant_layers(agent.critic_layout, VALUE, agent.config)
+    return equivariant_layers(agent.critic_layout, VALUE, agent.options)
 
 
-def equivariant_layers(inputs: Layout, outputs: Layout, config: SacConfig) -> list[nn.Module]:
+def equivariant_layers(inputs: Layout, outputs: Layout, options: SacOptions) -> list[nn.Module]:
     """``depth`` hidden layers of width/|G| regular fields and an output layer."""
-    group = Group.parse(config.group)
-    fields = max(1, round(config.width / group.order))
+    group = Group.parse(options.group)
+    fields = max(1, round(options.width / group.order))
     return [
         Lift(inputs, group, fields),
-        *[RegularLinear(group, fields, fields) for _ in range(config.depth - 1)],
+        *[RegularLinear(group, fields, fields) for _ in range(options.depth - 1)],
         Pool(group, fields, outputs),
     ]

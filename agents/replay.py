@@ -1,27 +1,63 @@
-"""Transitions in preallocated tensors on the learner's device."""
+"""Transitions in tensors on the learner's device, with the fields that an agent asks for."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from symsteer.errors import UserError
 
+FIRST_ROWS = 4096
+"""Rows allocated at first; the buffer doubles up to its capacity as it fills."""
 
-class Batch(NamedTuple):
-    """Transitions of the latent-noise environment, one per row.
 
-    ``terminal`` is 1 only where the episode ended by success. A time-out is not terminal: its
-    target bootstraps from ``next_obs``, which must be the true last observation of the episode,
-    not the first one after the reset.
+@dataclass
+class Transition:
+    """One decision of N environments.
+
+    ``terminal`` is true only where the episode ended by success. A time-out is not terminal: its
+    target bootstraps from ``next_obs``, which is the last observation of the episode, not the
+    first one after the reset.
+
+    Attributes:
+        obs: observation that was acted on, ``[N, obs_dim]``.
+        noise: what the agent chose, ``[N, Tp, Da]``.
+        actions: the executed action chunk, ``[N, Ta, Da]``.
+        reward: summed over the executed steps, ``[N]``.
+        next_obs: observation that the decision led to, ``[N, obs_dim]``.
+        terminal: success, ``[N]`` bool.
+        truncated: the time limit was reached without success, ``[N]`` bool.
     """
 
-    obs: torch.Tensor  # [B, obs_dim]
-    noise: torch.Tensor  # [B, Tp, Da]
-    reward: torch.Tensor  # [B], summed over the executed steps of the chunk
-    next_obs: torch.Tensor  # [B, obs_dim]
-    terminal: torch.Tensor  # [B], 0 or 1
+    obs: torch.Tensor
+    noise: torch.Tensor
+    actions: torch.Tensor
+    reward: torch.Tensor
+    next_obs: torch.Tensor
+    terminal: torch.Tensor
+    truncated: torch.Tensor
+
+
+class Batch(dict[str, torch.Tensor]):
+    """Transitions by field, one per row: ``batch.obs`` is ``batch["obs"]``.
+
+    Flags are 0 or 1 in the buffer's dtype.
+    """
+
+    def __getattr__(self, field: str) -> torch.Tensor:
+        try:
+            return self[field]
+        except KeyError as error:
+            raise AttributeError(
+                f"the replay holds no {field!r}; add it to the agent's replay_fields"
+            ) from error
+
+    def replace(self, **changes: torch.Tensor) -> Batch:
+        """A copy with some fields exchanged."""
+        return Batch({**self, **changes})
 
 
 class ReplayBuffer:
@@ -29,7 +65,7 @@ class ReplayBuffer:
 
     Args:
         capacity: number of transitions kept; the oldest is overwritten first.
-        obs_dim, horizon, act_dim: shapes of one transition.
+        shapes: shape of each field in one transition, by field name of :class:`Transition`.
         device, dtype: where and how the numbers are kept.
         seed: of the generator that draws batches.
 
@@ -40,23 +76,16 @@ class ReplayBuffer:
     def __init__(
         self,
         capacity: int,
-        obs_dim: int,
-        horizon: int,
-        act_dim: int,
+        shapes: Mapping[str, tuple[int, ...]],
         device: torch.device | str = "cpu",
         seed: int = 0,
         dtype: torch.dtype = torch.float32,
     ):
         if capacity < 1:
             raise UserError(f"the replay capacity must be at least 1, not {capacity}")
-
-        def empty(*shape: int) -> torch.Tensor:
-            return torch.zeros(capacity, *shape, dtype=dtype, device=device)
-
-        self.capacity, self.device = capacity, torch.device(device)
-        self.storage = Batch(
-            empty(obs_dim), empty(horizon, act_dim), empty(), empty(obs_dim), empty()
-        )
+        self.capacity, self.device, self.dtype = capacity, torch.device(device), dtype
+        self.shapes = dict(shapes)
+        self.storage = {name: self._rows(name, 0) for name in shapes}
         self.position = 0
         self.size = 0
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
@@ -64,28 +93,23 @@ class ReplayBuffer:
     def __len__(self) -> int:
         return self.size
 
-    def add(
-        self,
-        obs: torch.Tensor,
-        noise: torch.Tensor,
-        reward: torch.Tensor,
-        next_obs: torch.Tensor,
-        terminal: torch.Tensor,
-    ) -> None:
-        """Append N transitions (shapes as in :class:`Batch`).
+    def add(self, transition: Transition | Mapping[str, torch.Tensor]) -> None:
+        """Append N transitions; fields that the buffer does not hold are ignored.
 
         Raises:
             UserError: if N exceeds the capacity.
         """
-        count = len(obs)
+        new = transition if isinstance(transition, Mapping) else vars(transition)
+        count = len(new["reward"])
         if count > self.capacity:
             raise UserError(
                 f"{count} transitions at once do not fit a replay buffer of {self.capacity}; "
                 "raise replay_capacity"
             )
+        self._grow(min(self.position + count, self.capacity))
         rows = (torch.arange(count, device=self.device) + self.position) % self.capacity
-        for kept, new in zip(self.storage, (obs, noise, reward, next_obs, terminal), strict=True):
-            kept.index_copy_(0, rows, new.to(kept))
+        for name, kept in self.storage.items():
+            kept.index_copy_(0, rows, new[name].to(kept))
         self.position = (self.position + count) % self.capacity
         self.size = min(self.size + count, self.capacity)
 
@@ -98,29 +122,45 @@ class ReplayBuffer:
         if self.size == 0:
             raise UserError("the replay buffer is empty; collect transitions before updating")
         rows = torch.randint(self.size, (batch_size,), generator=self.generator, device=self.device)
-        return Batch(*(kept.index_select(0, rows) for kept in self.storage))
+        return Batch({name: kept.index_select(0, rows) for name, kept in self.storage.items()})
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """The filled rows, the position and the generator; tensors only."""
-        state = {name: kept[: self.size].clone() for name, kept in self.storage._asdict().items()}
-        state["position"] = torch.tensor(self.position)
-        state["generator"] = self.generator.get_state()
-        return state
+    def state_dict(self) -> dict[str, Any]:
+        """The filled rows, the position and the generator."""
+        return {
+            "rows": {name: kept[: self.size].clone() for name, kept in self.storage.items()},
+            "position": self.position,
+            "generator": self.generator.get_state(),
+        }
 
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned.
 
         Raises:
-            UserError: if the saved transitions have other shapes or do not fit.
+            UserError: if the saved transitions have other fields or shapes, or do not fit.
         """
-        for name, kept in self.storage._asdict().items():
-            saved = state[name]
-            if saved.shape[1:] != kept.shape[1:] or len(saved) > self.capacity:
-                raise UserError(
-                    f"the saved replay holds {name} of shape {tuple(saved.shape)}, this buffer "
-                    f"{tuple(kept.shape)}; resume with the run's own configuration"
-                )
-            kept[: len(saved)] = saved.to(kept)
-        self.size = len(state["obs"])
-        self.position = int(state["position"])
+        rows = state["rows"]
+        size = len(next(iter(rows.values())))
+        found = {name: tuple(kept.shape[1:]) for name, kept in rows.items()}
+        if found != self.shapes or size > self.capacity:
+            raise UserError(
+                f"the saved replay holds {size} transitions of {found}, this buffer up to "
+                f"{self.capacity} of {self.shapes}; resume with the run's own configuration"
+            )
+        self._grow(size)
+        for name, kept in self.storage.items():
+            kept[:size] = rows[name].to(kept)
+        self.size, self.position = size, int(state["position"])
         self.generator.set_state(state["generator"].cpu())
+
+    def _rows(self, name: str, count: int) -> torch.Tensor:
+        return torch.zeros(count, *self.shapes[name], dtype=self.dtype, device=self.device)
+
+    def _grow(self, needed: int) -> None:
+        """Allocate at least ``needed`` rows."""
+        there = len(next(iter(self.storage.values())))
+        if needed > there:
+            more = min(self.capacity, max(needed, 2 * there, FIRST_ROWS)) - there
+            self.storage = {
+                name: torch.cat([kept, self._rows(name, more)])
+                for name, kept in self.storage.items()
+            }

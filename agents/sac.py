@@ -1,10 +1,22 @@
-"""Soft actor-critic in the latent noise of a frozen diffusion policy: the core of every agent.
+"""Soft actor-critic in the latent noise of a frozen diffusion policy: the core of every learner.
 
 After Haarnoja et al., arXiv 1812.05905, as used for steering by DSRL, arXiv 2506.15799. An action
 is the whole noise chunk ``w [Tp, Da]``; a step is one decision of the latent-noise environment.
-Agents differ only in where the matrices of their networks come from (``actor_layers``,
-``critic_layers``) and in how those are penalised (``parameter_groups``). Deviations from the
-paper, numbered as in ``docs/agents.md``:
+An agent overrides only what it does differently:
+
+====================  ===============================================================
+``actor_layers``    layers of the actor
+``critic_layers``   layers of one critic
+``parameter_groups``  Adam's parameter groups of a network
+``critic_target``   what the critics are trained towards
+``critic_loss``     distance of the critics from their target
+``actor_loss``      what the actor minimises
+``critic_penalty``, ``actor_penalty``  regularisers, added to the losses
+``constraints``     gaps that trained multipliers close; the temperature is one
+``after_update``    what follows an update; more scalars
+====================  ===============================================================
+
+Deviations from the paper, numbered as in ``docs/agents.md``:
 
 1. the squash is radial, one scale per irrep block (``distributions.py``);
 2. the target carries no entropy bonus unless ``soft_backup`` (hard backup);
@@ -16,48 +28,54 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import nn
 
+from symsteer.agents.agent import Agent, AgentContext, AgentOptions, Budget, MakeEnv
+from symsteer.agents.diagnostics import critic_diagnostics
 from symsteer.agents.distributions import SquashedGaussian
+from symsteer.agents.episodes import Played
 from symsteer.agents.networks import Ensemble, Weights, count, detached
-from symsteer.agents.replay import Batch
+from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Field, Layout
-
-Normalize = Callable[[torch.Tensor], torch.Tensor]
+from symsteer.policies.geometry import Field, Group, Layout
 
 LOG_SCALE_MIN, LOG_SCALE_MAX = -5.0, 1.0
 
 
 @dataclass(frozen=True)
-class SacConfig:
-    """Everything that the learner can be told; the same for all agents."""
+class SacOptions(AgentOptions):
+    """What all SAC agents share.
+
+    The defaults suit many environments and few updates: data are cheap here, and a critic trained
+    hard on few decisions is exploited by the actor. They were chosen on PickCube, floating,
+    unbroken, with the equivariant and the standard agent, seeds 0 and 1.
+    """
 
     gamma: float = 0.95
     """Discount per decision (not per environment step)."""
-    lr: float = 5e-4
+    lr: float = 6e-4
     """Adam's learning rate of actor and critics."""
-    alpha_lr: float = 5e-4
+    alpha_lr: float = 6e-4
     """Adam's learning rate of log alpha."""
-    batch_size: int = 256
+    batch_size: int = 192
     """Transitions per update."""
-    tau: float = 0.005
+    tau: float = 0.015
     """Share of the online critics that enters the target critics at each update."""
     critics: int = 2
     """Number of critics; the smallest value counts."""
     layer_norm: bool = True
     """Normalise hidden features; without it Q diverges easily."""
-    width: int = 256
+    width: int = 128
     """Hidden features per layer; a group of order n shares them out over width/n fields."""
     depth: int = 2
     """Hidden layers."""
     group: str = "C8"
-    """Symmetry of the equivariant and approximate agents: C_n or D_n."""
+    """Symmetry group, C_n or D_n: of equivariant layers, and for measuring equivariance."""
     noise_bound: float = 1.5
     """Largest norm of an irrep block of the noise."""
     target_entropy: float | None = None
@@ -70,20 +88,15 @@ class SacConfig:
     """Factor on the actor's output layer at initialisation; small means w starts around 0."""
     soft_backup: bool = False
     """Put the entropy bonus into the critics' target, as in the paper."""
-    reward_scale: float = 1.0
-    """Factor on rewards before learning; reported Q values are divided by it again."""
-    utd: float = 1.0
-    """Updates per collected decision (the collecting loop reads it)."""
-    warmup: int = 600
-    """Decisions played by the base policy before the first update (the loop reads it)."""
+    reward_scale: float = 0.25
+    """Factor on rewards before learning (0.25: one decision of four steps costs 1); reported Q
+    values are divided by it again."""
+    utd: float = 0.3
+    """Updates per collected decision."""
+    warmup: int = 1280
+    """Decisions played with noise from N(0, I), the base policy, before the first update."""
     replay_capacity: int = 200_000
     """Decisions kept for replay."""
-    free_penalty: float = 0.1
-    """Approximate agent: weight of the squared free path, per network (w_b)."""
-    equivariant_penalty: float = 0.0
-    """Approximate agent: weight of the squared equivariant path (w_e < w_b)."""
-    free_init: float = 0.01
-    """Approximate agent: factor on the free path at initialisation."""
 
     def __post_init__(self) -> None:
         positive = (
@@ -93,7 +106,7 @@ class SacConfig:
         for name in positive:
             if not getattr(self, name) > 0:
                 raise UserError(f"agent option {name} must be positive, not {getattr(self, name)}")
-        for name in ("warmup", "initial_output", "free_init"):
+        for name in ("warmup", "initial_output"):
             if not getattr(self, name) >= 0:
                 raise UserError(
                     f"agent option {name} must not be negative, not {getattr(self, name)}"
@@ -108,105 +121,188 @@ class SacConfig:
                 f"agent option initial_scale must lie between {low:.4f} and {high:.2f}, "
                 f"not {self.initial_scale}"
             )
-        if not 0 <= self.equivariant_penalty <= self.free_penalty:
-            raise UserError(
-                "agent options need 0 <= equivariant_penalty <= free_penalty, not "
-                f"{self.equivariant_penalty} and {self.free_penalty}"
-            )
+        _ = Group.parse(self.group).order
 
 
-class SacAgent:
-    """Actor, critics, temperature and their updates; subclasses supply the layers.
+class Multiplier:
+    """A positive number ``exp(log)`` that grows while its constraint's gap is negative.
 
-    Args:
-        obs_layout, act_layout: geometry of an observation and of one action of the chunk.
-        horizon: actions in a chunk, Tp.
-        config: see :class:`SacConfig`.
-        device, dtype: of all tensors.
-        seed: of initialisation and of the agent's own noise.
-        normalize_obs: maps observations ``[B, obs_dim]`` to the networks' scale. It must commute
-            with the group, as the base policy's normaliser does; the identity by default.
+    Its loss is ``log * gap``, minimised by Adam: for the temperature the gap is the entropy minus
+    its target (Haarnoja et al., arXiv 1812.05905, section 5).
     """
 
-    name: ClassVar[str]
-    learns: ClassVar[bool] = True
-    searches: ClassVar[bool] = False
+    def __init__(self, initial: float, lr: float, device: torch.device, dtype: torch.dtype):
+        self.log = torch.tensor(math.log(initial), dtype=dtype, device=device, requires_grad=True)
+        self.optimizer = adam([{"params": [self.log]}], lr)
 
-    def __init__(
-        self,
-        obs_layout: Layout,
-        act_layout: Layout,
-        horizon: int,
-        config: SacConfig,
-        device: torch.device | str = "cpu",
-        seed: int = 0,
-        normalize_obs: Normalize | None = None,
-        dtype: torch.dtype = torch.float32,
-    ):
-        self.obs_layout, self.act_layout, self.horizon = obs_layout, act_layout, horizon
-        self.config, self.device, self.dtype = config, torch.device(device), dtype
-        self.normalize_obs = normalize_obs or (lambda obs: obs)
-        self.noise_layout = act_layout.repeat(horizon)
-        self.distribution = SquashedGaussian(self.noise_layout, config.noise_bound)
+    @property
+    def value(self) -> torch.Tensor:
+        """The present number, without gradient."""
+        return self.log.detach().exp()
+
+    def step(self, gap: torch.Tensor) -> torch.Tensor:
+        """One gradient step; returns the loss."""
+        loss = self.log * gap
+        descend(loss, self.optimizer)
+        return loss.detach()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Number and optimiser."""
+        return {"log": self.log.detach(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        with torch.no_grad():
+            self.log.copy_(state["log"])
+
+
+class SacAgent(Agent):
+    """Actor, critics, temperature and their updates; subclasses supply the layers."""
+
+    role = "learner"
+    Options = SacOptions
+    options: SacOptions
+
+    replay_fields: ClassVar[tuple[str, ...]] = ("obs", "noise", "reward", "next_obs", "terminal")
+    """Fields of :class:`Transition` that the replay keeps, e.g. also ``actions``."""
+
+    replay: ReplayBuffer
+
+    def __init__(self, context: AgentContext, options: SacOptions | None = None):
+        super().__init__(context, options)
+        options = self.options
+        self.noise_layout = context.noise_layout
+        self.distribution = SquashedGaussian(self.noise_layout, options.noise_bound)
         blocks = Field("log_scales", 0, self.distribution.blocks)
         # The actor's output: means, then one invariant number per irrep block.
         self.actor_layout = Layout([*self.noise_layout.fields, blocks])
-        self.critic_layout = _side_by_side(obs=obs_layout, noise=self.noise_layout)
+        self.critic_layout = _side_by_side(obs=self.obs_layout, noise=self.noise_layout)
         self.target_entropy = (
-            -0.5 * self.noise_layout.dim if config.target_entropy is None else config.target_entropy
+            -0.5 * self.noise_layout.dim
+            if options.target_entropy is None
+            else options.target_entropy
         )
         with torch.random.fork_rng(devices=[]):  # the caller's generator stays as it is
-            torch.manual_seed(seed)
-            actor = Ensemble([self.actor_layers()], config.layer_norm)
-            critics = [self.critic_layers() for _ in range(config.critics)]
-            critic = Ensemble(critics, config.layer_norm)
-        self.distribution.to(self.device, dtype)
-        self.actor, self.critic = actor.to(self.device, dtype), critic.to(self.device, dtype)
+            torch.manual_seed(context.seed)
+            actor = Ensemble([self.actor_layers()], options.layer_norm)
+            critics = [self.critic_layers() for _ in range(options.critics)]
+            critic = Ensemble(critics, options.layer_norm)
+        self.distribution.to(self.device, self.dtype)
+        self.actor = actor.to(self.device, self.dtype)
+        self.critic = critic.to(self.device, self.dtype)
         # The targets are kept as dense matrices: expansion is linear, so following the matrices is
         # following the parameters, without an expansion of their own.
         self.target = [(w.clone(), b.clone()) for w, b in detached(self.critic.weights())]
-        self.log_alpha = torch.tensor(
-            math.log(config.initial_alpha), dtype=dtype, device=self.device, requires_grad=True
+        self.actor_optimizer = adam(self.parameter_groups(self.actor), options.lr)
+        self.critic_optimizer = adam(self.parameter_groups(self.critic), options.lr)
+        self.multipliers = {
+            "alpha": Multiplier(options.initial_alpha, options.alpha_lr, self.device, self.dtype)
+        }
+        self.warm_up_generator = self._new_generator()
+        self.replay = ReplayBuffer(
+            options.replay_capacity, self._replay_shapes(), self.device, context.seed, self.dtype
         )
-        self.actor_optimizer = self._adam(self.parameter_groups(self.actor), config.lr)
-        self.critic_optimizer = self._adam(self.parameter_groups(self.critic), config.lr)
-        self.alpha_optimizer = self._adam([{"params": [self.log_alpha]}], config.alpha_lr)
-        self.generator = torch.Generator(device=self.device).manual_seed(seed)
+        self.decisions = 0
+        self.owed = 0.0
         self.updates = 0
 
-    # What subclasses decide.
+    @classmethod
+    def check(cls, options: SacOptions, budget: Budget) -> None:
+        """Refuse a budget in which nothing would be learned, or a replay that is too small."""
+        warm_up = options.warmup * budget.execute
+        if budget.env_steps <= warm_up:
+            raise UserError(
+                f"env_steps is {budget.env_steps}, which ends within the warm-up of {warm_up} "
+                "environment steps, so that nothing would be learned; raise env_steps or lower "
+                "agent.warmup"
+            )
+        if options.replay_capacity < budget.num_envs:
+            raise UserError(
+                f"agent.replay_capacity is {options.replay_capacity}, less than one decision of "
+                f"each of {budget.num_envs} environments; raise it or lower num_envs"
+            )
+
+    # What agents change.
 
     def actor_layers(self) -> list[nn.Module]:
         """Layers from an observation to ``actor_layout``."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must give the layers of its actor")
 
     def critic_layers(self) -> list[nn.Module]:
         """Layers from ``critic_layout`` to one value."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must give the layers of a critic")
 
     def parameter_groups(self, network: nn.Module) -> list[dict[str, Any]]:
         """Adam's parameter groups of the actor or the critics."""
         return [{"params": list(network.parameters())}]
 
+    def critic_target(self, batch: Batch, next_obs: torch.Tensor) -> torch.Tensor:
+        """Target of every critic, ``[B]``, in scaled rewards; called without gradients.
+
+        Args:
+            batch: transitions.
+            next_obs: the normalised next observations, ``[B, obs_dim]``.
+        """
+        noise, log_prob = self._sample(*self._heads(self.actor.weights(), next_obs))
+        next_q = self._q(self.target, next_obs, noise).amin(0)
+        if self.options.soft_backup:
+            next_q = next_q - self.alpha * log_prob
+        # Only success ends the future; a time-out has terminal 0 and bootstraps.
+        reward = self.options.reward_scale * batch.reward
+        return reward + self.options.gamma * (1 - batch.terminal) * next_q
+
+    def critic_loss(self, q: torch.Tensor, target: torch.Tensor, batch: Batch) -> torch.Tensor:
+        """Squared error, mean over the batch, summed over critics; ``q [critics, B]``."""
+        return (q - target).square().mean(1).sum()
+
+    def actor_loss(
+        self, q: torch.Tensor, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
+    ) -> torch.Tensor:
+        """Mean of alpha log pi - min Q.
+
+        Args:
+            q: values of ``noise``, ``[critics, B]``; differentiable with respect to it only.
+            noise: drawn from the actor, flat, ``[B, Tp * Da]``; see :meth:`chunk`.
+            log_prob: ``[B]``.
+            batch: transitions.
+        """
+        return (self.alpha * log_prob - q.amin(0)).mean()
+
+    def critic_penalty(self, batch: Batch) -> torch.Tensor | None:
+        """A regulariser of the critics, added to their loss; None for none."""
+        return None
+
+    def actor_penalty(self, batch: Batch) -> torch.Tensor | None:
+        """A regulariser of the actor, added to its loss; None for none."""
+        return None
+
+    def constraints(
+        self, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
+    ) -> dict[str, torch.Tensor]:
+        """Gap of each constraint in ``multipliers``, a scalar: below 0 its multiplier grows."""
+        return {"alpha": -log_prob.mean() - self.target_entropy}
+
+    def after_update(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """What follows an update; returns further scalars."""
+        return {}
+
     # Acting.
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
-        """Noise ``[B, Tp, Da]`` for observations ``[B, obs_dim]``."""
+        """Noise ``[B, Tp, Da]``; without ``deterministic`` N(0, I) during the warm-up."""
         if deterministic:
-            return self._chunk(self.distribution.mode(self.moments(obs)[0]))
+            return self.chunk(self.distribution.mode(self.moments(obs)[0]))
+        if self.decisions < self.options.warmup:
+            return self.gaussian_noise(len(obs), self.warm_up_generator)
         return self.sample(obs)[0]
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """A draw from the policy ``[B, Tp, Da]`` and its log-probability ``[B]``."""
         noise, log_prob = self._sample(*self.moments(obs))
-        return self._chunk(noise), log_prob
-
-    @torch.no_grad()
-    def log_prob(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Log-probability ``[B]`` of given noise ``[B, Tp, Da]``."""
-        return self.distribution.log_prob(*self.moments(obs), noise.to(self.dtype).flatten(1))
+        return self.chunk(noise), log_prob
 
     @torch.no_grad()
     def moments(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -217,135 +313,161 @@ class SacAgent:
     def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Every critic's value in the environment's reward units, ``[critics, B]``."""
         q = self._q(self.critic.weights(), self._features(obs), noise.to(self.dtype).flatten(1))
-        return q / self.config.reward_scale
+        return q / self.options.reward_scale
+
+    @property
+    def alpha(self) -> torch.Tensor:
+        """Entropy weight."""
+        return self.multipliers["alpha"].value
+
+    def chunk(self, noise: torch.Tensor) -> torch.Tensor:
+        """Flat noise ``[..., Tp * Da]`` as a chunk ``[..., Tp, Da]``."""
+        return noise.unflatten(-1, (self.horizon, self.act_layout.dim))
 
     # Learning.
 
+    def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
+        """Train for the whole budget."""
+        return budget.env_steps
+
+    def observe(self, transition: Transition) -> None:
+        """Keep the decisions; each one behind the warm-up pays for ``utd`` updates."""
+        self.replay.add(transition)
+        if self.decisions >= self.options.warmup:
+            self.owed += len(transition.reward) * self.options.utd
+        self.decisions += len(transition.reward)
+
+    def batches(self) -> Iterator[Batch]:
+        """One batch for each update that is paid for."""
+        while self.owed >= 1:
+            self.owed -= 1
+            yield self.replay.sample(self.options.batch_size)
+
     def update(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """One step of critics, actor, temperature and target critics.
+        """One step of critics, actor, multipliers and target critics.
 
         Returns:
             Scalars as tensors on the device (reading them waits for the device).
         """
-        config = self.config
         obs, next_obs = self._features(batch.obs), self._features(batch.next_obs)
-        alpha = self.log_alpha.detach().exp()
-        policy = self.actor.weights()
+        alpha = self.alpha
 
         with torch.no_grad():
-            noise, log_prob = self._sample(*self._heads(policy, next_obs))
-            next_q = self._q(self.target, next_obs, noise).amin(0)
-            if config.soft_backup:
-                next_q = next_q - alpha * log_prob
-            # Only success ends the future; a time-out has terminal 0 and bootstraps.
-            wanted = (
-                config.reward_scale * batch.reward + config.gamma * (1 - batch.terminal) * next_q
-            )
+            target = self.critic_target(batch, next_obs)
         q = self._q(self.critic.weights(), obs, batch.noise.flatten(1))
-        critic_loss = (q - wanted).square().mean(1).sum()
-        _descend(critic_loss, self.critic_optimizer)
+        critic_loss = self.critic_loss(q, target, batch)
+        descend(critic_loss, self.critic_optimizer, self.critic_penalty(batch))
         self.critic.changed()
 
-        noise, log_prob = self._sample(*self._heads(policy, obs))
+        noise, log_prob = self._sample(*self._heads(self.actor.weights(), obs))
         judge = detached(self.critic.weights())  # the actor's loss must not reach the critics
-        actor_loss = (alpha * log_prob - self._q(judge, obs, noise).amin(0)).mean()
-        _descend(actor_loss, self.actor_optimizer)
+        actor_loss = self.actor_loss(self._q(judge, obs, noise), noise, log_prob, batch)
+        descend(actor_loss, self.actor_optimizer, self.actor_penalty(batch))
         self.actor.changed()
 
-        entropy = -log_prob.detach().mean()
-        alpha_loss = self.log_alpha * (entropy - self.target_entropy)
-        _descend(alpha_loss, self.alpha_optimizer)
+        log_prob = log_prob.detach()
+        gaps = self.constraints(noise.detach(), log_prob, batch)
+        losses = {f"losses/{name}": self.multipliers[name].step(gap) for name, gap in gaps.items()}
 
         with torch.no_grad():
-            torch._foreach_lerp_(_flat(self.target), _flat(judge), config.tau)
+            torch._foreach_lerp_(_flat(self.target), _flat(judge), self.options.tau)
         self.updates += 1
-        q = q.detach() / config.reward_scale
+        q = q.detach() / self.options.reward_scale
         return {
             "losses/critic": critic_loss.detach(),
             "losses/actor": actor_loss.detach(),
-            "losses/alpha": alpha_loss.detach(),
+            **losses,
             "train/q_mean": q.mean(),
             "train/q_max_abs": q.abs().max(),
-            "train/target_mean": wanted.mean() / config.reward_scale,
+            "train/target_mean": target.mean() / self.options.reward_scale,
             "train/alpha": alpha,
-            "train/entropy": entropy,
+            "train/entropy": -log_prob.mean(),
+            **self.after_update(batch),
         }
+
+    def diagnostics(self, played: Played) -> Mapping[str, float | None]:
+        """Q against its bounds and fresh returns, symmetry, temperature (docs/metrics.md)."""
+        return critic_diagnostics(self, played)
 
     # Saving.
 
     def description(self) -> dict[str, Any]:
         """What a checkpoint must agree with: agent, geometry, sizes."""
         keys = ("group", "width", "depth", "critics", "layer_norm", "noise_bound")
-        return {
-            "agent": self.name,
-            "obs_layout": self.obs_layout.to_json(),
-            "act_layout": self.act_layout.to_json(),
-            "horizon": self.horizon,
-            **{key: getattr(self.config, key) for key in keys},
-        }
+        return {**super().description(), **{key: getattr(self.options, key) for key in keys}}
 
     def state_dict(self) -> dict[str, Any]:
-        """Networks, optimisers, temperature, generator; loads with ``weights_only=True``."""
-        state = {name: getattr(self, name).state_dict() for name in self._parts()}
+        """Networks, optimisers, multipliers, generators; loads with ``weights_only=True``."""
         return copy.deepcopy(
             {
-                "description": self.description(),
-                **state,
+                **super().state_dict(),
+                **{name: getattr(self, name).state_dict() for name in self._parts()},
                 "target": _flat(self.target),
-                "log_alpha": self.log_alpha.detach(),
-                "generator": self.generator.get_state(),
+                "multipliers": {k: m.state_dict() for k, m in self.multipliers.items()},
+                "warm_up_generator": self.warm_up_generator.get_state(),
+                "decisions": self.decisions,
+                "owed": self.owed,
                 "updates": self.updates,
             }
         )
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where :meth:`state_dict` was taken.
 
         Raises:
             UserError: if the checkpoint is of another agent, layout or size.
         """
-        check_description(self.description(), state.get("description", {}))
+        super().load_state_dict(state)
         for name in self._parts():
             getattr(self, name).load_state_dict(state[name])
         self.actor.changed()
         self.critic.changed()
+        for name, multiplier in self.multipliers.items():
+            multiplier.load_state_dict(state["multipliers"][name])
         with torch.no_grad():
-            self.log_alpha.copy_(state["log_alpha"])
-            torch._foreach_copy_(
-                _flat(self.target), [t.to(self.log_alpha) for t in state["target"]]
-            )
-        self.generator.set_state(state["generator"].cpu())
+            flat = _flat(self.target)
+            torch._foreach_copy_(flat, [t.to(flat[0]) for t in state["target"]])
+        self.warm_up_generator.set_state(state["warm_up_generator"].cpu())
+        self.decisions, self.owed = int(state["decisions"]), float(state["owed"])
         self.updates = int(state["updates"])
 
     def parameter_counts(self) -> dict[str, int]:
-        """Trainable numbers (all critics together, without targets) and hidden widths."""
+        """Trainable numbers (all critics together, without targets) and the actor's width."""
         actor, critic = count(self.actor), count(self.critic)
         return {
             "actor": actor,
             "critic": critic,
             "total": actor + critic,
-            "actor_width": self.actor.width,
-            "critic_width": self.critic.width,
+            "width": self.actor.width,
         }
 
     # Inner parts.
 
     @staticmethod
     def _parts() -> tuple[str, ...]:
-        return ("actor", "critic", "actor_optimizer", "critic_optimizer", "alpha_optimizer")
+        return ("actor", "critic", "actor_optimizer", "critic_optimizer")
 
-    @staticmethod
-    def _adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
-        return torch.optim.Adam(groups, lr=lr, fused=True)
+    def _replay_shapes(self) -> dict[str, tuple[int, ...]]:
+        obs, act = (self.obs_layout.dim,), self.act_layout.dim
+        known: dict[str, tuple[int, ...]] = {
+            "obs": obs,
+            "noise": (self.horizon, act),
+            "actions": (self.context.execute, act),
+            "reward": (),
+            "next_obs": obs,
+            "terminal": (),
+            "truncated": (),
+        }
+        return {name: known[name] for name in self.replay_fields}
 
     def _features(self, obs: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
-            return self.normalize_obs(obs).to(self.dtype)
+            return self.context.normalize_obs(obs).to(self.dtype)
 
     def _heads(self, policy: Weights, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         out = self.actor.apply_weights(policy, obs)[0]
         mean, raw = out.split([self.distribution.dim, self.distribution.blocks], dim=-1)
-        share = (math.log(self.config.initial_scale) - LOG_SCALE_MIN) / (
+        share = (math.log(self.options.initial_scale) - LOG_SCALE_MIN) / (
             LOG_SCALE_MAX - LOG_SCALE_MIN
         )
         start = math.log(share / (1 - share))
@@ -363,40 +485,18 @@ class SacAgent:
         )
         return self.distribution.sample(mean, log_scale, eps)
 
-    def _chunk(self, noise: torch.Tensor) -> torch.Tensor:
-        return noise.unflatten(-1, (self.horizon, self.act_layout.dim))
+
+def adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
+    """Adam as all parts of the learner use it."""
+    return torch.optim.Adam(groups, lr=lr, fused=True)
 
 
-def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float:
-    """Room that soft Q may need: ``alpha * gamma / (1 - gamma) * |log pi|``.
-
-    The bonus of a decision's own noise is not part of its Q value, hence the leading gamma.
-
-    Args:
-        gamma: discount per decision.
-        alpha: entropy weight.
-        log_prob_size: typical magnitude of log pi, e.g. its largest mean over evaluations.
-    """
-    return abs(alpha) * gamma / (1 - gamma) * abs(log_prob_size)
-
-
-def check_description(mine: dict[str, Any], saved: dict[str, Any]) -> None:
-    """Compare an agent with a checkpoint.
-
-    Raises:
-        UserError: naming the first thing that differs.
-    """
-    for key, value in mine.items():
-        if saved.get(key) != value:
-            raise UserError(
-                f"this checkpoint has {key} {saved.get(key)!r}, the agent has {value!r}; "
-                "load it with the run's own configuration"
-            )
-
-
-def _descend(loss: torch.Tensor, optimizer: torch.optim.Optimizer) -> None:
+def descend(
+    loss: torch.Tensor, optimizer: torch.optim.Optimizer, penalty: torch.Tensor | None = None
+) -> None:
+    """One gradient step on a loss and its regulariser."""
     optimizer.zero_grad()
-    loss.backward()
+    (loss if penalty is None else loss + penalty).backward()
     optimizer.step()
 
 

@@ -18,21 +18,21 @@ class StandardAgent(SacAgent):
 
     def actor_layers(self) -> list[nn.Module]:
         layers = plain_layers(
-            self.obs_layout.dim, self.actor_width(), self.config.depth, self.actor_layout.dim
+            self.obs_layout.dim, self.actor_width(), self.options.depth, self.actor_layout.dim
         )
-        shrink_(layers[-1], self.config.initial_output)
+        shrink_(layers[-1], self.options.initial_output)
         return layers
 
     def critic_layers(self) -> list[nn.Module]:
-        return plain_layers(self.critic_layout.dim, self.critic_width(), self.config.depth, 1)
+        return plain_layers(self.critic_layout.dim, self.critic_width(), self.options.depth, 1)
 
     def actor_width(self) -> int:
         """Hidden features of the actor."""
-        return self.config.width
+        return self.options.width
 
     def critic_width(self) -> int:
         """Hidden features of each critic."""
-        return self.config.width
+        return self.options.width
 
 
 class MatchedStandardAgent(StandardAgent):
@@ -47,12 +47,12 @@ class MatchedStandardAgent(StandardAgent):
     def actor_width(self) -> int:
         rival = nn.ModuleList(equivariant_actor_layers(self))
         return matched_width(
-            count(rival), self.obs_layout.dim, self.config.depth, self.actor_layout.dim
+            count(rival), self.obs_layout.dim, self.options.depth, self.actor_layout.dim
         )
 
     def critic_width(self) -> int:
         rival = nn.ModuleList(equivariant_critic_layers(self))
-        return matched_width(count(rival), self.critic_layout.dim, self.config.depth, 1)
+        return matched_width(count(rival), self.critic_layout.dim, self.options.depth, 1)
 
 
 def plain_layers(inputs: int, width: int, depth: int, outputs: int) -> list[nn.Module]:

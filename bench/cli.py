@@ -175,12 +175,12 @@ def list_names() -> int:
     """Name the tasks, embodiments, variants, agents, policies and suites."""
     from symsteer.agents import AGENTS
     from symsteer.bench.sweep.grid import read_suite, suite_names
-    from symsteer.bench.tasks import EMBODIMENT_SUMMARIES, TASKS
+    from symsteer.bench.tasks import EMBODIMENTS, TASKS
     from symsteer.bench.variants import VARIANTS
     from symsteer.policies import POLICIES
 
     _print_names("tasks (--task)", _summaries(TASKS))
-    _print_names("embodiments (--embodiment)", EMBODIMENT_SUMMARIES.items())
+    _print_names("embodiments (--embodiment)", EMBODIMENTS.items())
     _print_names(
         "variants (--variant NAME:STRENGTH, strength in [0, 1]; several joined by +; or none)",
         _summaries(VARIANTS),

@@ -1,8 +1,8 @@
 """How fast simulation is, against stock ManiSkill and against the physics alone.
 
-Everything is measured in one run: machines differ and drift, so only ratios of numbers taken side
-by side say something. The contenders take turns (a b c d a b c d ...), each turn plays whole
-episodes of random actions, one reset each, and a clock stops only after all work is done.
+Everything is measured in one run: machines differ and their speed changes, so only ratios of
+numbers from the same run mean something. The contenders take turns (a b c d a b c d ...). A turn
+plays whole episodes of random actions, with one reset each; its clock stops after all work is done.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -26,6 +26,7 @@ from typing import Any
 
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  (fills ManiSkill's registry)
+import psutil
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
@@ -34,7 +35,7 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from symsteer.bench.sim import create, prepare_headless
 from symsteer.bench.sim.environment import MAX_SCENES
 from symsteer.bench.sim.shards.messages import divide
-from symsteer.bench.sim.shards.server import WorkerProcess
+from symsteer.bench.sim.shards.processes import start_process
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
 
@@ -44,14 +45,14 @@ EPISODE = 50
 CONTROLLER = "pd_ee_delta_pose"
 
 MIN_STOCK_RATIO, MIN_LIMIT_SHARE = 6.0, 0.55
-"""What ours should reach: times stock in as many processes, and share of the physics alone."""
+"""Goals: speed relative to stock in as many processes, and relative to the physics alone."""
 
 _SETTINGS: dict[str, Any] = {"obs_mode": "state", "control_mode": CONTROLLER}
 
 
 @dataclass(frozen=True)
 class Turn:
-    """What one turn took: control steps summed over environments, wall and processor seconds."""
+    """Control steps of a turn, summed over environments; its wall and processor seconds."""
 
     steps: int
     seconds: float
@@ -65,10 +66,10 @@ class Row:
     Attributes:
         letter: ``a`` stock, ``b`` stock in several processes, ``c`` ours, ``d`` physics alone,
             ``g`` ours on CUDA.
-        name: in words.
-        processes: that simulate.
+        name: for the table.
+        processes: number of processes that simulate.
         num_envs: environments, summed over the processes.
-        turns: one each repeat.
+        turns: one for each repeat.
     """
 
     letter: str
@@ -79,7 +80,7 @@ class Row:
 
     @property
     def rates(self) -> list[float]:
-        """Control steps a second of wall clock, a turn."""
+        """Control steps per second of wall clock, for each turn."""
         return [turn.steps / turn.seconds for turn in self.turns]
 
     @property
@@ -89,11 +90,11 @@ class Row:
 
     @property
     def cpu_rate(self) -> float:
-        """Control steps a second of processor time and process; noise of other programs aside."""
+        """Control steps per second if every process had a core for itself: by processor time."""
         return statistics.median(t.steps / t.cpu for t in self.turns) * self.processes
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data, with the figures that the table shows."""
+        """Plain data, with the numbers of the table."""
         figures = {
             "median": self.median,
             "min": min(self.rates),
@@ -104,7 +105,7 @@ class Row:
 
 
 class Contender:
-    """Something that plays episodes; subclasses say how."""
+    """Something that plays episodes and is timed."""
 
     def __init__(self, letter: str, name: str, processes: int, num_envs: int) -> None:
         self.row = Row(letter, name, processes, num_envs)
@@ -115,7 +116,7 @@ class Contender:
         raise NotImplementedError
 
     def warm_up(self, seconds: float) -> None:
-        """Play one episode, unmeasured, and set how many make a turn of ``seconds``."""
+        """Play one episode, and choose how many episodes take about ``seconds``."""
         self.play(1)
         self.episodes = max(1, round(seconds / self.play(1).seconds))
 
@@ -124,16 +125,16 @@ class Contender:
         self.row.turns.append(self.play(self.episodes))
 
     def close(self) -> None:
-        """End what was started."""
+        """Close environments and processes."""
 
 
 class Environments(Contender):
     """Batched or single environments that are reset and stepped from this process.
 
     Args:
-        env: with ``reset`` and ``step``.
-        dim: of an action.
-        pids: processes that work for it, besides this one.
+        env: has ``reset`` and ``step``.
+        dim: dimension of an action.
+        pids: its worker processes.
         numpy: whether it takes numpy actions.
     """
 
@@ -179,54 +180,68 @@ class PhysicsAlone(Contender):
     """The substeps of an episode of ours, replayed in one or several processes.
 
     Args:
-        pool: the processes.
-        processes: how many of them take part.
+        helpers: the processes.
+        env_cls: stock task class.
+        num_envs: environments, summed over the processes.
     """
 
-    def __init__(self, pool: PhysicsPool, name: str, processes: int, num_envs: int) -> None:
-        super().__init__("d", name, processes, num_envs)
-        self.pool = pool
-        self.parts = [rows.stop - rows.start for rows in divide(num_envs, processes)]
-        self.pool.ask("record", self.parts)
+    def __init__(self, helpers: Sequence[Helper], env_cls: type[BaseEnv], num_envs: int) -> None:
+        super().__init__("d", "physics alone", len(helpers), num_envs)
+        self.helpers, self.env_cls = helpers, env_cls
+        self.parts = [rows.stop - rows.start for rows in divide(num_envs, len(helpers))]
 
     def play(self, episodes: int) -> Turn:
-        answers = self.pool.ask("play", [(count, episodes) for count in self.parts])
+        for helper, count in zip(self.helpers, self.parts, strict=True):
+            helper.ask(_replay_episodes, self.env_cls, count, episodes)
+        answers = [helper.answer() for helper in self.helpers]
         steps = episodes * EPISODE * self.row.num_envs
-        # All start together; the last one to finish decides.
+        # All start together; the slowest one counts.
         return Turn(steps, max(a[0] for a in answers), sum(a[1] for a in answers))
 
 
-class PhysicsPool:
-    """Processes that replay physics; each is asked over a pipe."""
+class Helper:
+    """A process that calls functions, one after the other.
 
-    def __init__(self, env_cls: type[BaseEnv], processes: int) -> None:
-        self.connections: list[Connection] = []
-        self.processes: list[WorkerProcess] = []
-        WorkerProcess.preload(env_cls.__module__)
-        for _ in range(processes):
-            ours, theirs = Pipe()
-            with theirs:
-                process = WorkerProcess(target=_serve_physics, args=(theirs, env_cls), daemon=True)
-                process.start()
-            self.connections.append(ours)
-            self.processes.append(process)
+    Args:
+        env_cls: stock task class that the process will use.
+    """
 
-    def ask(self, name: str, requests: Sequence[Any]) -> list[Any]:
-        """Ask the first processes, one request each, and wait for all answers."""
-        for connection, request in zip(self.connections, requests, strict=False):
-            connection.send((name, request))
-        return [c.recv() for c, _ in zip(self.connections, requests, strict=False)]
+    def __init__(self, env_cls: type[BaseEnv]) -> None:
+        self.connection, theirs = Pipe()
+        with theirs:
+            self.process = start_process(_serve, theirs, preload=env_cls.__module__)
+
+    def ask(self, function: Callable[..., Any], *args: Any) -> None:
+        """Start a call of a top-level function."""
+        self.connection.send((function, args))
+
+    def answer(self) -> Any:
+        """Wait for the result of the call.
+
+        Raises:
+            UserError: the process has ended.
+        """
+        try:
+            return self.connection.recv()
+        except EOFError as error:
+            raise UserError("a process of the measurement ended: free some memory") from error
 
     def close(self) -> None:
-        """End the processes."""
-        for connection in self.connections:
-            connection.close()
-        for process in self.processes:
-            process.join(10)
+        """End the process."""
+        self.connection.close()
+        self.process.join(10)
+
+
+def _serve(connection: Connection) -> None:
+    torch.set_num_threads(1)
+    with suppress(EOFError, KeyboardInterrupt):
+        while True:
+            function, args = connection.recv()
+            connection.send(function(*args))
 
 
 class Replay:
-    """An episode of ours, recorded so that its substeps can be taken again and nothing else.
+    """An episode of ours, recorded so that only its substeps can be taken again.
 
     Args:
         env_cls: stock task class.
@@ -250,7 +265,7 @@ class Replay:
         self.substeps = range(env._sim_steps_per_control)
 
     def play(self) -> tuple[float, float]:
-        """Wall and processor seconds of the substeps of an episode; the rest is not counted."""
+        """Wall and processor seconds of the substeps of an episode, without anything else."""
         wall = cpu = 0.0
         for system, packed in zip(self.systems, self.start, strict=True):
             system.unpack(packed)
@@ -260,7 +275,7 @@ class Replay:
                 for drive, value in zip(drives, values, strict=False):
                     drive(value)
             begin, begin_cpu = time.perf_counter(), time.process_time()
-            # Scene by scene, as ours takes them: their data stay in the processor's cache.
+            # Scene by scene, as in ours: a scene's data stay in the processor's cache.
             for step in steps:
                 for _ in substeps:
                     step()
@@ -269,26 +284,17 @@ class Replay:
         return wall, cpu
 
 
-def _serve_physics(connection: Connection, env_cls: type[BaseEnv]) -> None:
-    torch.set_num_threads(1)
-    replays: dict[int, Replay] = {}
-    while True:
-        try:
-            name, request = connection.recv()
-        except (EOFError, KeyboardInterrupt):
-            return
-        if name == "record":
-            if request not in replays:
-                replays[request] = Replay(env_cls, request)
-            connection.send(None)
-        else:
-            count, episodes = request
-            times = [replays[count].play() for _ in range(episodes)]
-            connection.send(tuple(map(sum, zip(*times, strict=True))))
+_replay = cache(Replay)
+
+
+def _replay_episodes(env_cls: type[BaseEnv], num_envs: int, episodes: int) -> tuple[float, float]:
+    """Wall and processor seconds of the substeps of some episodes, in this process."""
+    times = [_replay(env_cls, num_envs).play() for _ in range(episodes)]
+    return sum(wall for wall, _ in times), sum(cpu for _, cpu in times)
 
 
 def _stock(env_cls: type[BaseEnv]) -> gym.Env:
-    """Stock ManiSkill as its own documentation runs it on the CPU: one environment, NumPy."""
+    """Stock ManiSkill on the CPU as in its documentation: one environment, NumPy."""
     prepare_headless()
     torch.set_num_threads(1)
     env = env_cls(num_envs=1, sim_backend="physx_cpu", render_backend="none", **_SETTINGS)
@@ -305,34 +311,37 @@ def stock_class(task: str) -> type[BaseEnv]:
 
 
 def _contenders(
-    env_cls: type[BaseEnv], num_envs: Sequence[int], cores: int
-) -> tuple[list[Contender], PhysicsPool]:
+    env_cls: type[BaseEnv], num_envs: Sequence[int], helpers: Sequence[Helper]
+) -> list[Contender]:
     stock = _stock(env_cls)
     dim = stock.action_space.shape[0]  # type: ignore[index]
-    found: list[Contender] = [Environments("a", "stock", stock, 1, dim, numpy=True)]
-    found[0].actions = found[0].actions[:, 0]  # type: ignore[attr-defined]
-    for processes in sorted({1, cores}):
+    alone = Environments("a", "stock", stock, 1, dim, numpy=True)
+    alone.actions = alone.actions[:, 0]
+    found: list[Contender] = [alone]
+    numbers = sorted({1, len(helpers)})
+    for processes in numbers:
         vector = gym.vector.AsyncVectorEnv([partial(_stock, env_cls)] * processes, context="spawn")
         pids = [process.pid for process in vector.processes if process.pid is not None]
         name = "stock in AsyncVectorEnv"
         found.append(Environments("b", name, vector, processes, dim, pids, numpy=True))
-    pool = PhysicsPool(env_cls, cores)
-    for processes in sorted({1, cores}):
+    for processes in numbers:
         for count in num_envs:
-            if count < processes:
-                continue
-            env = create(env_cls, count, workers=processes, **_SETTINGS)
-            pids = getattr(env, "worker_pids", [])
-            found.append(Environments("c", "ours", env, count, dim, pids))
-            found.append(PhysicsAlone(pool, "physics alone", processes, count))
+            if count >= processes:
+                found.append(_ours(env_cls, count, workers=processes))
+                found.append(PhysicsAlone(helpers[:processes], env_cls, count))
     if torch.cuda.is_available():
-        for count in num_envs:
-            try:
-                env = create(env_cls, count, sim="cuda", **_SETTINGS)
-            except UserError:
-                break  # PhysX's GPU library is missing
-            found.append(Environments("g", "ours on CUDA", env, count, dim))
-    return found, pool
+        # Without PhysX's GPU library there is no such contender.
+        with suppress(UserError):
+            found += [_ours(env_cls, count, sim="cuda") for count in num_envs]
+    return found
+
+
+def _ours(env_cls: type[BaseEnv], num_envs: int, **options: Any) -> Environments:
+    """Our environments; ``options`` of `symsteer.bench.sim.create`."""
+    env = create(env_cls, num_envs, **_SETTINGS, **options)
+    letter, name = ("g", "ours on CUDA") if options.get("sim") == "cuda" else ("c", "ours")
+    dim = env.single_action_space.shape[0]
+    return Environments(letter, name, env, num_envs, dim, getattr(env, "worker_pids", []))
 
 
 def measure(
@@ -343,19 +352,19 @@ def measure(
     cores: int | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Measure all contenders in turns, and where time and memory go.
+    """Measure all contenders in turns, the parts of a step, and memory.
 
     Args:
-        task: one of ours, by name; it is measured with ManiSkill's stock class and controller.
+        task: name of a task; ManiSkill's stock class and controller are measured.
         num_envs: numbers of environments of ours and of the physics alone.
         repeats: turns of each contender, at least 5 to show a spread.
-        seconds: least length of a turn; it is rounded to whole episodes of 50 steps.
-        cores: processes of those contenders that use all cores; by default, all cores.
-        report: told what is going on.
+        seconds: length of a turn, rounded to whole episodes of 50 steps.
+        cores: processes of the contenders that use several; by default, one for each core.
+        report: called with messages about the progress.
 
     Returns:
-        Plain data: ``rows`` (one a contender), ``summary`` (ratios), ``step`` (where a step's
-        time goes), ``creation``, ``machine``, ``settings``.
+        Plain data: ``rows`` (one for each contender), ``summary`` (ratios), ``step`` (time of the
+        parts of a step), ``creation``, ``machine``, ``settings``.
 
     Raises:
         UserError: an unknown task, or a number out of range.
@@ -371,10 +380,11 @@ def measure(
     there = len(os.sched_getaffinity(0))
     cores = cores or there
     if not 1 <= cores <= there:
-        raise UserError(f"cores is {cores}; it must lie between 1 and {there}, which are here")
+        raise UserError(f"cores is {cores}; this machine has {there}: choose 1 to {there}")
     torch.set_num_threads(1)
     report("making environments")
-    contenders, pool = _contenders(env_cls, sorted(set(num_envs)), cores)
+    helpers = [Helper(env_cls) for _ in range(cores)]
+    contenders = _contenders(env_cls, sorted(set(num_envs)), helpers)
     try:
         report("warming up")
         for contender in contenders:
@@ -384,11 +394,10 @@ def measure(
             for contender in contenders:
                 contender.turn()
     finally:
-        pool.close()
-        for contender in contenders:
-            contender.close()
+        for started in (*helpers, *contenders):
+            started.close()
     rows = [contender.row for contender in contenders]
-    report("looking into a step")
+    report("timing the parts of a step")
     size = min((n for n in num_envs if n >= 64), default=max(num_envs))
     return {
         "settings": {
@@ -434,7 +443,7 @@ def summarise(rows: Sequence[Row], cores: int) -> dict[str, dict[str, float]]:
 
 
 class _Stopwatch:
-    """Seconds by part, a nested part not counted in the one around it."""
+    """Seconds by part; a nested part does not count for the part around it."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -459,7 +468,7 @@ class _Stopwatch:
         self._since = now
 
     def watch(self, owner: Any, method: str, part: str) -> None:
-        """Count the method of an object as a part."""
+        """Time a method of an object as a part."""
         original = getattr(owner, method)
 
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -470,7 +479,7 @@ class _Stopwatch:
 
 
 def split_step(env_cls: type[BaseEnv], num_envs: int, episodes: int = 2) -> dict[str, float]:
-    """Milliseconds of processor time that the parts of a step of ours take.
+    """Milliseconds of processor time of the parts of a step of ours.
 
     Returns:
         ``physics`` (substeps), ``fetch`` (reading the scenes, contacts included), ``apply``
@@ -478,12 +487,12 @@ def split_step(env_cls: type[BaseEnv], num_envs: int, episodes: int = 2) -> dict
         observation, reward), ``other``, ``total``, ``reset`` (of all environments, at once) and
         ``num_envs``.
     """
-    env = create(env_cls, num_envs, **_SETTINGS)
-    player = Environments("c", "ours", env, num_envs, env.single_action_space.shape[0])
+    player = _ours(env_cls, num_envs)
     player.play(1)
+    env = player.env
     watch, px = _Stopwatch(), env.scene.px
     watch.watch(px, "finish_substeps", "physics")
-    # Its class, not what it says to be.
+    # type(px), since px.__class__ is SAPIEN's PhysxGpuSystem.
     for name in dir(type(px)):
         if name.startswith(("gpu_fetch", "fetch_", "gpu_query")):
             watch.watch(px, name, "fetch")
@@ -520,43 +529,36 @@ def creation(env_cls: type[BaseEnv], num_envs: int) -> dict[str, float]:
     """Time and memory that environments take, measured in a fresh process.
 
     Returns:
-        ``first_ms`` (of one environment, with what is loaded once), ``per_env_ms``,
+        ``first_ms`` (of the first environment, which loads files), ``per_env_ms``,
         ``per_env_kib`` (from the difference of ``num_envs`` and one), ``process_mib`` (resident
         before any environment), ``num_envs``.
     """
-    ours, theirs = Pipe()
-    with theirs:
-        process = WorkerProcess(target=_creation, args=(theirs, env_cls, num_envs), daemon=True)
-        process.start()
+    helper = Helper(env_cls)
     try:
-        return ours.recv()
-    except EOFError as error:
-        raise UserError("the process that measures memory ended: free some memory") from error
+        helper.ask(_creation, env_cls, num_envs)
+        return helper.answer()
     finally:
-        ours.close()
-        process.join()
+        helper.close()
 
 
-def _creation(connection: Connection, env_cls: type[BaseEnv], num_envs: int) -> None:
-    torch.set_num_threads(1)
-    before = _resident()
-    seconds, sizes = [], [before]
+def _creation(env_cls: type[BaseEnv], num_envs: int) -> dict[str, float]:
+    seconds, sizes = [], [_resident()]
     kept = []
     for count in (1, num_envs):
         begin = time.process_time()
-        kept.append(create(env_cls, count, **_SETTINGS))
+        env = create(env_cls, count, **_SETTINGS)
         seconds.append(time.process_time() - begin)
-        kept[-1].step(torch.zeros(count, kept[-1].single_action_space.shape[0]))
+        env.step(torch.zeros(count, env.single_action_space.shape[0]))
+        kept.append(env)
         gc.collect()
         sizes.append(_resident())
-    result = {
+    return {
         "num_envs": num_envs,
         "first_ms": 1e3 * seconds[0],
         "per_env_ms": 1e3 * seconds[1] / num_envs,
         "per_env_kib": (sizes[2] - sizes[1]) / num_envs / 2**10,
-        "process_mib": before / 2**20,
+        "process_mib": sizes[0] / 2**20,
     }
-    connection.send(result)
 
 
 def memory_growth(
@@ -570,8 +572,7 @@ def memory_growth(
     Returns:
         ``steps`` and ``mib`` of ten samples, and ``growth_kib``, from the second to the last.
     """
-    env = create(stock_class(task), num_envs, **_SETTINGS)
-    player = Environments("c", "ours", env, num_envs, env.single_action_space.shape[0])
+    player = _ours(stock_class(task), num_envs)
     samples: dict[int, float] = {}
     every = max(1, steps // EPISODE // 10)
     for episode in range(1, steps // EPISODE + 1):
@@ -580,7 +581,7 @@ def memory_growth(
             gc.collect()
             samples[episode * EPISODE] = _resident() / 2**20
             report(f"{episode * EPISODE:6d} steps: {samples[episode * EPISODE]:.1f} MiB")
-    env.close()
+    player.close()
     mib = list(samples.values())
     growth = 2**10 * (mib[-1] - mib[min(1, len(mib) - 1)])
     return {
@@ -593,13 +594,13 @@ def memory_growth(
 
 def _resident() -> int:
     """Resident bytes of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return psutil.Process().memory_info().rss
 
 
 def _cpu_seconds(pid: int) -> float:
     """User and system time of a process."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    times = psutil.Process(pid).cpu_times()
+    return times.user + times.system
 
 
 def _machine() -> dict[str, Any]:
@@ -621,7 +622,7 @@ def _machine() -> dict[str, Any]:
 
 
 def table(data: dict[str, Any]) -> str:
-    """What `measure` found, for people."""
+    """Text table of the result of `measure`."""
     settings, rows = data["settings"], data["rows"]
     lines = [
         f"{settings['task']} with ManiSkill's own class and controller {settings['controller']}; "
@@ -629,7 +630,7 @@ def table(data: dict[str, Any]) -> str:
         f"median of {settings['repeats']} turns (smallest to largest), all contenders in turns; "
         f"episodes of {settings['episode']} random steps, resets included",
         "",
-        "                            processes   envs   steps/s                     a CPU second",
+        "                            processes   envs   steps/s               steps/CPU second",
     ]
     for row in rows:
         spread = f"({row['min']:,.0f} to {row['max']:,.0f})"
@@ -646,7 +647,7 @@ def table(data: dict[str, Any]) -> str:
             f"alone (d); by CPU time {found['times_stock_cpu']:.1f} x and "
             f"{found['share_of_limit_cpu']:.0%}"
         )
-    lines.append(f"wanted: {MIN_STOCK_RATIO:g} x and {MIN_LIMIT_SHARE:.0%}")
+    lines.append(f"goal: {MIN_STOCK_RATIO:g} x and {MIN_LIMIT_SHARE:.0%}")
     step, made = data["step"], data["creation"]
     parts = ", ".join(
         f"{part} {step[part]:.2f} ({step[part] / step['total']:.0%})"
@@ -656,13 +657,13 @@ def table(data: dict[str, Any]) -> str:
         "",
         f"CPU time of a step of {step['num_envs']} environments: {step['total']:.2f} ms = {parts};",
         f"of a reset of all: {step['reset']:.1f} ms",
-        f"an environment: {made['per_env_ms']:.1f} ms to make, {made['per_env_kib']:.0f} KiB "
-        f"(first one {made['first_ms']:.0f} ms; a process without any {made['process_mib']:.0f} "
-        "MiB resident, mostly shared libraries)",
+        f"to make an environment: {made['per_env_ms']:.1f} ms, {made['per_env_kib']:.0f} KiB "
+        f"(the first one {made['first_ms']:.0f} ms; a process without environments has "
+        f"{made['process_mib']:.0f} MiB resident, mostly shared libraries)",
     ]
     return "\n".join(lines)
 
 
 def dump(data: dict[str, Any]) -> str:
-    """The same for programs."""
+    """JSON of the result of `measure` or `memory_growth`."""
     return json.dumps(data, indent=2, allow_nan=False)

@@ -1,7 +1,6 @@
 """Whether a record may join the leaderboard: every rule of docs/submit.md, one function each.
 
-A problem keeps a record out; a note says how it would be shown. Both are one sentence with what to
-do about it.
+A problem keeps a record out; a note does not. Both are one sentence.
 """
 
 from __future__ import annotations
@@ -10,26 +9,31 @@ import functools
 import hashlib
 import json
 import math
-import subprocess
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from symsteer.leaderboard.errors import RecordError
+from symsteer.errors import UserError
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import (
     HELD_OUT_SEED,
+    Provenance,
     RunRecord,
     canonical_json,
     portable,
     read_record,
 )
-from symsteer.leaderboard.summary import MIN_SEEDS, REFERENCES, Key, recipe_of, seeds_of
+from symsteer.leaderboard.records.provenance import checkout, git
+from symsteer.leaderboard.summary import MIN_SEEDS, Key, recipe_of, row_place, seeds_of
 
 MIN_EPISODES = 100
 """Held-out episodes of an admissible record's final evaluation."""
+
+RELEASE = re.compile(r"\d+(\.\d+)*((a|b|rc)\d+)?(\.post\d+)?")
+"""Versions that a package index accepts and that are not of a development state."""
 
 RowKey = tuple[Key, str, str]
 """Table, agent, recipe: what the runs of one row have in common."""
@@ -56,7 +60,7 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
         committed: the folder of the committed records; none are known if it does not exist.
 
     Raises:
-        RecordError: for a path that cannot be read, or a damaged record among the committed ones.
+        UserError: for a path that cannot be read, or a damaged record among the committed ones.
     """
     files = record_files(paths)
     known = _Known()
@@ -69,7 +73,7 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
         verdicts.append(verdict := Verdict(file))
         try:
             records[file] = record = read_record(file)
-        except RecordError as error:
+        except UserError as error:
             verdict.problems.append(str(error))
             continue
         for rule in RULES:
@@ -77,8 +81,8 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
         verdict.problems += known.duplicates(record)
         known.add(file, record)
     for verdict in verdicts:
-        if verdict.path in records:
-            verdict.notes += known.notes(records[verdict.path])
+        if judged := records.get(verdict.path):
+            verdict.notes += [*known.notes(judged), *_code_from_elsewhere(judged)]
     return verdicts
 
 
@@ -101,20 +105,32 @@ def finished(file: Path, record: RunRecord) -> Iterator[str]:
 
 
 def reproducible(file: Path, record: RunRecord) -> Iterator[str]:
-    """Every part of the run used code of a known commit without local changes."""
+    """Others can look up all code that the parts of the run used.
+
+    That is a commit without local changes or a released version of SymSteer, and extensions from
+    installed distributions.
+    """
     parts = [("", record.provenance)]
     parts += [(f"part {n} of ", p) for n, p in enumerate(record.continued, 2)]
     for part, provenance in parts:
         if provenance.commit is None:
-            yield (
-                f"{part}the run names no commit, so nobody knows its code: run it again in a "
-                "git clone of the repository."
-            )
+            if not _is_released(provenance):
+                yield (
+                    f"{part}the run names neither a commit nor a released version, so nobody knows "
+                    "its code: run it again in a git clone of the repository."
+                )
         elif provenance.dirty is not False:
             yield (
                 f"{part}the run used code that is not in commit {provenance.commit[:12]}: "
                 "commit all changes and new files, then run it again."
             )
+        for extension in provenance.extensions:
+            if extension.distribution is None or extension.version is None:
+                yield (
+                    f"{part}the run used the {extension.kind} {extension.target}, which belongs to "
+                    "no installed distribution: install it as a package with an entry point, or "
+                    "add it to the repository, then run it again."
+                )
 
 
 def scored_on_held_out_episodes(file: Path, record: RunRecord) -> Iterator[str]:
@@ -136,23 +152,24 @@ def scored_on_held_out_episodes(file: Path, record: RunRecord) -> Iterator[str]:
 
 def consistent(file: Path, record: RunRecord) -> Iterator[str]:
     """Name and seeds of the run are those of its configuration."""
-    cell = record.cell
-    named = f"{cell.task}-{cell.embodiment}-{cell.variant.replace(':', '=')}-{cell.agent}-"
-    if not record.run_id.startswith(f"{named}s{cell.seed}-"):
+    settings, seed = record.settings, record.settings.seed
+    keys = (settings.task, settings.embodiment, settings.variant, settings.agent, f"s{seed}")
+    named = "-".join(keys).replace(":", "=")
+    if not record.run_id.replace(":", "=").startswith(f"{named}-"):
         yield (
-            f"the run is named {record.run_id}, but its configuration is that of {named}"
-            f"s{cell.seed}: take the record as `symsteer run` wrote it."
+            f"the run is named {record.run_id}, but its configuration is that of {named}: take the "
+            "record as `symsteer run` wrote it."
         )
-    elif record.seeds.get("run") != cell.seed:
+    elif record.seeds.get("run") != seed:
         yield (
             f"the run drew from seed {record.seeds.get('run')}, but its configuration says "
-            f"{cell.seed}: take the record as `symsteer run` wrote it."
+            f"{seed}: take the record as `symsteer run` wrote it."
         )
 
 
 def budget_used_up(file: Path, record: RunRecord) -> Iterator[str]:
     """A learner was scored at the end of its budget, a reference after what it searched."""
-    final, budget = record.final, record.cell.env_steps
+    final, budget = record.final, record.settings.env_steps
     if final is None:
         return
     if final.env_steps != record.budget.env_steps:
@@ -203,7 +220,8 @@ class _Known:
         self._seeds: dict[RowKey, set[int]] = defaultdict(set)
         self._committed: dict[Key, set[str]] = defaultdict(set)
         self._committed_seeds: dict[Key, set[int]] = defaultdict(set)
-        self._references: dict[tuple[Key, str], set[str]] = defaultdict(set)
+        self._references: dict[Key, set[str]] = defaultdict(set)
+        self._agents: dict[tuple[Key, str], set[str]] = defaultdict(set)
 
     def add(self, file: Path, record: RunRecord, committed: bool = False) -> None:
         row = _row(record)
@@ -211,12 +229,14 @@ class _Known:
         if outcome := _outcome(record):
             self._outcomes.setdefault(outcome, file)
         if committed:
+            if record.role == "reference":
+                self._references[row[0]].add(record.settings.agent)
             self._committed[row[0]].add(record.base_policy.content_hash)
-            self._committed_seeds[row[0]].add(record.cell.seed)
+            self._committed_seeds[row[0]].add(record.settings.seed)
         if record.status == "finished":
-            self._seeds[row].add(record.cell.seed)
+            self._seeds[row].add(record.settings.seed)
             policy = record.base_policy.content_hash
-            self._references[row[0], policy].add(record.cell.agent)
+            self._agents[row[0], policy].add(record.settings.agent)
 
     def duplicates(self, record: RunRecord) -> Iterator[str]:
         twin = self._runs.get((_row(record), seeds_of(record.config)))
@@ -237,22 +257,22 @@ class _Known:
     def notes(self, record: RunRecord) -> Iterator[str]:
         row = _row(record)
         number = len(self._seeds[row])
-        if record.cell.agent not in REFERENCES and number < MIN_SEEDS:
+        if record.role == "learner" and number < MIN_SEEDS:
             yield (
                 f"shown, not ranked: its row has {number} of the {MIN_SEEDS} finished seeds that a "
                 "ranking needs."
             )
-        usual = self._committed_seeds[row[0]]
-        if usual and record.cell.seed not in usual:
+        usual, seed = self._committed_seeds[row[0]], record.settings.seed
+        if usual and seed not in usual:
             yield (
-                f"its seed {record.cell.seed} is none of those of the committed runs of its table "
+                f"its seed {seed} is none of those of the committed runs of its table "
                 f"({', '.join(map(str, sorted(usual)))}): agents are compared on equal seeds."
             )
         policy, committed = record.base_policy.content_hash, self._committed[row[0]]
         if committed and policy not in committed:
-            present = self._references[row[0], policy]
-            lacking = [name for name in REFERENCES if name not in present]
-            wanted = f"; submit {', '.join(lacking)} on it as well" if lacking else ""
+            lacking = self._references[row[0]] - self._agents[row[0], policy]
+            names = sorted(lacking, key=lambda name: row_place(name, "reference"))
+            wanted = f"; submit {', '.join(names)} on it as well" if names else ""
             yield (
                 f"its base policy {policy[:12]} is not that of the committed runs of its table: it "
                 f"is compared only with runs on the same policy{wanted}."
@@ -266,11 +286,29 @@ class _Known:
 
 
 def _row(record: RunRecord) -> RowKey:
-    return Key.of(record), record.cell.agent, recipe_of(record.config)
+    return Key.of(record), record.settings.agent, recipe_of(record.config)
+
+
+def _code_from_elsewhere(record: RunRecord) -> Iterator[str]:
+    """Notes on code that is not in the repository."""
+    parts = [record.provenance, *record.continued]
+    for version, sha256 in dict.fromkeys((p.version, p.sha256) for p in parts if not p.commit):
+        if sha256:
+            yield f"it ran symsteer {version} as installed, not a checkout; sha256 {sha256[:12]}."
+    extensions = [e for p in parts for e in p.extensions]
+    used = {(e.kind, e.name, e.distribution, e.version, e.sha256[:12]) for e in extensions}
+    for kind, name, distribution, version, sha256 in sorted(used, key=str):
+        yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}."
+
+
+def _is_released(provenance: Provenance) -> bool:
+    version, sha256 = provenance.version, provenance.sha256
+    return sha256 is not None and version is not None and RELEASE.fullmatch(version) is not None
 
 
 def _learns(record: RunRecord) -> bool:
-    return record.parameters.total > 0 or record.budget.updates > 0 or record.has_critic
+    evidence = record.parameters.total > 0 or record.budget.updates > 0 or record.has_critic
+    return record.role == "learner" or evidence
 
 
 def _steps_of_a_decision(record: RunRecord) -> int:
@@ -307,15 +345,8 @@ def _texts(data: Any) -> Iterator[str]:
 
 @functools.cache
 def _is_missing(commit: str) -> bool:
-    """Whether this is a whole git clone without that commit."""
-
-    def git(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=20)
-
-    try:
-        if git("rev-parse", "--is-shallow-repository").stdout.strip() != "false":
-            return False
-        return git("cat-file", "-e", f"{commit}^{{commit}}").returncode != 0
-    except (OSError, subprocess.SubprocessError):
+    """Whether this code runs from a whole git clone that does not have the commit."""
+    root = checkout()
+    if root is None or git(root, "rev-parse", "--is-shallow-repository") != "false":
         return False
+    return git(root, "cat-file", "-e", f"{commit}^{{commit}}") is None

@@ -22,6 +22,12 @@ from symsteer.leaderboard.defects import (
     advantage,
     defect_of,
 )
+from symsteer.leaderboard.paper import (
+    APPROXIMATE,
+    EQUIVARIANT,
+    STANDARD,
+    WITHOUT_SYMMETRY,
+)
 from symsteer.leaderboard.statistics import (
     Interval,
     Sample,
@@ -38,9 +44,6 @@ NEARLY_SYMMETRIC = 0.05
 
 STRONGLY_BROKEN = 0.25
 """Cells with an audited defect from this on are where the paper expects strictness to hurt."""
-
-RIVALS = ("standard", "standard-matched")
-"""Agents without symmetry: with the channels of the equivariant one, and with its parameters."""
 
 SLOPE_UNIT = 0.1
 """Slopes are given for this much more defect."""
@@ -78,12 +81,12 @@ def claims(summary: Summary, audit: Audit, found: DefectMap) -> list[Claim]:
     """All tests, in the order of the paper's claims."""
     symmetric = [t for t in summary.tables if _below(t, audit)]
     return [
-        *(_sample_efficiency(symmetric, rival) for rival in RIVALS),
-        *(_divergence(summary.tables, rival) for rival in RIVALS),
-        *(_bias(summary.tables, rival) for rival in RIVALS),
+        *(_sample_efficiency(symmetric, rival) for rival in WITHOUT_SYMMETRY),
+        *(_divergence(summary.tables, rival) for rival in WITHOUT_SYMMETRY),
+        *(_bias(summary.tables, rival) for rival in WITHOUT_SYMMETRY),
         _fewest_demonstrations(symmetric),
         _fewer_demonstrations(symmetric),
-        *(_falls(found.panels["equivariant", measure]) for measure in ("auc", "success")),
+        *(_falls(found.panels[EQUIVARIANT, measure]) for measure in ("auc", "success")),
         _approximate_beyond(summary.tables, audit),
     ]
 
@@ -123,14 +126,14 @@ def _sample_efficiency(tables: Sequence[Table], rival: str) -> Claim:
         "Sample efficiency: symmetric agents learn faster",
         f"area under the curve, `equivariant` minus `{rival}`, defect up to {NEARLY_SYMMETRIC:g}",
         tables,
-        "equivariant",
+        EQUIVARIANT,
         rival,
         "auc",
         f" where the audited defect is at most {NEARLY_SYMMETRIC:g}",
     )
     if not cells:
         return claim
-    steps = [_threshold_steps([t for t, _ in cells], agent) for agent in ("equivariant", rival)]
+    steps = [_threshold_steps([t for t, _ in cells], agent) for agent in (EQUIVARIANT, rival)]
     return replace(claim, beside=f"steps: {steps[0]} against {steps[1]} of the budget")
 
 
@@ -162,7 +165,7 @@ def _divergence(tables: Sequence[Table], rival: str) -> Claim:
         return max(found, key=len, default={})
 
     found = [
-        (table, _joined(verdicts(table, rival), verdicts(table, "equivariant"))) for table in tables
+        (table, _joined(verdicts(table, rival), verdicts(table, EQUIVARIANT))) for table in tables
     ]
     cells, reason = _enough(found, f"`{rival}` and `equivariant` with a critic")
     if not cells:
@@ -186,7 +189,7 @@ def _bias(tables: Sequence[Table], rival: str) -> Claim:
 
     found: Cells[Sample] = []
     for table in tables:
-        both = _joined(biases(table, rival), biases(table, "equivariant"))
+        both = _joined(biases(table, rival), biases(table, EQUIVARIANT))
         found.append((table, {pair: Sample.constant(a - b) for pair, (a, b) in both.items()}))
     cells, reason = _enough(found, f"`{rival}` and `equivariant` with a critic")
     if not cells:
@@ -237,7 +240,7 @@ def _fewest_demonstrations(tables: Sequence[Table]) -> Claim:
         return Claim(FEW, test, 1, reason=_one_number(tables))
     fewest = [family[0] for family in families]
     where = " at the smallest number of demonstrations"
-    return _paired(FEW, test, fewest, "equivariant", "standard", "success", where)[0]
+    return _paired(FEW, test, fewest, EQUIVARIANT, STANDARD, "success", where)[0]
 
 
 def _fewer_demonstrations(tables: Sequence[Table]) -> Claim:
@@ -247,7 +250,7 @@ def _fewer_demonstrations(tables: Sequence[Table]) -> Claim:
         return Claim(FEW, test, 1, reason=_one_number(tables))
 
     def samples(table: Table) -> list[Sample]:
-        return list(advantage(table, "equivariant", "standard", "success").values())
+        return list(advantage(table, EQUIVARIANT, STANDARD, "success").values())
 
     ends = [(samples(family[0]), samples(family[-1])) for family in families]
     ends = [(few, many) for few, many in ends if few and many]
@@ -297,8 +300,8 @@ def _approximate_beyond(tables: Sequence[Table], audit: Audit) -> Claim:
         "Limits under breaking: approximate equivariance holds up where strictness does not",
         f"success, `approximate` minus `equivariant`, defect from {STRONGLY_BROKEN:g} on",
         broken,
-        "approximate",
-        "equivariant",
+        APPROXIMATE,
+        EQUIVARIANT,
         "success",
         f" where the audited defect is at least {STRONGLY_BROKEN:g}",
     )[0]

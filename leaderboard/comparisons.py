@@ -6,19 +6,21 @@ from a bootstrap that is stratified by table.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
+from symsteer.leaderboard.paper import BASE
+from symsteer.leaderboard.records import Role
 from symsteer.leaderboard.statistics import (
     Array,
     Interval,
     performance_profile,
     probability_of_improvement,
 )
-from symsteer.leaderboard.summary import REFERENCES, Row, Run, Summary, Table, reference_success
+from symsteer.leaderboard.summary import Row, Run, Summary, Table, reference_success
 
 GROUPS = ("unbroken", "broken")
 THRESHOLDS = np.linspace(-0.5, 1.0, 151)
@@ -30,6 +32,7 @@ class Profile:
     """Share of an agent's runs that close at least each share of the gap (`THRESHOLDS`)."""
 
     agent: str
+    role: Role
     cells: int
     runs: int
     share: Array
@@ -63,15 +66,15 @@ def group_of(table: Table) -> str:
 
 
 def compare_agents(summary: Summary) -> Comparisons:
-    """Profiles of all agents but the base, and every pair of learning agents."""
+    """Profiles of all agents but the base, and every pair of agents that are no references."""
     result = Comparisons({}, {}, {})
     for group in GROUPS:
         tables = [t for t in summary.tables if group_of(t) == group and t.learners]
         if not tables:
             continue
         result.cells[group] = len(tables)
-        result.profiles[group] = profiles(tables, summary.agents)
-        result.improvements[group] = improvements(tables, summary.agents)
+        result.profiles[group] = profiles(tables, summary.roles)
+        result.improvements[group] = improvements(tables, summary.roles)
     return result
 
 
@@ -93,21 +96,21 @@ def gap_closed(row: Row, base: Row) -> list[float]:
     return values
 
 
-def profiles(tables: Sequence[Table], agents: Sequence[str]) -> list[Profile]:
+def profiles(tables: Sequence[Table], roles: Mapping[str, Role]) -> list[Profile]:
     """A profile for every agent but the base that has runs."""
     found = []
-    for agent in agents:
-        if agent == "base":
+    for agent, role in roles.items():
+        if agent == BASE:
             continue
         cells = []
         for table in tables:
-            row, base = table.row_of(agent), table.row_of("base")
+            row, base = table.row_of(agent), table.row_of(BASE)
             if row and base and (values := gap_closed(row, base)):
                 cells.append(values)
         if cells:
             share, low, high = performance_profile(cells, THRESHOLDS)
             runs = sum(map(len, cells))
-            found.append(Profile(agent, len(cells), runs, share, low, high))
+            found.append(Profile(agent, role, len(cells), runs, share, low, high))
     return found
 
 
@@ -119,13 +122,13 @@ def _policies(row: Row) -> set[str]:
     return {_policy(run) for run in row.finished}
 
 
-def improvements(tables: Sequence[Table], agents: Sequence[str]) -> list[Improvement]:
-    """Every pair of learning agents, the later one of the page's order first.
+def improvements(tables: Sequence[Table], roles: Mapping[str, Role]) -> list[Improvement]:
+    """Every pair of agents that are no references, the later one of the page's order first.
 
     In each table, over the runs on base policies that both agents steered.
     """
     found = []
-    learning = [agent for agent in agents if agent not in REFERENCES]
+    learning = [agent for agent, role in roles.items() if role != "reference"]
     for second, first in combinations(learning, 2):
         cells = []
         for table in tables:

@@ -17,8 +17,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from symsteer.leaderboard.errors import RecordError
-from symsteer.leaderboard.records import canonical_json, canonical_variant
+from symsteer.errors import UserError
+from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.records import canonical_json
 from symsteer.leaderboard.statistics import (
     RESAMPLES,
     Array,
@@ -37,14 +38,14 @@ from symsteer.leaderboard.summary import (
     area_pairs,
     success_pairs,
 )
+from symsteer.variant import parse_variant, variant_text
 
-DEFAULT_AUDIT = Path(__file__).resolve().parents[1] / "docs" / "audit" / "summary.json"
+AUDIT = Path(__file__).resolve().parent / "results" / "audit" / "summary.json"
+"""The audit of all tasks and variants that the repository and every wheel contain."""
 
 COMPONENTS = {"tool_step": "dynamics", "cost": "reward", "observation": "observation"}
 """Defects of the audit that the map's x is the largest of, and what each one is a defect of."""
 
-BASELINE = "standard"
-COMPARED = ("equivariant", "approximate")
 MEASURES = ("auc", "success")
 """What the advantage is measured in: area under the curve, final-window success."""
 
@@ -105,15 +106,11 @@ Audit = Mapping[Place, Defect]
 
 
 def read_audit(path: Path | None = None) -> Audit:
-    """Defects by place from the audit's summary (`docs/audit/summary.json` by default).
+    """Defects by place from the audit's summary, `AUDIT` by default.
 
-    Without `path`, a summary that does not exist is an empty audit: an installed package has none.
-    Raises RecordError for a path that cannot be read or holds something else.
+    Raises UserError for a path that cannot be read or holds something else.
     """
-    if path is None:
-        if not DEFAULT_AUDIT.exists():
-            return {}
-        path = DEFAULT_AUDIT
+    path = path or AUDIT
     try:
         data = json.loads(path.read_bytes())
         if not isinstance(data, list):
@@ -121,13 +118,13 @@ def read_audit(path: Path | None = None) -> Audit:
         # JSON has no tuples, so strictness about them starts inside.
         cells = _CELLS.validate_python([_with_tuples(cell) for cell in data])
     except OSError as error:
-        raise RecordError(f"{path} cannot be read: {error.strerror}.") from error
+        raise UserError(f"{path} cannot be read: {error.strerror}.") from error
     except (ValueError, TypeError, RecursionError) as error:
         problem = "it is not such a list"
         if isinstance(error, ValidationError):
             first = error.errors(include_url=False, include_input=False)[0]
             problem = f"{'.'.join(map(str, first['loc']))[:120]}: {first['msg']}"
-        raise RecordError(
+        raise UserError(
             f"{path} is no summary of an audit ({problem}): "
             "name the summary.json that `symsteer audit --out` wrote."
         ) from error
@@ -135,7 +132,7 @@ def read_audit(path: Path | None = None) -> Audit:
     for cell in cells:
         place = cell.task, cell.embodiment, _in_order(cell.variant), cell.group
         if place in audit:
-            raise RecordError(
+            raise UserError(
                 f"{path} holds {' '.join(place)} twice: remove the older of the two cells."
             )
         audit[place] = _largest(cell)
@@ -161,8 +158,12 @@ def _largest(cell: _AuditCell) -> Defect:
 
 
 def _in_order(variant: str) -> str:
-    """One spelling for one variant, its parts in alphabetical order."""
-    return "+".join(sorted(canonical_variant(variant).split("+")))
+    """One spelling for one variant, its parts in alphabetical order; other texts as they are."""
+    try:
+        specs = parse_variant(variant)
+    except UserError:
+        return variant
+    return variant_text(sorted(specs, key=lambda spec: spec.text))
 
 
 def defect_of(key: Key, audit: Audit) -> Defect | None:
@@ -192,7 +193,7 @@ def audit_commands(keys: Sequence[Key]) -> list[str]:
 
 @dataclass(frozen=True)
 class Point:
-    """One table in one panel of the map: the advantage over `BASELINE`, paired by run seed."""
+    """One table in one panel of the map: the advantage over `STANDARD`, paired by run seed."""
 
     table: Table
     defect: Defect
@@ -257,14 +258,14 @@ class DefectMap:
 
 
 def defect_map(summary: Summary, audit: Audit) -> DefectMap:
-    """Advantage of `COMPARED` over `BASELINE` in every audited table, with lines and crossings."""
+    """Advantage of `WITH_SYMMETRY` over `STANDARD` in audited tables, with lines and crossings."""
     panels = {}
-    for agent in COMPARED:
+    for agent in WITH_SYMMETRY:
         for measure in MEASURES:
             points = []
             for table in summary.tables:
                 defect = defect_of(table.key, audit)
-                samples = tuple(advantage(table, agent, BASELINE, measure).values())
+                samples = tuple(advantage(table, agent, STANDARD, measure).values())
                 if defect and samples:
                     points.append(Point(table, defect, samples, crossed_bootstrap(samples)))
             line = fit([point for point in points if point.counts])

@@ -21,12 +21,12 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
-from symsteer.leaderboard.defects import BASELINE, COMPARED, MEASURES, DefectMap, Line, Panel
+from symsteer.leaderboard.defects import MEASURES, DefectMap, Line, Panel
 from symsteer.leaderboard.findings import Findings
+from symsteer.leaderboard.paper import BASE, STANDARD, WITH_SYMMETRY
 from symsteer.leaderboard.statistics import Interval, Sample, success_interval
 from symsteer.leaderboard.summary import (
     MIN_SEEDS,
-    REFERENCES,
     Row,
     Run,
     Summary,
@@ -177,7 +177,7 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
         start = min(row.search_steps or 0, budget)
         value = bands[0].value
         ax.hlines(value, start, budget, color=color, linestyle=line, linewidth=1.4, zorder=1.5)
-        if row.agent == "base":
+        if row.agent == BASE:
             ax.axhspan(low[0], high[0], color=color, alpha=0.10, linewidth=0)
         return
     ax.fill_between(steps, low, high, color=color, alpha=0.14, linewidth=0)
@@ -284,21 +284,22 @@ def advantage_map(found: DefectMap) -> Figure:
     its band over the audited range, the diamond is where it falls through zero, with its interval.
     """
     figure = Figure(figsize=(9.0, 6.9), layout="constrained")
-    grid = figure.subplots(len(COMPARED), len(MEASURES), sharex=True, sharey=True, squeeze=False)
+    shape = len(WITH_SYMMETRY), len(MEASURES)
+    grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
     points = [point for panel in found.panels.values() for point in panel.points]
     places = sorted({(p.table.key.task, p.table.key.embodiment) for p in points})
     markers = {p: PLACE_MARKERS[i % len(PLACE_MARKERS)] for i, p in enumerate(places)}
     right = 1.04 * max(point.defect.interval.high for point in points)
     names = {"auc": "area under the curve", "success": "final success"}
-    for row, agent in enumerate(COMPARED):
+    for row, agent in enumerate(WITH_SYMMETRY):
         for column, measure in enumerate(MEASURES):
             ax = grid[row, column]
             _draw_panel(ax, found.panels[agent, measure], markers, right)
             ax.set_title(f"{agent}, {names[measure]}")
-            if row == len(COMPARED) - 1:
+            if row == len(WITH_SYMMETRY) - 1:
                 ax.set_xlabel("audited defect")
             if column == 0:
-                ax.set_ylabel(f"advantage over {BASELINE}")
+                ax.set_ylabel(f"advantage over {STANDARD}")
     handles: dict[str, Line2D | Patch] = {
         _ascii(", ".join(place), 26): Line2D(
             [], [], color="#555555", marker=marker, linestyle="none", markersize=5
@@ -306,8 +307,8 @@ def advantage_map(found: DefectMap) -> Figure:
         for place, marker in markers.items()
     }
     if any(panel.line and panel.line.crossing.value is not None for panel in found.panels.values()):
-        shape: dict[str, Any] = {"marker": "d", "linestyle": "-", "markersize": 7}
-        handles["falls through 0, 95 %"] = Line2D([], [], color="black", **shape)
+        diamond: dict[str, Any] = {"marker": "d", "linestyle": "-", "markersize": 7}
+        handles["falls through 0, 95 %"] = Line2D([], [], color="black", **diamond)
     _legend(figure, handles, columns=4)
     return figure
 
@@ -368,7 +369,7 @@ def performance_profiles(found: Comparisons) -> Figure:
         ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
         for profile in found.profiles[group]:
             color, _, line = _style(profile.agent)
-            if profile.agent not in REFERENCES:
+            if profile.role != "reference":
                 band: dict[str, Any] = {"color": color, "alpha": 0.13, "linewidth": 0}
                 ax.fill_between(THRESHOLDS, profile.low, profile.high, **band)
             ax.plot(THRESHOLDS, profile.share, color=color, linestyle=line, linewidth=1.7)

@@ -9,8 +9,6 @@ import numpy as np
 from symsteer.leaderboard.claims import NEARLY_SYMMETRIC, STRONGLY_BROKEN, Claim
 from symsteer.leaderboard.comparisons import Comparisons
 from symsteer.leaderboard.defects import (
-    BASELINE,
-    COMPARED,
     COMPONENTS,
     MEASURES,
     MIN_CELLS,
@@ -21,6 +19,7 @@ from symsteer.leaderboard.defects import (
     audit_commands,
 )
 from symsteer.leaderboard.findings import Findings
+from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
 from symsteer.leaderboard.records import DIVERGED_EVALUATIONS, DIVERGED_SHARE, Provenance
 from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
 from symsteer.leaderboard.tables import Links, cell_name, section, status
@@ -93,7 +92,7 @@ is the audited one (next section): cells up to {NEARLY_SYMMETRIC:g} count as sym
 """
 
 MAP = f"""\
-Each point is a cell: the advantage over `{BASELINE}`, paired by seed, against the *audited
+Each point is a cell: the advantage over `{STANDARD}`, paired by seed, against the *audited
 defect*, which is measured in simulation and not read off a dial: the largest of the defects of
 dynamics (share of a step's own displacement), reward and observation. Bars are 95 % intervals;
 hollow points have fewer than {MIN_SEEDS} paired seeds and do not enter the line, which needs
@@ -229,7 +228,7 @@ def _map(summary: Summary, found: DefectMap, figures: Mapping[str, tuple[str, st
             measured = ", ".join(code(command, 1000) for command in commands)
             text += (
                 f" To measure them: {measured}; then "
-                "`python -m symsteer.bench.audit.page docs/audit/summary.json "
+                "`python -m symsteer.bench.audit.page leaderboard/results/audit/summary.json "
                 "runs/audit/summary.json`."
             )
         parts.append(text)
@@ -238,7 +237,7 @@ def _map(summary: Summary, found: DefectMap, figures: Mapping[str, tuple[str, st
 
 def _lines(found: DefectMap) -> str:
     rows = []
-    for agent in COMPARED:
+    for agent in WITH_SYMMETRY:
         for measure in MEASURES:
             panel = found.panels[agent, measure]
             counted = sum(point.counts for point in panel.points)
@@ -369,8 +368,8 @@ def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
         f"Audit of the defects: {code(audit)}",
     ]
     parts = [
-        "Regenerate with `symsteer report`, or `python -m leaderboard RECORDS --out FOLDER`: the "
-        "same records and audit give the same bytes. Each record holds the whole configuration and "
+        "Regenerate with `symsteer report`, or `symsteer report RECORDS --out FOLDER`: the same "
+        "records and audit give the same bytes. Each record holds the whole configuration and "
         "every evaluation episode with its seed.",
         "\n".join(f"- {fact}" for fact in facts),
     ]
@@ -402,7 +401,7 @@ def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
 
 def _commit(place: Provenance, short: bool = False) -> str:
     if place.commit is None:
-        return "outside git"
+        return f"version {place.version}" if place.version else "outside git"
     dirty = "+" if short else " with local changes"
     return place.commit[:12] + (dirty if place.dirty else "")
 

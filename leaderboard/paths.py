@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterable
 from pathlib import Path
 
-from symsteer.leaderboard.errors import RecordError
+from symsteer.errors import UserError
 
 RECORD = "record.json"
 """The record's name in a run folder; committed records are called by their run_id."""
@@ -19,12 +19,12 @@ _BEGINNING = re.compile(rb'\s*\{\s*"schema_version"\s*:\s*\d+\s*,\s*"run_id"')
 def record_files(paths: Iterable[Path]) -> list[Path]:
     """The files that `paths` name (files, run folders, folders of either), resolved, each once.
 
-    In a folder every `record.json` at any depth counts, and with them whatever begins like a
-    record; run folders hold other JSON as well. A folder without any `record.json` must hold
+    In a folder every `record.json` at any depth counts, and beside these every `*.json` that begins
+    like a record; run folders hold other JSON as well. A folder without any `record.json` must hold
     nothing but records as `*.json`. Links to files are followed, links to folders are not.
 
     Raises:
-        RecordError: for a path that does not exist or is neither a file nor a folder, a folder
+        UserError: for a path that does not exist or is neither a file nor a folder, a folder
             that cannot be listed, a name that is not UTF-8, or when there is no file at all.
     """
     paths = list(paths)
@@ -32,17 +32,17 @@ def record_files(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         for file in _in_folder(path) if stat.S_ISDIR(_mode(path)) else [path]:
             if not stat.S_ISREG(_mode(file)):
-                raise RecordError(f"{file} is no ordinary file: name a record or a folder.")
+                raise UserError(f"{file} is no ordinary file: name a record or a folder.")
             resolved = file.resolve()
             try:
                 os.fspath(resolved).encode()
             except UnicodeEncodeError as error:
                 name = ascii(os.fspath(resolved))
-                raise RecordError(f"{name} has a name that is not UTF-8: rename it.") from error
+                raise UserError(f"{name} has a name that is not UTF-8: rename it.") from error
             found[resolved] = None
     if not found:
         names = ", ".join(str(path) for path in paths)
-        raise RecordError(f"{names} holds no record: run `symsteer run` first or name its folder.")
+        raise UserError(f"{names} holds no record: run `symsteer run` first or name its folder.")
     return list(found)
 
 
@@ -50,16 +50,16 @@ def _mode(path: Path) -> int:
     try:
         return path.stat().st_mode
     except FileNotFoundError as error:
-        raise RecordError(
+        raise UserError(
             f"{path} does not exist: name a record or a folder with records."
         ) from error
     except OSError as error:
-        raise RecordError(f"{path} cannot be read: {error.strerror}; name another path.") from error
+        raise UserError(f"{path} cannot be read: {error.strerror}; name another path.") from error
 
 
 def _in_folder(folder: Path) -> list[Path]:
     def refuse(error: OSError) -> None:
-        raise RecordError(
+        raise UserError(
             f"{error.filename} cannot be read: {error.strerror}; make it readable or leave it out."
         ) from error
 
@@ -83,6 +83,6 @@ def _begins_like_a_record(file: Path) -> bool:
         with open(file, "rb") as opened:
             return _BEGINNING.match(opened.read(128)) is not None
     except OSError as error:
-        raise RecordError(
+        raise UserError(
             f"{file} cannot be read: {error.strerror}; make it readable or leave it out."
         ) from error

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import hashlib
 import os
 import re
@@ -11,8 +9,9 @@ import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from symsteer.errors import UserError
+from symsteer.files import write_together
 from symsteer.leaderboard.defects import Audit, read_audit
-from symsteer.leaderboard.errors import RecordError
 from symsteer.leaderboard.figures import render_figures, to_svg
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.page import render_page
@@ -21,41 +20,45 @@ from symsteer.leaderboard.tables import render_csv
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
 
-DEFAULT_OUT = Path(__file__).resolve().parent
-DEFAULT_RECORDS = DEFAULT_OUT / "results"
+PAGE_FOLDER = Path(__file__).resolve().parent
+"""The folder of the committed leaderboard, in a checkout of the repository."""
+
+RECORDS = PAGE_FOLDER / "results" / "records"
+"""The committed records; an installed package has none."""
+
 FIGURE_NAME = re.compile(r"(map|profiles|improvement|(success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
 
 
-def generate(
-    records: Sequence[Path] = (DEFAULT_RECORDS,),
-    out: Path = DEFAULT_OUT,
-    audit: Path | None = None,
-) -> list[Path]:
-    """Write LEADERBOARD.md, leaderboard.csv and figures/ into `out`; returns the files written.
+def generate(records: Sequence[Path], out: Path, audit: Path | None = None) -> list[Path]:
+    """Write LEADERBOARD.md, leaderboard.csv and figures/ into `out`.
 
-    `audit` is the summary of an audit, the committed one by default (`read_audit`).
+    Figures of an earlier call that no longer belong to a table are removed.
 
-    Everything is rendered, then everything is written under temporary names, before the first file
-    is replaced: bad records, a full disk or a read-only folder leave `out` as it was. Figures of an
-    earlier call that no longer belong to a table are removed. Raises RecordError.
+    Args:
+        records: record files, run folders, or folders of these.
+        out: the folder to write into.
+        audit: summary of an audit, the committed one by default (`read_audit`).
+
+    Returns:
+        The files written.
+
+    Raises:
+        UserError: for bad records, a full disk or a folder that cannot be written; `out` is then
+            as it was (`write_together`).
     """
     out = _folder(out)
     files = render(load_runs(records), out, read_audit(audit))
-    _replace_together(
-        {out / name: data for name, data in files.items()},
-        [out / name for name in _stale(out, files)],
-    )
+    if (out / "figures").is_symlink():
+        raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it.")
+    stale = [out / name for name in _stale(out, files)]
+    write_together({out / name: data for name, data in files.items()}, stale)
     return [out / name for name in files]
 
 
-def verify(
-    records: Sequence[Path] = (DEFAULT_RECORDS,),
-    out: Path = DEFAULT_OUT,
-    audit: Path | None = None,
-) -> Verification:
+def verify(records: Sequence[Path], out: Path, audit: Path | None = None) -> Verification:
     """Compare the files in `out` with what `generate` would write; changes nothing.
 
-    Arguments as of `generate`. Raises RecordError.
+    Arguments and errors are those of `generate`.
     """
     out = _folder(out)
     runs = load_runs(records)
@@ -85,7 +88,7 @@ def render(runs: Sequence[Run], out: Path, audit: Audit) -> dict[str, bytes]:
 
 
 def slug(*texts: str) -> str:
-    """A file name of lower-case letters, digits and dashes, told apart by a hash of the texts."""
+    """A file name of lower-case letters, digits and dashes; it ends with a hash of the texts."""
     words = "-".join(re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") for text in texts)
     digest = hashlib.sha256("\0".join(texts).encode()).hexdigest()
     return f"{words[:60].strip('-') or 'run'}-{digest[:6]}"
@@ -99,50 +102,11 @@ def _folder(out: Path) -> Path:
     except FileNotFoundError:
         return out
     except OSError as error:
-        raise RecordError(
-            f"{out} cannot be used: {error.strerror}; name another folder."
-        ) from error
-    raise RecordError(f"{out} is a file: name a folder for the leaderboard.")
+        raise UserError(f"{out} cannot be used: {error.strerror}; name another folder.") from error
+    raise UserError(f"{out} is a file: name a folder for the leaderboard.")
 
 
 def _stale(out: Path, files: Mapping[str, bytes]) -> list[str]:
     """Figures in `out` that carry a name of ours but belong to no table of `files`."""
     names = (f"figures/{path.name}" for path in (out / "figures").glob("*.svg"))
     return sorted(n for n in names if n not in files and FIGURE_NAME.fullmatch(Path(n).name))
-
-
-def _replace_together(files: Mapping[Path, bytes], stale: Sequence[Path]) -> None:
-    """Write all `files` and remove the `stale` ones or, as far as one can promise it, do nothing.
-
-    Raises:
-        RecordError: when a folder cannot be written, leads elsewhere, or the disk is full; nothing
-            has changed then (only a failing rename, after all data have reached the disk, can
-            leave a mixture, which `verify` tells).
-    """
-    staged: list[tuple[Path, Path]] = []
-    path = Path()
-    try:
-        for path, data in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.parent.resolve() != path.parent:
-                raise RecordError(f"{path.parent} is a link: make it a folder, or remove it.")
-            if path.is_dir():
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-            temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-            staged.append((temporary, path))
-            with open(temporary, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-        for temporary, path in staged:
-            os.replace(temporary, path)
-        for path in stale:
-            path.unlink()
-    except OSError as error:
-        raise RecordError(
-            f"{path} cannot be written: {error.strerror}; free space or choose another folder."
-        ) from error
-    finally:
-        for temporary, _ in staged:
-            with contextlib.suppress(OSError):
-                temporary.unlink()

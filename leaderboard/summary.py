@@ -12,8 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from symsteer.leaderboard.paper import BASE, ROW_ORDER
 from symsteer.leaderboard.paths import record_files
-from symsteer.leaderboard.records import Evaluation, Provenance, RunRecord, config_hash, read_record
+from symsteer.leaderboard.records import (
+    ROLES,
+    Evaluation,
+    Provenance,
+    Role,
+    RunRecord,
+    config_hash,
+    read_record,
+)
 from symsteer.leaderboard.statistics import (
     Block,
     Interval,
@@ -32,12 +41,6 @@ SYMMETRIC_EMBODIMENT = "floating"
 """The embodiment whose states turn with the world; any other one has an arm."""
 
 ARM = "arm kinematics"
-
-REFERENCES = ("base", "zero", "golden-ticket")
-"""Agents that do not learn: they are compared with, never ranked."""
-
-AGENTS = (*REFERENCES, "standard", "standard-matched", "equivariant", "approximate")
-"""The order of the rows; agents that are not listed follow in alphabetical order."""
 
 MIN_SEEDS = 5
 """Finished runs, or pairs of them, that a rank and a verdict need."""
@@ -60,9 +63,10 @@ Pair = tuple[str, int]
 """Content hash of the base policy and run seed."""
 
 
-def agent_rank(agent: str) -> tuple[int, str]:
-    """Sorting key of agents: the fixed order first, then by name."""
-    return (AGENTS.index(agent) if agent in AGENTS else len(AGENTS)), agent
+def row_place(agent: str, role: Role) -> tuple[int, int, str]:
+    """Sorting key of agents: by role, then those of `ROW_ORDER`, then by name."""
+    index = ROW_ORDER.index(agent) if agent in ROW_ORDER else len(ROW_ORDER)
+    return ROLES.index(role), index, agent
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class Run:
 
     @property
     def seed(self) -> int:
-        return self.record.cell.seed
+        return self.record.settings.seed
 
     @property
     def pair(self) -> Pair:
@@ -83,7 +87,7 @@ class Run:
 
     @property
     def agent(self) -> str:
-        return self.record.cell.agent
+        return self.record.settings.agent
 
     @property
     def finished(self) -> bool:
@@ -101,7 +105,7 @@ class Run:
 
     @property
     def is_reference(self) -> bool:
-        return self.agent in REFERENCES
+        return self.record.role == "reference"
 
     @cached_property
     def final_success(self) -> dict[int, float]:
@@ -118,7 +122,7 @@ class Run:
         final = self.record.final
         if final is None:
             return {}
-        start = (FINAL_WINDOW - 1) * self.record.cell.env_steps
+        start = (FINAL_WINDOW - 1) * self.record.settings.env_steps
         inside = [
             evaluation
             for step, evaluation in self.curve.items()
@@ -155,7 +159,7 @@ class Run:
         """Mean success by episode seed over the evaluations in a fifth of the budget, 1 to 5."""
         values: dict[int, list[float]] = defaultdict(list)
         for step, evaluation in self.curve.items():
-            inside = 1 + FINAL_WINDOW * step // self.record.cell.env_steps
+            inside = 1 + FINAL_WINDOW * step // self.record.settings.env_steps
             if min(inside, FINAL_WINDOW) == number:
                 for seed, success in episode_success(evaluation).items():
                     values[seed].append(success)
@@ -163,7 +167,7 @@ class Run:
 
     def in_window(self, name: str) -> list[float]:
         """Finite values of a diagnostic in the evaluations of the final window."""
-        start = (FINAL_WINDOW - 1) * self.record.cell.env_steps
+        start = (FINAL_WINDOW - 1) * self.record.settings.env_steps
         evaluations = [e for step, e in self.curve.items() if FINAL_WINDOW * step >= start]
         values = [evaluation.diagnostics.get(name) for evaluation in evaluations]
         return [value for value in values if value is not None]
@@ -215,16 +219,16 @@ class Key:
 
     @classmethod
     def of(cls, record: RunRecord) -> Key:
-        cell, policy = record.cell, record.base_policy
+        settings, policy = record.settings, record.base_policy
         return cls(
-            cell.task,
-            cell.embodiment,
-            (cell.variant != "none", cell.variant),
+            settings.task,
+            settings.embodiment,
+            (settings.variant != "none", settings.variant),
             policy.name,
             policy.group or "",
-            cell.demonstrations.mode,
-            cell.demonstrations.count,
-            cell.env_steps,
+            settings.demonstrations.mode,
+            settings.demonstrations.count,
+            settings.env_steps,
         )
 
 
@@ -233,6 +237,7 @@ class Row:
     """An agent (one recipe of it) in one table."""
 
     agent: str
+    role: Role
     recipe: str
     runs: list[Run]
     missing: int = 0
@@ -254,7 +259,8 @@ class Row:
 
     @property
     def is_reference(self) -> bool:
-        return self.agent in REFERENCES
+        """Whether it is compared with and never ranked."""
+        return self.role == "reference"
 
     @property
     def episodes(self) -> list[int]:
@@ -310,7 +316,7 @@ class Table:
 
     @property
     def learners(self) -> list[Row]:
-        """Rows with finished runs of agents that learn."""
+        """Rows with finished runs of agents that are no references."""
         return [row for row in self.rows if row.finished and not row.is_reference]
 
     def row_of(self, agent: str) -> Row | None:
@@ -353,14 +359,20 @@ class Summary:
         return [run for table in self.tables for run in table.runs]
 
     @property
+    def roles(self) -> dict[str, Role]:
+        """Role by agent, in the order of the rows."""
+        roles = {row.agent: row.role for table in self.tables for row in table.rows}
+        return dict(sorted(roles.items(), key=lambda item: row_place(*item)))
+
+    @property
     def agents(self) -> list[str]:
-        return sorted({row.agent for table in self.tables for row in table.rows}, key=agent_rank)
+        return list(self.roles)
 
 
 def load_runs(paths: Iterable[Path]) -> list[Run]:
     """Read the records that `paths` name: files, run folders, folders of either.
 
-    `record_files` says which files those are. Raises RecordError for a path that names none and
+    `record_files` says which files those are. Raises UserError for a path that names none and
     for a file that is not a valid record.
     """
     return [Run(file, read_record(file)) for file in record_files(paths)]
@@ -402,8 +414,10 @@ def summarize(runs: Sequence[Run]) -> Summary:
     tables: dict[Key, dict[tuple[str, str], list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in chosen:
         tables[Key.of(run.record)][run.agent, recipe_of(run.record.config)].append(run)
-    agents = {run.agent for run in chosen}
-    built = [_table(key, rows, agents) for key, rows in sorted(tables.items())]
+    # An agent has one role: that of its newest run.
+    by_age = sorted(chosen, key=lambda run: (run.record.started, run.record.run_id))
+    roles = {run.agent: run.record.role for run in by_age}
+    built = [_table(key, rows, roles) for key, rows in sorted(tables.items())]
     return Summary(built, set_aside)
 
 
@@ -427,15 +441,18 @@ def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
     return chosen, set_aside
 
 
-def _table(key: Key, groups: Mapping[tuple[str, str], list[Run]], agents: set[str]) -> Table:
+def _table(
+    key: Key, groups: Mapping[tuple[str, str], list[Run]], roles: Mapping[str, Role]
+) -> Table:
     seeds = {run.seed for runs in groups.values() for run in runs}
     rows = []
     for (agent, recipe), runs in groups.items():
         have = {run.seed for run in runs}
-        rows.append(Row(agent, recipe, sorted(runs, key=lambda r: r.seed), len(seeds - have)))
-    for agent in agents - {agent for agent, _ in groups}:
-        rows.append(Row(agent, "", [], len(seeds)))
-    rows.sort(key=lambda row: (agent_rank(row.agent), row.recipe))
+        runs = sorted(runs, key=lambda run: run.seed)
+        rows.append(Row(agent, roles[agent], recipe, runs, len(seeds - have)))
+    for agent in roles.keys() - {agent for agent, _ in groups}:
+        rows.append(Row(agent, roles[agent], "", [], len(seeds)))
+    rows.sort(key=lambda row: (row_place(row.agent, row.role), row.recipe))
     for row in rows:
         twins = sum(other.agent == row.agent for other in rows)
         row.label = row.agent if twins == 1 else f"{row.agent} {row.recipe[:6]}"
@@ -443,9 +460,9 @@ def _table(key: Key, groups: Mapping[tuple[str, str], list[Run]], agents: set[st
     for row in rows:
         _fill(row, key.env_steps)
     table = Table(key, rows, _threshold(rows))
-    base = table.row_of("base")
+    base = table.row_of(BASE)
     for row in rows:
-        if base and row.agent != "base":
+        if base and row.agent != BASE:
             _against_base(row, base)
         if table.threshold is not None and not row.is_reference:
             row.threshold_steps = [
@@ -487,7 +504,7 @@ def _pooled(window: Mapping[tuple[int, int], float]) -> Sample:
 
 
 def _threshold(rows: Sequence[Row]) -> float | None:
-    finals = [row.success.value for row in rows if row.success and not row.is_reference]
+    finals = [row.success.value for row in rows if row.success and row.role == "learner"]
     return THRESHOLD * max(finals) if finals else None
 
 
@@ -581,7 +598,7 @@ def aligned(run: Run, other: Run) -> dict[int, int]:
 
     That is the nearest one, if it is at most `SAME_POINT` of the budget away.
     """
-    reach = SAME_POINT * run.record.cell.env_steps
+    reach = SAME_POINT * run.record.settings.env_steps
     found = {}
     for step in run.curve:
         twin = min(other.curve, key=lambda there: (abs(there - step), there), default=None)
@@ -602,12 +619,12 @@ def compare(first: Row, second: Row) -> Interval | None:
 
 
 def _rank(rows: Sequence[Row]) -> None:
-    """Rank learning agents: 1 + the number of rows that are clearly better.
+    """Rank learners: 1 + the number of learners that are clearly better.
 
     Two rows are compared if they have `MIN_SEEDS` pairs of runs, with the same seed on the same
     base policy; a row that can be compared with no other one gets no rank.
     """
-    for first, second in combinations([row for row in rows if not row.is_reference], 2):
+    for first, second in combinations([row for row in rows if row.role == "learner"], 2):
         pairs = success_pairs(first, second)
         if len(pairs) < MIN_SEEDS:
             continue

@@ -7,6 +7,7 @@ import io
 from collections.abc import Mapping
 from pathlib import Path
 
+from symsteer.leaderboard.paper import BASE
 from symsteer.leaderboard.summary import ARM, THRESHOLD, Key, Row, Summary, Table
 from symsteer.leaderboard.text import (
     MARKS,
@@ -118,7 +119,7 @@ def _base_line(table: Table) -> str:
         f"noise {over('action_std')}, initial states solved in {draws} draws {over('solvable')}."
     )
     if table.threshold is not None:
-        base = table.row_of("base")
+        base = table.row_of(BASE)
         there = base and base.success and base.success.value >= table.threshold
         already = ", where the base policy already is" if there else ""
         text.append(f"Steps count to a success of {number(table.threshold)}{already}.")
@@ -257,7 +258,7 @@ def _notes(table: Table) -> list[str]:
                 f"{code(row.label)}, seed {run.seed}: {record.status}, "
                 f"last evaluated after {count(done)} steps{why}"
             )
-        if row.runs and row.agent != "base" and row.finished and row.difference is None:
+        if row.runs and row.agent != BASE and row.finished and row.difference is None:
             notes.append(f"{code(row.label)}: no base run on the same episodes to compare with")
     if any(row.label != row.agent for row in table.rows):
         split = ", ".join(code(row.label) for row in table.rows if row.label != row.agent)

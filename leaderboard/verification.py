@@ -54,7 +54,7 @@ def other_versions() -> list[str]:
     """Packages that are not of the pinned version, as "name version, pinned: version"."""
     try:
         pins = dict(re.findall(r"^([a-z0-9.-]+)==(\S+)$", REQUIREMENTS.read_text(), re.M))
-    except OSError:  # an installed package has no pins
+    except OSError:  # an installed package has no list of pinned versions
         return []
     return [
         f"{name} {version}, pinned: {pins[name]}"

@@ -1,8 +1,8 @@
 """How vectors split into geometric parts, and how planar symmetries act on them.
 
 A :class:`Layout` is the only place that knows which numbers of an observation, an action or a
-noise vector are horizontal vectors, scalars or higher frequencies. Normaliser, networks, audit
-and tests ask it; nobody else slices by index.
+noise vector are horizontal vectors, scalars or higher frequencies. All other code asks it for
+slices and matrices and never indexes such a vector by number.
 
 A planar symmetry is a pair ``(angle, reflect)``: first the reflection (x, y) -> (x, -y) if
 ``reflect``, then the rotation by ``angle`` about the vertical axis. An irrep block of frequency
@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -163,23 +163,33 @@ class Layout:
         return x @ self.matrix(angle, reflect, x.dtype).to(x.device).T
 
     def rotate(self, x: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-        """Turn every row of ``x [N, dim]`` by its own ``angle [N]`` (radians)."""
-        frequency = torch.cat([torch.full((f.dim,), float(f.frequency)) for f in self.fields]).to(x)
-        turn = frequency * angle.to(x)[:, None]
-        partner = torch.arange(self.dim)
-        sign = torch.zeros(self.dim)
+        """Turn every row of ``x [N, ..., dim]`` by its own ``angle [N]`` (radians)."""
+        frequency, partner, sign = self._quarter_turn
+        turn = angle.to(x).view(-1, *(1,) * (x.dim() - 1)) * frequency.to(x)
+        # x cos(k a) + J x sin(k a), where J turns each vector by 90 degrees.
+        return turn.cos() * x + turn.sin() * sign.to(x) * x[..., partner.to(x.device)]
+
+    @functools.cached_property
+    def _quarter_turn(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Each number's frequency, and J as (index, sign): (J x)[i] = sign[i] x[index[i]]."""
+        frequency = torch.cat([torch.full((f.dim,), float(f.frequency)) for f in self.fields])
+        partner, sign = torch.arange(self.dim), torch.zeros(self.dim)
         for block in self.blocks:
             if block.stop - block.start == 2:
                 partner[block] = partner[block].flip(0)
                 sign[block] = torch.tensor([-1.0, 1.0])
-        return turn.cos() * x + turn.sin() * sign.to(x) * x[:, partner.to(x.device)]
+        return frequency, partner, sign
 
     def field_type(self, group: Group) -> escnn.nn.FieldType:
-        """escnn's field type over a point, in the same basis as :meth:`matrix`."""
-        import escnn.nn
-        from escnn import gspaces
+        """escnn's field type over a point, in the same basis as :meth:`matrix`.
 
-        space = gspaces.no_base_space(group.escnn_group(max(f.frequency for f in self.fields)))
+        Raises:
+            UserError: if escnn is not installed.
+        """
+        escnn = _escnn()
+        space = escnn.gspaces.no_base_space(
+            group.escnn_group(max(f.frequency for f in self.fields))
+        )
         representations = [
             _escnn_representation(space.fibergroup, group, field)
             for field in self.fields
@@ -304,9 +314,12 @@ class Group:
         return _representation(self, layout, dtype, torch.device(device))
 
     def escnn_group(self, maximum_frequency: int = 1) -> escnn.group.Group:
-        """The same group in escnn."""
-        from escnn import group
+        """The same group in escnn.
 
+        Raises:
+            UserError: if escnn is not installed.
+        """
+        group = _escnn().group
         if self.rotations == 0:
             return group.so2_group(max(maximum_frequency, 1))
         if self.reflections:
@@ -322,6 +335,48 @@ def _representation(
     return torch.stack(matrices).to(dtype=dtype, device=device)
 
 
+def equivariance_error(
+    function: Callable[..., torch.Tensor],
+    inputs: Sequence[torch.Tensor],
+    layouts: Sequence[Layout],
+    output_layout: Layout,
+    group: Group,
+) -> float:
+    """max over g of rms ||f(g x) - g f(x)|| / rms ||f(x)||.
+
+    The outputs are compared in float64; the inputs are transformed in their own type.
+
+    Args:
+        function: f, called with the inputs as positional arguments.
+        inputs: x, each ``[..., dim]`` of its layout; the group acts on the last axis.
+        layouts: one for each input.
+        output_layout: of the last axis of what f returns.
+        group: a finite group.
+    """
+    own = function(*inputs).double()
+    size = own.square().mean().sqrt().clamp(min=1e-30)
+    worst = 0.0
+    for angle, reflect in group.elements:
+        moved = function(
+            *(n.transform(x, angle, reflect) for x, n in zip(inputs, layouts, strict=True))
+        )
+        gap = moved.double() - output_layout.transform(own, angle, reflect)
+        worst = max(worst, (gap.square().mean().sqrt() / size).item())
+    return worst
+
+
+def _escnn() -> Any:
+    try:
+        import escnn.gspaces
+        import escnn.nn
+    except ImportError as error:
+        raise UserError(
+            f"escnn is needed here and cannot be imported ({error}); "
+            'install it with: pip install "symsteer[escnn]"'
+        ) from error
+    return escnn
+
+
 def _cos_sin(angle: float) -> tuple[float, float]:
     """Cosine and sine, exact at multiples of 90 degrees so that C4 permutes axes exactly."""
     quarter = angle / (math.pi / 2)
@@ -335,7 +390,6 @@ def _escnn_representation(
 ) -> escnn.group.Representation:
     """One irrep block of ``field`` as an escnn representation in the layout's basis."""
     import numpy as np
-    from escnn.group import Representation
 
     n, k = group.rotations, field.frequency
     if n == 0:
@@ -361,5 +415,5 @@ def _escnn_representation(
     name = f"frequency{field.frequency}{'odd' if field.odd else ''}"
     known = fibergroup.representations
     if name not in known:
-        known[name] = Representation(fibergroup, name, irreps, basis)
+        known[name] = _escnn().group.Representation(fibergroup, name, irreps, basis)
     return known[name]

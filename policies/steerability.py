@@ -1,8 +1,8 @@
-"""How much of a base policy's behavior its noise decides.
+"""How much a base policy's actions depend on its noise.
 
-Steering chooses the noise; where every noise decodes to the same actions there is nothing to
-steer. This is the part of the steerability report that needs no simulator; success over noise
-draws is measured in the bench.
+Steering chooses the noise. If every noise decodes to the same actions, there is nothing to steer.
+This part of the steerability report needs no simulator; success over noise draws is measured in
+:mod:`symsteer.bench.steering.evaluation`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 
 DESIRED_ACTION_STD = 0.3
 """Below this spread of normalised actions steering gained little in pilot runs."""
@@ -26,12 +26,12 @@ STILL = 1e-2
 def action_spread(
     policy: ChunkPolicy, observations: torch.Tensor, draws: int = 16, seed: int = 0
 ) -> dict[str, Any]:
-    """Spread of the executed actions over the noise, relative to the demonstrations' variety.
+    """Standard deviation of the executed actions over the noise, relative to the demonstrations'.
 
     For each irrep block: the root mean square, over observations, executed steps and components,
     of the standard deviation over ``draws`` standard normal noises, divided by the block's
-    standard deviation over all demonstrated actions. 0: observations decide everything; 1: the
-    noise alone decides as much as all that differs between demonstrated actions. Invariant under
+    standard deviation over all demonstrated actions. 0: the actions depend on the observations
+    only. 1: at a fixed observation they vary as much as all demonstrated actions. Invariant under
     rotations.
 
     Args:

@@ -119,10 +119,26 @@ class Registry(Generic[T]):
         if not (isinstance(found, type) and issubclass(found, base)):
             module, _, attribute = self.base.partition(":")
             raise UserError(
-                f"{target} is not a {self.kind}; it must be a class that inherits from "
+                f"{target} cannot be used as {self.kind}; it must be a class that inherits from "
                 f"{module}.{attribute}"
             )
         return found  # type: ignore[return-value]
+
+    def name_of(self, found: type) -> str:
+        """The name under which :meth:`get` finds a class; ``module:Class`` if it has no other.
+
+        Raises:
+            UserError: if the class cannot be imported by a name.
+        """
+        target = f"{found.__module__}:{found.__qualname__}"
+        targets = {name: points[0].value for name, points in self._entry_points().items()}
+        names = [name for name, own in {**targets, **self.builtin}.items() if own == target]
+        if not names and (found.__module__ == "__main__" or not TARGET.fullmatch(target)):
+            raise UserError(
+                f"the {self.kind} {found.__qualname__} cannot be found again by a name; define it "
+                "at the top of a module that can be imported"
+            )
+        return names[0] if names else target
 
     def summary(self, name: str) -> str:
         """First line of the docstring of a name's class, read without importing it."""
@@ -159,7 +175,7 @@ class Registry(Generic[T]):
         owners += [point.dist.name if point.dist else point.value for point in points]
         if len(owners) > 1:
             raise UserError(
-                f"{' and '.join(owners)} both offer a {self.kind} {name!r}; uninstall one of them"
+                f"{' and '.join(owners)} both offer the {self.kind} {name!r}; uninstall one of them"
             )
 
 

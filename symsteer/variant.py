@@ -7,8 +7,10 @@ variants to say (``symsteer.bench.variants``).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from numbers import Real
+from typing import Any
 
 from symsteer.errors import UserError
 
@@ -31,7 +33,7 @@ class VariantSpec:
     strength: float | tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if not all(0 <= value <= 1 for value in self._strengths):
+        if not all(isinstance(value, Real) and 0 <= value <= 1 for value in self._strengths):
             raise UserError(
                 f"the strength of variant {self.name!r} must lie in [0, 1], one number or one per "
                 f"environment; it is {self.strength}"
@@ -39,7 +41,7 @@ class VariantSpec:
 
     @property
     def _strengths(self) -> tuple[float, ...]:
-        return self.strength if isinstance(self.strength, tuple) else (self.strength,)
+        return _as_tuple(self.strength)
 
     @property
     def changes_nothing(self) -> bool:
@@ -56,13 +58,15 @@ class VariantSpec:
 
 
 def parse_variant(
-    text: str, strength: float | Sequence[float] | None = None
+    text: str, strength: Any = None, check: Callable[[str], Any] = str
 ) -> tuple[VariantSpec, ...]:
     """Read a text such as ``action_gain:0.5+wind:1``.
 
     Args:
         text: ``none``, ``name:strength``, or several of these joined by ``+``.
-        strength: of a single name that is written without one.
+        strength: of a single name that is written without one; a number, or one per environment
+            as a sequence, array or tensor.
+        check: called with each name before its strength is read; raises for an unknown one.
 
     Returns:
         Every part in the given order, those of strength 0 included.
@@ -71,8 +75,9 @@ def parse_variant(
         UserError: for a repeated name, a missing, repeated or malformed strength, one outside of
             [0, 1], or one without a name.
     """
+    values = _plain(strength)
     if text == UNBROKEN:
-        if strength is not None and any(value != 0 for value in _as_tuple(strength)):
+        if any(value not in (None, 0) for value in _as_tuple(values)):
             raise UserError(
                 f"strength={strength} was given without a variant; name one, e.g. "
                 "variant='action_gain'"
@@ -87,6 +92,7 @@ def parse_variant(
     for part in parts:
         # The name may be package.module:Class, so the strength follows the last colon.
         name, colon, number = _divide(part)
+        check(name)
         if any(spec.name == name for spec in specs):
             raise UserError(f"the variant {name!r} is named twice in {text!r}; name it once")
         if colon and strength is not None:
@@ -97,9 +103,7 @@ def parse_variant(
         if colon:
             specs.append(VariantSpec(name, _number(name, number, text)))
         elif strength is not None and len(parts) == 1:
-            values = _as_tuple(strength)
-            single = isinstance(strength, int | float)
-            specs.append(VariantSpec(name, values[0] if single else values))
+            specs.append(VariantSpec(name, values))
         else:
             raise UserError(f"the variant {name!r} needs a strength in [0, 1], e.g. {name}:0.5")
     return tuple(specs)
@@ -110,6 +114,16 @@ def variant_text(specs: Iterable[VariantSpec]) -> str:
     return "+".join(spec.text for spec in specs) or UNBROKEN
 
 
+def lacks_strength(text: str) -> bool:
+    """Whether a text is a single name without a strength, such as ``wind``."""
+    return text != UNBROKEN and "+" not in text and not _divide(text)[1]
+
+
+def file_name(text: str) -> str:
+    """The text of a variant as a part of file names, which may not hold a colon."""
+    return text.replace(":", "=")
+
+
 def _divide(part: str) -> tuple[str, str, str]:
     """Name, colon and number of ``name:number``, ``name`` or ``package.module:Class:number``."""
     name, colon, number = part.rpartition(":")
@@ -118,8 +132,14 @@ def _divide(part: str) -> tuple[str, str, str]:
     return name, colon, number
 
 
-def _as_tuple(strength: float | Sequence[float]) -> tuple[float, ...]:
-    return (strength,) if isinstance(strength, int | float) else tuple(strength)
+def _plain(values: Any) -> Any:
+    """A number, or a tuple of the numbers of a sequence, array or tensor."""
+    values = values.tolist() if hasattr(values, "tolist") else values
+    return tuple(values) if isinstance(values, list) else values
+
+
+def _as_tuple(values: Any) -> tuple:
+    return values if isinstance(values, tuple) else (values,)
 
 
 def _number(name: str, number: str, text: str) -> float:

@@ -17,8 +17,8 @@ import torch
 from mani_skill.agents.robots import Panda
 
 from symsteer.bench.sim.kinematics import SerialChain
+from symsteer.bench.sim.rotations import planar_matrix, transform_angular, wrap
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.rotations import planar_matrix, transform_angular, wrap
 
 ITERATIONS = 60
 DAMPING = 0.02

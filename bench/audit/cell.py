@@ -31,10 +31,11 @@ from symsteer.bench.audit.states import Visited, visit
 from symsteer.bench.sim.environment import Simulator
 from symsteer.bench.tasks import check_embodiment, make, task_class
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.variants import parse
+from symsteer.bench.variants import read
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Field, Layout
+from symsteer.variant import file_name
 
 VERSION = 1
 
@@ -80,7 +81,7 @@ class Settings:
         """
         task_class(self.task)
         check_embodiment(self.embodiment)
-        parse(self.variant)
+        read(self.variant)
         check_group(self.group)
         for name, least in (("count", LEAST_STATES), ("chunk", 1), ("resets", 16)):
             if getattr(self, name) < least:
@@ -98,7 +99,7 @@ class Settings:
     @property
     def name(self) -> str:
         """A name for files."""
-        return f"{self.task}-{self.embodiment}-{self.variant.replace(':', '=')}-{self.group}"
+        return f"{self.task}-{self.embodiment}-{file_name(self.variant)}-{self.group}"
 
     @property
     def visitors(self) -> tuple[Literal["expert", "policy"], ...]:

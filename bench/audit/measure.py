@@ -26,10 +26,10 @@ from symsteer.bench.audit.states import (
     task_state,
 )
 from symsteer.bench.sim.environment import Simulator
+from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.rotations import planar_matrix, transform_quaternion
-from symsteer.bench.variants import overriding
+from symsteer.bench.variants.base import overriding
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 

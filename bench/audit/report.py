@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 from symsteer.bench.audit.cell import BIN, Cell, Defect, Settings
 from symsteer.bench.audit.estimates import Estimate
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import write_atomically
+from symsteer.files import write_atomically
 
 EXACT = 1e-3
 """Reward and observation defects below this are rounding."""
@@ -299,7 +299,7 @@ def write_cell(cell: Cell, folder: Path) -> None:
     """Write ``audit.json``, ``map.csv`` and ``map.png``.
 
     Raises:
-        RecordError: if the folder cannot be written.
+        UserError: if the folder cannot be written.
     """
     rows = ["body,x_mm,y_mm,copies,mm"]
     rows += [f"{b.body},{b.x_mm:g},{b.y_mm:g},{b.copies},{b.mm:.4g}" for b in cell.map]
@@ -331,7 +331,7 @@ def write_table(cells: Sequence[Cell], folder: Path) -> None:
     """Write ``table.csv``, ``table.md`` and ``summary.json`` of many cells.
 
     Raises:
-        RecordError: if the folder cannot be written.
+        UserError: if the folder cannot be written.
     """
     rows = [summary(cell) for cell in cells]
     write_atomically(folder / "table.csv", to_csv(rows).encode())

@@ -15,12 +15,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
+from symsteer.bench.sim.rotations import planar_matrix
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
-from symsteer.bench.tasks.rotations import planar_matrix
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
 
 Actions = Literal["random", "expert", "policy"]

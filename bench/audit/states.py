@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from symsteer.bench.audit.arm import ArmTurner
+from symsteer.bench.sim.rotations import planar_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
-from symsteer.bench.tasks.rotations import planar_matrix
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 
 Visitor = Literal["expert", "policy"]
 Element = tuple[float, bool]

@@ -11,10 +11,12 @@ from symsteer.bench.audit.cell import Cell, Settings, audit, reference_task, vis
 from symsteer.bench.audit.report import read_cell, same_settings, write_cell
 from symsteer.bench.runs.base_policy import prepare_base
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.tasks import embodiments, task_class, task_names
-from symsteer.bench.variants import describe, parse, variant_names
+from symsteer.bench.tasks import EMBODIMENTS, TASKS, task_class
+from symsteer.bench.variants import VARIANTS, read
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy, load_policy
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.files import load_policy
+from symsteer.variant import UNBROKEN, lacks_strength, variant_text
 
 Progress = Callable[[Cell], None]
 
@@ -28,24 +30,23 @@ def variant_texts(variants: Sequence[str], strengths: Sequence[float]) -> list[s
         strengths: of the single names.
 
     Raises:
-        UserError: for what ``parse`` of the variants refuses, or a strength that is for none.
+        UserError: for what :func:`symsteer.bench.variants.read` refuses, or a strength that no
+            variant takes.
     """
     names = [v for v in variants if v != "all"]
     if "all" in variants:
-        names += [v for v in ("none", *variant_names()) if v not in names]
+        names += [v for v in (UNBROKEN, *sorted(VARIANTS)) if v not in names]
     texts: list[str] = []
     used = False
     for name in names:
-        if name == "none" or ":" in name or not strengths:
-            parsed = [parse(name)]
-        else:
-            parsed = [parse(name, strength) for strength in strengths]
-            used = True
-        texts += [describe(p) for p in parsed]
+        takes = bool(strengths) and lacks_strength(name)
+        used = used or takes
+        for strength in strengths if takes else (None,):
+            texts.append(variant_text(s for s in read(name, strength) if not s.changes_nothing))
     if strengths and not used:
         raise UserError(
             f"no variant takes the strength {strengths[0]:g}: name one without a strength of its "
-            f"own, e.g. --variant {variant_names()[0]}"
+            f"own, e.g. --variant {min(VARIANTS)}"
         )
     return list(dict.fromkeys(texts))
 
@@ -159,7 +160,7 @@ def grid(
     texts = variant_texts(variants, strengths)
     return [
         dataclasses.replace(template, task=task, embodiment=body, variant=text)
-        for task in expand(tasks, task_names())
-        for body in expand(bodies, embodiments())
+        for task in expand(tasks, TASKS.names())
+        for body in expand(bodies, list(EMBODIMENTS))
         for text in texts
     ]

@@ -1,10 +1,11 @@
-"""Experts to demonstrations and back: ManiSkill trajectory files (`.h5` with `.json`).
+"""Demonstrations as ManiSkill trajectory files (`.h5` with `.json`).
 
 - `collect(...)` runs the scripted experts and writes their successes.
-- `load(...)` reads such files, ours and ManiSkill's published ones.
+- `load(...)` reads them, and ManiSkill's published ones.
 """
 
-from symsteer.bench.demos.collect import CLEAN, DIVERSE, FORMAT, MODES, Diversity, collect
+from symsteer.bench.demos.collect import CLEAN, DIVERSE, MODES, Diversity, collect
+from symsteer.bench.demos.files import FORMAT
 from symsteer.bench.demos.load import Demonstrations, load
 
 __all__ = [

@@ -1,36 +1,28 @@
 """Run the scripted experts and write their successful episodes as ManiSkill trajectories.
 
-A base policy trained on clean demonstrations hardly depends on its noise and cannot be steered;
-diverse demonstrations carry correlated action noise of a strength drawn per demonstration and an
-offset of the point that is grasped or pushed, and only successes are kept.
+A base policy trained on clean demonstrations hardly depends on its noise and cannot be steered.
+Diverse demonstrations have correlated action noise, whose strength is drawn per demonstration,
+and an offset of the point that is grasped or pushed. Only successes are kept.
 """
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import io
-import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import torch
 
-from symsteer.bench.demos.seal import SEAL, checksum
+from symsteer.bench.demos.files import write
 from symsteer.bench.sim.environment import Simulator
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import write_atomically
-
-FORMAT = 2
-"""Of our files; 2 has a checksum."""
+from symsteer.names import unknown
 
 
 @dataclass(frozen=True)
@@ -60,7 +52,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass
-class _Attempt:
+class Attempt:
     """One successful episode, arrays over time."""
 
     seed: int
@@ -87,9 +79,9 @@ def collect(
     """Write ``count`` successful expert episodes to ``out_path`` (``.h5``) and its ``.json``.
 
     Episodes end at their first success. On the CPU the same arguments give the same
-    demonstrations. Initial states and disturbances depend on each attempt's own seed only, and
-    attempts are kept in the order of their seeds; with another ``num_envs`` contacts may still
-    turn out differently in the last digits, because PhysX remembers earlier contacts.
+    demonstrations. Initial states and disturbances depend only on each attempt's own seed, and
+    attempts are kept in the order of their seeds. With another ``num_envs`` contacts may still
+    differ in the last digits, because PhysX remembers earlier contacts.
 
     Args:
         task: name of a task.
@@ -108,8 +100,8 @@ def collect(
         The path of the ``.h5`` file.
 
     Raises:
-        UserError: for a bad argument, or if the expert fails too often.
-        RecordError: if the files cannot be written; earlier ones stay as they were.
+        UserError: for a bad argument, if the expert fails too often, or if the files cannot be
+            written; earlier ones stay as they were.
     """
     path = Path(out_path)
     if path.suffix != ".h5":
@@ -123,7 +115,7 @@ def collect(
     if not 0 <= seed < 2**32:
         raise UserError(f"the seed must lie in [0, 2^32); it is {seed}")
     if mode not in MODES:
-        raise UserError(f"there is no mode {mode!r}; valid: {', '.join(MODES)}")
+        raise unknown("mode", mode, MODES)
     settings = diversity or MODES[mode]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -137,7 +129,7 @@ def collect(
         task, num_envs=min(num_envs, 2 * count), embodiment=embodiment, variant=variant, sim=sim
     )
     seeds = np.random.RandomState(seed)
-    kept: list[_Attempt] = []
+    kept: list[Attempt] = []
     tried = 0
     while len(kept) < count:
         if tried >= ATTEMPTS_PER_DEMO * count:
@@ -150,12 +142,12 @@ def collect(
         tried += len(batch)
         if progress is not None:
             progress(min(len(kept), count), count)
-    _write(path, env, kept[:count], mode, settings, seed, tried, variant)
+    write(path, env, kept[:count], mode, settings, seed, tried, variant)
     env.close()
     return path
 
 
-def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[_Attempt]:
+def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[Attempt]:
     """Attempt one episode per seed side by side; return the successful ones in order."""
     obs, _ = env.reset(seed=seeds)
     expert = Expert(env)
@@ -176,7 +168,7 @@ def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[_Att
         if (length > 0).all():
             break
     return [
-        _Attempt(
+        Attempt(
             seed=seeds[i],
             obs=np.stack([o[i] for o in observations[: end + 1]]),
             actions=np.stack([a[i] for a in actions[:end]]),
@@ -216,88 +208,6 @@ def _disturbances(
         torch.as_tensor(noise, dtype=torch.float32, device=env.device),
         torch.as_tensor(offsets, dtype=torch.float32, device=env.device),
     )
-
-
-def _write(
-    path: Path,
-    env: SymmetricTask,
-    attempts: list[_Attempt],
-    mode: str,
-    settings: Diversity,
-    seed: int,
-    tried: int,
-    variant: str,
-) -> None:
-    description = {
-        "env_info": {
-            "env_id": f"SymSteer/{env.task_id}",
-            "env_kwargs": {
-                "obs_mode": "state",
-                "control_mode": env.control_mode,
-                "embodiment": env.embodiment,
-                "variant": variant,
-                "reward_mode": env.reward_mode,
-                "sim_backend": "physx_cpu" if env.device.type == "cpu" else "physx_cuda",
-                "num_envs": 1,
-            },
-            "max_episode_steps": env.max_episode_steps,
-        },
-        "episodes": [
-            {
-                "episode_id": i,
-                "episode_seed": attempt.seed,
-                "control_mode": env.control_mode,
-                "elapsed_steps": len(attempt.actions),
-                "reset_kwargs": {"seed": attempt.seed},
-                "success": True,
-            }
-            for i, attempt in enumerate(attempts)
-        ],
-        "source_type": "scripted",
-        "source_desc": f"SymSteer's scripted expert, {mode} demonstrations",
-        "symsteer": {
-            "format": FORMAT,
-            "mode": mode,
-            "diversity": dataclasses.asdict(settings),
-            "seed": seed,
-            "attempts": tried,
-            "observation_layout": env.observation_layout.to_json(),
-            "action_layout": env.action_layout.to_json(),
-        },
-    }
-    # In memory first: HDF5 itself reports a full disk late, and leaves a file behind.
-    buffer = io.BytesIO()
-    with h5py.File(buffer, "w") as file:
-        for i, attempt in enumerate(attempts):
-            group = file.create_group(f"traj_{i}", track_order=True)
-            end = len(attempt.actions)
-            last = np.arange(end) == end - 1
-            group.create_dataset("obs", data=attempt.obs, dtype=np.float32)
-            group.create_dataset("actions", data=attempt.actions, dtype=np.float32)
-            group.create_dataset("terminated", data=last)
-            group.create_dataset("truncated", data=last & (end >= env.max_episode_steps))
-            group.create_dataset("success", data=last)
-            group.create_dataset("rewards", data=attempt.rewards, dtype=np.float32)
-            _write_tree(group.create_group("env_states", track_order=True), attempt.states)
-        file.attrs[SEAL] = checksum(file, description)
-    text = json.dumps(description, indent=2) + "\n"
-    # Both or none: an earlier pair survives a disk that gets full on the way.
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        write_atomically(partial, buffer.getvalue())
-        write_atomically(path.with_suffix(".json"), text.encode())
-        os.replace(partial, path)
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-
-
-def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            _write_tree(group.create_group(key, track_order=True), value)
-        else:
-            group.create_dataset(key, data=value, dtype=np.float32)
 
 
 def _numpy(tree: Any) -> Any:

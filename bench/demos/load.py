@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
-from symsteer.bench.demos.seal import SEAL, checksum
-from symsteer.bench.tasks import check_embodiment, make, task_class
-from symsteer.bench.tasks.embodiments import EMBODIMENTS
+from symsteer.bench.demos.files import SEAL, checksum
+from symsteer.bench.tasks import check_embodiment, make, task_class, task_name
+from symsteer.bench.tasks.embodiments import BODIES
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Layout
 
@@ -99,20 +99,20 @@ def load(
         UserError: one sentence on why the file cannot be used.
     """
     path = Path(h5_path)
-    env_class = task_class(task)
+    task, env_class = task_name(task), task_class(task)
     check_embodiment(embodiment)
     description = _read_description(path)
-    records = _usable_records(path, description, env_class.task_id, embodiment, count)
+    records = _usable_records(path, description, task, embodiment, count)
     layout = env_class.observation_layout
     own = description.get("symsteer", {}).get("observation_layout") == layout.to_json()
     try:
         with h5py.File(path, "r") as file:
             groups = [_read_group(path, file, record, own) for record in records]
             seal = file.attrs.get(SEAL)
-            # Ours say so twice, so that damage cannot make a file pass for somebody else's.
+            # Both mark a file as ours: damage to one mark must not turn the check off.
             sealed = seal is not None or "symsteer" in description
             intact = not sealed or str(seal) == checksum(file, description)
-    # HDF5 meets damage with many kinds of errors.
+    # HDF5 reports damage by many kinds of errors.
     except (OSError, KeyError, RuntimeError, TypeError, ValueError, MemoryError) as error:
         raise UserError(
             f"{path} is truncated or not an HDF5 file of trajectories; download or collect it again"
@@ -120,7 +120,7 @@ def load(
     for group in groups:
         _check_actions(path, group, env_class.action_layout.dim)
     if not own:
-        _rebuild_observations(path, groups, env_class.task_id, embodiment)
+        _rebuild_observations(path, groups, task, embodiment)
     for group in groups:
         _check_observations(path, group, layout.dim)
     if not intact:
@@ -139,7 +139,7 @@ def load(
         observation_layout=layout,
         action_layout=env_class.action_layout,
         meta={
-            "task": env_class.task_id,
+            "task": task,
             "embodiment": embodiment,
             "variant": kwargs.get("variant", "none"),
             "mode": description.get("symsteer", {}).get("mode", "external"),
@@ -178,11 +178,11 @@ def _usable_records(
 ) -> list[dict[str, Any]]:
     """The JSON records of the episodes to read, after all checks that need no arrays."""
     info = description["env_info"]
-    found = str(info["env_id"]).removeprefix("SymSteer/")
+    found = task_name(str(info["env_id"]))
     if found != task:
         raise UserError(f"{path} holds demonstrations of {found}, but {task} is wanted")
     kwargs = info["env_kwargs"]
-    body = EMBODIMENTS[embodiment]
+    body = BODIES[embodiment]
     robot = kwargs.get("robot_uids", _STOCK_ROBOT)
     robot = robot[0] if isinstance(robot, list) and len(robot) == 1 else robot
     found = kwargs.get("embodiment", _SAME_ROBOT.get(str(robot), str(robot)))

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from symsteer.agents.presets import preset_options
 
 from symsteer.agents import AGENTS
+from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
 
 ABOUT = """Steer a base policy with one agent on one task, and record the results.

@@ -11,14 +11,15 @@ import torch
 from tqdm import tqdm
 
 from symsteer.bench.demos import FORMAT, MODES, Demonstrations, collect, load
-from symsteer.bench.runs.config import DemonstrationConfig, RunConfig, content_key, flat
+from symsteer.bench.runs.config import RunConfig, build_config, content_key, flat
 from symsteer.bench.steering.evaluation import DRAWS, Steerability, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import BasePolicy
-from symsteer.policies.base import ChunkPolicy, load_policy, policy_path, save_policy
-from symsteer.policies.training import train_policy
+from symsteer.policies import POLICIES
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.files import load_policy, policy_path, save_policy
 
 STEERABILITY_ENVS = 128
 """Parallel environments of the steerability report; fewer if it has fewer episodes."""
@@ -35,7 +36,7 @@ def prepare_base(
     """The frozen base policy of a run, with its steerability report.
 
     It is trained on demonstrations of the unbroken task in the run's embodiment, whatever the
-    run's variant: steering, not imitation, has to cope with the break.
+    run's variant is: the agent has to cope with the broken symmetry, not the base policy.
 
     Args:
         config: the run.
@@ -66,7 +67,7 @@ def prepare_base(
 
 
 def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
-    """A configuration that says what a saved base policy is, in place of one to be trained.
+    """The configuration of a run that uses a saved base policy instead of training one.
 
     Args:
         config: with the default settings of the base policy and its demonstrations, or those of
@@ -87,11 +88,13 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
                 f"{path} was trained for {there}, and this run's {key} is {here}; name a policy of "
                 "the same task and embodiment"
             )
-    own: dict[str, Any] = {"policy": base.config}
+    own: dict[str, Any] = {
+        "policy": {"name": POLICIES.name_of(type(base)), **base.options.to_json()}
+    }
     if "demonstrations" in world:
-        own["demonstrations"] = DemonstrationConfig(**world["demonstrations"])
+        own["demonstrations"] = world["demonstrations"]
         own["policy_seed"] = world["policy_seed"]
-    told = dataclasses.replace(config, **own)
+    told = build_config(config.to_json() | own, str(path))
     default, asked, found = (flat(c.to_json()) for c in (RunConfig(), config, told))
     for key, value in asked.items():
         if value not in (default[key], found[key]):
@@ -103,7 +106,7 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
 
 
 def _world(config: RunConfig) -> dict[str, Any]:
-    """What a policy's file says of where it was trained."""
+    """Task and demonstrations of a policy's training, for its file."""
     return {
         "task": config.task,
         "embodiment": config.embodiment,
@@ -113,22 +116,22 @@ def _world(config: RunConfig) -> dict[str, Any]:
 
 
 def find_base(config: RunConfig, out: Path) -> Path | None:
-    """The folder of a run's trained base policy; None if it is yet to be built."""
+    """The folder of a run's trained base policy; None if it has not been trained yet."""
     path = demonstration_path(config, out)
     if not path.is_file():
         return None
     try:
         demos = load(path, config.task, config.embodiment, config.demonstrations.count)
-    except UserError:  # whoever builds the policy says what is wrong with the file
+    except UserError:  # the run that trains the policy reports what is wrong with the file
         return None
     folder = _policy_folder(config, out, demos)
     return folder if policy_path(folder).is_file() else None
 
 
 def demonstration_path(config: RunConfig, out: Path) -> Path:
-    """Where the scripted expert's demonstrations for a run lie, or will."""
+    """Path of the scripted expert's demonstrations for a run, whether they exist or not."""
     wanted = config.demonstrations
-    # The mode's own settings are part of the name: a change of theirs must not find old files.
+    # The mode's settings are part of the name: after a change of them old files are not found.
     key = content_key(dataclasses.asdict(MODES[wanted.mode]), FORMAT)
     name = f"{config.task}-{config.embodiment}-{wanted.mode}-{wanted.count}-s{wanted.seed}-{key}.h5"
     return out / "base" / name
@@ -160,7 +163,7 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
     """The record's block on a base policy."""
     report = policy.report["steerability"]
     return BasePolicy(
-        name=policy.config.name,
+        name=policy.name,
         group=str(policy.group),
         content_hash=policy.content_hash(),
         base_success=report["success"],
@@ -175,20 +178,26 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
 
 
 def _policy_folder(config: RunConfig, out: Path, demos: Demonstrations) -> Path:
-    key = content_key(demos.content_hash, config.policy.to_json(), config.policy_seed)
-    return out / "base" / f"{config.task}-{config.embodiment}-{config.policy.name}-{key}"
+    name, options = config.policy_name, config.policy.to_json()
+    # Code from outside of SymSteer may change while its name stays.
+    extension = POLICIES.extension(name)
+    key = content_key(
+        demos.content_hash, name, options, extension and extension.sha256, config.policy_seed
+    )
+    short = name.rpartition(":")[2]
+    return out / "base" / f"{config.task}-{config.embodiment}-{short}-{key}"
 
 
 def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPolicy:
-    with tqdm(
-        total=config.policy.steps, desc="base policy", disable=None if progress else True
-    ) as bar:
+    kind = POLICIES.get(config.policy_name)
+    with tqdm(desc="base policy", disable=None if progress else True) as bar:
 
         def advance(step: int, steps: int, loss: float) -> None:
+            bar.total = steps
             bar.update(step - bar.n)
             bar.set_postfix(loss=f"{loss:.4f}")
 
-        return train_policy(
+        return kind.fit(
             config.policy,
             demos.episodes,
             demos.observation_layout,

@@ -1,4 +1,4 @@
-"""How good are base policies at few demonstrations? EDP against its plain rivals."""
+"""Success of base policies trained from few demonstrations."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from symsteer.bench.demos import load
 from symsteer.bench.runs.base_policy import demonstration_file
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
 from symsteer.bench.runs.folder import write_json
-from symsteer.bench.steering.evaluation import held_out_seeds, rollout
+from symsteer.bench.steering.evaluation import rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
-from symsteer.policies.base import PolicyName
-from symsteer.policies.training import train_policy
+from symsteer.policies import POLICIES
 
 EVALUATION_ENVS = 100
 
 
 @dataclass(frozen=True)
 class BaseCell:
-    """One base policy: which, from how many demonstrations, with which seed."""
+    """One base policy: its name, number of demonstrations and seed."""
 
-    name: PolicyName
+    name: str
     count: int
     seed: int
 
@@ -40,7 +40,7 @@ class BaseCell:
 def study(
     config: RunConfig,
     out: Path,
-    names: Sequence[PolicyName],
+    names: Sequence[str],
     counts: Sequence[int],
     seeds: int,
     episodes: int,
@@ -48,29 +48,32 @@ def study(
 ) -> list[dict[str, Any]]:
     """Train every policy at every number of demonstrations and play held-out episodes.
 
-    Seed s has its own demonstrations, initialisation and noise; the policies of one seed share the
-    demonstrations, and fewer demonstrations are the first of the more.
+    Seed s has its own demonstrations, initialisation and noise. The policies of one seed share the
+    demonstrations; n demonstrations are the first n of the largest number.
 
     Args:
-        config: task, embodiment, kind of demonstrations and the policies' common settings.
+        config: task, embodiment, kind of demonstrations and options of one policy, which the
+            others share as far as they have them.
         out: folder that keeps demonstrations in ``out/base``.
-        names: kinds of policy.
+        names: of the policies.
         counts: numbers of demonstrations.
         seeds: number of seeds, from 0.
         episodes: held-out episodes of each policy, with noise from N(0, I).
         workers: processes side by side.
 
     Returns:
-        One plain dictionary a policy: its cell, ``success``, ``successes``, ``episodes``,
+        A plain dictionary for each policy: its cell, ``success``, ``successes``, ``episodes``,
         ``parameters``, ``training_seconds``.
 
     Raises:
-        UserError: if a number is not positive.
+        UserError: if a number is not positive or there is no such policy.
     """
     if not counts or not names:
         raise UserError("a study needs at least one number of demonstrations and one policy")
     if min(*counts, seeds, episodes, workers) < 1:
         raise UserError("numbers of demonstrations, seeds, episodes and workers must be positive")
+    for name in names:
+        POLICIES.get(name)
     files = {}
     for seed in range(seeds):
         wanted = DemonstrationConfig(config.demonstrations.mode, max(counts), seed)
@@ -117,8 +120,14 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def _play(config: RunConfig, cell: BaseCell, demos: Path, episodes: int) -> dict[str, Any]:
     torch.set_num_threads(1)
     data = load(demos, config.task, config.embodiment, cell.count)
-    policy = train_policy(
-        dataclasses.replace(config.policy, name=cell.name),
+    kind = POLICIES.get(cell.name)
+    common = {
+        field.name: getattr(config.policy, field.name)
+        for field in dataclasses.fields(kind.Options)
+        if hasattr(config.policy, field.name)
+    }
+    policy = kind.fit(
+        kind.Options(**common),
         data.episodes,
         data.observation_layout,
         data.action_layout,

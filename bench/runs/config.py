@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import hashlib
 import json
@@ -12,13 +11,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from symsteer.agents.sac import SacConfig
+from symsteer.agents import AGENTS
+from symsteer.agents.agent import AgentOptions
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import canonical_variant
-from symsteer.policies.base import PolicyConfig
+from symsteer.names import unknown
+from symsteer.policies import POLICIES
+from symsteer.policies.contract import PolicyOptions
+from symsteer.variant import VariantSpec, parse_variant, variant_text
 
 LARGEST_COUNT = 10**12
 LARGEST_BATCH = 100_000
@@ -51,30 +52,17 @@ class EvaluationConfig:
     final_episodes: int = 100
     """Episodes of the last evaluation, the one that tables report."""
     diagnostic_episodes: int = 32
-    """Stochastic on-policy episodes against whose returns Q is held at every evaluation."""
+    """Stochastic on-policy episodes; Q is compared with their returns at every evaluation."""
     steerability_states: int = 24
     """Initial states of the base policy's steerability report, each with 16 noise draws."""
 
 
-STEERING = SacConfig(
-    lr=6e-4,
-    alpha_lr=6e-4,
-    tau=0.015,
-    width=128,
-    batch_size=192,
-    utd=0.3,
-    warmup=1280,
-    # The cost of one decision of four steps becomes 1.
-    reward_scale=0.25,
-)
-"""The learner's settings: many environments and few updates, because data are cheap here and a
-critic trained hard on few decisions is exploited by the actor. Chosen on PickCube, floating,
-unbroken, with the equivariant and the standard agent, seeds 0 and 1."""
-
-
 @dataclass(frozen=True)
 class RunConfig:
-    """One steering run."""
+    """One steering run.
+
+    Options of the agent and of the policy that are left out take their defaults.
+    """
 
     task: str = "PickCube-v1"
     """Task; `symsteer list` names them."""
@@ -83,7 +71,7 @@ class RunConfig:
     variant: str = "none"
     """How the symmetry is broken: `none`, `action_gain:0.5`, or several joined with `+`."""
     agent: str = "equivariant"
-    """Agent; `symsteer list` names them."""
+    """Agent; `symsteer list` names them. One of your own: `package.module:Class`."""
     seed: int = 0
     """Seed of the run: networks, exploration, training episodes."""
     env_steps: int = 50_000
@@ -98,13 +86,26 @@ class RunConfig:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where networks run."""
     demonstrations: DemonstrationConfig = field(default_factory=DemonstrationConfig)
-    policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(execute=4, sampling_steps=4))
+    policy_name: str = "edp"
+    """Base policy; `symsteer list` names them. One of your own: `package.module:Class`."""
+    policy: PolicyOptions = None  # type: ignore[assignment]
     policy_seed: int = 0
     """Seed of the base policy's training; runs that share it share the base policy."""
-    sac: SacConfig = field(default_factory=lambda: STEERING)
+    agent_options: AgentOptions = None  # type: ignore[assignment]
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
+        for kind, name, options in (
+            ("agent_options", self.agent, AGENTS.get(self.agent).Options),
+            ("policy", self.policy_name, POLICIES.get(self.policy_name).Options),
+        ):
+            given = getattr(self, kind)
+            if given is None:
+                object.__setattr__(self, kind, options())
+            elif type(given) is not options:
+                raise UserError(
+                    f"{kind} are {type(given).__name__}, but {name!r} takes {options.__name__}"
+                )
         _check_plain(dataclasses.asdict(self), "", "")
         counts = {
             **{name: getattr(self, name) for name in ("env_steps", "num_envs", "checkpoint_every")},
@@ -129,29 +130,19 @@ class RunConfig:
                 f"the variant {self.variant[:40]!r}... has {len(self.variant)} characters; it must "
                 f"not have more than {LONGEST_VARIANT}, so join fewer of them"
             )
-        # The variant is a part of the run's identity, however its strengths were written.
-        object.__setattr__(self, "variant", canonical_variant(self.variant))
+        # The variant is a part of the run's identity: each strength in its shortest form.
+        object.__setattr__(self, "variant", variant_text(self.variants))
+
+    @functools.cached_property
+    def variants(self) -> tuple[VariantSpec, ...]:
+        """The variant, parsed."""
+        return parse_variant(self.variant)
 
     def to_json(self) -> dict[str, Any]:
-        """Nested plain data."""
-        return dataclasses.asdict(self)
-
-
-FIRST_TRAINING_SEED = 2**22
-"""Episodes of evaluation, diagnostics and steerability have smaller seeds."""
-
-
-def training_seeds(run_seed: int, start: int, count: int) -> list[int]:
-    """Seeds of ``count`` training episodes, for the ``start``-th fresh start of a run."""
-    words = np.random.SeedSequence((run_seed, start)).generate_state(count, np.uint64)
-    span = 2**31 - FIRST_TRAINING_SEED
-    return [FIRST_TRAINING_SEED + int(word % span) for word in words]
-
-
-@functools.cache
-def _adapter() -> TypeAdapter[RunConfig]:
-    # Made once: a suite has thousands of configurations, and making it takes longer than using it.
-    return TypeAdapter(RunConfig)
+        """Nested plain data; :func:`build_config` reads it."""
+        data = dataclasses.asdict(self)
+        data["policy"] = {"name": data.pop("policy_name"), **data["policy"]}
+        return json.loads(json.dumps(data))
 
 
 def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
@@ -164,25 +155,34 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
     Raises:
         UserError: on an unknown key (with the nearest valid one) or a value of a wrong type.
     """
-    defaults = RunConfig().to_json()
-    _check_nested_keys(data, defaults, source, "")
+    data = dict(data)
     _check_plain(data, f"{source}: ", "")
-    # As JSON, in which strictness still takes 1 for 1.0, but "1" or true for no number.
-    text = json.dumps(_merge(defaults, data))
+    tables = {key: _table(data, key, source) for key in ("policy", "agent_options")}
+    policy_name = tables["policy"].pop("name", RunConfig.policy_name)
+    agent = data.get("agent", RunConfig.agent)
+    for key, name in (("policy.name", policy_name), ("agent", agent)):
+        if not isinstance(name, str):
+            raise UserError(f"{source}: {key} must be a text in quotes, not {name!r}")
     try:
-        return _adapter().validate_json(text, strict=True)
+        defaults = RunConfig(agent=agent, policy_name=policy_name)
+        plain = defaults.to_json()
+        del plain["policy"]["name"]
+        _check_nested_keys({**data, **tables}, plain, source, "")
+        chosen = {
+            key: _validated(type(getattr(defaults, key)), {**plain[key], **table}, key)
+            for key, table in tables.items()
+        }
+        rest = {key: value for key, value in data.items() if key not in tables}
+        merged = _merge({key: plain[key] for key in plain if key not in tables}, rest)
+        config = _validated(RunConfig, {**merged, "policy_name": policy_name}, "")
+        return dataclasses.replace(config, **chosen)
     except UserError as error:
-        raise UserError(f"{source}: {error}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        problem = first["msg"].removeprefix("Value error, ")
-        given = "" if isinstance(first["input"], dict) else f" (got {first['input']!r})"
-        raise UserError(f"{source}: {key}{': ' * bool(key)}{problem}{given}") from error
+        where = "" if str(error).startswith(f"{source}: ") else f"{source}: "
+        raise UserError(f"{where}{error}") from error
 
 
 def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one, keys joined by dots, e.g. ``sac.critic_lr``."""
+    """Nested tables as one, keys joined by dots, e.g. ``policy.width``."""
     found: dict[str, Any] = {}
     for key, value in data.items():
         if isinstance(value, Mapping):
@@ -201,9 +201,39 @@ def check_keys(data: Iterable[str], valid: Iterable[str], source: str, prefix: s
     valid = sorted(valid)
     for key in data:
         if key not in valid:
-            close = difflib.get_close_matches(key, valid, n=1)
-            hint = f"did you mean {prefix}{close[0]}?" if close else f"valid: {', '.join(valid)}"
-            raise UserError(f"{source}: there is no key {prefix + key!r}; {hint}")
+            raise unknown("key", prefix + key, [prefix + name for name in valid], source)
+
+
+def content_key(*parts: Any) -> str:
+    """Twelve hexadecimal digits that change with any of the JSON-able parts."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+@functools.cache
+def _adapter(of: type) -> TypeAdapter[Any]:
+    # Made once: a suite has thousands of configurations, and making it takes longer than using it.
+    return TypeAdapter(of)
+
+
+def _validated(of: type, data: Mapping[str, Any], prefix: str) -> Any:
+    """An instance of a dataclass from plain data."""
+    try:
+        # As JSON, in which strictness still takes 1 for 1.0, but "1" or true for no number.
+        return _adapter(of).validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in (*([prefix] if prefix else []), *first["loc"]))
+        problem = first["msg"].removeprefix("Value error, ")
+        given = "" if isinstance(first["input"], dict) else f" (got {first['input']!r})"
+        raise UserError(f"{key}{': ' * bool(key)}{problem}{given}") from error
+
+
+def _table(data: Mapping[str, Any], key: str, source: str) -> dict[str, Any]:
+    table = data.get(key, {})
+    if not isinstance(table, Mapping):
+        raise UserError(f"{source}: {key} must be a table, not {table!r}")
+    return dict(table)
 
 
 def _merge(defaults: dict[str, Any], data: Mapping[str, Any]) -> dict[str, Any]:
@@ -227,7 +257,7 @@ def _check_nested_keys(
 
 
 def _check_plain(data: Any, head: str, key: str) -> None:
-    """Refuse what JSON has no word for: NaN, infinities, and TOML's dates and times."""
+    """Refuse what JSON cannot hold: NaN, infinities, and TOML's dates and times."""
     if isinstance(data, Mapping):
         for name, value in data.items():
             _check_plain(value, head, f"{key}.{name}" if key else name)
@@ -239,9 +269,3 @@ def _check_plain(data: Any, head: str, key: str) -> None:
             raise UserError(f"{head}{key} is {data}; it must be finite")
     elif data is not None and not isinstance(data, str | int):
         raise UserError(f"{head}{key} must be a number, a text or a flag, not {data!r}")
-
-
-def content_key(*parts: Any) -> str:
-    """Twelve hexadecimal digits that change with any of the JSON-able parts."""
-    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -1,21 +1,19 @@
-"""Held-out episodes of an agent, and what its Q-values are worth there."""
+"""Held-out episodes of an agent, and on-policy ones against which its Q-values are held."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import torch
 
+from symsteer.agents.agent import Agent, HasCritic
+from symsteer.agents.episodes import Played, Rollout
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.steering.diagnostics import OnPolicy, measure
-from symsteer.bench.steering.evaluation import HELD_OUT_SEED, Rollout, held_out_seeds, rollout
+from symsteer.bench.steering.evaluation import rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.steering.seeds import DIAGNOSTIC_SEED, diagnostic_seeds, held_out_seeds
 from symsteer.bench.tasks import make
-from symsteer.policies.base import ChunkPolicy
-
-DIAGNOSTIC_SEED = HELD_OUT_SEED + 500_000
-"""On-policy episodes for the bias of Q start here: held out, and apart from the reported ones."""
+from symsteer.policies.contract import ChunkPolicy
 
 
 def make_env(
@@ -35,7 +33,7 @@ def make_env(
         sim=config.sim,
         workers=min(workers, num_envs),
     )
-    return LatentNoiseEnv(env, base, ignore_terminations)
+    return LatentNoiseEnv(env, base, ignore_terminations, config.seed)
 
 
 class Evaluator:
@@ -44,8 +42,8 @@ class Evaluator:
     Args:
         config: the run.
         base: the frozen policy.
+        agent: plays.
         feasible: lowest and highest return that the reward allows, per decision.
-        learns: whether the agent has a critic to diagnose.
         variant: how the world is broken in these episodes.
         workers: processes that share the environments.
 
@@ -57,38 +55,37 @@ class Evaluator:
         self,
         config: RunConfig,
         base: ChunkPolicy,
+        agent: Agent,
         feasible: tuple[float, float],
-        learns: bool,
         variant: str,
         workers: int = 1,
     ):
-        self.config, self.base, self.feasible = config, base, feasible
+        self.config, self.agent, self.feasible = config, agent, feasible
         self.played: Rollout | None = None
-        self.extra = config.evaluation.diagnostic_episodes if learns else 0
-        self.env = make_env(
-            config, base, config.evaluation.episodes + self.extra, variant, True, workers
-        )
+        wanted = config.evaluation
+        self.extra = wanted.diagnostic_episodes if isinstance(agent, HasCritic) else 0
+        self.env = make_env(config, base, wanted.episodes + self.extra, variant, True, workers)
 
-    def measure(
-        self, agent: Any, count: int
-    ) -> tuple[dict[str, torch.Tensor], dict[str, float | None]]:
+    def measure(self, count: int) -> tuple[dict[str, torch.Tensor], Mapping[str, float | None]]:
         """Episodes of the deterministic actor on the first ``count`` held-out seeds.
 
         Returns:
             ManiSkill's metrics, a column of ``count`` values each, and the diagnostics.
         """
-        seeds = held_out_seeds(count)
+        agent, seeds = self.agent, held_out_seeds(count)
         state = agent.generator.get_state()
         try:
-            if not agent.learns:
-                self.played = rollout(self.env, lambda obs, rows: agent.act(obs), seeds)
-                return self.played.episodes, agent.scalars()
-            agent.generator.manual_seed(DIAGNOSTIC_SEED + self.config.seed)
-            greedy, on_policy = self._learner_episodes(agent, seeds)
+            on_policy: Rollout | None = None
+            log_prob: torch.Tensor | None = None
+            if isinstance(agent, HasCritic):
+                agent.generator.manual_seed(DIAGNOSTIC_SEED + self.config.seed)
+                greedy, on_policy, log_prob = self._with_on_policy(agent, seeds)
+            else:
+                greedy = rollout(self.env, lambda obs, rows: agent.act(obs, True), seeds)
             generator = torch.Generator(agent.device).manual_seed(self.config.seed)
-            diagnostics = measure(agent, self.base, greedy, on_policy, self.feasible, generator)
+            played = Played(greedy, on_policy, log_prob, self.feasible, generator)
             self.played = greedy
-            return greedy.episodes, dict(diagnostics)
+            return greedy.episodes, agent.diagnostics(played)
         finally:
             # An evaluation draws noise of its own, so that training goes on as if without it.
             agent.generator.set_state(state)
@@ -97,10 +94,13 @@ class Evaluator:
         """Free the simulation."""
         self.env.close()
 
-    def _learner_episodes(self, agent: Any, seeds: Sequence[int]) -> tuple[Rollout, OnPolicy]:
+    def _with_on_policy(
+        self, agent: Agent, seeds: Sequence[int]
+    ) -> tuple[Rollout, Rollout, torch.Tensor]:
         """Deterministic episodes from ``seeds`` and stochastic ones, side by side."""
+        assert isinstance(agent, HasCritic)
         greedy_count = len(seeds)
-        extra = [DIAGNOSTIC_SEED + i for i in range(self.extra)]
+        extra = diagnostic_seeds(self.extra)
         log_probs: list[torch.Tensor] = []
 
         def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
@@ -112,12 +112,14 @@ class Evaluator:
             )
 
         whole = rollout(self.env, act, [*seeds, *extra])
-        # One entry a decision and batch: [batches * T] x [N] -> [T, batches * N].
+        # One entry per decision and batch: [batches * T] x [N] -> [T, batches * N].
         steps = len(whole.obs)
         log_prob = torch.cat(
             [torch.stack(log_probs[i : i + steps]) for i in range(0, len(log_probs), steps)], dim=1
         )
-        return whole.episodes_of(slice(0, greedy_count)), OnPolicy(
-            whole.episodes_of(slice(greedy_count, None)),
+        on_policy = whole.episodes_of(slice(greedy_count, None))
+        return (
+            whole.episodes_of(slice(0, greedy_count)),
+            on_policy,
             log_prob[:, greedy_count : greedy_count + len(extra)],
         )

@@ -17,12 +17,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from symsteer.agents.agent import Agent
+from symsteer.agents.episodes import Rollout
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.steering.evaluation import Rollout, held_out_seeds
+from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA, SIZE
 from symsteer.bench.variants import evaluated
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Layout
 
 EPISODES = 32
@@ -151,7 +153,7 @@ def _draw_rose(axes: Axes, direction: np.ndarray, success: np.ndarray) -> None:
     axes.set_yticks(range(0, counts.max() + 1, max(1, math.ceil(counts.max() / 5))))
 
 
-def film(config: RunConfig, policy: ChunkPolicy, agent: Any) -> np.ndarray:
+def frames_of(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> np.ndarray:
     """Frames of the first held-out episode, from its start to its first success or its time limit.
 
     Args:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,63 +12,46 @@ import torch
 
 from symsteer.agents import AGENTS
 from symsteer.bench.runs.base_policy import origin, prepare_base, with_policy_of
-from symsteer.bench.runs.config import RunConfig, build_config
+from symsteer.bench.runs.checkpoint import load_checkpoint
+from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.evaluator import Evaluator
 from symsteer.bench.runs.folder import (
     CONFIG,
     RECORD,
-    Heartbeat,
     claimed,
     discard_empty,
     is_finished,
-    load_checkpoint,
-    read_config,
     run_id,
     write_json,
 )
-from symsteer.bench.runs.loop import Loop, feasible_return, new_agent
-from symsteer.bench.steering.search import rounds
+from symsteer.bench.runs.observers import ProgressFile, observers_of
+from symsteer.bench.runs.stored import named, restored, stored_config, stored_policy
+from symsteer.bench.runs.trainer import Trainer, budget_of, feasible_return
 from symsteer.bench.tasks import check_embodiment, task_class
-from symsteer.bench.variants import evaluated, parse
+from symsteer.bench.variants import evaluated, read
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import Episodes, Evaluation, canonical_variant, read_record
-from symsteer.policies.base import ChunkPolicy, load_policy, policy_path, save_policy
-from symsteer.policies.geometry import Group
+from symsteer.leaderboard.records import Episodes, Evaluation, read_record
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.files import save_policy
+from symsteer.variant import variant_text
 
 
 def check(config: RunConfig) -> None:
     """Refuse what cannot be run before anything is built.
 
     Raises:
-        UserError: for an unknown task, embodiment, variant, agent or group, a strength out of
-            range, a budget in which nothing is learned, or a device that this machine lacks.
+        UserError: for an unknown task, embodiment or variant, a strength out of range, a budget
+            in which nothing is learned, or a device that this machine lacks.
     """
     task_class(config.task)
     check_embodiment(config.embodiment)
-    variants = parse(config.variant)
-    if config.agent not in AGENTS:
-        raise UserError(f"there is no agent {config.agent!r}; valid: {', '.join(AGENTS)}")
-    if config.variant != "none" and len(variants) < len(config.variant.split("+")):
+    read(config.variants)
+    if any(spec.changes_nothing for spec in config.variants):
         raise UserError(
             f"the variant {config.variant} has a part of strength 0, which changes nothing; leave "
             "it out, or use none, the unbroken task"
         )
-    _ = Group.parse(config.sac.group).order
-    if AGENTS[config.agent].learns:
-        warm_up = config.sac.warmup * config.policy.execute
-        if config.env_steps <= warm_up:
-            raise UserError(
-                f"env_steps is {config.env_steps}, which ends within the warm-up of {warm_up} "
-                "environment steps, so that nothing would be learned; raise env_steps or lower "
-                "sac.warmup"
-            )
-        if config.sac.replay_capacity < config.num_envs:
-            raise UserError(
-                f"sac.replay_capacity is {config.sac.replay_capacity}, less than one decision of "
-                f"each of {config.num_envs} environments; raise it or lower num_envs"
-            )
-    if AGENTS[config.agent].searches:
-        rounds(config.num_envs, task_class(config.task).max_episode_steps, config.env_steps)
+    AGENTS.get(config.agent).check(config.agent_options, budget_of(config))
     for option, device in (("--device", config.device), ("--sim", config.sim)):
         if device == "cuda" and not torch.cuda.is_available():
             raise UserError(
@@ -105,7 +87,7 @@ def execute(
 
     Raises:
         UserError: if the input is wrong, the run is finished already, or another process is
-            working on it (:class:`symsteer.bench.runs.folder.RunBusyError`).
+            working on it (``RunBusyError``).
     """
     if policy is not None:
         if demonstrations is not None:
@@ -131,8 +113,8 @@ def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
         UserError: if the folder is no run's, the run is finished, its checkpoint is damaged, or
             another process is working on it.
     """
-    folder = _named(folder)
-    config, files = _stored(folder)
+    folder = named(folder)
+    config, files = stored_config(folder)
     _check_all(config, workers)
 
     def prepare() -> ChunkPolicy:
@@ -187,44 +169,26 @@ def evaluate(
     Raises:
         UserError: if the folder is no run's, or it has no checkpoint yet.
     """
-    folder = _named(folder)
-    config, _ = _stored(folder)
+    run = restored(folder)
+    config, folder = run.config, run.folder
     _check_all(config, workers)
     own = evaluated(config.variant)
-    variant = own if variant is None else canonical_variant(variant)
-    parse(variant)
+    variant = own if variant is None else variant_text(read(variant))
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}; it must be at least 1")
-    state = load_checkpoint(folder)
-    if state is None:
-        raise UserError(
-            f"the run {folder.name} has no checkpoint yet; `symsteer resume` brings it to its end"
-        )
-    base = _stored_policy(folder, config)
-    if base is None or base.content_hash() != state["base_policy"]:
-        raise UserError(
-            f"{policy_path(folder)} is not the base policy that the checkpoint of {folder.name} "
-            "steers; restore it from where the run was made"
-        )
-    agent = new_agent(config.agent, config, base)
-    agent.load_state_dict(state["agent"])
-    evaluator = Evaluator(
-        config, base, feasible_return(config, base), agent.learns, variant, workers
-    )
+    feasible = feasible_return(config, run.agent, run.policy)
+    evaluator = Evaluator(config, run.policy, run.agent, feasible, variant, workers)
     begin = time.perf_counter()
     try:
-        columns, diagnostics = evaluator.measure(agent, count)
+        columns, diagnostics = evaluator.measure(count)
     finally:
         evaluator.close()
     evaluation = Evaluation(
-        env_steps=state["env_steps"],
-        decisions=state["decisions"],
-        updates=state["updates"],
+        **{key: run.state[key] for key in ("env_steps", "decisions", "updates", "final")},
         wall_clock=time.perf_counter() - begin,
-        final=state["final"],
         episodes=Episodes.model_validate(columns),
-        diagnostics=diagnostics,
+        diagnostics=dict(diagnostics),
     )
     final = read_record(folder / RECORD).final if is_finished(folder) else None
     comparable = final and variant == own and len(final.episodes.seed) == count
@@ -263,47 +227,20 @@ def _play(
     with claimed(folder):
         try:
             write_json(folder / CONFIG, resolved)
-            base = _stored_policy(folder, config)
+            base = stored_policy(folder, config)
             if base is None:
-                Heartbeat(folder, config.env_steps).beat("base policy", 0)
+                ProgressFile(folder, config.env_steps).write("base policy", 0)
                 base = prepare()
                 save_policy(base, folder)
         except BaseException:
             discard_empty(folder)
             raise
-        loop = Loop(config, resolved, folder, base, progress, workers)
+        observers = observers_of(config, resolved, progress)
+        trainer = Trainer(config, folder, base, load_checkpoint(folder), observers, workers)
         try:
-            loop.play()
+            trainer.play()
         except BaseException as error:
-            loop.stop(error)
+            trainer.stop(error)
             error.add_note(f"continue the run with: symsteer resume {folder}")
             raise
     return folder
-
-
-def _named(folder: Path) -> Path:
-    """The folder by its own name, which is the run's, however it was called (".", a link)."""
-    return Path(os.path.realpath(folder))
-
-
-def _stored(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
-    """Configuration of a run's folder, and the content hashes of the files it began from."""
-    data = read_config(folder)
-    files = data.pop("files", {})
-    data.pop("evaluation_variant", None)
-    config = build_config(data, str(folder / CONFIG))
-    if not isinstance(files, dict) or run_id(config, files) != folder.name:
-        raise UserError(
-            f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or the "
-            "folder renamed; undo that"
-        )
-    return config, files
-
-
-def _stored_policy(folder: Path, config: RunConfig) -> ChunkPolicy | None:
-    """The base policy that lies in a run's folder, if it has got that far."""
-    if not policy_path(folder).is_file():
-        return None
-    task = task_class(config.task)
-    base = load_policy(folder, task.observation_layout, task.action_layout)
-    return base.to(config.device)

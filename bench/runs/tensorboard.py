@@ -88,12 +88,12 @@ class RunLog:
             )
             self.writer.flush()
 
-    def scalars(self, namespace: str, values: Mapping[str, float | None], step: int) -> None:
-        """Write every value that was measured."""
+    def scalars(self, values: Mapping[str, float | None], step: int) -> None:
+        """Write every value that was measured, by tag (``eval/success_once``)."""
         with self._reported():
-            for name, value in values.items():
+            for tag, value in values.items():
                 if value is not None:
-                    self.writer.add_scalar(f"{namespace}/{name}", value, step)
+                    self.writer.add_scalar(tag, value, step)
 
     def picture(self, tag: str, picture: np.ndarray, step: int) -> None:
         """Write a picture ``[height, width, 3]`` uint8."""

@@ -1,12 +1,11 @@
 """N parallel ManiSkill environments on any machine.
 
-- `create(env_cls, num_envs, sim)`: environments of any ManiSkill task class.
+- `create(env_cls, num_envs, sim, workers=W)`: environments of any ManiSkill task class.
 - `make_env_class(env_cls, sim)`: the class behind it, to subclass or register.
-- `BatchedCpuMixin`: what makes a task class run on batched CPU physics.
+- `BatchedCpuMixin`: runs a task class on batched CPU physics.
 - `prepare_headless()`: lets state-only environments run without a Vulkan driver.
 
-Names are imported when they are first used: `capabilities` must work where ManiSkill cannot be
-imported, to say why.
+Names are imported on first use: `capabilities` must also work where importing ManiSkill fails.
 """
 
 from __future__ import annotations
@@ -15,8 +14,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from symsteer.bench.sim.environment import BatchedCpuMixin, create, make_env_class
+    from symsteer.bench.sim.environment import BatchedCpuMixin, make_env_class
     from symsteer.bench.sim.headless import prepare_headless, rendering_works
+    from symsteer.bench.sim.parallel import create
 
 __all__ = [
     "BatchedCpuMixin",
@@ -28,7 +28,7 @@ __all__ = [
 
 _HOME = {
     "BatchedCpuMixin": "environment",
-    "create": "environment",
+    "create": "parallel",
     "make_env_class": "environment",
     "prepare_headless": "headless",
     "rendering_works": "headless",

@@ -1,6 +1,6 @@
 """What this machine can do, and what to install for more.
 
-Runs without ManiSkill, torch or a driver: whatever cannot be imported is a finding, not a crash.
+Runs without ManiSkill, torch or a driver: a failed import is a finding, not a crash.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from symsteer.bench.sim.pins import PINNED
+from symsteer.bench.sim.versions import PINNED
 
 _RENDER_PROBE = (
     "import warnings; warnings.simplefilter('ignore'); import sapien; "
@@ -25,17 +25,24 @@ _RENDER_PROBE = (
 )
 _PROBE_SECONDS = 60
 
+_ROOT = Path(__file__).resolve().parents[2]
+_IN_CHECKOUT = (_ROOT / "Makefile").is_file() and (_ROOT / "pyproject.toml").is_file()
+_REINSTALL = "make setup" if _IN_CHECKOUT else "pip install --force-reinstall symsteer"
+
+_DEVELOPMENT = "dev"
+"""The extra that only developers of SymSteer need."""
+
 
 @dataclass(frozen=True)
 class Check:
     """One finding about this machine.
 
     Attributes:
-        name: what was looked at.
-        ok: whether it is there.
+        name: what was checked.
+        ok: whether it was found.
         detail: what was found, one line.
-        cure: what to do for more, one line; empty when nothing is needed.
-        required: whether SymSteer cannot run without it.
+        cure: what to do about it, one line; empty if nothing is needed.
+        required: whether SymSteer needs it.
     """
 
     name: str
@@ -46,9 +53,9 @@ class Check:
 
 
 def probe() -> list[Check]:
-    """Look at processors, memory, packages, system libraries, CUDA, PhysX on GPU and rendering.
+    """Check processors, memory, packages, system libraries, CUDA, PhysX on GPU and rendering.
 
-    Never raises: a check that fails unexpectedly reports its error as the finding.
+    Never raises: an unexpected error of a check is its finding.
     """
     return [_guarded(name, check) for name, check in _CHECKS.items()]
 
@@ -91,33 +98,69 @@ def _check_python() -> Check:
 
 
 def _check_versions() -> Check:
-    wrong, found = [], []
-    for requirement in _requirements():
-        try:
-            installed = version(requirement.name)
-        except PackageNotFoundError:
-            installed = "missing"
-        if requirement.name in PINNED or requirement.name in ("torch", "escnn", "numpy"):
-            found.append(f"{requirement.name} {installed}")
-        if installed == "missing" or not requirement.specifier.contains(installed):
-            wrong.append(f"{requirement.name}{requirement.specifier} (found: {installed})")
+    requirements = _requirements("")
+    wrong = [r for r in requirements if not _satisfied(r)]
+    shown = [r.name for r in requirements if r.name in (*PINNED, "torch", "numpy")]
+    details = [f"{r.name}{r.specifier} (found: {_installed(r.name)})" for r in wrong]
+    packages = " ".join(f"'{r.name}{r.specifier}'" for r in wrong)
     return Check(
         "package versions",
         not wrong,
-        f"wrong: {', '.join(wrong)}" if wrong else ", ".join(found),
-        "make setup" if wrong else "",
+        f"wrong: {', '.join(details)}"
+        if wrong
+        else ", ".join(f"{name} {_installed(name)}" for name in shown),
+        "" if not wrong else "make setup" if _IN_CHECKOUT else f"pip install {packages}",
         required=True,
     )
 
 
-def _requirements() -> list[Requirement]:
-    """What SymSteer asks for, or only the simulator's pins where it runs uninstalled."""
+def _check_extras() -> Check:
+    try:
+        names = metadata("symsteer").get_all("Provides-Extra") or []
+    except PackageNotFoundError:
+        names = []
+    extras = [name for name in names if name != _DEVELOPMENT]
+    absent = [name for name in extras if not all(map(_satisfied, _requirements(name)))]
+    found = ", ".join(name for name in extras if name not in absent) or "none"
+    return Check(
+        "optional packages",
+        not absent,
+        f"{found} found; absent: {', '.join(absent)}" if absent else f"{found} found",
+        f"optional: {_install(absent)}" if absent else "",
+    )
+
+
+def _install(extras: Sequence[str]) -> str:
+    return "make setup" if _IN_CHECKOUT else f"pip install 'symsteer[{','.join(extras)}]'"
+
+
+def _requirements(extra: str) -> list[Requirement]:
+    """Requirements of an extra; of SymSteer itself for ``""``.
+
+    Only the simulator's pinned versions if SymSteer is not installed.
+    """
     try:
         texts = requires("symsteer") or []
     except PackageNotFoundError:
         texts = [f"{package}=={wanted}" for package, wanted in PINNED.items()]
-    parsed = [Requirement(text) for text in texts]
-    return [r for r in parsed if r.marker is None or r.marker.evaluate({"extra": ""})]
+    found = []
+    for requirement in map(Requirement, texts):
+        always = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        if always != bool(extra) and (always or requirement.marker.evaluate({"extra": extra})):  # type: ignore[union-attr]
+            found.append(requirement)
+    return found
+
+
+def _installed(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def _satisfied(requirement: Requirement) -> bool:
+    installed = _installed(requirement.name)
+    return installed != "missing" and requirement.specifier.contains(installed)
 
 
 def _check_x11() -> Check:
@@ -127,7 +170,7 @@ def _check_x11() -> Check:
         return Check(
             "libX11",
             False,
-            "libX11.so.6 is missing; SAPIEN links it, even to run without a display",
+            "libX11.so.6 is missing; SAPIEN links to it, also without a display",
             "apt install libx11-6 (Fedora: dnf install libX11)",
             required=True,
         )
@@ -141,12 +184,10 @@ def _check_simulator() -> Check:
     try:
         importlib.import_module("mani_skill.envs")
     except Exception as error:
-        # A missing shared library is the usual reason, and names itself in the message.
+        # The usual reason is a missing shared library; the message begins with its name.
         library = str(error).split(":")[0]
         packages = {"libX11.so.6": "libx11-6", "libGL.so.1": "libgl1", "libEGL.so.1": "libegl1"}
-        cure = (
-            f"apt install {packages[library]}" if library in packages else "make setup, once more"
-        )
+        cure = f"apt install {packages[library]}" if library in packages else _REINSTALL
         return Check("ManiSkill", False, f"cannot be imported: {error}", cure, required=True)
     return Check("ManiSkill", True, "imports", required=True)
 
@@ -174,7 +215,7 @@ def _check_physx_gpu() -> Check:
         return Check(
             "PhysX on GPU",
             False,
-            f"{library.name} is not there yet",
+            f"{library.name} has not been downloaded yet",
             "optional: python -c 'import sapien.physx as p; p.enable_gpu()' downloads it; "
             "sim=cpu with the learner on CUDA works without",
         )
@@ -191,7 +232,7 @@ def _check_physx_gpu() -> Check:
 
 
 def _check_rendering() -> Check:
-    # In its own process, because a broken driver may end it.
+    # In a process of its own: a broken driver may crash it.
     try:
         result = subprocess.run(
             [sys.executable, "-c", _RENDER_PROBE],
@@ -210,7 +251,7 @@ def _check_rendering() -> Check:
     return Check(
         "rendering",
         False,
-        f"{reason}; state-only runs need no Vulkan device, pictures and videos do",
+        f"{reason}; pictures and videos need a Vulkan device, state-only runs do not",
         "optional: your GPU's Vulkan driver, or apt install chromium and set VK_ICD_FILENAMES to "
         "/usr/lib/chromium/vk_swiftshader_icd.json for software rendering",
     )
@@ -229,6 +270,7 @@ _CHECKS: dict[str, Callable[[], Check]] = {
     "memory": _check_memory,
     "python": _check_python,
     "package versions": _check_versions,
+    "optional packages": _check_extras,
     "libX11": _check_x11,
     "ManiSkill": _check_simulator,
     "CUDA": _check_torch,

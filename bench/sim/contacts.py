@@ -41,7 +41,7 @@ class PairImpulseQuery:
             self._entries[second, first].append((row, -1))
 
     def entries(self, first: Any, second: Any) -> _Entries:
-        """Rows and signs for a contact between two bodies; empty when it is none of ours."""
+        """Rows and signs of a contact between two bodies; empty if the query has no such pair."""
         return self._entries.get((first, second), [])
 
 
@@ -55,7 +55,7 @@ class BodyImpulseQuery:
             self._rows[body].append(row)
 
     def entries(self, first: Any, second: Any) -> _Entries:
-        """Rows and signs for a contact between two bodies; empty when it is none of ours."""
+        """Rows and signs of a contact between two bodies; empty if the query has neither."""
         on_first = [(row, 1) for row in self._rows.get(first, ())]
         return on_first + [(row, -1) for row in self._rows.get(second, ())]
 
@@ -64,7 +64,7 @@ Query = TypeVar("Query", PairImpulseQuery, BodyImpulseQuery)
 
 
 class ContactReader:
-    """Walks through the contacts of all scenes at most once a substep, for all queries."""
+    """Reads the contacts of all scenes at most once per substep, for all queries."""
 
     def __init__(self, systems: Sequence[physx.PhysxCpuSystem]) -> None:
         self._systems = systems
@@ -78,25 +78,25 @@ class ContactReader:
         self._known_pairs: dict[tuple[Any, Any], list[tuple[int, int, int]]] = {}
 
     def register(self, query: Query) -> Query:
-        """Answer this query too from now on."""
+        """Add a query."""
         self._queries.append(query)
         self._known_pairs.clear()
         self._must_read = True
         return query
 
     def invalidate(self) -> None:
-        """All scenes have taken a substep."""
+        """Mark all contacts as out of date, after a substep of all scenes."""
         self._must_read = True
         self._forgotten.clear()
 
     def forget(self, scene: int) -> None:
-        """A scene was set to another state: it has no contacts until its next substep."""
+        """Drop the contacts of a scene whose state was set, until its next substep."""
         self._forgotten.add(scene)
         self._found[scene].clear()
         self._must_sum = True
 
     def answer(self, query: PairImpulseQuery | BodyImpulseQuery) -> None:
-        """Bring the results of this and all other queries up to date."""
+        """Update the results of all queries."""
         if self._must_read:
             self._read()
         if self._must_sum:

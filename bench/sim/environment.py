@@ -6,7 +6,7 @@ import dataclasses
 import gc
 import weakref
 from functools import cache
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import sapien
 import sapien.physx as physx
@@ -21,14 +21,14 @@ from mani_skill.utils.structs import Actor
 from symsteer.bench.sim import patches, rendering
 from symsteer.bench.sim.headless import prepare_headless
 from symsteer.bench.sim.scene import BatchedScene
+from symsteer.bench.sim.versions import check_versions
 from symsteer.errors import UserError
 
 Simulator = Literal["cpu", "cuda"]
 
-
 MAX_SCENES = 900
-"""PhysX scenes of a process, those of environments before their reconfiguration included. With
-about 1,000 of them the interpreter ends with a fatal error (``_PyGILState_NoteThreadState``)."""
+"""PhysX scenes that one process may hold. With about 1,000 of them the interpreter ends with a
+fatal error (``_PyGILState_NoteThreadState``)."""
 
 _LIVE_SCENES: weakref.WeakSet[BatchedScene] = weakref.WeakSet()
 
@@ -36,13 +36,13 @@ _LIVE_SCENES: weakref.WeakSet[BatchedScene] = weakref.WeakSet()
 def _make_room(count: int) -> None:
     """Raise `UserError` unless this process can hold ``count`` more scenes."""
     if _number_of_scenes() + count > MAX_SCENES:
-        # Environments that were closed hold their scenes until they are collected.
+        # Closed environments hold their scenes until they are collected.
         gc.collect()
     if (there := _number_of_scenes()) + count > MAX_SCENES:
         raise UserError(
             f"one process holds at most {MAX_SCENES} PhysX scenes: {count} were asked for and "
-            f"{there} are there already (a reset that reconfigures needs each twice); make fewer, "
-            "or spread them over processes with workers"
+            f"{there} exist already (a reset that reconfigures needs twice as many); make fewer "
+            "environments, or divide them among processes with workers"
         )
 
 
@@ -51,7 +51,7 @@ def _number_of_scenes() -> int:
 
 
 class _BatchedDevice:
-    """The simulation device as ManiSkill asks for it: "cuda" means that buffers are applied."""
+    """Simulation device that makes ManiSkill take its GPU branch, which applies buffers."""
 
     def is_cuda(self) -> bool:
         return True
@@ -64,11 +64,12 @@ class BatchedCpuMixin(BaseEnv):
     """Runs a ManiSkill task for N environments in one process on CPU physics.
 
     Mix in before a `BaseEnv` subclass: ``class MyEnv(BatchedCpuMixin, PickCubeEnv)``. Takes the
-    arguments of that class. Cameras work where there is a Vulkan driver and ``render_mode`` or a
-    visual ``obs_mode`` asks for them; without either nothing is prepared for rendering.
+    arguments of that class. Cameras exist only if ``render_mode`` or a visual ``obs_mode`` asks
+    for them; they need a Vulkan driver.
 
     Raises:
-        UserError: another simulator or release is asked for, or cameras without a driver.
+        UserError: another simulator is asked for, ManiSkill or SAPIEN does not have the pinned
+            version, or cameras are asked for without a Vulkan driver.
     """
 
     def __init__(
@@ -89,10 +90,10 @@ class BatchedCpuMixin(BaseEnv):
             )
         if parallel_in_single_scene:
             raise UserError("parallel_in_single_scene needs the GPU simulation: use sim='cuda'.")
-        patches.check_versions()
+        check_versions()
         patches.install()
         prepare_headless()
-        cameras = render_mode is not None or obs_mode not in (None, "state", "state_dict", "none")
+        cameras = _needs_cameras(render_mode, obs_mode)
         self._camera_device = rendering.find_device(render_backend) if cameras else None
         super().__init__(
             *args,
@@ -111,8 +112,8 @@ class BatchedCpuMixin(BaseEnv):
 
     @backend.setter
     def backend(self, info: BackendInfo) -> None:
-        # Another name than ManiSkill's CPU backends, which refuse several environments, and the
-        # render device that ManiSkill's parser may not be able to name.
+        # ManiSkill refuses several environments on its own CPU backends, so the name differs.
+        # Its parser may not know the render device either.
         self._backend = dataclasses.replace(
             info,
             sim_backend="physx_cpu_batched",
@@ -126,7 +127,7 @@ class BatchedCpuMixin(BaseEnv):
 
     @_sim_device.setter
     def _sim_device(self, device: sapien.Device) -> None:
-        """Ignored: BaseEnv assigns the plain CPU device."""
+        """Ignore the plain CPU device that `BaseEnv` assigns."""
 
     def _setup_scene(self) -> None:
         self._set_scene_config()
@@ -148,7 +149,7 @@ class BatchedCpuMixin(BaseEnv):
         self._check_controllers()
 
     def _check_controllers(self) -> None:
-        """Refuse what ManiSkill refuses on the GPU: the batched solver works in the root frame."""
+        """Refuse what ManiSkill refuses on the GPU: its batched solver needs the root frame."""
         agents = self.agent.agents if isinstance(self.agent, MultiAgent) else [self.agent]
         for agent in agents:
             controller = getattr(agent, "controller", None)
@@ -164,13 +165,13 @@ class BatchedCpuMixin(BaseEnv):
                         ) from error
 
     def hold_force(self, body: Actor, force: torch.Tensor) -> None:
-        """Push a dynamic body in every substep from now on, until this is called again.
+        """Apply a force to a dynamic body in every substep until the next call for that body.
 
-        Substeps are still taken scene by scene: nothing has to run between them.
+        No code runs between substeps for this, so it costs little.
 
         Args:
-            body: of all environments.
-            force: at its centre of mass, ``[N, 3]`` newtons in the world frame.
+            body: an actor of all environments.
+            force: ``[N, 3]`` newtons in the world frame, at the centre of mass.
         """
         self.scene.px.hold_forces(body._body_data_index.numpy(), force.numpy())
 
@@ -219,16 +220,10 @@ class CudaMixin(BaseEnv):
             sim_backend = "physx_cuda"
         self._held: dict[str, tuple[Actor, torch.Tensor]] = {}
         check_cuda()
-        patches.check_versions()
+        check_versions()
         prepare_headless()
         if render_backend is None:
-            cameras = render_mode is not None or obs_mode not in (
-                None,
-                "state",
-                "state_dict",
-                "none",
-            )
-            render_backend = "gpu" if cameras else "none"
+            render_backend = "gpu" if _needs_cameras(render_mode, obs_mode) else "none"
         super().__init__(
             *args,
             num_envs=num_envs,
@@ -240,7 +235,7 @@ class CudaMixin(BaseEnv):
         )
 
     def hold_force(self, body: Actor, force: torch.Tensor) -> None:
-        """Push a dynamic body in every substep; see `BatchedCpuMixin.hold_force`."""
+        """Apply a force in every substep; see `BatchedCpuMixin.hold_force`."""
         self._held[body.name] = (body, force)
 
     def _setup_scene(self) -> None:
@@ -253,6 +248,10 @@ class CudaMixin(BaseEnv):
         super()._before_simulation_step()
 
 
+def _needs_cameras(render_mode: str | None, obs_mode: str | None) -> bool:
+    return render_mode is not None or obs_mode not in (None, "state", "state_dict", "none")
+
+
 def check_cuda() -> None:
     """Raise `UserError` unless ManiSkill's GPU simulation can run here."""
     if not torch.cuda.is_available():
@@ -261,11 +260,11 @@ def check_cuda() -> None:
         )
     try:
         physx.enable_gpu()
-    except Exception as error:  # a missing library shows as a network or a loader error
+    except Exception as error:  # a network or a loader error if the library is missing
         raise UserError(
-            "sim='cuda' needs PhysX's GPU library, which SAPIEN downloads at first use and could "
-            f"not get or load ({type(error).__name__}): use sim='cpu', which may feed a learner "
-            "on the GPU."
+            "sim='cuda' needs PhysX's GPU library, which SAPIEN could not download or load "
+            f"({type(error).__name__}): use sim='cpu', which also works with the learner on the "
+            "GPU."
         ) from error
 
 
@@ -292,40 +291,14 @@ def make_env_class(env_cls: type[BaseEnv], sim: Simulator = "cpu") -> type[BaseE
     )
 
 
-def create(
+def create_in_process(
     env_cls: type[BaseEnv],
     num_envs: int,
     sim: Simulator = "cpu",
     render: bool = False,
-    workers: int = 1,
     **kwargs: Any,
 ) -> BaseEnv:
-    """Make N parallel environments of a ManiSkill task.
-
-    Args:
-        env_cls: any `BaseEnv` subclass, ManiSkill's or ours.
-        num_envs: how many environments.
-        sim: ``"cpu"`` or ``"cuda"``.
-        render: whether ``env.render()`` must give pictures; needs a Vulkan driver.
-        workers: processes that share the environments; see `ShardedEnv`, which
-            is what is returned for more than one.
-        kwargs: passed on to the class.
-
-    Raises:
-        UserError: the simulator or the renderer is unknown or not available here, or ManiSkill
-            or SAPIEN is of another release than this package was written for.
-    """
-    if num_envs < 1:
-        raise UserError(f"num_envs is {num_envs}, but at least one environment is needed.")
+    """Make N parallel environments in this process; see `symsteer.bench.sim.create`."""
     if render:
         kwargs.setdefault("render_mode", "rgb_array")
-    if workers != 1:
-        if sim != "cpu":
-            raise UserError(
-                f"workers={workers} divides CPU physics among processes; the GPU simulates all "
-                "environments in one: leave workers out, or use sim='cpu'"
-            )
-        from symsteer.bench.sim.shards import ShardedEnv
-
-        return cast(BaseEnv, ShardedEnv(env_cls, num_envs, workers, **kwargs))
     return make_env_class(env_cls, sim)(num_envs=num_envs, **kwargs)  # type: ignore[arg-type]

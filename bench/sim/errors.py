@@ -1,8 +1,8 @@
-"""What can go wrong with worker processes; light to import."""
+"""Errors of worker processes. Light to import: the command line handles them."""
 
 
 class WorkerError(Exception):
-    """A worker process failed; its cause holds the worker's own traceback."""
+    """A worker process failed; its cause holds the worker's traceback."""
 
 
 class WorkerLostError(WorkerError):

@@ -1,8 +1,8 @@
 """State-only simulation on machines without Vulkan.
 
-SAPIEN's loaders and ManiSkill's task code construct render materials even when nothing will be
-rendered, and SAPIEN raises ``failed to find a rendering device`` where there is no Vulkan
-device. Where that is so, and only there, `prepare_headless` puts inert stand-ins in their place.
+SAPIEN's loaders and ManiSkill's task code construct render materials even if nothing is rendered,
+and without a Vulkan device SAPIEN raises ``failed to find a rendering device``. Only in that case
+`prepare_headless` replaces them by objects that do nothing.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import warnings
 from functools import lru_cache
 from typing import Any
 
-# The noise that importing SAPIEN and escnn makes on a machine without Vulkan or Fortran.
+# Warnings of SAPIEN and escnn at import on a machine without Vulkan or Fortran.
 _NOISE = (
     "Failed to find system libvulkan.*",
     "Failed to find Vulkan ICD file.*",
@@ -19,7 +19,7 @@ _NOISE = (
     ".*py3nj.*",
 )
 
-# What ManiSkill logs about objects of its own tasks that get their pose at the first reset.
+# ManiSkill logs this about objects of its own tasks, which get their pose at the first reset.
 _LOGGED_NOISE = "No initial pose set for actor builder"
 
 _VISUAL_METHODS = (
@@ -33,7 +33,7 @@ _VISUAL_METHODS = (
 
 
 class InertMaterial:
-    """Stands in for ``sapien.render.RenderMaterial``: takes any argument, keeps any attribute."""
+    """Replaces ``sapien.render.RenderMaterial``: accepts any argument, stores any attribute."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.__dict__.update(kwargs)
@@ -45,7 +45,7 @@ class InertMaterial:
 
 
 class InertTexture:
-    """Stands in for ``sapien.render.RenderTexture2D``, which would read an image for nothing."""
+    """Replaces ``sapien.render.RenderTexture2D``; does not read the image."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         pass
@@ -65,12 +65,11 @@ def rendering_works() -> bool:
 
 
 def prepare_headless() -> bool:
-    """Make state-only simulation possible where there is no Vulkan device.
+    """Make state-only simulation possible without a Vulkan device.
 
-    Idempotent, cheap after the first call, and without effect where rendering works. Where it
-    does not, render materials and textures become inert and the ``add_*_visual`` methods of
-    SAPIEN's actor builder do nothing, for every user of SAPIEN in this process: those calls
-    would raise otherwise.
+    Cheap after the first call; does nothing if rendering works. Otherwise render materials and
+    textures become inert and the ``add_*_visual`` methods of SAPIEN's actor builder do nothing, in
+    the whole process. Those calls would raise without this.
 
     Returns:
         Whether rendering works.
@@ -84,7 +83,7 @@ def prepare_headless() -> bool:
 
 
 def silence_import_noise() -> None:
-    """Hide the warnings that importing SAPIEN and escnn causes and nobody needs to act on."""
+    """Hide harmless warnings that SAPIEN and escnn give at import."""
     for message in _NOISE:
         warnings.filterwarnings("ignore", message=message)
 

@@ -1,8 +1,8 @@
 """Jacobians of serial chains, batched.
 
 ManiSkill's batched inverse kinematics spends most of its time in pytorch_kinematics, which
-builds hundreds of small tensors for one Jacobian. This computes the same matrix in some thirty
-tensor operations.
+builds hundreds of small tensors for one Jacobian. This module computes the same matrix in about
+thirty tensor operations.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ _TOLERANCE = 1e-4
 
 
 class SerialChain:
-    """A chain of revolute and prismatic joints, taken from a pytorch_kinematics chain.
+    """A chain of revolute and prismatic joints, built from a pytorch_kinematics chain.
 
-    Has the two methods of that chain that ManiSkill's solver calls.
+    It has the two methods of that chain which ManiSkill's solver calls.
 
     Args:
         chain: a ``pytorch_kinematics.SerialChain``.
@@ -51,14 +51,14 @@ class SerialChain:
 
     @classmethod
     def replace(cls, chain: Any) -> Any:
-        """Ours for a pytorch_kinematics chain, or that chain itself where ours does not fit."""
+        """Our chain, or the given one if the Jacobians differ (another kind of joint)."""
         ours = cls(chain)
         q = torch.linspace(-1.1, 0.7, len(ours._revolute))[None]
         same = torch.allclose(ours.jacobian(q), chain.jacobian(q), atol=_TOLERANCE)
         return ours if same else chain
 
     def forward_kinematics(self, q: torch.Tensor) -> Any:
-        """Pose of the end link; the original chain's own method."""
+        """Pose of the end link, from the original chain."""
         return self.chain.forward_kinematics(q)
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
@@ -68,7 +68,7 @@ class SerialChain:
             q: joint positions [B, J], radians or metres.
 
         Returns:
-            [B, 6, J]: linear velocity above angular velocity, per joint velocity.
+            ``[B, 6, J]``: per joint velocity, three rows of linear and three of angular velocity.
         """
         angle = q[:, :, None, None]
         turn = torch.sin(angle) * self._cross + (1 - torch.cos(angle)) * self._cross_squared

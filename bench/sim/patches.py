@@ -1,35 +1,22 @@
-"""The few places of ManiSkill that cannot be reached from a subclass.
+"""Patches of ManiSkill code that a subclass cannot replace.
 
-Each patch dispatches on the scene: objects of a batched CPU scene take our path, all others
-take ManiSkill's own code unchanged, so stock environments may run in the same process. They are
-tied to the releases they were written against.
+Each patch looks at the scene: objects of a batched CPU scene use our code, all others use
+ManiSkill's own, so stock environments can run in the same process. The patches depend on the
+versions in `versions.PINNED`.
 """
 
 from __future__ import annotations
 
 from functools import cached_property, lru_cache
-from importlib.metadata import version
 from typing import Any
 
 import torch
 
 from symsteer.bench.sim.kinematics import SerialChain
-from symsteer.bench.sim.pins import PINNED
-from symsteer.errors import UserError
-
-
-def check_versions() -> None:
-    """Raise `UserError` unless the installed simulator is the one this package was written for."""
-    for package, wanted in PINNED.items():
-        if (found := version(package)) != wanted:
-            raise UserError(
-                f"SymSteer is written against {package} {wanted}, but {found} is installed: "
-                f'run "pip install {package}=={wanted}".'
-            )
 
 
 def is_batched(scene: Any) -> bool:
-    """Whether a ManiSkill scene is one of ours."""
+    """Whether a ManiSkill scene is a `BatchedScene`."""
     return getattr(scene, "batched_cpu", False)
 
 
@@ -47,7 +34,7 @@ def _dispatch_property(cls: type, name: str, ours: Any) -> None:
 
 @lru_cache(maxsize=1)
 def install() -> None:
-    """Install the patches, once per process. Call `check_versions` first."""
+    """Install the patches, once per process. Call `versions.check_versions` first."""
     from mani_skill.agents.controllers.utils.kinematics import Kinematics
     from mani_skill.envs.tasks.tabletop.push_t import WhiteTableSceneBuilder
     from mani_skill.utils.structs.articulation import Articulation
@@ -75,7 +62,7 @@ def install() -> None:
     stock_setup_cpu = Kinematics._setup_cpu
 
     def setup_cpu(self: Any) -> None:
-        # The batched solver, which ManiSkill chooses by device type, works on CPU tensors too.
+        # ManiSkill chooses the batched solver by device type, but it works on CPU tensors too.
         if is_batched(self.articulation.scene):
             self._setup_gpu()
             self.pk_chain = SerialChain.replace(self.pk_chain)
@@ -87,7 +74,7 @@ def install() -> None:
     stock_table = WhiteTableSceneBuilder.build
 
     def build_table(self: Any) -> None:
-        # PushT repaints its table, which has no render component where nothing is rendered.
+        # PushT repaints its table, which has no render component if nothing is rendered.
         if self.scene.can_render():
             stock_table(self)
         else:

@@ -1,22 +1,22 @@
 """N CPU physics scenes behind the interface of SAPIEN's ``PhysxGpuSystem``.
 
-ManiSkill's GPU branch is batched torch code that reads and writes a few large buffers and asks
-the physics system to *fetch* them from, or *apply* them to, the simulation. `BatchedPhysx`
-offers the same buffers and calls over N ``PhysxCpuSystem`` scenes: torch tensors on the CPU that
-share memory with numpy arrays. What differs from the GPU is invisible to task code:
+ManiSkill's GPU branch is batched torch code that reads and writes a few large buffers. It asks the
+physics system to *fetch* them from the simulation, or to *apply* them to it. `BatchedPhysx` has the
+same buffers and methods for N ``PhysxCpuSystem`` scenes: torch tensors on the CPU that share memory
+with numpy arrays. It differs from the GPU in ways that task code does not notice:
 
-- *Apply writes only what changed* since the last fetch. A partial reset therefore leaves the
-  other scenes untouched to the last bit: writing a fetched value back could move a body, wake
-  it or reset its solver state.
-- *Fetch reads only scenes that may have changed*, most of it in one call per scene
-  (``PhysxCpuSystem.pack``), and the poses of only those links whose row somebody has asked for.
-- *Contacts are forgotten when a scene is reset*, so what a reset reports depends on the state
-  it sets and not on the episode before.
+- *Apply writes only what changed* since the last fetch. So a partial reset does not change a bit of
+  the other scenes: writing a fetched value back could move a body, wake it or reset its solver
+  state.
+- *Fetch reads only scenes that may have changed*, mostly with one call per scene
+  (``PhysxCpuSystem.pack``), and only those links whose row was asked for.
+- *A reset deletes the contacts of its scene*, so what it reports depends on the new state only,
+  not on the episode before.
 
-Repeats are exact to the last bit, with one limit of PhysX itself: the order in which it solves
-contacts that begin in the same substep follows the scene's history. A scene that must not show
-its past at all is made anew by ``env.reset(options={"reconfigure": True})``, in milliseconds
-per environment.
+Repetitions are equal to the bit, with one limit of PhysX: if several contacts begin in the same
+substep, the order in which it solves them depends on the scene's history.
+``env.reset(options={"reconfigure": True})`` makes scenes without history, in milliseconds per
+environment.
 
 Rows of the body buffer: rigid bodies first (dynamic and kinematic, scene by scene), then
 articulation links. Columns: position (3), quaternion wxyz (4), linear velocity (3), angular
@@ -47,8 +47,8 @@ class Buffer:
     """A float32 array that numpy and torch share, with the ``.torch()`` of SAPIEN's CudaArray.
 
     Args:
-        array: what to share.
-        fill: called before each ``.torch()``, for buffers that are read on demand.
+        array: the shared array.
+        fill: called before each ``.torch()``; for buffers that are filled on demand.
     """
 
     def __init__(self, array: np.ndarray, fill: Callable[[], None] | None = None) -> None:
@@ -69,14 +69,14 @@ class Buffer:
 
 
 class BatchedPhysx:
-    """N ``PhysxCpuSystem`` scenes with the surface of one ``PhysxGpuSystem``.
+    """N ``PhysxCpuSystem`` scenes with the interface of one ``PhysxGpuSystem``.
 
     Args:
         scenes: one SAPIEN scene per environment, each with its own ``PhysxCpuSystem``.
     """
 
-    # ManiSkill chooses its batched branch by isinstance(system, PhysxGpuSystem). A real subclass
-    # would need CUDA to be constructed, so this object only says that it is one.
+    # ManiSkill chooses its batched branch by isinstance(system, PhysxGpuSystem). Constructing a
+    # real subclass needs CUDA, so this property makes isinstance return True.
     __class__ = property(lambda self: physx.PhysxGpuSystem)  # type: ignore[assignment]
 
     def __init__(self, scenes: Sequence[sapien.Scene]) -> None:
@@ -88,7 +88,7 @@ class BatchedPhysx:
         # Per scene: forces by row of the body that they act on in every substep.
         self._held: list[dict[int, np.ndarray]] = [{} for _ in self.systems]
 
-    # ------------------------------------------------------------------ plain system surface
+    # ------------------------------------------------------------------ plain system interface
     @property
     def timestep(self) -> float:
         """Duration of a substep in seconds."""
@@ -133,7 +133,7 @@ class BatchedPhysx:
         return [contact for system in self.systems for contact in system.get_contacts()]
 
     def get_scene_offset(self, scene: sapien.Scene) -> np.ndarray:
-        """Scenes do not share a space here, so none is moved aside: always zero."""
+        """Always zero: each scene has a space of its own."""
         return np.zeros(3, dtype=np.float32)
 
     # ------------------------------------------------------------------ setup
@@ -146,7 +146,7 @@ class BatchedPhysx:
         self._index_scenes()
         n, m = len(self._bodies), len(self._articulations)
         d = max(self._dof, default=0)
-        # What the simulation holds, to tell which rows a task has written.
+        # State of the simulation at the last fetch: buffers that differ were written by the task.
         self._body_state = np.zeros((n, 13), dtype=np.float32)
         self._joint_state = {
             name: np.zeros((m, d), dtype=np.float32)
@@ -176,8 +176,8 @@ class BatchedPhysx:
         self._contacts = ContactReader(self.systems)
         self._stale = np.ones(len(self.systems), dtype=bool)
         self._qacc_stale = True
-        # Articulations whose drives a controller sets: their targets are written at each control
-        # step, as stock ManiSkill does, which also keeps PhysX from putting them to sleep.
+        # Articulations whose drives a controller sets. Their targets are written at each control
+        # step, as in stock ManiSkill; this also prevents PhysX from putting them to sleep.
         self._driven = np.zeros(m, dtype=bool)
         self._initialized = True
         self._refresh()
@@ -185,7 +185,7 @@ class BatchedPhysx:
         self.fetch_all()
 
     def _index_scenes(self) -> None:
-        """Number bodies and articulations, and find their numbers in the packed scenes."""
+        """Assign rows to bodies and articulations, and find their places in packed scenes."""
         rigid: list[Any] = []
         links: list[Any] = []
         rigid_scene: list[int] = []
@@ -231,7 +231,7 @@ class BatchedPhysx:
         self._root_row = np.array([self._body_row[a.root] for a in self._articulations], int)
         self._live_links: list[list[int]] = [[] for _ in self.systems]
         self._live = set(range(self._n_rigid)) | set(self._root_row.tolist())
-        # The last number of the flat array is a zero that padded joints point to.
+        # Padded joints point to the last number of the flat array, which is zero.
         total = self._pack_start[-1]
         self._packed = np.zeros(total + 1, dtype=np.float32)
         self._rigid_at = np.array(rigid_at, int).reshape(-1, 1) + _PACKED_BODY
@@ -249,7 +249,7 @@ class BatchedPhysx:
             self._joint_at["target_qvel"][row, :dof] = at + 14 + 2 * dof + 2 * joints
 
     def _check_packing(self) -> None:
-        """Compare what was unpacked with what SAPIEN's objects say, once per scene set-up."""
+        """Compare unpacked values with those of SAPIEN's objects, once per set-up."""
         for row, body in enumerate(self._bodies[: self._n_rigid]):
             if tuple(self._body_state[row, :7].tolist()) != body.entity.pose.__getstate__():
                 raise RuntimeError(f"SAPIEN packs the pose of {body.name} in an unknown order")
@@ -266,7 +266,7 @@ class BatchedPhysx:
                 raise RuntimeError(f"SAPIEN packs {articulation.name} in an unknown order")
 
     def body_index(self, body: Any) -> int:
-        """Row of a rigid body or link in the body buffer, which is kept up to date from now on."""
+        """Row of a rigid body or link in the body buffer; from now on it is kept up to date."""
         row = self._body_row[body]
         if row not in self._live:
             self._live.add(row)
@@ -288,12 +288,12 @@ class BatchedPhysx:
 
     @contextmanager
     def deferred_substeps(self) -> Iterator[None]:
-        """Substeps in this block are taken scene by scene at its end.
+        """Take the substeps of this block at its end, scene by scene.
 
-        A scene's data then stays in the processor's cache for all substeps of a control step,
-        which makes them a third faster. Any call of this object that depends on the simulation
-        takes the outstanding substeps first, so only code that reads or writes SAPIEN's own
-        objects between substeps would see a difference.
+        All substeps of a control step then find the scene's data in the processor's cache, which
+        makes them a third faster. Any method that depends on the simulation takes the pending
+        substeps first, so only code that uses SAPIEN's own objects between substeps would see a
+        difference.
         """
         self._deferring = True
         try:
@@ -303,7 +303,7 @@ class BatchedPhysx:
             self.finish_substeps()
 
     def finish_substeps(self) -> None:
-        """Take the substeps that have been asked for and not taken yet."""
+        """Take the pending substeps."""
         count, self._pending_substeps = self._pending_substeps, 0
         if count == 0:
             return
@@ -359,7 +359,7 @@ class BatchedPhysx:
         self._stale[:] = False
 
     def fetch_all(self) -> None:
-        """Bring every buffer up to date; those read on demand when they are asked for."""
+        """Update every buffer, except those that are filled on demand."""
         self._refresh()
         self._body_buffer[:] = self._body_state
         for name, state in self._joint_state.items():
@@ -402,7 +402,7 @@ class BatchedPhysx:
         self._fetch_joints("target_qvel")
 
     def gpu_fetch_articulation_qacc(self) -> None:
-        """Joint accelerations are read when the buffer is asked for: see `_read_qacc`."""
+        """Do nothing: joint accelerations are read on demand, see `_read_qacc`."""
 
     def _read_qacc(self) -> None:
         self._refresh()
@@ -428,7 +428,7 @@ class BatchedPhysx:
 
     # ------------------------------------------------------------------ apply
     def apply_all(self) -> None:
-        """Write all that a task has changed in the buffers to the simulation."""
+        """Write everything that a task changed in the buffers to the simulation."""
         self.gpu_apply_rigid_dynamic_data()
         self.gpu_apply_articulation_qpos()
         self.gpu_apply_articulation_qvel()
@@ -440,7 +440,7 @@ class BatchedPhysx:
 
     @staticmethod
     def _changed(buffer: np.ndarray, state: np.ndarray) -> list[int]:
-        """Rows in which a task has written another value than the simulation holds."""
+        """Rows in which the buffer differs from the simulation."""
         return np.flatnonzero((buffer != state).any(axis=1)).tolist()
 
     def _touch(self, scene: int, moved: bool = False) -> None:
@@ -474,7 +474,7 @@ class BatchedPhysx:
         self._body_state[roots, _POSE] = buffer[roots, _POSE]
 
     def gpu_apply_articulation_root_velocity(self) -> None:
-        """Apply root velocities; roots that are fixed have none."""
+        """Apply root velocities; fixed roots are skipped."""
         self.finish_substeps()
         roots, buffer = self._root_row, self._body_buffer
         for i in self._changed(buffer[roots, _VELOCITY], self._body_state[roots, _VELOCITY]):
@@ -519,20 +519,20 @@ class BatchedPhysx:
             for set_target, value in zip(calls[row], values[row], strict=False):
                 set_target(value)
         state[:] = buffer
-        # A refresh that reads scenes again must find what was written here.
+        # The next refresh must find the new targets.
         self._packed[self._joint_at[name]] = buffer
         self._packed[-1] = 0
 
     def gpu_apply_articulation_target_position(self) -> None:
-        """Apply drive targets, of articulations under control even where they are unchanged."""
+        """Apply drive targets; those of controlled articulations even if unchanged."""
         self._apply_targets("target_qpos", self._set_target_calls, refresh_driven=True)
 
     def gpu_apply_articulation_target_velocity(self) -> None:
-        """Apply drive velocity targets, likewise."""
+        """Apply drive velocity targets; those of controlled articulations even if unchanged."""
         self._apply_targets("target_qvel", self._set_target_velocity_calls, refresh_driven=True)
 
     def _apply_forces(self, buffer: Buffer, is_force: bool) -> None:
-        """Each request acts in the next substep and once: the buffer is cleared."""
+        """Apply forces for the next substep only, and clear the buffer."""
         self.finish_substeps()
         zero = np.zeros(3, dtype=np.float32)
         for row in np.flatnonzero(buffer.array[: self._n_rigid].any(axis=1)).tolist():
@@ -547,15 +547,15 @@ class BatchedPhysx:
         self._apply_forces(self.cuda_rigid_body_force, is_force=True)
 
     def hold_forces(self, rows: np.ndarray, forces: np.ndarray) -> None:
-        """Forces that act on bodies in every substep from now on, until they are set anew.
+        """Apply forces to bodies in every substep, until the next call for the same bodies.
 
-        Unlike `gpu_apply_rigid_dynamic_force` they need no code between substeps, which can
-        therefore be taken scene by scene.
+        Unlike `gpu_apply_rigid_dynamic_force` this needs no code between substeps, so these can be
+        taken scene by scene.
 
         Args:
             rows: of dynamic bodies in the body buffer, ``[k]``.
-            forces: at their centres of mass, ``[k, 3]`` newtons in the world frame; a body
-                without force is left alone, also asleep.
+            forces: at their centres of mass, ``[k, 3]`` newtons in the world frame; zero ends the
+                force and does not wake the body.
         """
         self.finish_substeps()
         for row, force in zip(rows.tolist(), forces, strict=True):
@@ -573,7 +573,7 @@ class BatchedPhysx:
         """Nothing to do: the CPU system updates link poses when joints are set."""
 
     def sync_poses_gpu_to_cpu(self) -> None:
-        """Take outstanding substeps: entities live on the CPU and need nothing else."""
+        """Take the pending substeps. Nothing to copy: entities are on the CPU."""
         self.finish_substeps()
 
     # ------------------------------------------------------------------ contacts

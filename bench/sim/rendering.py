@@ -1,8 +1,8 @@
 """Cameras of batched CPU scenes, for ManiSkill's batched rendering code.
 
 ManiSkill's GPU branch renders all scenes at once through SAPIEN's ``RenderSystemGroup`` and
-``RenderCameraGroup``, which read poses from CUDA. The stand-ins here have the same calls and
-render scene by scene from the entities' own poses, on whatever Vulkan device there is.
+``RenderCameraGroup``, which read poses from CUDA. The classes here have the same methods, but
+render one scene after the other from the entities' poses, on any Vulkan device.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ def find_device(name: str | None = None) -> sapien.Device:
             first device that can render.
 
     Raises:
-        UserError: there is no Vulkan device, or not this one.
+        UserError: there is no Vulkan device, or none with this name.
     """
     if not rendering_works():
         raise UserError(
             "Rendering needs a Vulkan driver, and none was found: install your GPU's driver, or "
-            "Debian's chromium for a software renderer and set VK_ICD_FILENAMES to its "
-            "vk_swiftshader_icd.json; state-only runs need none."
+            "Debian's chromium for software rendering, and set VK_ICD_FILENAMES to its "
+            "vk_swiftshader_icd.json; state-only runs need no driver."
         )
     if name in (None, "gpu", "cpu", "none"):
         return sapien.render.RenderSystem().device
@@ -41,7 +41,7 @@ def find_device(name: str | None = None) -> sapien.Device:
         return sapien.Device(name)
     except RuntimeError as error:
         raise UserError(
-            f'There is no render device "{name}": leave render_backend out to take the first one.'
+            f'There is no render device "{name}": leave render_backend out to use the first one.'
         ) from error
 
 
@@ -68,7 +68,7 @@ class CameraGroup:
             camera.take_picture()
 
     def get_picture_cuda(self, name: str) -> Pictures:
-        """One texture of the pictures taken last, for instance "Color"."""
+        """A texture of the last pictures, for instance "Color"."""
         pictures = [common.to_tensor(camera.get_picture(name)) for camera in self._cameras]
         return Pictures(torch.stack(pictures))
 
@@ -81,7 +81,7 @@ class RenderGroup:
         self._px = px
 
     def update_render(self) -> None:
-        """Move what is drawn to where the simulation has it."""
+        """Update the drawn poses from the simulation."""
         self._px.finish_substeps()
         for scene in self._scenes:
             scene.update_render()
@@ -89,5 +89,5 @@ class RenderGroup:
     def create_camera_group(
         self, cameras: Sequence[sapien.render.RenderCameraComponent], names: Sequence[str]
     ) -> CameraGroup:
-        """Group one camera of each scene; textures need not be named in advance here."""
+        """Group one camera of each scene; the names of textures are not used here."""
         return CameraGroup(cameras)

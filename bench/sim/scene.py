@@ -20,7 +20,7 @@ class BatchedScene(ManiSkillScene):
     """
 
     batched_cpu = True
-    """What the patches of ManiSkill's structs recognise."""
+    """Tells the patches of ManiSkill's classes that this scene is ours."""
 
     px: BatchedPhysx
 
@@ -30,15 +30,15 @@ class BatchedScene(ManiSkillScene):
         self.gpu_sim_enabled = True
 
     def create_actor_builder(self) -> ActorBuilder:
-        # On the GPU all scenes share one space, so ManiSkill builds a ground plane once. Here
-        # every scene needs its own.
+        # On the GPU all scenes share one space, and ManiSkill builds one ground plane. Here every
+        # scene needs its own.
         return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
 
     def _setup(self, enable_gpu: bool) -> None:
         """Start the simulation at the initial poses, at rest.
 
-        Differs from ManiSkill's only in not asking for the row of every link: a link's row is
-        kept up to date from the moment somebody asks for it.
+        As in ManiSkill, but without asking for the row of every link: rows are kept up to date
+        once they have been asked for, which costs time.
         """
         self.px.gpu_init()
         self.non_static_actors = [a for a in self.actors.values() if a.px_body_type != "static"]
@@ -64,7 +64,7 @@ class BatchedScene(ManiSkillScene):
 
     def add_camera(self, *args: Any, **kwargs: Any) -> RenderCamera:
         """Add a camera to every scene; takes the arguments of `ManiSkillScene.add_camera`."""
-        # Mounted cameras follow their entity, as on the CPU, and not a row of a CUDA buffer.
+        # A mounted camera must follow its entity, as on the CPU, not a row of a CUDA buffer.
         self.gpu_sim_enabled = False
         try:
             return super().add_camera(*args, **kwargs)

@@ -8,51 +8,12 @@ from dataclasses import dataclass
 
 import torch
 
+from symsteer.agents.episodes import DECISION_FIELDS, Rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.steering.seeds import steerability_seeds
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import HELD_OUT_SEED
-from symsteer.policies.base import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.steerability import DESIRED_ACTION_STD, action_spread
-
-
-def held_out_seeds(count: int) -> list[int]:
-    """The seeds of the first ``count`` evaluation episodes."""
-    return [HELD_OUT_SEED + i for i in range(count)]
-
-
-DECISION_FIELDS = ("obs", "noise", "reward", "next_obs", "running", "terminal")
-
-
-@dataclass
-class Rollout:
-    """Full-length episodes, one row an episode.
-
-    Attributes:
-        episodes: columns ``seed, success_once, success_at_end, return, episode_len`` of
-            ManiSkill's metrics, each ``[N]``.
-        obs: observation of every decision, ``[T, N, obs_dim]``.
-        noise: what the agent chose, ``[T, N, Tp, Da]``.
-        reward: summed over the executed steps, ``[T, N]``.
-        next_obs: ``[T, N, obs_dim]``.
-        running: whether the episode had not yet succeeded before the decision, ``[T, N]`` bool.
-        terminal: whether the decision led to the first success, ``[T, N]`` bool.
-    """
-
-    episodes: dict[str, torch.Tensor]
-    obs: torch.Tensor
-    noise: torch.Tensor
-    reward: torch.Tensor
-    next_obs: torch.Tensor
-    running: torch.Tensor
-    terminal: torch.Tensor
-
-    def episodes_of(self, rows: slice) -> Rollout:
-        """The same for some of the episodes."""
-        return Rollout(
-            episodes={name: value[rows] for name, value in self.episodes.items()},
-            **{name: getattr(self, name)[:, rows] for name in DECISION_FIELDS},
-        )
-
 
 Act = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """``(obs [N, obs_dim], rows [N]) -> noise [N, Tp, Da]``; ``rows`` index the list of seeds."""
@@ -98,7 +59,7 @@ def _rollout_batch(
         for name, value in zip(DECISION_FIELDS, row, strict=True):
             steps[name].append(value[:keep])
         running = running & ~succeeded
-        obs = result.obs
+        obs = result.obs_after
     # All episodes end with the last decision, so the rows are the environments in order.
     episodes = {name: value[:keep] for name, value in result.episodes.items()}
     episodes["seed"] = torch.tensor(seeds[:keep])
@@ -139,14 +100,12 @@ MIN_SOLVABLE = 0.9
 def steerability(
     env: LatentNoiseEnv, policy: ChunkPolicy, seed: int, states: int, draws: int = DRAWS
 ) -> Steerability:
-    """Draw noise ``draws`` times for each of ``states`` initial states (below the held-out seeds).
+    """Draw noise ``draws`` times for each of ``states`` initial states.
 
     The thresholds of the warning come from pilot runs: bases under them gained nothing from SAC.
     """
     generator = torch.Generator().manual_seed(seed)
-    span = HELD_OUT_SEED // 2
-    first = span + states * seed % (span - states)
-    seeds = [first + i for i in range(states) for _ in range(draws)]
+    seeds = [start for start in steerability_seeds(seed, states) for _ in range(draws)]
 
     def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
         shape = (len(obs), policy.horizon, policy.act_layout.dim)

@@ -13,31 +13,26 @@ from typing import Any
 
 import torch
 
-from symsteer.policies.base import ChunkPolicy
+from symsteer.agents.replay import Transition
+from symsteer.bench.steering.seeds import training_seeds
+from symsteer.policies.contract import ChunkPolicy
 
 
 @dataclass
-class Transition:
+class Step(Transition):
     """What one decision led to; every tensor has N rows.
 
+    ``reward`` is -1 for every executed step before success, and what a variant makes it cost in
+    addition (``info["extra_cost"]``), summed over the chunk.
+
     Attributes:
-        obs: observation to act on next, ``[N, obs_dim]``: the first one of a new episode where
-            the last one ended.
-        reward: -1 for every executed step before success, and what a variant makes it cost in
-            addition (``info["extra_cost"]``), summed, ``[N]``.
-        next_obs: observation that the decision led to, also where the episode ended,
-            ``[N, obs_dim]``.
-        terminal: success; nothing is bootstrapped behind it, ``[N]`` bool.
-        truncated: the time limit was reached without success, ``[N]`` bool.
+        obs_after: observation to act on next, ``[N, obs_dim]``: the first one of a new episode
+            where the last one ended.
         success_once: the episode of this decision has had a success so far, ``[N]`` bool.
         episodes: ManiSkill's metrics of the episodes that ended, each ``[number ended]``.
     """
 
-    obs: torch.Tensor
-    reward: torch.Tensor
-    next_obs: torch.Tensor
-    terminal: torch.Tensor
-    truncated: torch.Tensor
+    obs_after: torch.Tensor
     success_once: torch.Tensor
     episodes: dict[str, torch.Tensor]
 
@@ -60,11 +55,17 @@ class LatentNoiseEnv:
             goes in and comes out, wherever physics runs.
         ignore_terminations: let episodes run to the time limit after a success, as ManiSkill's
             evaluation does; without it a success ends the episode.
+        seed: of the run, for :meth:`training_seeds`.
+
+    Attributes:
+        control_steps: executed so far, summed over the environments.
+        decisions: taken so far, summed over the environments.
     """
 
     env: Any
     policy: ChunkPolicy
     ignore_terminations: bool = False
+    seed: int = 0
     clock: Clock = field(default_factory=Clock)
 
     def __post_init__(self) -> None:
@@ -73,6 +74,11 @@ class LatentNoiseEnv:
         self.max_episode_steps: int = self.env.max_episode_steps
         self.device = next(self.policy.parameters()).device
         self.control_steps = 0
+        self.decisions = 0
+
+    def training_seeds(self, start: int, count: int) -> list[int]:
+        """Seeds of ``count`` training episodes, for the ``start``-th fresh start of the run."""
+        return training_seeds(self.seed, start, count)
 
     def reset(self, seeds: list[int]) -> torch.Tensor:
         """Start an episode everywhere, environment i from ``seeds[i]``; ``[N, obs_dim]``."""
@@ -88,27 +94,28 @@ class LatentNoiseEnv:
         return self._obs
 
     @torch.no_grad()
-    def step(self, noise: torch.Tensor) -> Transition:
+    def step(self, noise: torch.Tensor) -> Step:
         """Decode ``noise [N, Tp, Da]``, execute the first Ta actions, reset what ended.
 
         What a chunk still does after its episode has ended counts for nothing.
         """
         start = time.perf_counter()
-        actions = self.policy.decode(self._obs, noise).to(self.env.device)
+        obs = next_obs = self._obs
+        chunk = self.policy.decode(obs, noise)
+        actions = chunk.to(self.env.device)
         decoded = time.perf_counter()
-        next_obs = self._obs
         alive = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         reward = torch.zeros(self.num_envs, device=self.device)
         terminal, truncated = torch.zeros_like(alive), torch.zeros_like(alive)
         success_at_end = torch.zeros_like(alive)
         # Where every episode reaches its limit within the chunk, nobody needs the rest of it.
         steps = min(self.execute, self.max_episode_steps - int(self._elapsed.min()))
-        for obs, info in self._play(actions[:, :steps]):
+        for seen, info in self._play(actions[:, :steps]):
             if not alive.any():
                 continue
             self.control_steps += self.num_envs
             success = info["success"].to(self.device)
-            next_obs = torch.where(alive[:, None], obs.to(self.device), next_obs)
+            next_obs = torch.where(alive[:, None], seen.to(self.device), next_obs)
             self._elapsed += alive
             self._success_once |= alive & success
             cost = 1 + info["extra_cost"].to(self.device) if "extra_cost" in info else 1
@@ -119,6 +126,7 @@ class LatentNoiseEnv:
             truncated |= timed_out
             success_at_end |= success & (terminal | timed_out) & alive
             alive &= ~(terminal | truncated)
+        self.decisions += self.num_envs
         self._return += reward
         success_once = self._success_once.clone()
         ended = (terminal | truncated).nonzero().flatten()
@@ -138,7 +146,18 @@ class LatentNoiseEnv:
             self._success_once[ended] = False
         self.clock.decode += decoded - start
         self.clock.simulate += time.perf_counter() - decoded
-        return Transition(self._obs, reward, next_obs, terminal, truncated, success_once, episodes)
+        return Step(
+            obs=obs,
+            noise=noise,
+            actions=chunk[:, : self.execute],
+            reward=reward,
+            next_obs=next_obs,
+            terminal=terminal,
+            truncated=truncated,
+            obs_after=self._obs,
+            success_once=success_once,
+            episodes=episodes,
+        )
 
     def _play(self, actions: torch.Tensor) -> Iterator[tuple[torch.Tensor, dict[str, Any]]]:
         """Observation and info after each step of ``actions [N, T, Da]``.

@@ -107,7 +107,7 @@ class _Options:
 
     def _text(self, value: Any, key: str) -> str:
         if not isinstance(value, str):
-            raise UserError(f"{self.source}: {self.kind}.{key} must be a text, not {value!r}")
+            raise UserError(f"{self.source}: {self.kind}.{key} must be a text in quotes, not {value!r}")
         return value
 
     def _check(self, path: list[str], names: list[str]) -> None:

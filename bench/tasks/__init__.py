@@ -1,153 +1,138 @@
-"""ManiSkill tasks with their geometry.
+"""ManiSkill tasks with their geometry, and what their robots are.
 
+- `TASKS`, `EMBODIMENTS`: what there is, by name.
 - `make(task, num_envs=...)`: N parallel environments of a task.
 - `gym.make("SymSteer/PickCube-v1", num_envs=...)`: the same for users of gymnasium.
 - `gym.make("SymSteer/PickCube-single-v1")`: one environment on NumPy arrays.
 - `task_class(task)`: layouts, limits and feasible returns without making an environment.
-- `task_names()`, `embodiments()`: what there is.
+
+Importing this package registers the tasks with gymnasium. It is cheap: gymnasium, torch and
+ManiSkill are not imported here. If gymnasium is imported later, the ids are registered then.
 """
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Sequence
-from typing import Any
+import importlib
+import importlib.util
+import sys
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
+from typing import TYPE_CHECKING, Any
 
-import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
-import torch
+from symsteer.names import unknown
+from symsteer.registry import Registry
 
-from symsteer.bench.sim import create
-from symsteer.bench.sim.environment import Simulator
-from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.embodiments import EMBODIMENTS
-from symsteer.bench.tasks.lift_peg_upright import LiftPegUpright
-from symsteer.bench.tasks.pick_cube import PickCube
-from symsteer.bench.tasks.place_sphere import PlaceSphere
-from symsteer.bench.tasks.poke_cube import PokeCube
-from symsteer.bench.tasks.pull_cube import PullCube
-from symsteer.bench.tasks.push_cube import PushCube
-from symsteer.bench.tasks.push_t import PushT
-from symsteer.bench.tasks.registration import make_batched, make_single, register
-from symsteer.bench.tasks.stack_cube import StackCube
-from symsteer.bench.variants import Strength, parse
-from symsteer.errors import UserError
+if TYPE_CHECKING:
+    from symsteer.bench.tasks.base import SymmetricTask
+    from symsteer.bench.tasks.making import make, make_batched, make_single
 
 __all__ = [
+    "EMBODIMENTS",
+    "TASKS",
     "SymmetricTask",
     "check_embodiment",
-    "embodiments",
+    "gym_id",
     "make",
     "make_batched",
     "make_single",
     "task_class",
-    "task_names",
+    "task_name",
 ]
 
-_TASKS: dict[str, type[SymmetricTask]] = {
-    task.task_id: task
-    for task in (
-        PushCube,
-        PullCube,
-        PickCube,
-        StackCube,
-        PlaceSphere,
-        LiftPegUpright,
-        PokeCube,
-        PushT,
-    )
+TASKS: Registry[type[SymmetricTask]] = Registry(
+    "task",
+    "symsteer.tasks",
+    {
+        "PushCube-v1": "symsteer.bench.tasks.push_cube:PushCube",
+        "PullCube-v1": "symsteer.bench.tasks.pull_cube:PullCube",
+        "PickCube-v1": "symsteer.bench.tasks.pick_cube:PickCube",
+        "StackCube-v1": "symsteer.bench.tasks.stack_cube:StackCube",
+        "PlaceSphere-v1": "symsteer.bench.tasks.place_sphere:PlaceSphere",
+        "LiftPegUpright-v1": "symsteer.bench.tasks.lift_peg_upright:LiftPegUpright",
+        "PokeCube-v1": "symsteer.bench.tasks.poke_cube:PokeCube",
+        "PushT-v1": "symsteer.bench.tasks.push_t:PushT",
+    },
+    "symsteer.bench.tasks.base:SymmetricTask",
+)
+"""All tasks by name, easiest first."""
+
+EMBODIMENTS = {
+    "floating": "The armless gripper: actions and states turn with the world.",
+    "panda": "ManiSkill's stock Panda arm: its kinematics break the symmetry.",
 }
+"""All embodiments by name, each in one line; their classes are in the module ``embodiments``."""
 
+NAMESPACE = "SymSteer/"
+"""Before a task's name in ids of gymnasium."""
 
-def task_names() -> list[str]:
-    """Names of all tasks, easiest first."""
-    return list(_TASKS)
-
-
-def embodiments() -> list[str]:
-    """Names of all embodiments."""
-    return list(EMBODIMENTS)
+_HOME = {
+    "SymmetricTask": "base",
+    "make": "making",
+    "make_batched": "making",
+    "make_single": "making",
+}
 
 
 def check_embodiment(embodiment: str) -> None:
     """Raise `UserError` if there is no such embodiment."""
     if embodiment not in EMBODIMENTS:
-        raise UserError(unknown_name("embodiment", embodiment, embodiments()))
+        raise unknown("embodiment", embodiment, EMBODIMENTS)
+
+
+def task_name(task: str) -> str:
+    """The name of a task that may be given as an id of gymnasium, with or without its module."""
+    return task.removeprefix(f"{__name__}:").removeprefix(NAMESPACE)
+
+
+def gym_id(task: str) -> str:
+    """An id that ``gym.make`` resolves without an import; of an unregistered class its target."""
+    return f"{__name__}:{NAMESPACE}{task}" if task in TASKS else task
 
 
 def task_class(task: str) -> type[SymmetricTask]:
     """The class of a task, which knows its layouts without a simulation.
 
+    Args:
+        task: its name, an id of gymnasium, or ``package.module:Class``.
+
     Raises:
         UserError: if there is no such task.
     """
-    task = task.removeprefix("SymSteer/")
-    if task not in _TASKS:
-        raise UserError(unknown_name("task", task, task_names()))
-    return _TASKS[task]
+    return TASKS.get(task_name(task))
 
 
-def make(
-    task: str,
-    *,
-    num_envs: int,
-    embodiment: str = "floating",
-    variant: str = "none",
-    strength: Strength | None = None,
-    sim: Simulator = "cpu",
-    obs_mode: str = "state",
-    reward_mode: str = "sparse",
-    render: bool = False,
-    workers: int = 1,
-    **kwargs: Any,
-) -> SymmetricTask:
-    """Make N parallel environments of a task.
-
-    Args:
-        task: one of :func:`task_names`.
-        num_envs: how many.
-        embodiment: ``floating`` (near-exact symmetry) or ``panda`` (the stock arm).
-        variant: symmetry-breaking variants, e.g. ``action_gain:0.5+...``; ``none`` for none.
-        strength: of a single variant named without one; one number or one per environment.
-        sim: ``cpu`` (batched CPU physics) or ``cuda``.
-        obs_mode: ManiSkill's; ``state`` is what ``observation_layout`` describes.
-        reward_mode: ManiSkill's.
-        render: whether ``env.render()`` must work.
-        workers: processes that share the environments, at most ``num_envs``. More than one give
-            the same numbers from more cores; what lives in the simulation (``env.agent``,
-            ``env.scene``, a task's actors) is then out of reach.
-        kwargs: further arguments of ManiSkill's task class.
-
-    Raises:
-        UserError: unknown task, embodiment, variant or simulator, a strength or the number of
-            workers out of range.
-    """
-    env_class = task_class(task)
-    check_embodiment(embodiment)
-    kwargs.update(
-        sim=sim,
-        render=render,
-        embodiment=embodiment,
-        variant=variant,
-        strength=strength,
-        obs_mode=obs_mode,
-        reward_mode=reward_mode,
-    )
-    if workers == 1:
-        return create(env_class, num_envs, **kwargs)
-    variants = parse(variant, strength)
-    if strength is not None and torch.as_tensor(strength).ndim:
-        kwargs.update(strength=None, per_env={"strength": torch.as_tensor(strength)})
-    env = create(env_class, num_envs, workers=workers, attributes={"variants": variants}, **kwargs)
-    for part in variants:
-        part.bind(env)
-    return env
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
 
 
-def unknown_name(kind: str, name: str, valid: Sequence[str]) -> str:
-    """The sentence for a name that is none of the valid ones, with the nearest of them."""
-    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.4)
-    hint = f", did you mean {near[0]!r}?" if near else "."
-    return f"there is no {kind} {name!r}{hint} Valid: {', '.join(valid)}"
+def _register() -> None:
+    from symsteer.bench.tasks.registration import register
+
+    register()
 
 
-register(_TASKS)
+class _AfterGymnasium(MetaPathFinder):
+    """Registers the tasks as soon as gymnasium has been imported."""
+
+    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        if fullname != "gymnasium":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(fullname)
+        if spec is not None and spec.loader is not None:
+            load = spec.loader.exec_module
+
+            def load_and_register(module: Any) -> None:
+                load(module)
+                _register()
+
+            spec.loader.exec_module = load_and_register  # type: ignore[method-assign]
+        return spec
+
+
+if "gymnasium" in sys.modules:
+    _register()
+else:
+    sys.meta_path.insert(0, _AfterGymnasium())

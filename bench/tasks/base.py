@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,20 +21,22 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils import common
 from mani_skill.utils.structs import Actor, Pose
 
-from symsteer.bench.tasks.embodiments import EMBODIMENTS, Embodiment
-from symsteer.bench.tasks.experts import Intent
-from symsteer.bench.tasks.floating import ACTION_LAYOUT
-from symsteer.bench.tasks.gym_env import GymEnv
-from symsteer.bench.tasks.rotations import (
+from symsteer.bench.sim.rotations import (
     planar_matrix,
     quaternion_to_matrix,
     transform_angular,
     transform_quaternion,
 )
-from symsteer.bench.variants import Role, Strength, overriding, parse
+from symsteer.bench.tasks.embodiments import BODIES, Embodiment
+from symsteer.bench.tasks.experts import Intent
+from symsteer.bench.tasks.floating import ACTION_LAYOUT
+from symsteer.bench.tasks.gym_env import GymEnv
+from symsteer.bench.variants import parse
+from symsteer.bench.variants.base import Role, overriding
 from symsteer.bench.variants.friction import Frictions
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Layout
+from symsteer.variant import UNBROKEN, VariantSpec
 
 GRIPPER_FIELDS = (
     Field("tcp_xy", 1),
@@ -57,15 +60,19 @@ class SymmetricTask(GymEnv):
     """Mixin; list it before the ManiSkill task class.
 
     Args:
+        task_id: the name under which the task was made, if it is not the class's own.
         embodiment: ``floating`` or ``panda``.
-        variant: which symmetry-breaking variants act, e.g. ``action_gain:0.5`` (``none``: none).
-        strength: strength of a single variant named without one; a float or one per environment.
+        variant: which symmetry-breaking variants act, e.g. ``action_gain:0.5`` (``none``: none),
+            as text or as data.
+        strength: of a single variant that is named without one; one number, or one per
+            environment.
         kwargs: as for ManiSkill's class.
     """
 
-    SUPPORTED_ROBOTS: ClassVar[list[str]] = [e.robot_uid for e in EMBODIMENTS.values()]
+    SUPPORTED_ROBOTS: ClassVar[list[str]] = [e.robot_uid for e in BODIES.values()]
 
-    task_id: ClassVar[str]
+    task_id: str
+    """Name in the registry, from which :func:`symsteer.bench.tasks.make` makes the same task."""
     max_episode_steps: ClassVar[int]
     task_fields: ClassVar[tuple[Field, ...]]
     action_layout: ClassVar[Layout] = ACTION_LAYOUT
@@ -89,13 +96,16 @@ class SymmetricTask(GymEnv):
     def __init__(
         self,
         *args: Any,
+        task_id: str | None = None,
         embodiment: str = "floating",
-        variant: str = "none",
-        strength: Strength | None = None,
+        variant: str | Sequence[VariantSpec] = UNBROKEN,
+        strength: Any = None,
         **kwargs: Any,
     ):
+        if task_id is not None:
+            self.task_id = task_id
         self.embodiment = embodiment
-        self.body: Embodiment = EMBODIMENTS[embodiment]
+        self.body: Embodiment = BODIES[embodiment]
         self.variants = parse(variant, strength)
         num_envs = kwargs.get("num_envs", 1)
         for part in self.variants:

@@ -14,6 +14,13 @@ import numpy as np
 import torch
 from mani_skill.agents.robots import Panda
 
+from symsteer.bench.sim.rotations import (
+    euler_rates_matrix,
+    euler_to_matrix,
+    matrix_to_euler_facing_down,
+    planar_matrix,
+    transform_angular,
+)
 from symsteer.bench.tasks.floating import (
     ACTION_LAYOUT,
     TCP_OFFSET,
@@ -21,19 +28,12 @@ from symsteer.bench.tasks.floating import (
     PlanarPoseControllerConfig,
     bound_blocks,
 )
-from symsteer.bench.tasks.rotations import (
-    euler_rates_matrix,
-    euler_to_matrix,
-    matrix_to_euler_facing_down,
-    planar_matrix,
-    transform_angular,
-)
 from symsteer.errors import UserError
 
 
 @dataclass(frozen=True)
 class Embodiment:
-    """Base of the embodiments; one shared instance each in :data:`EMBODIMENTS`."""
+    """Base of the embodiments; one shared instance each in :data:`BODIES`."""
 
     name: str
     robot_uid: str
@@ -276,5 +276,5 @@ class PandaArm(Embodiment):
         return turns.gather(1, best)[:, 0]
 
 
-EMBODIMENTS: dict[str, Embodiment] = {e.name: e for e in (Floating(), PandaArm())}
+BODIES: dict[str, Embodiment] = {e.name: e for e in (Floating(), PandaArm())}
 """All embodiments by name."""

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from symsteer.bench.sim.rotations import quaternion_to_matrix, wrap
 from symsteer.bench.tasks.features import fourfold_yaw
-from symsteer.bench.tasks.rotations import quaternion_to_matrix, wrap
 
 if TYPE_CHECKING:
     from symsteer.bench.tasks.base import SymmetricTask

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from mani_skill.utils.structs import Pose
 
-from symsteer.bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
+from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
 
 
 def fourfold_yaw(q: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ closed form, so that rotating state and action rotates the target exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots import FloatingPandaGripper, Panda
 
-from symsteer.bench.tasks.rotations import (
+from symsteer.bench.sim.rotations import (
     euler_to_matrix,
     matrix_to_euler_facing_down,
     rotation_vector_to_matrix,
@@ -205,7 +205,13 @@ class FloatingGripper(FloatingPandaGripper):
             force_limit=self.gripper_force_limit,
             mimic={"panda_finger_joint2": {"joint": "panda_finger_joint1"}},
         )
-        joints = {k: inherited[k] for k in ("pd_joint_delta_pos", "pd_joint_pos")}
+        # ManiSkill leaves out which finger follows, and warns each time that it has to assume it.
+        first, second = self.gripper_joint_names
+        mimic = {first: {"joint": second}}
+        joints = {
+            mode: {**inherited[mode], "gripper": replace(inherited[mode]["gripper"], mimic=mimic)}
+            for mode in ("pd_joint_delta_pos", "pd_joint_pos")
+        }
         return {"pd_ee_delta_pose": {"root": root, "gripper": gripper}, **joints}
 
     is_grasping = Panda.is_grasping

@@ -1,4 +1,4 @@
-"""What gymnasium and ManiSkill's wrappers ask of an environment, and ManiSkill leaves open."""
+"""What gymnasium and ManiSkill's wrappers expect of an environment beyond ManiSkill's own."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from mani_skill.envs.sapien_env import BaseEnv
 
 from symsteer.bench.sim import rendering_works
@@ -19,17 +20,17 @@ from symsteer.errors import UserError
 class GymEnv(BaseEnv):
     """A ManiSkill environment as gymnasium's checker and ``CPUGymWrapper`` expect it.
 
-    ``gpu_sim_enabled`` has two readers in ManiSkill. Its own methods choose the batched branch by
-    it, which is the one that runs here, on any device. Wrappers conclude from it that tensors
-    live on a GPU: ``CPUGymWrapper`` refuses such an environment. So it is true while the former
-    run, and for one environment on the CPU false to everybody else.
+    ManiSkill reads ``gpu_sim_enabled`` for two purposes. Its own methods use it to choose the
+    batched branch, which is the one that runs here, on any device. Wrappers conclude from it that
+    tensors live on a GPU: ``CPUGymWrapper`` refuses such an environment. So it is true while
+    ManiSkill's methods run; at other times it is false for one environment on the CPU.
     """
 
     _batched_branch = False
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        # Of this environment alone (ManiSkill's belongs to the class), and of this machine.
+        # ManiSkill's belongs to the class and lists modes that this machine may lack.
         self.metadata = {
             "render_modes": [mode for mode in self.SUPPORTED_RENDER_MODES if _renders(mode)],
             "render_fps": self.control_freq,
@@ -37,7 +38,7 @@ class GymEnv(BaseEnv):
 
     @property
     def gpu_sim_enabled(self) -> bool:
-        """Whether ManiSkill's batched branch is what a caller has to deal with."""
+        """Whether ManiSkill's batched branch is used, as the caller sees it."""
         one_on_cpu = self.num_envs == 1 and self.device.type == "cpu"
         return self.scene.gpu_sim_enabled and (self._batched_branch or not one_on_cpu)
 
@@ -50,14 +51,14 @@ class GymEnv(BaseEnv):
             self._batched_branch = before
 
     def reset(self, seed: Any = None, options: dict | None = None) -> tuple:
-        """As ManiSkill's; a seed also seeds ``np_random``, as gymnasium wants it."""
+        """As ManiSkill's; a seed also seeds ``np_random``, as gymnasium requires."""
         if seed is not None:
             gym.Env.reset(self, seed=int(np.atleast_1d(seed)[0]))
         with self._in_batched_branch():
             return super().reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple:
-        """As ManiSkill's; whole numbers are an action too.
+        """As ManiSkill's; actions may be integers too.
 
         Raises:
             UserError: if the action is a list.
@@ -91,6 +92,40 @@ class GymEnv(BaseEnv):
     def _step_action(self, action: Any) -> Any:
         with self._in_batched_branch():
             return super()._step_action(action)
+
+
+class EpisodeLimit(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """gymnasium's ``TimeLimit`` for batched environments: each counts its own steps.
+
+    Replaces the ``TimeLimit`` that ``gym.make`` put around the environment and takes over its
+    limit, so that ``gym.make(..., max_episode_steps=100)`` works. Without one (gymnasium's
+    ``max_episode_steps=-1``) nothing is truncated.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self)
+        self.max_episode_steps: int | None = None
+        if isinstance(env, gym.wrappers.TimeLimit):
+            self.max_episode_steps = env._max_episode_steps
+            env = env.env
+        gym.Wrapper.__init__(self, env)
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What ``gym.make`` needs to make this environment again, limit included."""
+        spec = super().spec
+        if spec is not None:
+            spec.max_episode_steps = self.max_episode_steps
+        return spec
+
+    def step(self, action: Any) -> tuple:
+        """As the environment's; ``truncated`` ``[N]`` depends on the limit only."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if self.max_episode_steps is None:
+            truncated = truncated & False
+        else:
+            truncated = self.get_wrapper_attr("elapsed_steps") >= self.max_episode_steps
+        return obs, reward, terminated, truncated, info
 
 
 def _renders(mode: str) -> bool:

@@ -1,4 +1,4 @@
-"""Set a lying peg upright."""
+"""The task LiftPegUpright-v1."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from mani_skill.envs.tasks.tabletop.lift_peg_upright import LiftPegUprightEnv
 from mani_skill.utils.structs import Actor
 
+from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import (
     CLOSED,
@@ -22,12 +23,13 @@ from symsteer.bench.tasks.experts import (
     yaw_along,
 )
 from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose, twofold_yaw
-from symsteer.bench.tasks.rotations import quaternion_to_matrix
 from symsteer.policies.geometry import Field
 
 
 class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
-    """ManiSkill's LiftPegUpright-v1 with rotation-symmetric resets and success.
+    """Set a lying peg upright.
+
+    ManiSkill's LiftPegUpright-v1 with rotation-symmetric resets and success.
 
     Reset: the peg lies with its centre uniform in a disc of 10 cm radius and its direction
     uniform on the circle (stock: a square, always along x). Success is stock's (axis within

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from mani_skill.utils.structs import Actor
 
+from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, HOVER, Intent, funnel
 from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, goal_disc_pose
-from symsteer.bench.tasks.rotations import quaternion_to_matrix
 from symsteer.policies.geometry import Field
 
 

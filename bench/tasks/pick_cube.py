@@ -1,4 +1,4 @@
-"""Pick up a cube and hold it at a goal in the air."""
+"""The task PickCube-v1."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from symsteer.policies.geometry import Field
 
 
 class PickCube(SymmetricTask, PickCubeEnv):
-    """ManiSkill's PickCube-v1 with rotation-symmetric resets.
+    """Pick up a cube and hold it at a goal in the air.
+
+    ManiSkill's PickCube-v1 with rotation-symmetric resets.
 
     Reset: cube uniform in a disc of 10 cm radius about the centre with uniform yaw; goal uniform
     in a disc of 10 cm radius, 0 to 20 cm above the cube's resting height (stock: squares, 0 to

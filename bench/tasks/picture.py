@@ -15,7 +15,7 @@ import numpy as np
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image
 
-from symsteer.bench.tasks import embodiments, make, task_names
+from symsteer.bench.tasks import EMBODIMENTS, TASKS, make
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
 
@@ -51,13 +51,13 @@ def snapshot(task: str, embodiment: str, seed: int, steps: int) -> np.ndarray:
 
 def task_picture(task: str, axis: int = 1, seed: int = 1, steps: int = 8) -> np.ndarray:
     """All embodiments at one task along ``axis`` (0: below one another, 1: side by side), uint8."""
-    frames = [snapshot(task, e, seed, steps)[SIZE // 5 :] for e in embodiments()]
+    frames = [snapshot(task, e, seed, steps)[SIZE // 5 :] for e in EMBODIMENTS]
     return np.concatenate(frames, axis=axis)
 
 
 def contact_sheet() -> np.ndarray:
     """Tasks from left to right, in rows; of each the embodiments from top to bottom; uint8."""
-    pictures = [task_picture(task, axis=0) for task in task_names()]
+    pictures = [task_picture(task, axis=0) for task in TASKS]
     blank = [np.full_like(pictures[0], 255)] * (-len(pictures) % TASKS_PER_ROW)
     pictures += blank
     rows = [
@@ -74,7 +74,7 @@ def main() -> int:
         return 2
     try:
         picture = task_picture(sys.argv[2]) if len(sys.argv) == 3 else contact_sheet()
-        # The grain of the table costs most of the bytes; nobody misses it.
+        # The texture of the table would take most of the bytes.
         small = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
         small.save(Path(sys.argv[1]), optimize=True)
     except (UserError, OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Put a sphere into a shallow bin and let go."""
+"""The task PlaceSphere-v1."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ from symsteer.policies.geometry import Field
 
 
 class PlaceSphere(SymmetricTask, PlaceSphereEnv):
-    """ManiSkill's PlaceSphere-v1 with rotation-symmetric resets.
+    """Put a sphere into a shallow bin and let go.
+
+    ManiSkill's PlaceSphere-v1 with rotation-symmetric resets.
 
     Reset: the midpoint of sphere and bin is uniform in a disc of 7 cm radius about the centre,
     their bearing uniform on the circle, their distance uniform in 11 to 18 cm (so that open

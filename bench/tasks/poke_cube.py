@@ -1,4 +1,4 @@
-"""Poke a cube into a disc on the table with a peg, in any direction."""
+"""The task PokeCube-v1."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from mani_skill.envs.tasks.tabletop.poke_cube import PokeCubeEnv
 from mani_skill.utils.structs import Actor
 
+from symsteer.bench.sim.rotations import quaternion_to_matrix, wrap
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, OPEN, Intent, choose, funnel, grasp_at, yaw_along
 from symsteer.bench.tasks.features import (
@@ -20,12 +21,13 @@ from symsteer.bench.tasks.features import (
     goal_disc_pose,
     twofold_yaw,
 )
-from symsteer.bench.tasks.rotations import quaternion_to_matrix, wrap
 from symsteer.policies.geometry import Field
 
 
 class PokeCube(SymmetricTask, PokeCubeEnv):
-    """ManiSkill's PokeCube-v1 turned by a uniform angle in every episode.
+    """Poke a cube into a disc on the table with a peg, in any direction.
+
+    ManiSkill's PokeCube-v1 turned by a uniform angle in every episode.
 
     Stock PokeCube always pokes along +x. Here the direction is uniform on the circle; seen along
     it, the peg (24 cm long, lying on the table, parallel to the direction) has its middle 7 cm

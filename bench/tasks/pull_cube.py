@@ -1,4 +1,4 @@
-"""Pull a cube into a disc on the table, in any direction."""
+"""The task PullCube-v1."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from symsteer.bench.tasks.move_cube import MoveCube
 
 
 class PullCube(MoveCube, PullCubeEnv):
-    """ManiSkill's PullCube-v1 turned by a uniform angle in every episode.
+    """Pull a cube into a disc on the table, in any direction.
+
+    ManiSkill's PullCube-v1 turned by a uniform angle in every episode.
 
     Stock PullCube always pulls along -x, towards the arm, in reset and dense reward; here the
     direction is uniform (see :class:`MoveCube`), which leaves two differences from PushCube:

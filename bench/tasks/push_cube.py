@@ -1,4 +1,4 @@
-"""Push a cube into a disc on the table, in any direction."""
+"""The task PushCube-v1."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from symsteer.bench.tasks.move_cube import MoveCube
 
 
 class PushCube(MoveCube, PushCubeEnv):
-    """ManiSkill's PushCube-v1 turned by a uniform angle in every episode.
+    """Push a cube into a disc on the table, in any direction.
+
+    ManiSkill's PushCube-v1 turned by a uniform angle in every episode.
 
     Stock PushCube always pushes along +x, in reset and dense reward; here the direction is
     uniform (see :class:`MoveCube`). Success (cube within 10 cm of the goal, on the table) is

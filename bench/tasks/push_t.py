@@ -1,4 +1,4 @@
-"""Bring a T-shaped block onto a T drawn on the table."""
+"""The task PushT-v1."""
 
 from __future__ import annotations
 
@@ -10,15 +10,19 @@ import torch
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.utils.structs import Actor, Pose
 
+from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, grasp_at, yaw_along
 from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose
-from symsteer.bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix
-from symsteer.policies.geometry import Field
+from symsteer.policies.geometry import Field, Layout
+
+HORIZONTAL = Layout([Field("xy", 1)])
 
 
 class PushT(SymmetricTask, PushTEnv):
-    """ManiSkill's PushT-v1 with a goal anywhere and any gripper.
+    """Bring a T-shaped block onto a T drawn on the table.
+
+    ManiSkill's PushT-v1 with a goal anywhere and any gripper.
 
     Reset: block and goal are uniform in discs of 10 and 5 cm radius, each with uniform yaw
     (stock: one goal for ever, block in a rectangle beside it, yaw uniform). The goal is the pose
@@ -155,10 +159,9 @@ class PushT(SymmetricTask, PushTEnv):
         yaw = self.body.reachable_turn(self.agent.robot.get_qpos(), yaw, math.pi, turn)
         # Fingers that grip the 5 cm of the stem slightly askew stop a little further apart.
         approach, held = grasp_at(self, handle + offset, handle, yaw, 0.053)
-        # Where the tool is in the block's frame, there it shall be in the goal's.
+        # The tool keeps its place in the frame of the block, which becomes that of the goal.
         arm = (tcp - tee.p)[:, :2]
-        cos, sin = torch.cos(turn)[:, None], torch.sin(turn)[:, None]
-        turned = cos * arm + sin * torch.stack([-arm[:, 1], arm[:, 0]], dim=1)
+        turned = HORIZONTAL.rotate(arm, turn)
         fit = goal.p[:, :2] + self.drawing_offset * goal_stem
         # Keep the block on the table, and the finger tips, 9 mm below the tool, above it.
         height = self.half_thickness - tee.p[:, 2:] + (self.lowest_grip - tcp[:, 2:]).clamp_min(0.0)

@@ -1,4 +1,4 @@
-"""Stack one cube on another and let go."""
+"""The task StackCube-v1."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from symsteer.policies.geometry import Field
 
 
 class StackCube(SymmetricTask, StackCubeEnv):
-    """ManiSkill's StackCube-v1 with rotation-symmetric resets.
+    """Stack one cube on another and let go.
+
+    ManiSkill's StackCube-v1 with rotation-symmetric resets.
 
     Reset: the midpoint of the two cubes is uniform in a disc of 7 cm radius about the centre,
     their bearing uniform on the circle, their distance uniform in 8 to 16 cm, both yaws uniform.

@@ -16,10 +16,6 @@ class ActuatorOffset(Variant):
     Breaks actuation, everywhere; the mirror image in the x axis survives.
     """
 
-    name = "actuator_offset"
-    breaks = "actuation"
-    moves = frozenset({"dynamics"})
-
     def load_scene(self) -> None:
         along = 0.3 * self.amount
         bias = torch.stack([along, torch.zeros_like(along)], dim=1)

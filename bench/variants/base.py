@@ -1,82 +1,57 @@
-"""What a symmetry-breaking variant is, and how its name is read.
+"""The base class of all variants.
 
-To add one, write a file in this folder with a subclass of :class:`Variant` and list it in
-:func:`registry`. A variant acts through its hooks, which the task calls inside ``env.step`` and
-``env.reset``, so that it holds for every user of ``gym.make``. At strength 0 no hook is called at
-all, and where strengths differ between environments a hook leaves those of strength 0 alone: they
-are the unbroken task to the bit (on the CPU).
+A variant acts through its hooks, which the task calls inside ``env.step`` and ``env.reset``, so
+that it acts for every user of ``gym.make``. At strength 0 no hook is called. Where strengths
+differ between environments, a hook leaves those of strength 0 unchanged: they are the unbroken
+task to the bit (on the CPU).
+
+To add one, write a file in this folder with a subclass of :class:`Variant` and name it in
+``symsteer.bench.variants.VARIANTS``, or offer the class as an entry point ``symsteer.variants``.
 """
 
 from __future__ import annotations
 
-import difflib
 import functools
-import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
-from symsteer.errors import UserError
+from symsteer.bench.variants.world import World
 from symsteer.policies.geometry import Layout
+from symsteer.variant import VariantSpec
 
 if TYPE_CHECKING:
     from mani_skill.utils.structs import Actor, Pose
 
-    from symsteer.bench.tasks.base import SymmetricTask
-
-Strength = float | torch.Tensor
-"""One strength for all environments, or one each as a tensor ``[N]``; in [0, 1]."""
-
-
 Role = Literal["tool", "object", "goal"]
 """What a pose in the observation belongs to."""
 
-Component = Literal["dynamics", "reward", "observation", "resets"]
-"""A part of the MDP that the audit measures on its own."""
-
 
 class Variant:
-    """One way to break the symmetry.
+    """One way to break the symmetry; the docstring of a subclass says what strength 1 means.
 
     Args:
-        strength: in [0, 1]; what 1 means physically stands in the subclass's docstring.
+        spec: its name and strength.
 
     Attributes:
+        name: as in the registry.
+        strength: one number, or one per environment as a tensor ``[N]``.
         env: the environments that it acts in, once :meth:`bind` was called.
-
-    Raises:
-        UserError: if the strength is not a number in [0, 1].
     """
 
-    name: ClassVar[str]
-    breaks: ClassVar[str]
-    """Part of the MDP that it breaks, in words."""
-    moves: ClassVar[frozenset[Component]]
-    """The components of the audit that it breaks; actuation counts as dynamics."""
-    where: ClassVar[Literal["everywhere", "in a region"]] = "everywhere"
     training_only: ClassVar[bool] = False
     """Whether agents are evaluated without it."""
-    rotations_survive: ClassVar[bool] = False
-    """Whether every rotation about the policy's origin remains a symmetry and only reflections
-    are lost."""
 
-    env: SymmetricTask
+    env: World
 
-    def __init__(self, strength: Strength):
-        try:
-            values = torch.as_tensor(strength, dtype=torch.float32)
-        except (TypeError, ValueError, RuntimeError):
-            values = torch.tensor(math.nan)
-        if values.ndim > 1 or not bool(((values >= 0) & (values <= 1)).all()):
-            raise UserError(
-                f"the strength of variant {self.name!r} must lie in [0, 1], one number or one per "
-                f"environment; it is {strength}"
-            )
-        self.strength: Strength = values if values.ndim == 1 else float(values)
+    def __init__(self, spec: VariantSpec):
+        self.name = spec.name
+        values = torch.as_tensor(spec.strength, dtype=torch.float32)
+        self.strength: float | torch.Tensor = values if values.ndim else float(values)
 
-    def bind(self, env: SymmetricTask) -> None:
-        """Take note of the environments that it acts in, before their first scene is built."""
+    def bind(self, env: World) -> None:
+        """Remember the environments that it acts in, before their first scene is built."""
         self.env = env
 
     @functools.cached_property
@@ -103,7 +78,7 @@ class Variant:
     def reset(self, env_idx: torch.Tensor) -> None:
         """Change what was just placed in the environments ``env_idx`` (sorted, ``[b]``).
 
-        Poses are read for all environments and written for ``env_idx`` alone.
+        Poses are read for all environments and written for ``env_idx`` only.
         """
 
     def action(self, action: torch.Tensor) -> torch.Tensor:
@@ -113,14 +88,14 @@ class Variant:
     def force(self, body: Actor) -> torch.Tensor | None:
         """Force on a dynamic body at its centre of mass, ``[N, 3]`` newtons in the world's axes.
 
-        It is asked for once a control step and acts in each of its substeps.
+        It is read once for each scene, and acts in every substep.
         """
         return None
 
     def friction(self, body: Actor) -> torch.Tensor | None:
         """What is added to the friction coefficients of a dynamic body or of the table, ``[N]``.
 
-        It is asked for when a scene is built and before every control step.
+        It is read when a scene is built and before every control step.
         """
         return None
 
@@ -152,134 +127,3 @@ class Variant:
 def overriding(variants: Iterable[Variant], hook: str) -> list[Variant]:
     """Those of ``variants`` that implement ``hook``."""
     return [v for v in variants if getattr(type(v), hook) is not getattr(Variant, hook)]
-
-
-def registry() -> dict[str, type[Variant]]:
-    """All variants by name."""
-    from symsteer.bench.variants.action_gain import ActionGain
-    from symsteer.bench.variants.actuator_offset import ActuatorOffset
-    from symsteer.bench.variants.directional_reward import DirectionalReward
-    from symsteer.bench.variants.frame_offset import FrameOffset
-    from symsteer.bench.variants.frame_rotation import FrameRotation
-    from symsteer.bench.variants.friction_patch import FrictionPatch
-    from symsteer.bench.variants.gravity_tilt import GravityTilt
-    from symsteer.bench.variants.observation_noise import ObservationNoise
-    from symsteer.bench.variants.obstacle import Obstacle
-    from symsteer.bench.variants.perception_bias import PerceptionBias
-    from symsteer.bench.variants.spawn_sector import SpawnSector
-    from symsteer.bench.variants.wind import Wind
-
-    variants = (
-        GravityTilt,
-        Wind,
-        ActionGain,
-        ActuatorOffset,
-        FrictionPatch,
-        Obstacle,
-        PerceptionBias,
-        FrameOffset,
-        FrameRotation,
-        DirectionalReward,
-        SpawnSector,
-        ObservationNoise,
-    )
-    return {variant.name: variant for variant in variants}
-
-
-def variant_names() -> list[str]:
-    """Names of all variants, sorted."""
-    return sorted(registry())
-
-
-def parse(text: str, strength: Strength | None = None) -> tuple[Variant, ...]:
-    """Read ``none``, ``name:strength`` or several of them joined by ``+``.
-
-    Args:
-        text: e.g. ``action_gain:0.5``.
-        strength: for a single name without a strength of its own.
-
-    Returns:
-        The variants whose strength is not zero, in the given order.
-
-    Raises:
-        UserError: for an unknown or repeated name, a missing or malformed strength, one out of
-            [0, 1], or one without a name.
-    """
-    if text == "none":
-        if strength is not None and bool((torch.as_tensor(strength) != 0).any()):
-            raise UserError(
-                f"strength={strength} was given without a variant; name one, e.g. "
-                "variant='action_gain'"
-            )
-        return ()
-    if "," in text or ";" in text:
-        raise UserError(
-            f"variants must be joined with +, e.g. action_gain:0.5+wind:0.5, not {text!r}"
-        )
-    parts = text.split("+")
-    variants: list[Variant] = []
-    for part in parts:
-        name, colon, number = part.partition(":")
-        if name not in registry():
-            raise UserError(_unknown(name))
-        if any(variant.name == name for variant in variants):
-            raise UserError(f"the variant {name!r} is named twice in {text!r}; name it once")
-        if colon and strength is not None:
-            raise UserError(
-                f"the strength of {name!r} is given twice, in {text!r} and as strength={strength}; "
-                "give it once"
-            )
-        value = strength if not colon and len(parts) == 1 else _number(name, number, text)
-        if value is None:
-            raise UserError(f"the variant {name!r} needs a strength in [0, 1], e.g. {name}:0.5")
-        variants.append(registry()[name](value))
-    return tuple(v for v in variants if torch.is_tensor(v.strength) or v.strength != 0)
-
-
-def evaluated(text: str) -> str:
-    """The variants of ``text`` in which agents are evaluated: those of training alone left out.
-
-    Raises:
-        UserError: as :func:`parse`.
-    """
-    parse(text)
-    kept = [part for part in text.split("+") if not _training_only(part)]
-    return "+".join(kept) or "none"
-
-
-def _training_only(part: str) -> bool:
-    name = part.partition(":")[0]
-    return name in registry() and registry()[name].training_only
-
-
-def highest_cost(variants: Iterable[Variant]) -> float:
-    """The largest cost of a step before success: 1 and what the variants may add."""
-    return 1.0 + sum(variant.highest_cost for variant in variants)
-
-
-def describe(variants: tuple[Variant, ...]) -> str:
-    """The text that :func:`parse` reads; per-environment strengths appear as their mean."""
-    if not variants:
-        return "none"
-    means = (float(torch.as_tensor(v.strength, dtype=torch.float32).mean()) for v in variants)
-    return "+".join(f"{v.name}:{mean:g}" for v, mean in zip(variants, means, strict=True))
-
-
-def _number(name: str, number: str, text: str) -> float:
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
-    if math.isnan(value):
-        raise UserError(
-            f"no strength can be read for {name!r} in {text!r}; write name:number with a number "
-            f"in [0, 1], e.g. {name}:0.5"
-        )
-    return value
-
-
-def _unknown(name: str) -> str:
-    names = ["none", *variant_names()]
-    near = difflib.get_close_matches(name, names, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"there is no variant {name!r}{hint} Valid: {', '.join(names)}".replace("' V", "'; v")

@@ -13,13 +13,10 @@ class DirectionalReward(Variant):
     The extra cost is strength * d / full step for a displacement d > 0 of the tool centre point
     along +x in a control step (at most strength; nothing at rest or towards -x), until success.
     ``env.step`` reports it as ``info["extra_cost"]`` and subtracts it from ManiSkill's reward; a
-    steering agent is paid -(1 + extra cost) a step. Success rates are untouched by it.
-    Breaks the reward alone, everywhere; the mirror image in the x axis survives.
+    steering agent is paid -(1 + extra cost) a step. Success rates do not
+    include it.
+    Breaks the reward only, everywhere; the mirror image in the x axis survives.
     """
-
-    name = "directional_reward"
-    breaks = "reward"
-    moves = frozenset({"reward"})
 
     def extra_cost(self, moved: torch.Tensor) -> torch.Tensor:
         return self.amount * (moved[:, 0] / self.env.body.horizontal_step).clamp(0, 1)

@@ -1,4 +1,4 @@
-"""The policy takes another point for the workspace's centre."""
+"""The policy uses a wrong centre of the workspace."""
 
 from __future__ import annotations
 
@@ -16,10 +16,6 @@ class FrameOffset(Variant):
     only where episodes begin is not. Heights, directions and relative vectors are unchanged.
     Breaks the initial states, everywhere; the mirror image in the x axis survives.
     """
-
-    name = "frame_offset"
-    breaks = "initial states"
-    moves = frozenset({"resets"})
 
     def origin(self) -> torch.Tensor:
         return torch.stack([0.05 * self.amount, torch.zeros_like(self.amount)], dim=1)

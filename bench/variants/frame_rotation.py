@@ -20,11 +20,6 @@ class FrameRotation(Variant):
     Breaks the observation, everywhere; rotations survive, reflections do not.
     """
 
-    name = "frame_rotation"
-    breaks = "observation (reflections alone)"
-    moves = frozenset({"observation"})
-    rotations_survive = True
-
     def observation(self, values: torch.Tensor, layout: Layout) -> torch.Tensor:
         turned = layout.rotate(values, math.radians(45) * self.amount)
         return self.only_active(turned, values)

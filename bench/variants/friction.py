@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import sapien.physx as physx
 import torch
 from mani_skill.utils.structs import Actor
 
-if TYPE_CHECKING:
-    from symsteer.bench.tasks.base import SymmetricTask
-    from symsteer.bench.variants.base import Variant
+from symsteer.bench.variants.base import Variant
+from symsteer.bench.variants.world import World
 
 
 @dataclass
@@ -30,14 +28,14 @@ class _Surface:
 
 
 class Frictions:
-    """Keeps the friction of the dynamic bodies and the table at what the variants make of it.
+    """Writes the friction of the dynamic bodies and the table as the variants change it.
 
     Args:
         env: whose scene is complete and not yet simulated.
         variants: those that add to friction.
     """
 
-    def __init__(self, env: SymmetricTask, variants: Sequence[Variant]):
+    def __init__(self, env: World, variants: Sequence[Variant]):
         self.variants = variants
         self.surfaces: list[_Surface] = []
         if not variants:

@@ -17,18 +17,14 @@ class FrictionPatch(Variant):
     For ManiSkill's cubes on its table that is 0.3 outside and 0.3 + 0.75 * strength inside. A body
     counts as inside while its origin is; before each control step its own material gets
     1.5 * strength more (PhysX takes the mean of two materials), so that fingers hold it better
-    there too. What rests on the patch stays there, also with ``gravity_tilt``. It shows where
-    objects are pushed or pulled over the table; one that is lifted out of the disc hardly notices.
+    there too. What rests on the patch stays there, also with ``gravity_tilt``. It matters where
+    objects are pushed or pulled over the table; it hardly changes how one is lifted out of the
+    disc.
 
     Breaks the dynamics of objects, in a region; the mirror image in the x axis survives. On CUDA
     the coefficients are written to PhysX's materials while the simulation runs, which has not been
     tried there.
     """
-
-    name = "friction_patch"
-    breaks = "dynamics"
-    moves = frozenset({"dynamics"})
-    where = "in a region"
 
     def friction(self, body: Actor) -> torch.Tensor | None:
         env = self.env

@@ -27,10 +27,6 @@ class GravityTilt(Variant):
     materials are written before the simulation starts, which PhysX needs.
     """
 
-    name = "gravity_tilt"
-    breaks = "dynamics"
-    moves = frozenset({"dynamics"})
-
     @property
     def tilt(self) -> torch.Tensor:
         """Slope of each environment, ``[N]`` radians."""

@@ -15,18 +15,14 @@ STD_X, STD_Y = 0.01, 0.0025
 class ObservationNoise(Variant):
     """Objects are reported with Gaussian noise, four times larger along x than along y.
 
-    Standard deviations are 10 mm * strength along x and 2.5 mm * strength along y, fresh in every
-    control step and the same for all objects of an environment, as of a camera that shakes. Tool
-    and goal are seen truly. The noise is a function of the episode's key (its seed, see
-    ``SymmetricTask.episode_key``) and the elapsed steps alone: asking twice gives the same
-    observation, and neither the number of environments nor the device plays a part.
+    Standard deviations are 10 mm * strength along x and 2.5 mm * strength along y. The noise is
+    new in every control step and the same for all objects of an environment, as of a camera that
+    shakes. Tool and goal are reported exactly. The noise depends only on the episode's key (its
+    seed, see ``SymmetricTask.episode_key``) and the elapsed steps: reading an observation twice
+    gives the same one, on any device and with any number of environments.
     Breaks the observation, everywhere; the half turn and mirror images in the axes survive in
     distribution.
     """
-
-    name = "observation_noise"
-    breaks = "observation"
-    moves = frozenset({"observation"})
 
     def perceive(self, pose: Pose, role: Role) -> Pose:
         if role != "object":

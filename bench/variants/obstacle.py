@@ -16,17 +16,12 @@ class Obstacle(Variant):
 
     Its axis stands 4.5 cm outside of the disc in which the task's objects are placed
     (``spawn_extent``), so that at strength 1 its face is 5 mm away from it; no reset touches it.
-    It collides with robot and objects and is not observed. Being static it is no part of
-    simulation states, which environments with and without it may exchange.
+    It collides with robot and objects and is not observed. It is static and hence not part of
+    simulation states: environments with and without it can exchange them.
 
     Breaks dynamics and reachability, in a region; the mirror image in the x axis survives. Scenes
     of different strength hold different bodies, which ManiSkill allows on CUDA too.
     """
-
-    name = "obstacle"
-    breaks = "dynamics and reachability"
-    moves = frozenset({"dynamics"})
-    where = "in a region"
 
     @property
     def position(self) -> tuple[float, float]:

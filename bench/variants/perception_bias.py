@@ -9,16 +9,12 @@ from symsteer.bench.variants.base import Role, Variant
 
 
 class PerceptionBias(Variant):
-    """Objects are reported 2 cm * strength too far along +x; tool and goal are seen truly.
+    """Objects are reported 2 cm * strength too far along +x; tool and goal are exact.
 
     As with a badly calibrated camera. What the observation derives from positions (vectors from
     the tool to an object, from an object to the goal) is off by the same vector.
     Breaks the observation, everywhere; the mirror image in the x axis survives.
     """
-
-    name = "perception_bias"
-    breaks = "observation"
-    moves = frozenset({"observation"})
 
     def perceive(self, pose: Pose, role: Role) -> Pose:
         if role != "object":

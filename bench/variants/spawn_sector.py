@@ -5,8 +5,11 @@ from __future__ import annotations
 import torch
 from mani_skill.utils.structs import Pose
 
-from symsteer.bench.tasks.rotations import quaternion_multiply, yaw_quaternion
+from symsteer.bench.sim.rotations import quaternion_multiply, yaw_quaternion
 from symsteer.bench.variants.base import Variant
+from symsteer.policies.geometry import Field, Layout
+
+POINT = Layout([Field("xy", 1), Field("z", 0)])
 
 
 class SpawnSector(Variant):
@@ -19,9 +22,6 @@ class SpawnSector(Variant):
     Breaks the initial states, everywhere; the mirror image in the x axis survives.
     """
 
-    name = "spawn_sector"
-    breaks = "initial states"
-    moves = frozenset({"resets"})
     training_only = True
 
     def reset(self, env_idx: torch.Tensor) -> None:
@@ -35,17 +35,10 @@ class SpawnSector(Variant):
             if body.px_body_type == "static" or body is furniture:
                 continue
             p, q = body.pose.p[env_idx], body.pose.q[env_idx]
-            turned = center + _rotate(p - center, turn)
+            turned = center + POINT.rotate(p - center, turn)
             body.set_pose(
                 Pose.create_from_pq(
                     torch.where(active, turned, p),
                     torch.where(active, quaternion_multiply(yaw_quaternion(turn), q), q),
                 )
             )
-
-
-def _rotate(p: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Points ``[b, 3]`` turned about the vertical, each by its own ``angle [b]``."""
-    c, s = angle.cos(), angle.sin()
-    x, y, z = p.unbind(dim=1)
-    return torch.stack([c * x - s * y, s * x + c * y, z], dim=1)

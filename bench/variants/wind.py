@@ -23,10 +23,6 @@ class Wind(Variant):
     Breaks the dynamics of one object, everywhere; the mirror image in the x axis survives.
     """
 
-    name = "wind"
-    breaks = "dynamics"
-    moves = frozenset({"dynamics"})
-
     def load_scene(self) -> None:
         body, table, n = self.env.manipulated, self.env.table_scene.table, self.env.num_envs
         prepare_for_force(body, self.active, stacks=len(self.env.moving_bodies) > 1)

@@ -5,7 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from symsteer.agents import Batch, ReplayBuffer, SacConfig, make_agent
+from symsteer.agents import AGENTS
+from symsteer.agents.agent import AgentContext
+from symsteer.agents.replay import Batch, ReplayBuffer
 from symsteer.policies.geometry import Field, Layout
 
 OBS = Layout(
@@ -28,7 +30,15 @@ ACT = Layout(
     ]
 )
 HORIZON = 3
-SMALL = SacConfig(width=32, batch_size=32, lr=1e-3, alpha_lr=1e-3)
+SMALL = {
+    "width": 32,
+    "batch_size": 32,
+    "lr": 1e-3,
+    "alpha_lr": 1e-3,
+    "tau": 0.005,
+    "reward_scale": 1.0,
+    "warmup": 0,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,20 +46,31 @@ class Problem:
     obs_layout: Layout = OBS
     act_layout: Layout = ACT
     horizon: int = HORIZON
-    config: SacConfig = SMALL
+    options: dict = dataclasses.field(default_factory=lambda: SMALL, hash=False)
 
-    def agent(self, name, seed=0, dtype=torch.float32, normalize_obs=None, **options):
-        config = dataclasses.replace(self.config, **options)
-        return make_agent(
-            name,
+    def context(self, seed=0, dtype=torch.float32, normalize_obs=None, decode=None):
+        return AgentContext(
             self.obs_layout,
             self.act_layout,
             self.horizon,
-            config,
+            2,
+            decode or (lambda obs, noise: noise.clamp(-1, 1)),
+            normalize_obs or (lambda obs: obs),
             seed=seed,
             dtype=dtype,
-            normalize_obs=normalize_obs,
         )
+
+    def agent(self, name, seed=0, dtype=torch.float32, normalize_obs=None, **options):
+        agent = AGENTS.get(name)
+        known = {field.name for field in dataclasses.fields(agent.Options)}
+        shared = {key: value for key, value in self.options.items() if key in known}
+        context = self.context(seed, dtype, normalize_obs)
+        return agent(context, agent.Options(**{**shared, **options}))
+
+    def shapes(self):
+        obs = (self.obs_layout.dim,)
+        noise = (self.horizon, self.act_layout.dim)
+        return {"obs": obs, "noise": noise, "reward": (), "next_obs": obs, "terminal": ()}
 
     def batch(self, size=32, seed=0, dtype=torch.float32, terminal=None):
         g = torch.Generator().manual_seed(seed)
@@ -58,19 +79,13 @@ class Problem:
             return torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)
 
         ends = (torch.rand(size, generator=g) < 0.3).to(dtype)
-        return Batch(
-            draw(size, self.obs_layout.dim),
-            draw(size, self.horizon, self.act_layout.dim),
-            draw(size),
-            draw(size, self.obs_layout.dim),
-            ends if terminal is None else torch.full((size,), terminal, dtype=dtype),
-        )
+        rows = {name: draw(size, *shape) for name, shape in self.shapes().items()}
+        rows["terminal"] = ends if terminal is None else torch.full((size,), terminal, dtype=dtype)
+        return Batch(rows)
 
     def replay(self, size=128, seed=0, dtype=torch.float32):
-        buffer = ReplayBuffer(
-            1000, self.obs_layout.dim, self.horizon, self.act_layout.dim, seed=seed, dtype=dtype
-        )
-        buffer.add(*self.batch(size, seed, dtype))
+        buffer = ReplayBuffer(1000, self.shapes(), seed=seed, dtype=dtype)
+        buffer.add(self.batch(size, seed, dtype))
         return buffer
 
 

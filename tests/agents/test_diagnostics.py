@@ -113,8 +113,8 @@ def test_orbit_variance_and_actor_error_tell_the_agents_apart(problem):
     for name in ("equivariant", "approximate", "standard"):
         agent = problem.agent(name, initial_output=1.0)
         orbit = diagnostics.orbit_variance(agent, batch.obs, batch.noise, C8)
-        error = diagnostics.equivariance_error(agent, batch.obs, C8)
-        results[name] = (orbit["orbit_share"], error["actor_equivariance_error"])
+        error = diagnostics.actor_equivariance_error(agent, batch.obs, C8)
+        results[name] = (orbit["orbit_share"], error)
     assert results["equivariant"][0] < 1e-9
     assert results["equivariant"][1] < 1e-5
     assert 1e-6 < results["approximate"][0] < 0.2

@@ -34,7 +34,6 @@ def errors(agent, problem, name, dtype, size=64):
             "deterministic": agent.act(obs, deterministic=True).flatten(1),
             "sample": sample,
             "sample_log_prob": log_prob,
-            "log_prob": agent.log_prob(obs, noise),
             "q": agent.q_values(obs, noise),
         }
 

@@ -28,7 +28,8 @@ def test_zero_is_fixed_by_the_group(problem):
 @pytest.mark.parametrize("name", ["base", "zero", "golden-ticket"])
 def test_references_share_the_interface(problem, name):
     agent = problem.agent(name)
-    assert not agent.learns
+    assert agent.role == "reference"
+    assert list(agent.batches()) == []
     assert agent.update(problem.batch()) == {}
     assert agent.parameter_counts()["total"] == 0
     agent.act(problem.batch().obs)
@@ -37,22 +38,3 @@ def test_references_share_the_interface(problem, name):
     assert torch.equal(agent.act(problem.batch().obs), other.act(problem.batch().obs))
     with pytest.raises(UserError, match="agent"):
         problem.agent("zero" if name == "base" else "base").load_state_dict(agent.state_dict())
-
-
-def test_a_golden_ticket_is_one_noise_for_all_states(problem):
-    agent = problem.agent("golden-ticket", seed=1)
-    obs = problem.batch().obs
-    assert agent.searches
-    assert not agent.act(obs).any()
-    candidates = agent.candidates(2000)
-    assert not candidates[0].any()
-    assert candidates[1:].std().item() == pytest.approx(1.0, abs=0.02)
-    agent.ticket, agent.searched = candidates[5], {"ticket_success": 0.5}
-    assert torch.equal(agent.act(obs), candidates[5].expand(32, -1, -1))
-    other = problem.agent("golden-ticket", seed=9)
-    other.load_state_dict(agent.state_dict())
-    assert torch.equal(other.act(obs), agent.act(obs))
-    assert other.scalars() == agent.scalars()
-    assert agent.scalars()["ticket_rms"] == pytest.approx(
-        candidates[5].square().mean().sqrt().item()
-    )

@@ -1,101 +1,140 @@
-"""Agents are found by themselves: one file in the package is all that a new one needs."""
+"""The registry: SymSteer's agents, those of other distributions, and classes for trying."""
 
 import sys
+from importlib import metadata
 
 import pytest
-import torch
 
-import symsteer.agents
-from symsteer.agents import make_agent, registry
-from symsteer.agents.sac import SacAgent
+import symsteer.registry
+from symsteer.agents import AGENTS
+from symsteer.agents.agent import Agent
+from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.errors import UserError
 
-MINE = '''
-"""A file as a user would write it."""
-from symsteer.agents.equivariant import equivariant_critic_layers
+MINE = """
 from symsteer.agents.standard import StandardAgent
 
-class _Helper(StandardAgent):
-    name = "standard"
+class Mine(StandardAgent):
+    '''My own agent.
 
-class Mine(_Helper):
-    """Half of the symmetry."""
+    More about it.
+    '''
     name = "mine"
-    def critic_layers(self):
-        return equivariant_critic_layers(self)
 
-class AlsoMine(Mine):
-    name = "also-mine"
-'''
+class NoAgent:
+    name = "none"
+"""
 
 
 @pytest.fixture
-def add(monkeypatch, tmp_path):
-    """Puts files into the package of agents, for the length of a test."""
-    monkeypatch.setattr(symsteer.agents, "__path__", [*symsteer.agents.__path__, str(tmp_path)])
+def module(monkeypatch, tmp_path):
+    """Writes a module that can be imported for the length of a test."""
+    monkeypatch.syspath_prepend(tmp_path)
     before = set(sys.modules)
 
-    def write(name, text):
-        (tmp_path / name).write_text(text)
-        registry.cache_clear()
+    def write(text, name="my_agents"):
+        (tmp_path / f"{name}.py").write_text(text)
 
     yield write
     for name in set(sys.modules) - before:
-        if name.startswith("symsteer.agents."):
+        if name.startswith("my_"):
             del sys.modules[name]
-            vars(symsteer.agents).pop(name.removeprefix("symsteer.agents."), None)
-    registry.cache_clear()
+
+
+@pytest.fixture
+def entry_points(monkeypatch):
+    """Stands in for installed distributions."""
+
+    class Dist(metadata.Distribution):
+        def __init__(self, name):
+            self._name = name
+
+        def read_text(self, filename):
+            return f"Name: {self._name}\nVersion: 1.2\n" if filename == "METADATA" else None
+
+        def locate_file(self, path):
+            return path
+
+    def install(*points):
+        found = {}
+        for distribution, name, value in points:
+            point = metadata.EntryPoint(name, value, "symsteer.agents")._for(Dist(distribution))
+            found.setdefault(name, []).append(point)
+        monkeypatch.setattr(symsteer.registry, "_entry_points", lambda group: found)
+
+    return install
 
 
 def test_the_order_is_that_of_a_comparison():
-    names = list(symsteer.agents.AGENTS)
-    assert names[:4] == ["standard", "standard-matched", "equivariant", "approximate"]
-    learners = [name for name in names if symsteer.agents.AGENTS[name].learns]
-    assert names[: len(learners)] == learners
-    assert names[len(learners) :][:2] == ["base", "zero"]
-    assert all(symsteer.agents.AGENTS[name].name == name for name in names)
+    assert AGENTS.names()[:4] == ["standard", "standard-matched", "equivariant", "approximate"]
+    roles = [AGENTS.get(name).role for name in AGENTS.builtin]
+    assert roles == ["learner"] * 4 + ["reference"] * 3
 
 
-def test_a_new_file_is_a_new_agent(add, problem):
-    add("mine.py", MINE)
-    assert list(symsteer.agents.AGENTS)[4:7] == ["also-mine", "mine", "base"]
-    agent = make_agent("mine", problem.obs_layout, problem.act_layout, problem.horizon)
-    assert isinstance(agent, SacAgent)
-    assert type(agent).__module__ == "symsteer.agents.mine"
-    batch = problem.batch()
-    turned = agent.obs_layout.transform(batch.obs, torch.pi / 4)
-    noise = agent.act_layout.transform(batch.noise, torch.pi / 4)
-    values, turned_values = agent.q_values(batch.obs, batch.noise), agent.q_values(turned, noise)
-    assert torch.allclose(values, turned_values, rtol=1e-4, atol=1e-5)
+@pytest.mark.parametrize("name", AGENTS.builtin)
+def test_each_agent_says_its_name_role_options_and_what_it_is(name):
+    agent = AGENTS.get(name)
+    assert agent.name == name
+    assert AGENTS.summary(name) == agent.__doc__.partition("\n")[0].replace("``", "")
+    assert agent.Options() == agent.Options()
+    assert AGENTS.extension(name) is None
+
+
+def test_an_entry_point_is_an_agent(module, entry_points):
+    module(MINE)
+    entry_points(("lab-agents", "mine", "my_agents:Mine"))
+    assert AGENTS.names()[-1] == "mine"
+    assert AGENTS.summary("mine") == "My own agent."
+    assert issubclass(AGENTS.get("mine"), Agent)
+    extension = AGENTS.extension("mine")
+    assert (extension.kind, extension.name, extension.target) == ("agent", "mine", "my_agents:Mine")
+    assert (extension.distribution, extension.version) == ("lab-agents", "1.2")
+    assert len(extension.sha256) == 64
+
+
+def test_a_class_can_be_tried_by_its_place(module):
+    module(MINE)
+    assert AGENTS.get("my_agents:Mine").name == "mine"
+    first = AGENTS.extension("my_agents:Mine")
+    assert (first.distribution, first.version) == (None, None)
+    module(MINE + "\n# changed\n")
+    assert AGENTS.extension("my_agents:Mine").sha256 != first.sha256
 
 
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("text", "name", "sentence"),
     [
-        (MINE.replace('"also-mine"', '"zero"'), r"mine\.py: AlsoMine and agents/references\.py"),
-        (MINE.replace('    name = "also-mine"', "    pass"), r"both called 'mine'"),
-        (MINE.replace('"also-mine"', '"../mine"'), r"AlsoMine has the name '\.\./mine'; use"),
-        (MINE.replace('"also-mine"', '""'), r"letters, digits"),
-        (MINE.replace('"also-mine"', f'"{"m" * 61}"'), r"at most 60"),
-        (
-            'class Bare:\n    name = "bare"\n',
-            r"Bare has a name but is no agent; inherit .*SacAgent",
-        ),
-        ("import nothing_of_the_sort\n", r"ModuleNotFoundError.*line 1\); mend or remove it"),
-        ("class Mine(\n", r"agents/mine\.py cannot be imported \(SyntaxError"),
+        (MINE, "my_agents:NoAgent", r"NoAgent cannot be used as agent; .*inherits from .*Agent"),
+        (MINE, "my_agents:Mein", r"my_agents has no Mein"),
+        (MINE, "my_agent:Mine", r"cannot be imported from my_agent .*ModuleNotFoundError"),
+        ("x = 1 +", "my_agents:Mine", r"my_agents .*SyntaxError.*line 1"),
+        ("import os\n\n1 / 0", "my_agents:Mine", r"ZeroDivisionError: division by zero, line 3"),
     ],
 )
-def test_what_cannot_be_an_agent_is_named(add, text, sentence):
-    add("mine.py", text)
+def test_what_cannot_be_an_agent_is_named(module, text, name, sentence):
+    module(text)
     with pytest.raises(UserError, match=sentence):
-        _ = symsteer.agents.AGENTS
+        AGENTS.get(name)
 
 
-def test_a_damaged_file_does_not_keep_the_package_from_being_imported(add):
-    add("mine.py", "1 / 0\n")
-    with pytest.raises(UserError, match=r"mine\.py.*ZeroDivisionError"):
-        registry()
-    with pytest.raises(UserError, match="mend or remove it"):
-        make_agent("zero", None, None, 1)
-    with pytest.raises(AttributeError, match="no attribute 'AGENT'"):
-        _ = symsteer.agents.AGENT
+def test_an_unknown_name_gets_the_nearest():
+    with pytest.raises(UserError, match=r"no agent 'equivarient'; did you mean 'equivariant'\?"):
+        AGENTS.get("equivarient")
+
+
+def test_two_distributions_with_one_name_are_refused(module, entry_points):
+    module(MINE)
+    entry_points(("a", "mine", "my_agents:Mine"), ("b", "mine", "my_agents:Mine"))
+    with pytest.raises(UserError, match="a and b both offer the agent 'mine'"):
+        AGENTS.get("mine")
+    entry_points(("a", "equivariant", "my_agents:Mine"))
+    with pytest.raises(UserError, match="symsteer and a both offer"):
+        AGENTS.get("equivariant")
+
+
+def test_a_broken_distribution_does_not_hide_the_others(entry_points):
+    entry_points(("broken", "broken", "not_there:Agent"))
+    assert AGENTS.get("equivariant") is EquivariantAgent
+    assert AGENTS.summary("broken") == ""
+    with pytest.raises(UserError, match="not_there"):
+        AGENTS.get("broken")

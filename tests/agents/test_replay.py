@@ -3,52 +3,77 @@
 import pytest
 import torch
 
-from symsteer.agents.replay import ReplayBuffer
+from symsteer.agents import replay
+from symsteer.agents.replay import ReplayBuffer, Transition
 from symsteer.errors import UserError
+
+SHAPES = {"obs": (2,), "noise": (3, 2), "reward": (), "next_obs": (2,), "terminal": ()}
 
 
 def numbered(start, count):
     n = torch.arange(start, start + count, dtype=torch.float32)
-    return n[:, None].repeat(1, 2), n[:, None, None].repeat(1, 3, 2), n, n[:, None].repeat(1, 2), n
+    return {
+        "obs": n[:, None].repeat(1, 2),
+        "noise": n[:, None, None].repeat(1, 3, 2),
+        "reward": n,
+        "next_obs": n[:, None].repeat(1, 2),
+        "terminal": n,
+    }
 
 
 def held(buffer):
     return sorted(buffer.sample(2000).reward.unique().int().tolist())
 
 
-def test_wraps_around_and_forgets_the_oldest():
-    buffer = ReplayBuffer(10, 2, 3, 2)
-    buffer.add(*numbered(0, 4))
+@pytest.mark.parametrize("first_rows", [1, 3, 4096])
+def test_wraps_around_and_forgets_the_oldest(monkeypatch, first_rows):
+    monkeypatch.setattr(replay, "FIRST_ROWS", first_rows)
+    buffer = ReplayBuffer(10, SHAPES)
+    buffer.add(numbered(0, 4))
     assert (len(buffer), held(buffer)) == (4, [0, 1, 2, 3])
-    buffer.add(*numbered(4, 4))
-    buffer.add(*numbered(8, 4))  # crosses the end
+    buffer.add(numbered(4, 4))
+    buffer.add(numbered(8, 4))  # crosses the end
     assert (len(buffer), held(buffer)) == (10, list(range(2, 12)))
-    buffer.add(*numbered(12, 10))
+    buffer.add(numbered(12, 10))
     assert held(buffer) == list(range(12, 22))
 
 
 def test_rows_stay_together():
-    buffer = ReplayBuffer(7, 2, 3, 2)
+    buffer = ReplayBuffer(7, SHAPES)
     for start in range(0, 20, 4):
-        buffer.add(*numbered(start, 4))
+        buffer.add(numbered(start, 4))
     batch = buffer.sample(100)
-    for tensor in batch:
+    for tensor in batch.values():
         assert torch.equal(tensor.flatten(1).mean(1) if tensor.ndim > 1 else tensor, batch.reward)
     assert batch.noise.shape == (100, 3, 2)
 
 
 def test_keeps_copies():
-    buffer = ReplayBuffer(4, 2, 3, 2)
+    buffer = ReplayBuffer(4, SHAPES)
     rows = numbered(1, 2)
-    buffer.add(*rows)
-    rows[0].zero_()
+    buffer.add(rows)
+    rows["obs"].zero_()
     assert buffer.sample(50).obs.min() >= 1
+
+
+def test_holds_the_fields_that_were_asked_for():
+    rows = numbered(0, 4)
+    actions = torch.arange(16.0).view(4, 2, 2)
+    step = Transition(**rows, actions=actions, truncated=torch.ones(4, dtype=torch.bool))
+    buffer = ReplayBuffer(8, {"actions": (2, 2), "truncated": ()})
+    buffer.add(step)
+    batch = buffer.sample(64)
+    assert set(batch) == {"actions", "truncated"}
+    assert torch.equal(batch.actions.unique(), torch.arange(16.0))
+    assert batch.truncated.eq(1).all()
+    with pytest.raises(AttributeError, match="replay_fields"):
+        _ = batch.noise
 
 
 def test_sampling_is_seeded_and_continues_after_loading():
     def filled(seed):
-        buffer = ReplayBuffer(10, 2, 3, 2, seed=seed)
-        buffer.add(*numbered(0, 8))
+        buffer = ReplayBuffer(10, SHAPES, seed=seed)
+        buffer.add(numbered(0, 8))
         return buffer
 
     first, second, third = filled(3), filled(3), filled(4)
@@ -58,25 +83,18 @@ def test_sampling_is_seeded_and_continues_after_loading():
     third.load_state_dict(first.state_dict())
     assert torch.equal(first.sample(64).reward, third.sample(64).reward)
     for buffer in (first, third):
-        buffer.add(*numbered(8, 5))
+        buffer.add(numbered(8, 5))
     assert held(first) == held(third) == list(range(3, 13))
-
-
-def test_saved_state_is_tensors_of_the_filled_part():
-    buffer = ReplayBuffer(10, 2, 3, 2)
-    buffer.add(*numbered(0, 4))
-    state = buffer.state_dict()
-    assert all(isinstance(value, torch.Tensor) for value in state.values())
-    assert len(state["obs"]) == 4
+    assert len(first.state_dict()["rows"]["obs"]) == 10
 
 
 def test_mistakes_are_named():
     with pytest.raises(UserError, match="empty"):
-        ReplayBuffer(4, 2, 3, 2).sample(1)
+        ReplayBuffer(4, SHAPES).sample(1)
     with pytest.raises(UserError, match="replay_capacity"):
-        ReplayBuffer(4, 2, 3, 2).add(*numbered(0, 5))
+        ReplayBuffer(4, SHAPES).add(numbered(0, 5))
     with pytest.raises(UserError, match="capacity"):
-        ReplayBuffer(0, 2, 3, 2)
-    other = ReplayBuffer(4, 3, 3, 2)
+        ReplayBuffer(0, SHAPES)
+    other = ReplayBuffer(4, {**SHAPES, "obs": (3,)})
     with pytest.raises(UserError, match="configuration"):
-        other.load_state_dict(ReplayBuffer(4, 2, 3, 2).state_dict())
+        other.load_state_dict(ReplayBuffer(4, SHAPES).state_dict())

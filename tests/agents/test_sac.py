@@ -7,11 +7,12 @@ import io
 import pytest
 import torch
 
-from symsteer.agents import ReplayBuffer, SacConfig
-from symsteer.agents.approximate import paths
-from symsteer.agents.diagnostics import equivariance_error
+from symsteer.agents.agent import Budget
+from symsteer.agents.approximate import ApproximateOptions, paths
+from symsteer.agents.diagnostics import actor_equivariance_error, entropy_allowance
 from symsteer.agents.networks import count
-from symsteer.agents.sac import entropy_allowance
+from symsteer.agents.replay import ReplayBuffer
+from symsteer.agents.sac import SacAgent
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Group, Layout
 
@@ -60,7 +61,7 @@ def test_critic_target_is_the_hand_computed_one(problem, terminal, soft):
         target_q = agent.critic.apply_weights(agent.target, inputs)[..., 0]
         value = torch.minimum(target_q[0], target_q[1])
         if soft:
-            value = value - agent.log_alpha.exp() * log_prob
+            value = value - agent.alpha * log_prob
         wanted = batch.reward if terminal else batch.reward + 0.95 * value
         q = agent.q_values(batch.obs, batch.noise)
         expected = (q[0] - wanted).square().mean() + (q[1] - wanted).square().mean()
@@ -116,7 +117,7 @@ def test_actor_loss_is_the_hand_computed_one(problem):
         _, eps = (torch.randn(mean.shape, generator=generator, dtype=mean.dtype) for _ in range(2))
         noise, log_prob = agent.distribution.sample(mean, log_scale, eps)
         q = agent.q_values(batch.obs, noise.unflatten(1, (problem.horizon, -1)))
-        expected = (agent.log_alpha.exp() * log_prob - torch.minimum(q[0], q[1])).mean()
+        expected = (agent.alpha * log_prob - torch.minimum(q[0], q[1])).mean()
     scalars = agent.update(batch)
     assert scalars["losses/actor"].item() == pytest.approx(expected.item(), rel=1e-12)
     assert scalars["train/entropy"].item() == pytest.approx(-log_prob.mean().item(), rel=1e-12)
@@ -125,10 +126,10 @@ def test_actor_loss_is_the_hand_computed_one(problem):
 @pytest.mark.parametrize(("wanted", "sign"), [(100.0, 1), (-100.0, -1)])
 def test_alpha_moves_towards_the_target_entropy(problem, wanted, sign):
     agent = problem.agent("equivariant", target_entropy=wanted)
-    before = agent.log_alpha.item()
+    before = agent.multipliers["alpha"].log.item()
     entropy = agent.update(problem.batch())["train/entropy"].item()
     assert (wanted - entropy) * sign > 0
-    assert (agent.log_alpha.item() - before) * sign > 0
+    assert (agent.multipliers["alpha"].log.item() - before) * sign > 0
 
 
 def test_default_target_entropy_is_minus_half_the_noise(problem):
@@ -148,7 +149,7 @@ def test_reward_scale_leaves_reported_values_in_reward_units(problem):
 
 def parameters(agent):
     parts = (agent.actor, agent.critic, agent.target)
-    return [*(t for part in parts for t in tensors(part)), agent.log_alpha.detach()]
+    return [*(t for part in parts for t in tensors(part)), agent.multipliers["alpha"].log.detach()]
 
 
 def same(a, b):
@@ -259,7 +260,7 @@ def test_matched_agent_has_the_equivariant_ones_size(problem, group, width):
     for key in ("actor", "critic", "total"):
         assert matched[key] == pytest.approx(equivariant[key], rel=0.02)
     assert plain["total"] > 2 * equivariant["total"]
-    assert matched["actor_width"] < plain["actor_width"] == width
+    assert matched["width"] < plain["width"] == width
 
 
 def test_parameter_counts_are_those_of_the_modules(problem):
@@ -314,7 +315,84 @@ def test_unknown_agent_names_the_known_ones(problem):
 )
 def test_impossible_options_are_refused(options):
     with pytest.raises(UserError, match=r"agent options?"):
-        SacConfig(**options)
+        ApproximateOptions(**options)
+
+
+def test_losses_penalties_and_multipliers_of_an_agent_are_used(problem):
+    """Each hook changes what it should, and nothing else, in one update."""
+    from symsteer.agents.sac import Multiplier
+    from symsteer.agents.standard import StandardAgent
+
+    class Own(StandardAgent):
+        name = "own"
+        seen: tuple = ()
+
+        def __init__(self, *args):
+            super().__init__(*args)
+            self.multipliers["norm"] = Multiplier(0.5, 1e-2, self.device, self.dtype)
+
+        def critic_target(self, batch, next_obs):
+            return torch.full_like(batch.reward, 3.0)
+
+        def actor_penalty(self, batch):
+            return 1e3 * sum(p.square().sum() for p in self.actor.parameters())
+
+        def constraints(self, noise, log_prob, batch):
+            norm = noise.norm(dim=1).mean()
+            return {**super().constraints(noise, log_prob, batch), "norm": -norm}
+
+        def after_update(self, batch):
+            return {"train/seen": torch.tensor(float(len(batch.reward)))}
+
+    options = {**problem.options}
+    agent = Own(problem.context(), StandardAgent.Options(**options))
+    size = sum(p.square().sum() for p in agent.actor.parameters()).item()
+    before = agent.multipliers["norm"].value.item()
+    scalars = agent.update(problem.batch())
+    assert scalars["train/target_mean"].item() == 3.0
+    assert scalars["train/seen"].item() == 32
+    assert sum(p.square().sum() for p in agent.actor.parameters()).item() < size
+    assert agent.multipliers["norm"].value.item() > before
+    again = Own(problem.context(seed=5), StandardAgent.Options(**options))
+    again.load_state_dict(agent.state_dict())
+    assert torch.equal(again.multipliers["norm"].log, agent.multipliers["norm"].log)
+
+
+def test_a_noise_dependent_loss_reaches_the_actor_through_the_decoder(problem):
+    """The decoder in the context is differentiable with respect to the noise."""
+    from symsteer.agents.standard import StandardAgent
+
+    class Still(StandardAgent):
+        name = "still"
+
+        def actor_loss(self, q, noise, log_prob, batch):
+            return self.context.decode(batch.obs, self.chunk(noise)).square().mean()
+
+    target = torch.linspace(-0.5, 0.5, problem.act_layout.dim)
+    context = problem.context(decode=lambda obs, noise: noise - target)
+    agent = Still(context, StandardAgent.Options(**{**problem.options, "lr": 1e-2}))
+    for seed in range(150):
+        agent.update(problem.batch(seed=seed))
+    mode = agent.act(problem.batch().obs, deterministic=True)
+    assert (mode - target).abs().mean() < 0.05
+
+
+def test_updates_are_paid_for_behind_the_warm_up(problem):
+    agent = problem.agent("standard", warmup=40, utd=0.25)
+    updates = []
+    for step in range(6):
+        noise = agent.act(problem.batch(16).obs)
+        assert (noise.abs().max() > 1.5) == (step < 3)  # beyond the bound: N(0, I)
+        agent.observe(problem.batch(16, seed=step))
+        updates.append(len(list(agent.batches())))
+    assert updates == [0, 0, 0, 4, 4, 4]
+
+
+def test_a_budget_within_the_warm_up_is_refused(problem):
+    options = problem.agent("standard", warmup=40).options
+    with pytest.raises(UserError, match="nothing would be learned"):
+        SacAgent.check(options, Budget(160, 4, 4, 50))
+    SacAgent.check(options, Budget(161, 4, 4, 50))
 
 
 def test_bad_groups_are_refused(problem):
@@ -351,19 +429,27 @@ def solve(problem, name, broken, rounds=400):
         obs_layout=BANDIT_OBS,
         act_layout=BANDIT_ACT,
         horizon=2,
-        config=SacConfig(width=128, batch_size=128, lr=1e-3, alpha_lr=1e-3),
+        options={**problem.options, "width": 128, "batch_size": 128},
     )
     agent, base = bandit.agent(name), bandit.agent("base", seed=1)
-    replay = ReplayBuffer(30_000, BANDIT_OBS.dim, 2, BANDIT_ACT.dim, seed=3)
+    replay = ReplayBuffer(30_000, bandit.shapes(), seed=3)
     g = torch.Generator().manual_seed(2)
     for i in range(rounds):
         obs = torch.randn(64 if i else 512, BANDIT_OBS.dim, generator=g)
         noise = (agent if i else base).act(obs)
-        replay.add(obs, noise, bandit_reward(obs, noise, broken), obs, torch.ones(len(obs)))
+        replay.add(
+            {
+                "obs": obs,
+                "noise": noise,
+                "reward": bandit_reward(obs, noise, broken),
+                "next_obs": obs,
+                "terminal": torch.ones(len(obs)),
+            }
+        )
         agent.update(replay.sample(128))
     obs = torch.randn(512, BANDIT_OBS.dim, generator=g)
     reward = bandit_reward(obs, agent.act(obs, deterministic=True), broken).mean().item()
-    error = equivariance_error(agent, obs, Group.parse("C8"))["actor_equivariance_error"]
+    error = actor_equivariance_error(agent, obs, Group.parse("C8"))
     return reward, error
 
 

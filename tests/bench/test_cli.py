@@ -13,7 +13,8 @@ from symsteer.cli import _threads, main
 
 from symsteer.bench.demos import collect
 from symsteer.bench.tasks import task_class
-from symsteer.policies.base import ChunkPolicy, PolicyConfig, save_policy
+from symsteer.policies.files import save_policy
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 
 
 def symsteer(monkeypatch, *arguments) -> int:
@@ -99,8 +100,8 @@ def test_demonstrations_with_nan(demos, monkeypatch, capsys, tmp_path):
 
 def test_a_checkpoint_of_another_layout(monkeypatch, capsys, tmp_path):
     task = task_class("PushCube-v1")
-    config = PolicyConfig(channels=8, width=16, depth=1)
-    policy = ChunkPolicy(config, task.observation_layout, task.action_layout)
+    options = EquivariantOptions(channels=8, width=16, depth=1)
+    policy = EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
     path = save_policy(policy, tmp_path / "push.safetensors")
     arguments = ("run", "--quiet", "--base-policy", path, "--out", tmp_path / "runs")
     assert symsteer(monkeypatch, *arguments) == 2
@@ -122,7 +123,7 @@ def test_report_checks_and_verifies_from_any_folder(monkeypatch, capsys, tmp_pat
     shown = capsys.readouterr().out
     assert shown.count("NOT ADMISSIBLE") == 2
     assert "0 of 2 records are admissible" in shown
-    committed = Path(__file__).parents[2] / "leaderboard" / "results"
+    committed = Path(__file__).parents[2] / "leaderboard" / "results" / "records"
     record = next(committed.rglob("*.json"))
     assert symsteer(monkeypatch, "report", record, "--verify", "--out", tmp_path / "page") == 1
     assert "LEADERBOARD.md: missing" in capsys.readouterr().out

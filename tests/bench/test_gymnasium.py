@@ -23,7 +23,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from stable_baselines3 import SAC
 
 from symsteer.bench.sim import rendering_works
-from symsteer.bench.tasks import make, task_class, task_names
+from symsteer.bench.tasks import TASKS, make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
 
@@ -77,7 +77,7 @@ def test_render_modes_are_those_of_this_machine():
     assert env.metadata["render_fps"] == 20
 
 
-@pytest.mark.parametrize("task", task_names())
+@pytest.mark.parametrize("task", TASKS.names())
 def test_every_task_has_an_id_for_numpy(task):
     env = gym.make(single_id(task), **BROKEN)
     batched = CPUGymWrapper(gym.make(f"SymSteer/{task}", num_envs=1, **BROKEN))

@@ -1,20 +1,34 @@
 """A tiny but complete configuration: everything happens, nothing is learned."""
 
+import dataclasses
 import json
 
-from symsteer.agents.sac import SacConfig
-from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
-from symsteer.policies.base import PolicyConfig
+from symsteer.agents import AGENTS
+from symsteer.bench.runs.config import (
+    DemonstrationConfig,
+    EvaluationConfig,
+    PolicyConfig,
+    RunConfig,
+)
 
 
-def tiny_config(**changes) -> RunConfig:
+AGENT = {"width": 16, "batch_size": 16, "warmup": 16, "group": "C4"}
+POLICY = {"channels": 8, "width": 16, "depth": 1, "steps": 20, "batch_size": 32}
+
+
+def tiny_config(agent="equivariant", policy_name="edp", options=None, **changes) -> RunConfig:
+    """A run of an agent; ``options`` are those of the agent that differ from ``AGENT``."""
+    kind = AGENTS.get(agent).Options
+    known = {field.name for field in dataclasses.fields(kind)}
+    shared = {key: value for key, value in AGENT.items() if key in known}
     values = {
-        "agent": "equivariant",
+        "agent": agent,
+        "agent_options": kind(**{**shared, **(options or {})}),
         "env_steps": 320,
         "num_envs": 4,
         "demonstrations": DemonstrationConfig(count=3),
-        "policy": PolicyConfig(channels=8, width=16, depth=1, steps=20, batch_size=32, execute=4),
-        "sac": SacConfig(width=16, batch_size=16, warmup=16, group="C4"),
+        "policy_name": policy_name,
+        "policy": POLICIES.get(policy_name).Options(**POLICY),
         "evaluation": EvaluationConfig(
             every=160, episodes=3, final_episodes=5, diagnostic_episodes=2, steerability_states=2
         ),

@@ -82,7 +82,7 @@ def test_one_new_file_in_agents_is_a_run(tmp_path):
     (path,) = tmp_path.glob("runs/*/record.json")
     record = read_record(path)
     assert record.status == "finished"
-    assert record.cell.agent == "augmented"
+    assert record.settings.agent == "augmented"
     assert record.budget.updates > 3
     # What the page says of files, rules and cells.
     copied = tmp_path / f"{path.parent.name}.json"

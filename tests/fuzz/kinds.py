@@ -40,7 +40,8 @@ from symsteer.bench.runs.loop import Loop
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.bench.tasks import task_class
 from symsteer.leaderboard.records import config_hash, read_record
-from symsteer.policies.base import ChunkPolicy, PolicyConfig, save_policy
+from symsteer.policies.files import save_policy
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 from tests.fuzz.judge import BadEndingError, Ending, end_of, stopped_at
 from tests.fuzz.mutate import (
     POISON,
@@ -592,8 +593,10 @@ def _edit_policy(path: Path, random: Random) -> None:
         meta["policy"] = json.dumps(poison_data(json.loads(meta["policy"]), random))
     else:
         task = task_class("PushCube-v1")
-        config = PolicyConfig(channels=8, width=16, depth=1)
-        save_policy(ChunkPolicy(config, task.observation_layout, task.action_layout), path)
+        options = EquivariantOptions(channels=8, width=16, depth=1)
+        save_policy(
+            EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout), path
+        )
         return
     save_file(tensors, path, meta)
 

@@ -24,6 +24,7 @@ from symsteer.leaderboard.records import (
 
 START = datetime(2026, 1, 31, 12, 0, tzinfo=UTC)
 LEARNING = ("standard", "standard-matched", "equivariant", "approximate")
+REFERENCES = ("base", "zero", "golden-ticket")
 
 
 def make_config(**changes: Any) -> dict[str, Any]:
@@ -82,9 +83,13 @@ def make_record(
     return RunRecord(
         run_id=re.sub(r"[^\w.=-]", "=", f"run-{config['variant']}-{agent}-{seed}", flags=re.ASCII),
         config=config,
+        role="reference" if agent in REFERENCES else "learner",
         provenance=Provenance(
             commit="0123456789abcdef0123456789abcdef01234567",
             dirty=False,
+            version="0.1.0",
+            sha256=None,
+            extensions=[],
             packages={"torch": "2.13.0", "mani-skill": "3.0.1"},
             python="3.11.7",
             platform="Linux x86_64",
@@ -172,7 +177,7 @@ def make_cell(
                 return (order < round(share * episodes)).astype(int).tolist()
 
             steps = np.linspace(0, config.get("env_steps", 50_000), len(curve)).astype(int)
-            if agent not in ("base", "zero", "golden-ticket"):
+            if agent not in REFERENCES:
                 evaluations = [
                     make_evaluation(outcomes(share), int(step), step == steps[-1], q_mean=-5.0)
                     for share, step in zip(curve, steps, strict=True)

@@ -11,12 +11,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from record_factory import LEARNING, make_curve, make_evaluation, make_record
 
-from symsteer.leaderboard import __main__ as command
+from symsteer.errors import UserError
+from symsteer.leaderboard import command
 from symsteer.leaderboard.admission import RULES, Verdict, check
-from symsteer.leaderboard.errors import RecordError
-from symsteer.leaderboard.records import HELD_OUT_SEED, RunRecord, config_hash, write_record
+from symsteer.leaderboard.records import (
+    HELD_OUT_SEED,
+    RecordedExtension,
+    RunRecord,
+    config_hash,
+    write_record,
+)
+from tests.leaderboard.command_line import main
+from tests.leaderboard.record_factory import LEARNING, make_curve, make_evaluation, make_record
 
 REPOSITORY = Path(__file__).parents[2]
 COMMIT = subprocess.run(
@@ -34,7 +41,7 @@ def admissible(agent: str = "standard", seed: int = 0, **config: Any) -> RunReco
         evaluation.episodes.seed = [HELD_OUT_SEED + i for i in range(number)]
     record = make_record(curve, agent=agent, seed=seed, **config)
     record.provenance.commit = COMMIT or record.provenance.commit
-    cell = record.cell
+    cell = record.settings
     variant = cell.variant.replace(":", "=")
     record.run_id = f"{cell.task}-{cell.embodiment}-{variant}-{agent}-s{seed}-0123456789ab"
     return record
@@ -75,6 +82,20 @@ def interrupted(record: RunRecord) -> None:
 
 def no_commit(record: RunRecord) -> None:
     record.provenance.commit = record.provenance.dirty = None
+
+
+def unreleased(record: RunRecord) -> None:
+    record.provenance.commit = record.provenance.dirty = None
+    record.provenance.version, record.provenance.sha256 = "0.2.dev3+g0123456", "cd" * 32
+
+
+def extension(**changes: Any) -> RecordedExtension:
+    data = {"kind": "agent", "name": "mine:Mine", "target": "mine:Mine", "sha256": "ab" * 32}
+    return RecordedExtension(**({"distribution": None, "version": None} | data | changes))
+
+
+def loose_extension(record: RunRecord) -> None:
+    record.provenance.extensions = [extension()]
 
 
 def local_changes(record: RunRecord) -> None:
@@ -142,10 +163,12 @@ def windows_path(record: RunRecord) -> None:
     [
         (failed, r"the run is failed, not finished: continue it with `symsteer resume"),
         (interrupted, r"the run is interrupted, not finished"),
-        (no_commit, r"the run names no commit.*run it again in a git clone"),
+        (no_commit, r"the run names neither a commit nor a released version.*in a git clone"),
+        (unreleased, r"the run names neither a commit nor a released version"),
+        (loose_extension, r"the run used the agent mine:Mine, which belongs to no installed"),
         (local_changes, r"the run used code that is not in commit [0-9a-f]{12}: commit all"),
         (continued_with_changes, r"^part 3 of the run used code that is not in commit"),
-        (continued_without_commit, r"^part 2 of the run names no commit"),
+        (continued_without_commit, r"^part 2 of the run names neither a commit nor"),
         (few_episodes, r"99 episodes, fewer than 100: run it again with --evaluation\.final"),
         (chosen_seeds, r"the evaluation at step 50000 is not on the held-out seeds 1000000, 100"),
         (chosen_seeds_on_the_way, r"the evaluation at step 25000 is not on the held-out seeds"),
@@ -173,6 +196,23 @@ def test_each_rule_alone(tmp_path: Path, spoil: Callable[[RunRecord], None], sen
 def test_every_rule_is_tested() -> None:
     """A rule that joins the list needs a line above."""
     assert len(RULES) == 7
+
+
+def test_what_others_can_install_is_admitted_with_a_note(tmp_path: Path) -> None:
+    record = admissible("base")
+    record.provenance.commit = record.provenance.dirty = None
+    record.provenance.sha256 = "cd" * 32
+    record.provenance.extensions = [
+        extension(name="mine", distribution="my-agents", version="1.2"),
+        extension(kind="variant", name="fog", distribution="fogs", version="3.0"),
+    ]
+    verdict = judge(store(record, tmp_path))[0]
+    assert verdict.is_admissible
+    assert verdict.notes == [
+        "it ran symsteer 0.1.0 as installed, not a checkout; sha256 cdcdcdcdcdcd.",
+        "it uses the agent mine of my-agents 1.2; sha256 abababababab.",
+        "it uses the variant fog of fogs 3.0; sha256 abababababab.",
+    ]
 
 
 def edit(path: Path, **changes: Any) -> None:
@@ -264,6 +304,7 @@ def test_another_base_policy_is_said(tmp_path: Path) -> None:
     committed, new = tmp_path / "committed", tmp_path / "new"
     five(committed)
     store(admissible("base"), committed)
+    store(admissible("zero"), committed)
 
     def on_another_policy(agent: str, seed: int) -> Path:
         record = admissible(agent, seed)
@@ -274,9 +315,9 @@ def test_another_base_policy_is_said(tmp_path: Path) -> None:
     learner = on_another_policy("standard", 7)
     note = judge(learner, committed=committed)[0].notes[1]
     assert "base policy abababababab is not that of the committed runs" in note
-    assert "submit base, zero" in note
+    assert "submit base, zero on it" in note
     verdicts = judge(learner, on_another_policy("base", 0), committed=committed)
-    assert "submit zero" in verdicts[0].notes[1]
+    assert "submit zero on it" in verdicts[0].notes[1]
     # A table of its own has nothing to agree with.
     elsewhere = store(admissible(task="PushCube-v1", seed=3), new, "elsewhere.json")
     assert not any("base policy" in n for n in judge(elsewhere, committed=committed)[0].notes)
@@ -304,7 +345,7 @@ def test_a_damaged_committed_record_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "committed").mkdir()
     (tmp_path / "committed" / "bad.json").write_text("{")
     path = store(admissible(), tmp_path)
-    with pytest.raises(RecordError, match=r"bad\.json is not strict JSON"):
+    with pytest.raises(UserError, match=r"bad\.json is not strict JSON"):
         judge(path, committed=tmp_path / "committed")
 
 
@@ -314,13 +355,14 @@ def test_a_damaged_committed_record_is_an_error(tmp_path: Path) -> None:
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Nothing is committed yet."""
-    monkeypatch.setattr(command, "DEFAULT_RECORDS", tmp_path / "nothing")
+    (tmp_path / "nothing").mkdir()
+    monkeypatch.setattr(command, "RECORDS", tmp_path / "nothing")
 
 
 @pytest.mark.usefixtures("alone")
 def test_the_command_says_what_to_mend(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = five(tmp_path / "new")
-    assert command.main(["--check", *map(str, paths)]) == 0
+    assert main(["--check", *map(str, paths)]) == 0
     shown = capsys.readouterr()
     assert shown.err == ""
     assert shown.out.splitlines() == [
@@ -329,9 +371,9 @@ def test_the_command_says_what_to_mend(tmp_path: Path, capsys: pytest.CaptureFix
     ]
     edit(paths[4], status="running", ended=None)
     (tmp_path / "new" / "hostile.json").write_text(
-        '{"schema_version": 3, "config_hash": "", "\\u001b[2J\\nadmissible": 1}'
+        '{"schema_version": 4, "config_hash": "", "\\u001b[2J\\nadmissible": 1}'
     )
-    assert command.main(["--check", str(tmp_path / "new")]) == 2
+    assert main(["--check", str(tmp_path / "new")]) == 2
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "4 of 6 records are admissible"
     assert sum(line.endswith(": NOT ADMISSIBLE") for line in lines) == 2
@@ -345,10 +387,10 @@ def test_of_many_records_the_command_names_those_it_complains_about(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paths = [store(admissible(seed=seed), tmp_path / "new") for seed in range(11)]
-    assert command.main(["--check", str(tmp_path / "new")]) == 0
+    assert main(["--check", str(tmp_path / "new")]) == 0
     assert capsys.readouterr().out == "11 of 11 records are admissible\n"
     edit(paths[4], status="running", ended=None)
-    assert command.main(["--check", str(tmp_path / "new")]) == 2
+    assert main(["--check", str(tmp_path / "new")]) == 2
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if ".json: " in line] == [f"{paths[4]}: NOT ADMISSIBLE"]
     assert lines[-1] == "10 of 11 records are admissible"
@@ -356,13 +398,11 @@ def test_of_many_records_the_command_names_those_it_complains_about(
 
 @pytest.mark.usefixtures("alone")
 def test_the_command_refuses_two_things_at_once(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        command.main(["--check", "--verify"])
-    assert stopped.value.code == 2
-    assert "not allowed with" in capsys.readouterr().err
+    assert main(["--check", "--verify"]) == 2
+    assert "cannot be given together" in capsys.readouterr().err
 
 
 def test_what_is_committed_is_admissible() -> None:
-    verdicts = check([command.DEFAULT_RECORDS], command.DEFAULT_RECORDS)
+    verdicts = check([command.RECORDS], command.RECORDS)
     problems = [problem for verdict in verdicts for problem in verdict.problems]
     assert problems == []

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from record_factory import make_cell, make_evaluation, make_record
 
 from symsteer.leaderboard.claims import Claim, claims
 from symsteer.leaderboard.defects import Audit, Defect, defect_map
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import Run, summarize
+from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 
 NAMES = (
     "faster than standard",

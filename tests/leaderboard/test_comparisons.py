@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from record_factory import make_cell, make_evaluation, make_record
 
 from symsteer.leaderboard.comparisons import THRESHOLDS, compare_agents, gap_closed
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.summary import Run, Summary, summarize
+from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 
 
 def summary_of(records: list[RunRecord]) -> Summary:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from record_factory import make_cell
 
+from symsteer.errors import UserError
 from symsteer.leaderboard.defects import (
     DEFAULT_AUDIT,
     Audit,
@@ -23,10 +23,10 @@ from symsteer.leaderboard.defects import (
     fit,
     read_audit,
 )
-from symsteer.leaderboard.errors import RecordError
 from symsteer.leaderboard.page import crossing_text
 from symsteer.leaderboard.statistics import Interval, Sample
 from symsteer.leaderboard.summary import Run, Summary, Table, summarize
+from tests.leaderboard.record_factory import make_cell
 
 CELL = {
     "task": "PickCube-v1",
@@ -87,23 +87,23 @@ def bad(**changes: Any) -> list[Any]:
     ],
 )
 def test_a_bad_audit_is_one_sentence(tmp_path: Path, data: object) -> None:
-    with pytest.raises(RecordError, match=r"summary\.json is no summary of an audit") as error:
+    with pytest.raises(UserError, match=r"summary\.json is no summary of an audit") as error:
         read_audit(write(tmp_path, data))
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 500
 
 
 def test_a_cell_is_audited_once(tmp_path: Path) -> None:
-    with pytest.raises(RecordError, match=r"holds PickCube-v1 .* twice: remove the older"):
+    with pytest.raises(UserError, match=r"holds PickCube-v1 .* twice: remove the older"):
         read_audit(write(tmp_path, [CELL, CELL | {"tool_step": [0.2, 0.1, 0.3]}]))
 
 
 def test_a_missing_audit_is_an_error_only_if_it_was_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(RecordError, match=r"cannot be read"):
+    with pytest.raises(UserError, match=r"cannot be read"):
         read_audit(tmp_path / "nowhere.json")
-    with pytest.raises(RecordError, match=r"cannot be read"):
+    with pytest.raises(UserError, match=r"cannot be read"):
         read_audit(tmp_path)
     monkeypatch.setattr("symsteer.leaderboard.defects.DEFAULT_AUDIT", tmp_path / "nowhere.json")
     assert read_audit() == {}

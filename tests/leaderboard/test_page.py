@@ -10,13 +10,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from record_factory import make_cell, make_evaluation, make_record
 
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.page import render_page
 from symsteer.leaderboard.records import RunRecord, write_record
 from symsteer.leaderboard.report import generate
 from symsteer.leaderboard.summary import Run, summarize
+from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 
 DEFECTS = {"none": 0.002, "wind:0.25": 0.1, "wind:0.5": 0.2, "wind:1": 0.4}
 HOSTILE = "x`</td><img src=x onerror=alert(1)>`|$a$\n# H [l](javascript:alert(1))"
@@ -56,7 +56,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rates |= {"standard-matched": 0.5, "equivariant": 0.8 - defect, "approximate": 0.7}
         records += make_cell(rates, episodes=100, variant=variant)
     for record in records:
-        if record.cell.agent == "golden-ticket":
+        if record.settings.agent == "golden-ticket":
             record.budget.env_steps = 12_800
     first = records[0]
     other = first.provenance.model_copy(update={"commit": "f" * 40, "device": "cuda"})

@@ -8,13 +8,14 @@ import shutil
 from pathlib import Path
 
 import pytest
-from record_factory import make_record
 
-from symsteer.leaderboard.__main__ import main
-from symsteer.leaderboard.errors import RecordError
+from symsteer.errors import UserError
 from symsteer.leaderboard.paths import record_files
-from symsteer.leaderboard.records import MAX_BYTES, write_record
+from symsteer.leaderboard.records import write_record
+from symsteer.leaderboard.records.files import MAX_BYTES
 from symsteer.leaderboard.report import generate, slug
+from tests.leaderboard.command_line import main
+from tests.leaderboard.record_factory import make_record
 
 
 @pytest.fixture
@@ -157,7 +158,7 @@ def test_what_cannot_be_replaced_leaves_the_rest_alone(
     stale = out / "figures" / f"q-{slug('OldTask-v1', 'floating')}.svg"
     stale.write_text("")
     before = snapshot(out)
-    assert "LEADERBOARD.md cannot be written: Is a directory" in refused(capsys, good, "--out", out)
+    assert "LEADERBOARD.md is a folder; remove it" in refused(capsys, good, "--out", out)
     assert snapshot(out) == before
 
 
@@ -177,7 +178,7 @@ def test_a_full_disk_leaves_everything_as_it_was(
         real(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(RecordError, match=r"No space left on device; free space"):
+    with pytest.raises(UserError, match=r"No space left on device; free space"):
         generate([good], out)
     assert snapshot(out) == before
 

@@ -5,23 +5,32 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-from symsteer.leaderboard.records import Provenance
+import numpy as np
+import pytest
+
+from symsteer.leaderboard.records import Provenance, provenance
+from symsteer.registry import Extension
+
+REPOSITORY = Path(__file__).parents[2]
 
 
-def test_code_that_git_does_not_know_counts_as_a_local_change(tmp_path: Path) -> None:
-    def git(*arguments: str) -> None:
-        identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
-        subprocess.run(["git", *identity, *arguments], cwd=tmp_path, check=True)
+def git(folder: Path, *arguments: str) -> None:
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
+    subprocess.run(["git", *identity, *arguments], cwd=folder, check=True)
 
+
+def test_code_that_git_does_not_track_counts_as_a_local_change(tmp_path: Path) -> None:
     def dirty() -> bool | None:
-        return Provenance.collect("cpu", 1, tmp_path, []).dirty
+        return provenance.commit_of(tmp_path)[1]
 
     (tmp_path / "agents").mkdir()
     (tmp_path / "agents" / "mine.py").write_text("")
+    (tmp_path / "symsteer").mkdir()
+    (tmp_path / "symsteer" / "agents").symlink_to("../agents")
     (tmp_path / ".gitignore").write_text("*_cache/\n")
-    git("init", "-q")
-    git("add", ".")
-    git("commit", "-qm", "first")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "first")
     (tmp_path / "notes.txt").write_text("no code")
     (tmp_path / "scratch.py").write_text("no code of ours")
     (tmp_path / "agents" / "a_cache").mkdir()
@@ -29,8 +38,43 @@ def test_code_that_git_does_not_know_counts_as_a_local_change(tmp_path: Path) ->
     assert dirty() is False
     (tmp_path / "agents" / "another.py").write_text("")
     assert dirty() is True
-    git("add", ".")
-    git("commit", "-qm", "second")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "second")
     assert dirty() is False
+    (tmp_path / "symsteer" / "new.py").write_text("")
+    assert dirty() is True
+    (tmp_path / "symsteer" / "new.py").unlink()
     (tmp_path / "agents" / "mine.py").write_text("1")
     assert dirty() is True
+
+
+def test_only_a_checkout_that_tracks_the_code_is_its_checkout(tmp_path: Path) -> None:
+    """An installed copy in a virtual environment may lie in some repository, or in ours."""
+    code = tmp_path / "symsteer" / "registry.py"
+    installed = tmp_path / ".venv" / "site-packages" / "symsteer" / "registry.py"
+    for file in (code, installed):
+        file.parent.mkdir(parents=True)
+        file.write_text("")
+    assert provenance._checkout_of(code) is None
+    git(tmp_path, "init", "-q")
+    assert provenance._checkout_of(code) is None
+    git(tmp_path, "add", "symsteer")
+    assert provenance._checkout_of(code) == tmp_path
+    assert provenance._checkout_of(installed) is None
+    git(tmp_path, "add", "-f", ".venv")
+    assert provenance._checkout_of(installed) is None
+
+
+def test_the_code_is_named_by_a_commit_or_by_its_hash(monkeypatch: pytest.MonkeyPatch) -> None:
+    extension = Extension("agent", "mine", "mine:Mine", None, None, "ab" * 32)
+    here = Provenance.collect("cpu", 1, [extension])
+    assert here.packages["numpy"] == np.__version__
+    assert [e.model_dump() for e in here.extensions] == [extension.to_json()]
+    if provenance.checkout() == REPOSITORY:
+        assert here.commit is not None
+        assert here.sha256 is None
+    monkeypatch.setattr(provenance, "checkout", lambda: None)
+    installed = Provenance.collect("cpu", 1)
+    assert (installed.commit, installed.dirty, installed.extensions) == (None, None, [])
+    assert installed.sha256 is not None
+    assert installed.version == here.version

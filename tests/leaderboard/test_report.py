@@ -12,15 +12,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from record_factory import LEARNING, make_curve, make_evaluation, make_record
 
-from symsteer.leaderboard.__main__ import main
 from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.records import read_record, write_record
-from symsteer.leaderboard.report import DEFAULT_RECORDS, generate, slug
+from symsteer.leaderboard.report import RECORDS, generate, slug
 from symsteer.leaderboard.summary import Run, summarize
 from symsteer.leaderboard.text import code, compact, count, number, relative_link
+from tests.leaderboard.command_line import main
+from tests.leaderboard.record_factory import LEARNING, make_curve, make_evaluation, make_record
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -298,7 +298,7 @@ def test_numbers_are_readable() -> None:
 
 def call(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "leaderboard", *map(str, arguments)],
+        [sys.executable, "-m", "symsteer", "report", *map(str, arguments)],
         cwd=REPOSITORY,
         capture_output=True,
         text=True,
@@ -346,7 +346,7 @@ def test_bad_arguments_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_committed_records_are_valid_and_name_no_machine() -> None:
-    paths = sorted((REPOSITORY / DEFAULT_RECORDS).rglob("*.json"))
+    paths = sorted((REPOSITORY / RECORDS).rglob("*.json"))
     for path in paths:
         read_record(path)
         found = re.search(r"/(home|root|tmp|work|Users|mnt)/", path.read_text())

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from record_factory import START, make_curve, make_evaluation, make_record
 
-from symsteer.leaderboard.errors import RecordError
+from symsteer.errors import UserError
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.page import render_page
 from symsteer.leaderboard.records import Evaluation, RunRecord, config_hash, write_record
@@ -28,6 +27,7 @@ from symsteer.leaderboard.summary import (
     success_pairs,
     summarize,
 )
+from tests.leaderboard.record_factory import START, make_curve, make_evaluation, make_record
 
 
 def run(record: RunRecord, name: str = "") -> Run:
@@ -392,12 +392,12 @@ def test_folders_are_searched_for_records(tmp_path: Path) -> None:
     write_record(make_record(seed=3), results / "suite" / "second.json")
     assert len(load_runs([results])) == 2
     (results / "notes.json").write_text("{}")
-    with pytest.raises(RecordError, match=r"notes\.json"):
+    with pytest.raises(UserError, match=r"notes\.json"):
         load_runs([results])
 
 
 def test_nothing_to_read_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(RecordError, match="does not exist"):
+    with pytest.raises(UserError, match="does not exist"):
         load_runs([tmp_path / "nowhere"])
-    with pytest.raises(RecordError, match="holds no record"):
+    with pytest.raises(UserError, match="holds no record"):
         load_runs([tmp_path])

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from record_factory import make_curve, make_evaluation, make_record
 
-from symsteer.leaderboard.__main__ import main
 from symsteer.leaderboard.records import write_record
-from symsteer.leaderboard.report import DEFAULT_OUT, DEFAULT_RECORDS, generate, slug
+from symsteer.leaderboard.report import PAGE_FOLDER, RECORDS, generate, slug
 from symsteer.leaderboard.verification import differences, other_versions
+from tests.leaderboard.command_line import main
+from tests.leaderboard.record_factory import make_curve, make_evaluation, make_record
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -142,7 +142,7 @@ def test_another_kind_of_machine_gives_the_same_bytes(written: Path, tmp_path: P
         "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA",
         "PYTHONPATH": str(REPOSITORY),
     }
-    command = [sys.executable, "-m", "leaderboard", str(written / "records"), "--verify"]
+    command = [sys.executable, "-m", "symsteer", "report", str(written / "records"), "--verify"]
     result = subprocess.run(
         [*command, "--out", str(written / "board")],
         cwd=tmp_path,
@@ -154,8 +154,8 @@ def test_another_kind_of_machine_gives_the_same_bytes(written: Path, tmp_path: P
 
 
 def test_the_defaults_do_not_depend_on_the_folder_one_is_in() -> None:
-    assert DEFAULT_OUT == REPOSITORY / "leaderboard"
-    assert DEFAULT_RECORDS == REPOSITORY / "leaderboard" / "results"
+    assert PAGE_FOLDER == REPOSITORY / "leaderboard"
+    assert RECORDS == REPOSITORY / "leaderboard" / "results" / "records"
 
 
 def test_pinned_versions_are_those_that_run() -> None:

@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from symsteer.policies.base import PolicyConfig
+from symsteer.policies import POLICIES
 from symsteer.policies.geometry import Field, Layout
-from symsteer.policies.training import train_policy
 
 OBS = Layout(
     [
@@ -84,6 +83,26 @@ def make_episodes(count: int, seed: int = 0, length: int = 8, noise: float = 0.0
     return [(states[i], actions[i]) for i in range(count)]
 
 
+def small_options(name: str = "edp", **fields):
+    """Options of a policy, small enough for tests."""
+    return POLICIES.get(name).Options(**{**SMALL, **fields})
+
+
+def fit(name: str = "edp", seed: int = 0, progress=None, episodes=None, **fields):
+    """A policy trained for a few steps."""
+    if name != "edp":
+        fields.setdefault("match_compute", False)
+    episodes = make_episodes(6, noise=0.2) if episodes is None else episodes
+    options = small_options(name, **{"steps": 30, "batch_size": 32, **fields})
+    return POLICIES.get(name).fit(options, episodes, OBS, ACT, seed, progress)
+
+
+def untrained(name: str = "edp", **fields):
+    """A policy with random weights."""
+    torch.manual_seed(0)
+    return POLICIES.get(name)(small_options(name, **fields), OBS, ACT)
+
+
 @pytest.fixture(scope="session")
 def world() -> SimpleNamespace:
     """Layouts, controller, episodes and a configuration small enough for tests."""
@@ -96,24 +115,25 @@ def world() -> SimpleNamespace:
         ),
         episodes=make_episodes,
         small=SMALL,
+        options=small_options,
+        fit=fit,
+        untrained=untrained,
     )
 
 
 @pytest.fixture(scope="session")
 def trained(world):
-    """Policies trained briefly, one per configuration; ``trained(**config fields)``."""
+    """Policies trained briefly, each once; ``trained(name, **options)``."""
     cache = {}
 
-    def get(**fields):
-        key = tuple(sorted(fields.items()))
+    def get(name="edp", **fields):
+        key = (name, *sorted(fields.items()))
         if key not in cache:
             short = {"steps": 120, "batch_size": 64, "ema_decay": 0.9}
             if fields.get("network") == "unet":
                 short |= {"steps": 100, "batch_size": 32, "width": 16}
-            config = PolicyConfig(**{**world.small, **short, **fields})
-            cache[key] = train_policy(
-                config, world.episodes(24, noise=0.2), world.obs_layout, world.act_layout
-            )
+            episodes = world.episodes(24, noise=0.2)
+            cache[key] = world.fit(name, episodes=episodes, **{**short, **fields})
         return cache[key]
 
     return get

@@ -5,7 +5,7 @@ import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
 from symsteer.errors import UserError
-from symsteer.policies.diffusion import Diffusion
+from symsteer.policies.training.diffusion import Diffusion
 
 
 def reference(prediction, clip=False):

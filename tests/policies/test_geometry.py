@@ -1,14 +1,14 @@
 """Layouts and groups: representations, agreement with escnn, serialisation, user mistakes."""
 
 import math
+import sys
 
-import escnn.nn
 import pytest
 import torch
 
 from symsteer.errors import UserError
-from symsteer.policies.equivariant import Lift, Project, RegularLinear
-from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
+from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
 
 LAYOUT = Layout(
     [
@@ -36,6 +36,7 @@ def test_representation_is_a_homomorphism(name):
 
 @pytest.mark.parametrize("name", GROUPS)
 def test_field_type_is_escnns_in_the_same_basis(name):
+    pytest.importorskip("escnn")
     group = Group.parse(name)
     field_type = LAYOUT.field_type(group)
     assert field_type.size == LAYOUT.dim
@@ -48,6 +49,7 @@ def test_field_type_is_escnns_in_the_same_basis(name):
 
 
 def test_field_type_over_so2():
+    pytest.importorskip("escnn")
     field_type = LAYOUT.field_type(Group.parse("SO2"))
     element = field_type.gspace.fibergroup.element(0.37)
     theirs = torch.tensor(field_type.representation(element))
@@ -64,6 +66,37 @@ def test_transform_rotates_each_frequency():
     assert torch.allclose(turned[LAYOUT.slice("xy")], expected)
     assert torch.allclose(turned[LAYOUT.slice("rod")], torch.tensor([0.0, 1.0]).double())
     assert turned[LAYOUT.slice("z")] == 3.0
+
+
+def test_rotate_turns_each_row_by_its_own_angle():
+    x, angle = torch.randn(5, 3, LAYOUT.dim, dtype=torch.float64), torch.arange(5) - 0.3
+    turned = LAYOUT.rotate(x, angle)
+    for i in range(5):
+        expected = LAYOUT.transform(x[i], float(angle[i]))
+        assert torch.allclose(turned[i], expected, atol=1e-6)
+
+
+def test_equivariance_error_is_the_largest_relative_one():
+    x = torch.randn(6, LAYOUT.dim)
+    group = Group.parse("C4")
+
+    def error(function):
+        return equivariance_error(function, [x], [LAYOUT], LAYOUT, group)
+
+    assert error(lambda v: 3 * v) < 1e-6
+    # A constant c in the direction of xy: g c - c is largest for the half turn, 2 ||c||.
+    constant = torch.zeros(LAYOUT.dim)
+    constant[LAYOUT.slice("xy")] = 1.0
+    assert error(lambda v: constant.expand_as(v)) == pytest.approx(2)
+    assert error(torch.zeros_like) == 0
+
+
+def test_escnn_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "escnn", None)
+    with pytest.raises(UserError, match=r"symsteer\[escnn\]"):
+        LAYOUT.field_type(Group.parse("C4"))
+    with pytest.raises(UserError, match=r"symsteer\[escnn\]"):
+        Group.parse("C4").escnn_group()
 
 
 def test_reflection_of_odd_fields():
@@ -134,13 +167,14 @@ def test_layers_commute_with_the_group(name, dtype, tolerance):
 
 @pytest.mark.parametrize("name", ["C3", "C8", "D4"])
 def test_layers_span_all_of_escnns_equivariant_maps(name):
+    nn = pytest.importorskip("escnn.nn")
     group = Group.parse(name)
     irreps = LAYOUT.field_type(group)
     space = irreps.gspace
-    regular = escnn.nn.FieldType(space, [space.regular_repr] * 2)
+    regular = nn.FieldType(space, [space.regular_repr] * 2)
     lift = Lift(LAYOUT, group, 2)
-    assert lift.weight.numel() == escnn.nn.Linear(irreps, regular, bias=False).weights.numel()
+    assert lift.weight.numel() == nn.Linear(irreps, regular, bias=False).weights.numel()
     linear = RegularLinear(group, 2, 2)
-    assert linear.weight.numel() == escnn.nn.Linear(regular, regular, bias=False).weights.numel()
+    assert linear.weight.numel() == nn.Linear(regular, regular, bias=False).weights.numel()
     project = Project(group, 2, LAYOUT)
-    assert project.weight.numel() == escnn.nn.Linear(regular, irreps, bias=False).weights.numel()
+    assert project.weight.numel() == nn.Linear(regular, irreps, bias=False).weights.numel()

@@ -6,19 +6,15 @@ import pytest
 import torch
 
 from symsteer.errors import UserError
-from symsteer.policies.base import PolicyConfig
 from symsteer.policies.normalizer import clip_blocks
 from symsteer.policies.steerability import action_spread
-from symsteer.policies.training import make_chunks, train_policy
+from symsteer.policies.training.demonstrations import make_chunks
 
 
 def test_diverse_demonstrations_spread_more_than_clean_ones(world):
-    config = PolicyConfig(**world.small, steps=200, batch_size=64)
     spread = {
         noise: action_spread(
-            train_policy(
-                config, world.episodes(24, noise=noise), world.obs_layout, world.act_layout
-            ),
+            world.fit(episodes=world.episodes(24, noise=noise), steps=200, batch_size=64),
             world.observations(32),
         )["action_std"]
         for noise in (0.0, 0.6)
@@ -62,8 +58,7 @@ def test_what_never_moves_is_left_out(world):
     episodes = [(o, a.clone()) for o, a in world.episodes(8, noise=0.2)]
     for _, actions in episodes:
         actions[:, world.act_layout.slice("tilt")] = 0.0
-    config = PolicyConfig(**world.small, steps=5)
-    policy = train_policy(config, episodes, world.obs_layout, world.act_layout)
+    policy = world.fit(episodes=episodes, steps=5)
     by_field = action_spread(policy, world.observations(4))["action_std_by_field"]
     assert by_field["tilt"] is None
     assert by_field["xy"] is not None

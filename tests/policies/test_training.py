@@ -6,18 +6,11 @@ import pytest
 import torch
 
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy, PolicyConfig
-from symsteer.policies.edp import parameter_count
+from symsteer.policies import POLICIES
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
-from symsteer.policies.training import Augmentation, make_chunks, train_policy
-
-
-def train(world, seed=0, progress=None, episodes=None, **fields):
-    config = PolicyConfig(
-        **{**world.small, "steps": 30, "batch_size": 32, "match_compute": False, **fields}
-    )
-    episodes = world.episodes(6, noise=0.2) if episodes is None else episodes
-    return train_policy(config, episodes, world.obs_layout, world.act_layout, seed, progress)
+from symsteer.policies.symmetry.augmented import Augmentation
+from symsteer.policies.training.demonstrations import make_chunks
 
 
 def test_chunks_end_with_a_held_gripper_and_no_motion(world):
@@ -73,7 +66,7 @@ def test_augmented_training_sees_turned_pairs(world):
     noise = torch.randn(64, 8, world.act_layout.dim, generator=generator)
     errors = {}
     for name in ("plain", "plain-augmented", "edp"):
-        policy = train(world, episodes=episodes, name=name, steps=250, batch_size=64)
+        policy = world.fit(episodes=episodes, name=name, steps=250, batch_size=64)
         got = policy.decode(west, noise)[:, 0, world.act_layout.slice("xy")]
         errors[name] = float((got - expected).norm(dim=-1).mean())
     assert errors["plain-augmented"] < 0.5 < 1.0 < errors["plain"]
@@ -82,18 +75,18 @@ def test_augmented_training_sees_turned_pairs(world):
 
 @pytest.mark.parametrize("name", ["edp", "plain", "plain-augmented"])
 def test_the_same_seed_gives_the_same_policy(world, name):
-    first, second, other = (train(world, seed, name=name) for seed in (3, 3, 4))
+    first, second, other = (world.fit(name, seed) for seed in (3, 3, 4))
     assert first.content_hash() == second.content_hash()
     assert first.training_record["losses"] == second.training_record["losses"]
     assert first.content_hash() != other.content_hash()
 
 
 def test_the_policy_keeps_averaged_weights(world):
-    last, averaged = (train(world, ema_decay=decay) for decay in (0.0, 0.9))
+    last, averaged = (world.fit(ema_decay=decay) for decay in (0.0, 0.9))
     assert last.training_record["losses"] == averaged.training_record["losses"]
     assert last.content_hash() != averaged.content_hash()
     # The average is a point on the way there.
-    start = train(world, steps=1, ema_decay=0.0)
+    start = world.fit(steps=1, ema_decay=0.0)
 
     def distance(a, b):
         pairs = zip(a.denoiser.parameters(), b.denoiser.parameters(), strict=True)
@@ -105,7 +98,7 @@ def test_the_policy_keeps_averaged_weights(world):
 def test_training_leaves_the_global_generator_alone(world):
     torch.manual_seed(5)
     before = torch.get_rng_state()
-    train(world, steps=2)
+    world.fit(steps=2)
     assert torch.equal(before, torch.get_rng_state())
 
 
@@ -125,12 +118,12 @@ def test_it_learns_the_controller(trained, world, network):
 
 def test_record_progress_and_frozen_weights(world):
     calls = []
-    policy = train(world, progress=lambda *call: calls.append(call))
+    policy = world.fit(progress=lambda *call: calls.append(call))
     assert isinstance(policy, ChunkPolicy)
     assert calls[-1][:2] == (30, 30)
     record = policy.training_record
     assert record["losses"] == [(step, loss) for step, _, loss in calls]
-    assert record["parameters"] == parameter_count(policy.denoiser) == policy.parameter_count()
+    assert record["parameters"] == policy.parameter_count()
     assert record["episodes"] == 6
     assert record["chunks"] == sum(len(a) for _, a in world.episodes(6))
     assert not policy.training
@@ -140,38 +133,34 @@ def test_record_progress_and_frozen_weights(world):
 def test_actions_beyond_the_environments_bound_are_bounded_first(world):
     """The environment executes bounded actions; imitating the excess would be wrong."""
     episodes = [(o, 3 * a) for o, a in world.episodes(4)]
-    policy = train(world, episodes=episodes, steps=2)
+    policy = world.fit(episodes=episodes, steps=2)
     assert policy.act_normalizer.scale.max() <= 1 + 1e-6
 
 
 @pytest.mark.parametrize("network", ["mlp", "unet"])
 @pytest.mark.parametrize("name", ["plain", "plain-augmented"])
 def test_plain_policies_have_matched_parameters_and_no_group(world, name, network):
-    sizes = {}
-    for kind in ("edp", name):
-        config = PolicyConfig(name=kind, network=network, width=64)
-        policy = ChunkPolicy(config, world.obs_layout, world.act_layout)
-        sizes[kind] = policy.parameter_count()
-        assert str(policy.group) == ("C8" if kind == "edp" else "C1")
-        assert policy.config == policy.config.resolved(world.obs_layout, world.act_layout)
-    assert abs(sizes[name] / sizes["edp"] - 1) < 0.05
-    assert policy.config.steps == 4 * config.steps
-    free = PolicyConfig(
-        name=name, network=network, width=64, match_parameters=False, match_compute=False
-    ).resolved(world.obs_layout, world.act_layout)
-    assert free.width == 64
-    assert free.steps == config.steps
+    equivariant = world.untrained(network=network, width=64)
+    policy = world.untrained(name, network=network, width=64)
+    assert (str(equivariant.group), str(policy.group)) == ("C8", "C1")
+    assert abs(policy.parameter_count() / equivariant.parameter_count() - 1) < 0.05
+    assert policy.options.steps == 4 * equivariant.options.steps
+    assert policy.options == policy.options.resolved(world.obs_layout, world.act_layout)
+    free = {"match_parameters": False, "match_compute": False}
+    options = world.untrained(name, network=network, width=64, **free).options
+    assert (options.width, options.steps) == (64, equivariant.options.steps)
 
 
 @pytest.mark.parametrize(
     "mistake",
     [
-        {"name": "quantum"},
         {"network": "transformer"},
         {"prediction": "velocity"},
         {"group": "E8"},
         {"group": "SO2"},
-        {"augmentation": "everything"},
+        {"name": "plain", "group": "SO2"},
+        {"name": "plain-augmented", "augmentation": "everything"},
+        {"snr_cap": 0.0},
         {"horizon": 0},
         {"execute": 9},
         {"network": "unet", "horizon": 7, "execute": 4},
@@ -182,9 +171,11 @@ def test_plain_policies_have_matched_parameters_and_no_group(world, name, networ
         {"steps": 0},
     ],
 )
-def test_bad_configurations_raise_user_errors(mistake, world):
+def test_bad_options_raise_user_errors(mistake):
+    fields = dict(mistake)
+    options = POLICIES.get(fields.pop("name", "edp")).Options
     with pytest.raises(UserError) as error:
-        ChunkPolicy(PolicyConfig(**mistake), world.obs_layout, world.act_layout)
+        options(**fields)
     assert "\n" not in str(error.value)
 
 
@@ -201,4 +192,4 @@ def test_bad_configurations_raise_user_errors(mistake, world):
 )
 def test_bad_demonstrations_raise_user_errors(world, episodes):
     with pytest.raises(UserError):
-        train(world, episodes=episodes)
+        world.fit(episodes=episodes)

@@ -1,9 +1,9 @@
-"""Memory that processes share, and how a tree of tensors lies in it.
+"""Shared memory, and how a tree of tensors is stored in it.
 
-A tree (nested dictionaries, lists and tuples) is taken apart into *rows*, tensors whose first
-axis counts environments, and a *skeleton* that holds all else. Rows lie field by field, each
-field for all environments of all workers, so that a worker writes a slice of every field and the
-user's process reads whole fields without joining anything.
+A tree (nested dictionaries, lists and tuples) is split into *rows*, tensors whose first axis counts
+environments, and a *skeleton* with everything else. Memory is ordered by field, and each field
+has room for the environments of all workers: a worker writes its slice of every field, and the
+caller's process reads whole fields without concatenating.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Slot:
 
 @dataclass(frozen=True)
 class Field:
-    """One tensor of rows: its type and the shape of a row."""
+    """Type of a tensor of rows, and the shape of one row."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
@@ -46,7 +46,7 @@ class Field:
 
 
 def take_apart(tree: Any, count: int, rows: list[torch.Tensor]) -> Any:
-    """Move the tensors of ``count`` rows out of a tree into ``rows``; returns the skeleton."""
+    """Append the tensors with ``count`` rows to ``rows``; returns the skeleton."""
     if isinstance(tree, torch.Tensor):
         if tree.ndim and len(tree) == count:
             rows.append(tree)
@@ -60,7 +60,7 @@ def take_apart(tree: Any, count: int, rows: list[torch.Tensor]) -> Any:
 
 
 def put_together(skeleton: Any, rows: Sequence[torch.Tensor]) -> Any:
-    """The tree that `take_apart` took apart."""
+    """Inverse of `take_apart`."""
     if isinstance(skeleton, Slot):
         return rows[skeleton.index]
     if isinstance(skeleton, dict):
@@ -78,14 +78,14 @@ def select(tree: Any, count: int, index: Any) -> Any:
 
 
 class SharedBlock:
-    """Anonymous memory that is sent to a worker when it is started.
+    """Anonymous shared memory; pickled only while a worker process is started.
 
-    It has no name, so nothing of it can be left behind, however a process ends; pages cost
-    memory from when they are first written.
+    It has no name, so the system frees it with the last process that uses it. Pages take memory
+    once they are written.
 
     Args:
         size: in bytes.
-        count: how many environments its fields have rows for.
+        count: number of environments, the rows of each field.
     """
 
     def __init__(self, size: int, count: int) -> None:
@@ -107,7 +107,7 @@ class SharedBlock:
         self._map()
 
     def close_descriptor(self) -> None:
-        """Give the file descriptor back once the workers have theirs; the memory stays."""
+        """Close the file descriptor, once all workers have theirs; the memory stays mapped."""
         os.close(self._fd)
 
     def fits(self, fields: Sequence[Field]) -> bool:
@@ -115,7 +115,7 @@ class SharedBlock:
         return sum(field.bytes(self.count) for field in fields) <= self.size
 
     def fields(self, fields: tuple[Field, ...]) -> list[torch.Tensor]:
-        """Tensors ``[count, ...]`` over the shared memory, one a field."""
+        """Tensors ``[count, ...]`` that share this memory, one for each field."""
         views = self._layouts.get(fields)
         if views is None:
             views, offset = [], 0

@@ -1,4 +1,4 @@
-"""N parallel environments in W processes, for a user who need not know."""
+"""N parallel environments in W worker processes, with the interface of one environment."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any, NoReturn
 
 import gymnasium as gym
@@ -18,38 +19,41 @@ import torch
 from symsteer.bench.sim.errors import WorkerError, WorkerLostError
 from symsteer.bench.sim.shards.block import Field, SharedBlock, put_together, select
 from symsteer.bench.sim.shards.messages import FAILURE, MISTAKE, SAME, Recipe, divide
-from symsteer.bench.sim.shards.server import WorkerProcess
+from symsteer.bench.sim.shards.processes import start_process
+from symsteer.bench.sim.shards.worker import serve
 from symsteer.errors import UserError
 
 _BYTES_PER_ENV = 2**16
-"""Room for one environment's actions, and for its results; what is larger goes through a pipe."""
+"""Shared memory for the actions of one environment, and as much for its results. Larger results
+are sent through the pipe."""
 
-_GOODBYE_SECONDS = 5.0
-"""How long a worker may take to end once it is told to."""
+_CLOSE_SECONDS = 5.0
+"""A worker that has not ended this long after its connection was closed is killed."""
 
 
 class NotHereError(UserError, AttributeError):
-    """Something was asked for that lives in the worker processes."""
+    """The attribute exists in the worker processes only."""
 
 
 class ShardedEnv(gym.Env):
     """N environments of a ManiSkill task in W worker processes.
 
-    To its user it is the environment that one process would hold: resets (seeds, partial resets,
-    reconfiguration), steps, states, observations, info and spaces are the same, to the bit for
-    tasks that draw only from their environments' own generators (all of SymSteer's do;
-    ManiSkill's stock tasks draw for the batch). Tensors that it returns are the caller's own.
+    It behaves as one process with all environments: resets (seeds, partial resets,
+    reconfiguration), steps, states, observations, info and spaces are the same. They are equal to
+    the bit for tasks that draw only from their environments' own generators, as all of SymSteer's
+    do (ManiSkill's stock tasks draw once for the batch). Later calls do not change the tensors
+    that it returned.
 
-    What cannot be had is what lives in the workers (``env.agent``, ``env.scene``, a task's
-    actors): asking for it raises one sentence.
+    The simulation itself (``env.agent``, ``env.scene``, a task's actors) exists in the workers
+    only; reading such an attribute raises a `UserError`.
 
     Args:
-        env_cls: task class, importable by its name.
-        num_envs: N; uneven shards where W does not divide it.
-        workers: W, at most N; more than there are cores only costs time and memory.
+        env_cls: task class that can be imported by its name.
+        num_envs: N; if W does not divide it, shards differ by one environment.
+        workers: W, at most N; more than the cores costs time and memory.
         per_env: arguments of the class with one entry per environment.
-        attributes: what the environment shall have besides, under these names.
-        kwargs: further arguments of `symsteer.bench.sim.create`.
+        attributes: further attributes of this object.
+        kwargs: further arguments of `environment.create_in_process`.
 
     Raises:
         UserError: the number of workers is out of range, an argument cannot be sent to another
@@ -127,15 +131,15 @@ class ShardedEnv(gym.Env):
         return tuple(result)
 
     def step_chunk(self, actions: Any) -> tuple:
-        """The steps of an action chunk with one exchange between processes.
+        """Execute an action chunk, with one exchange between processes.
 
         Args:
             actions: ``[N, T, action_dim]``.
 
         Returns:
-            What T calls of :meth:`step` return, with a second axis for the step: observations
-            ``[N, T, ...]``, rewards, terminated and truncated ``[N, T]``, info. Nothing is reset
-            on the way.
+            The results of T calls of :meth:`step`, stacked along a second axis: observations
+            ``[N, T, ...]``, rewards, terminated and truncated ``[N, T]``, info. No environment is
+            reset in between.
         """
         given = self._give(actions, "step_chunk")
         if len(given.shape) != 2 or given.shape[0] == 0:
@@ -147,7 +151,7 @@ class ShardedEnv(gym.Env):
         return tuple(result)
 
     def _give(self, actions: Any, method: str) -> Field:
-        """Lay actions into the shared memory; says what lies there."""
+        """Write actions to the shared memory; returns their field."""
         self._check_open()
         actions = _tensors(actions if hasattr(actions, "dtype") else np.asarray(actions))
         if not actions.ndim or len(actions) != self.num_envs:
@@ -167,7 +171,7 @@ class ShardedEnv(gym.Env):
 
     # ------------------------------------------------------------------ resets
     def reset(self, seed: Any = None, options: dict | None = None) -> tuple:
-        """As one process would: see ``SymmetricTask.reset``.
+        """Reset all or some environments; see ``SymmetricTask.reset``.
 
         Args:
             seed: one integer (expanded as ManiSkill does), one per environment that is reset,
@@ -175,8 +179,8 @@ class ShardedEnv(gym.Env):
             options: ``env_idx`` selects the environments to reset, in any order.
 
         Raises:
-            UserError: there are fewer or more seeds than environments, or some environments
-                alone are to be reconfigured.
+            UserError: the number of seeds does not fit, or only some environments are to be
+                reconfigured.
         """
         options = dict(options or {})
         partial = options.pop("env_idx", None)
@@ -186,8 +190,8 @@ class ShardedEnv(gym.Env):
             index, order = _index(partial).sort()
             if options.get("reconfigure") and len(index) != self.num_envs:
                 raise UserError(
-                    "some environments alone cannot be reconfigured: leave out env_idx or "
-                    "reconfigure"
+                    "some environments cannot be reconfigured without the others: leave out "
+                    "env_idx or reconfigure"
                 )
         seeds = None
         if seed is not None:
@@ -222,15 +226,15 @@ class ShardedEnv(gym.Env):
         return result
 
     def get_obs(self, info: dict | None = None) -> Any:
-        """The present observation."""
+        """The current observation."""
         return self._call("get_obs")
 
     def get_info(self) -> dict:
-        """The present info."""
+        """The current info."""
         return self._call("get_info")
 
     def evaluate(self) -> dict:
-        """Success and what else the task says about the present state."""
+        """Success and other facts about the current state."""
         return self._call("evaluate")
 
     def get_state_dict(self) -> dict:
@@ -251,7 +255,7 @@ class ShardedEnv(gym.Env):
         self._set("set_state_dict", state, env_idx)
 
     def set_state(self, state: Any, env_idx: Any = None) -> None:
-        """The same for a state as one tensor."""
+        """Restore a state that is one tensor; see `set_state_dict`."""
         self._set("set_state", state, env_idx)
 
     def _set(self, name: str, state: Any, env_idx: Any) -> None:
@@ -273,17 +277,17 @@ class ShardedEnv(gym.Env):
         return turned
 
     def render(self) -> Any:
-        """Pictures of all environments, where ``render_mode`` asked for them."""
+        """Pictures of all environments, if ``render_mode`` was given."""
         return self._call("render")
 
     # ------------------------------------------------------------------ the rest
     def close(self) -> None:
-        """End the workers. What was returned stays valid."""
+        """End the workers. Tensors that were returned stay valid."""
         self._closed = self._closed or "because it was closed"
         self._end()
 
     def __getattr__(self, name: str) -> Any:
-        """Constants of the task class; all else lives in the workers."""
+        """Look up a constant of the task class."""
         if name.startswith("_"):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         missing = object()
@@ -294,8 +298,8 @@ class ShardedEnv(gym.Env):
             if not (callable(found) or hasattr(type(found), "__get__")) and found is not None:
                 return found
         raise NotHereError(
-            f"env.{name} lives in the worker processes of this environment: make it with "
-            "workers=1 to reach it"
+            f"env.{name} exists in the worker processes only: make the environment with workers=1 "
+            "to use it"
         )
 
     def __str__(self) -> str:
@@ -306,7 +310,7 @@ class ShardedEnv(gym.Env):
             raise UserError(f"this environment cannot be used any more, {self._closed}")
 
     def _ask(self, name: str, requests: Sequence[tuple | None]) -> Any:
-        """Send every worker its request (None: none) and join the answers."""
+        """Ask the workers, and remember why no more requests are possible after a failure."""
         self._check_open()
         try:
             return self._pool.ask(name, requests)
@@ -315,38 +319,36 @@ class ShardedEnv(gym.Env):
                 self._closed = f"because {self._pool.lost}"
             raise
         except BaseException as error:
-            # Interrupted between question and answer: what comes next would answer the wrong one.
+            # The answers to this request may still arrive, and would be taken for later ones.
             self._closed = f"because {type(error).__name__} interrupted it"
             self._end()
             raise
 
 
 class _Pool:
-    """The worker processes, the memory shared with them, and one exchange with all."""
+    """The worker processes and the memory shared with them."""
 
     def __init__(self, recipes: list[bytes], num_envs: int, preload: str) -> None:
         self.rows = divide(num_envs, len(recipes))
         self.inbox = SharedBlock(_BYTES_PER_ENV * num_envs, num_envs)
         self.outbox = SharedBlock(_BYTES_PER_ENV * num_envs, num_envs)
         self.lost = ""
-        self.processes: list[WorkerProcess] = []
+        self.processes: list[BaseProcess] = []
         self.connections: list[Connection] = []
         self.answers: list[dict[str, tuple]] = [{} for _ in recipes]
-        WorkerProcess.preload(preload)
-        from symsteer.bench.sim.shards.serve import serve
-
         try:
             for i, recipe in enumerate(recipes):
                 ours, theirs = Pipe()
                 self.connections.append(ours)
-                process = WorkerProcess(
-                    target=serve,
-                    args=(theirs, self.inbox, self.outbox),
-                    name=f"symsteer-shard-{i + 1}-of-{len(recipes)}",
-                    daemon=True,
-                )
                 with theirs:
-                    process.start()
+                    process = start_process(
+                        serve,
+                        theirs,
+                        self.inbox,
+                        self.outbox,
+                        preload=preload,
+                        name=f"symsteer-shard-{i + 1}-of-{len(recipes)}",
+                    )
                 self.processes.append(process)
                 ours.send_bytes(recipe)
         except BaseException:
@@ -362,19 +364,20 @@ class _Pool:
         return [process.pid for process in self.processes if process.pid is not None]
 
     def ask(self, name: str, requests: Sequence[tuple | None]) -> Any:
+        """Send every worker its request (None: none) and join the answers."""
         asked = [i for i, request in enumerate(requests) if request is not None]
         for i in asked:
             try:
                 self.connections[i].send_bytes(pickle.dumps((name, requests[i])))
             except (BrokenPipeError, ConnectionResetError):
-                self._mourn(i)
-        # All answers are taken before any error is raised: none is left for the next question.
+                self._lose(i)
+        # Receive all answers before raising: none may be left in a pipe for the next request.
         errors: list[Exception] = []
         for i in asked:
             try:
                 answer = self.connections[i].recv_bytes()
             except (EOFError, ConnectionResetError):
-                self._mourn(i)
+                self._lose(i)
             kind, content = answer[:1], answer[1:]
             if kind == MISTAKE:
                 errors.append(UserError(content.decode()))
@@ -383,7 +386,7 @@ class _Pool:
             elif kind != SAME:
                 self.answers[i][name] = pickle.loads(content)
         if errors:
-            # The cause of all is more likely a bug than one user's mistake seen by some.
+            # A bug explains more than a user's mistake, so it goes first.
             raise next((e for e in errors if isinstance(e, WorkerError)), errors[0])
         return self._join(name, asked)
 
@@ -411,12 +414,13 @@ class _Pool:
         error.__cause__ = WorkerError(f"\n{trace}")
         return error
 
-    def _mourn(self, i: int) -> NoReturn:
+    def _lose(self, i: int) -> NoReturn:
+        """Close all workers because worker ``i`` has ended, and say how it ended."""
         process = self.processes[i]
-        process.join(_GOODBYE_SECONDS)
+        process.join(_CLOSE_SECONDS)
         code = process.exitcode
         if code is None:
-            how = "hung up"
+            how = "closed its connection"
         elif code < 0:
             try:
                 how = f"was killed by {signal.Signals(-code).name}"
@@ -437,17 +441,17 @@ class _Pool:
         return f"worker {i + 1} of {len(self.rows)} (environments {rows.start} to {rows.stop - 1})"
 
     def close(self) -> None:
-        """Hang up, wait for the workers to end, kill those that do not."""
+        """Close the connections, which ends the workers; kill those that take too long."""
         for connection in self.connections:
             connection.close()
         for process in self.processes:
-            process.join(_GOODBYE_SECONDS)
+            process.join(_CLOSE_SECONDS)
             if process.is_alive():
                 process.kill()
                 process.join()
             process.close()
         self.processes.clear()
-        # The mapping goes with the last tensor over it.
+        # The memory is unmapped with the last tensor that uses it.
         self.__dict__.pop("inbox", None)
         self.__dict__.pop("outbox", None)
 
@@ -457,8 +461,8 @@ def _recipe(
 ) -> bytes:
     if env_cls.__module__ == "__main__" or "<locals>" in env_cls.__qualname__:
         raise UserError(
-            f"workers import the task class {env_cls.__qualname__} by its name, which they cannot: "
-            "define it at the top level of a module other than the main program, or use workers=1"
+            f"workers cannot import the task class {env_cls.__qualname__} by its name: define it "
+            "at the top level of a module other than the main program, or use workers=1"
         )
     seed = (torch.initial_seed() + number) % 2**63
     recipe = Recipe(env_cls, rows.start, rows.stop - rows.start, seed, {**kwargs, **per_env})
@@ -467,7 +471,7 @@ def _recipe(
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise UserError(
             f"an argument of the environment cannot be sent to a worker process ({error}): "
-            "give plain data, or use workers=1"
+            "pass plain data, or use workers=1"
         ) from error
 
 
@@ -476,7 +480,7 @@ def _index(env_idx: Any) -> torch.Tensor:
 
 
 def _tensors(tree: Any) -> Any:
-    """The tree with its arrays as tensors, doubles as ManiSkill takes them."""
+    """The tree with arrays as tensors; float64 arrays become float32, as in ManiSkill."""
     if isinstance(tree, dict):
         return {key: _tensors(value) for key, value in tree.items()}
     if isinstance(tree, np.ndarray):
@@ -486,7 +490,7 @@ def _tensors(tree: Any) -> Any:
 
 
 def _batched(tree: Any) -> Any:
-    """A leading axis of environments for a state that was given without one."""
+    """Add the axis of environments to a state that has none."""
     if isinstance(tree, dict):
         return {key: _batched(value) for key, value in tree.items()}
     return tree[None] if isinstance(tree, torch.Tensor) and tree.ndim == 1 else tree

@@ -1,4 +1,4 @@
-"""What the user's process and its workers say to each other."""
+"""Messages between the caller's process and its workers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 SAME, RESULT, MISTAKE, FAILURE = b"=", b"!", b"?", b"x"
-"""First byte of an answer: a result like the last one of this kind (the numbers lie in the shared
-memory), a result, the text of a `UserError`, another error's summary and traceback."""
+"""First byte of an answer. SAME: fields and skeleton equal those of the last answer to this
+request, only the numbers in the shared memory are new. RESULT: fields and skeleton follow.
+MISTAKE: the text of a `UserError`. FAILURE: summary and traceback of another error."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Recipe:
         start: index of the shard's first environment among all.
         count: how many environments it holds.
         seed: of the process's global random generators.
-        kwargs: further arguments of `symsteer.bench.sim.create`.
+        kwargs: further arguments of `environment.create_in_process`.
     """
 
     env_cls: type
@@ -31,7 +32,7 @@ class Recipe:
 
 
 def divide(total: int, workers: int) -> list[slice]:
-    """Rows of each worker: as even as can be, the first ones have one more."""
+    """Rows of each worker: sizes differ by at most one, larger ones first."""
     size, more = divmod(total, workers)
     bounds = [i * size + min(i, more) for i in range(workers + 1)]
     return [slice(a, b) for a, b in itertools.pairwise(bounds)]

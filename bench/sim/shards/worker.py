@@ -1,9 +1,10 @@
-"""What runs in the process of a shard: a batched environment and the loop that serves it."""
+"""The worker process of a shard: a batched environment and the loop that answers requests."""
 
 from __future__ import annotations
 
 import pickle
 import random
+import signal
 import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from symsteer.bench.sim.environment import create
+from symsteer.bench.sim.environment import create_in_process
 from symsteer.bench.sim.shards.block import Field, SharedBlock, put_together, take_apart
 from symsteer.bench.sim.shards.messages import FAILURE, MISTAKE, RESULT, SAME, Recipe
 from symsteer.errors import UserError
@@ -35,17 +36,17 @@ FACTS = (
     "embodiment",
     "body",
 )
-"""Attributes that are the same in every shard, as far as the environment has them."""
+"""Attributes that are the same in every shard, if the environment has them."""
 
 
 def make_shard(recipe: Recipe) -> BaseEnv:
-    """A shard's environments, in the state in which one process would have them."""
+    """Make a shard's environments in the same state as if one process held all of them."""
     torch.manual_seed(recipe.seed)
     np.random.seed(recipe.seed % 2**32)
     random.seed(recipe.seed)
 
     class Shard(recipe.env_cls):  # type: ignore[name-defined, misc]
-        """Seeds its environments, while it is made, as those after the shards before it."""
+        """Shifts the seeds of the first reset by the number of environments before the shard."""
 
         _init_raw_obs: Any = None
 
@@ -59,27 +60,33 @@ def make_shard(recipe: Recipe) -> BaseEnv:
         def _set_episode_rng(self, seed: Any, env_idx: Any) -> None:
             super()._set_episode_rng(self._own(seed), env_idx)
 
-    return create(Shard, recipe.count, **recipe.kwargs)
+    return create_in_process(Shard, recipe.count, **recipe.kwargs)
+
+
+def serve(connection: Connection, inbox: SharedBlock, outbox: SharedBlock) -> None:
+    """Make a shard and answer requests until the caller closes the connection."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    Worker(connection, inbox, outbox).run()
 
 
 class Worker:
-    """Owns a shard and answers requests about it until the other side hangs up.
+    """Owns a shard and answers requests until the caller closes the connection.
 
     Args:
-        connection: to the user's process; the first message is the recipe.
-        inbox: shared memory in which actions lie.
-        outbox: shared memory in which results are laid.
+        connection: to the caller's process; the first message is the recipe.
+        inbox: shared memory that holds the actions.
+        outbox: shared memory that results are written to.
     """
 
     env: BaseEnv
 
     def __init__(self, connection: Connection, inbox: SharedBlock, outbox: SharedBlock) -> None:
-        torch.set_num_threads(1)
         self.connection, self.inbox, self.outbox = connection, inbox, outbox
         self.last: dict[str, bytes] = {}
 
     def run(self) -> None:
-        """Answer until the connection ends: the environment is closed, or its user is gone."""
+        """Answer until the connection ends: the caller closed it, or its process has ended."""
         try:
             recipe = self.connection.recv_bytes()
             while True:
@@ -102,7 +109,7 @@ class Worker:
 
     # ------------------------------------------------------------------ requests
     def facts(self) -> dict[str, Any]:
-        """What does not change about the environment."""
+        """Attributes of the environment that do not change."""
         found = {name: getattr(self.env, name) for name in FACTS if hasattr(self.env, name)}
         return {**found, "elapsed_steps": self.env.elapsed_steps}
 
@@ -111,12 +118,12 @@ class Worker:
         return actions[self.rows].clone()
 
     def step(self, given: Field | None, action: Any = None) -> tuple:
-        """One step; the action lies in the shared memory, or is given where it is no tensor."""
+        """One step; the action lies in the shared memory, or is ``action`` if it is no tensor."""
         action = action if given is None else self._received(given)
         return (*self.env.step(action), self.env.elapsed_steps)
 
     def step_chunk(self, given: Field) -> tuple:
-        """The steps of a chunk; every result gets a second axis for the step."""
+        """All steps of a chunk; results are stacked along a second axis."""
         actions = self._received(given)
         parts = []
         for t in range(actions.shape[1]):
@@ -128,7 +135,7 @@ class Worker:
         return (*put_together(skeleton, stacked), self.env.elapsed_steps)
 
     def reset(self, seed: list[int] | None, options: dict) -> tuple:
-        """Reset the environments that ``options["env_idx"]`` names: all, some, or none."""
+        """Reset the environments in ``options["env_idx"]``: all if it is absent, maybe none."""
         if "env_idx" in options and len(options["env_idx"]) == 0:
             info = self.env.get_info()
             obs = self.env.get_obs(info)
@@ -138,12 +145,12 @@ class Worker:
         return obs, info, self.env.elapsed_steps
 
     def call(self, name: str, *args: Any) -> tuple:
-        """A method of the environment."""
+        """Call a method of the environment."""
         return getattr(self.env, name)(*args), self.env.elapsed_steps
 
     # ------------------------------------------------------------------ answers
     def _answer(self, name: str, tree: Any) -> None:
-        """Lay the rows of a result into the shared memory and say how, unless as last time."""
+        """Write the rows of a result to the shared memory and send the skeleton if it changed."""
         rows: list[torch.Tensor] = []
         skeleton = take_apart(tree, self.count, rows)
         fields = tuple(Field.of(row) for row in rows)

@@ -7,8 +7,8 @@ import torch
 
 from symsteer.bench.audit.measure import check_group
 from symsteer.bench.audit.states import Turner, visit
+from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
 from symsteer.bench.tasks import make
-from symsteer.bench.tasks.rotations import planar_matrix, transform_quaternion
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 

@@ -18,7 +18,7 @@ from symsteer.bench.demos import Diversity, collect, load
 from symsteer.bench.sim import make_env_class
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import write_atomically
+from symsteer.files import write_atomically
 
 TASK = "PickCube-v1"
 collecting = importlib.import_module("symsteer.bench.demos.collect")

@@ -12,7 +12,7 @@ from symsteer.bench.runs.loop import new_agent
 from symsteer.bench.runs.pictures import FAILURE, FRAMES, SUCCESS, draw_paths, film, positions
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.evaluation import Rollout
-from symsteer.bench.tasks import task_class, task_names
+from symsteer.bench.tasks import TASKS, task_class
 from tests.bench.tiny_run import tiny_config
 
 LAYOUT = task_class("PushCube-v1").observation_layout
@@ -53,7 +53,7 @@ def color(picture, name):
     return (np.abs(picture.astype(int) - wanted).max(axis=-1) < 12).sum()
 
 
-@pytest.mark.parametrize("task", task_names())
+@pytest.mark.parametrize("task", TASKS.names())
 def test_every_task_names_a_tool_and_something_to_move(task):
     names = positions(task_class(task).observation_layout)
     assert names[0] == "tcp_xy"

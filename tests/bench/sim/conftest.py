@@ -10,7 +10,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
 from symsteer.bench.sim import create, prepare_headless
-from symsteer.bench.tasks import task_names
+from symsteer.bench.tasks import TASKS
 from symsteer.bench.throughput import stock_class
 
 
@@ -18,7 +18,7 @@ class Kit:
     """What the tests share."""
 
     tasks: ClassVar[dict[str, type[BaseEnv]]] = {
-        name.removesuffix("-v1"): stock_class(name) for name in task_names()
+        name.removesuffix("-v1"): stock_class(name) for name in TASKS
     }
     robots: ClassVar[dict[str, str]] = {"PushT": "panda_stick"}
     settings: ClassVar[dict[str, Any]] = {

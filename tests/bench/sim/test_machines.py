@@ -6,12 +6,13 @@ import gc
 import os
 import subprocess
 import sys
+from email.message import Message
 
 import pytest
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
-from symsteer.bench.sim import create, make_env_class, patches, rendering_works
+from symsteer.bench.sim import capabilities, create, make_env_class, rendering_works, versions
 from symsteer.bench.sim import environment as batched
 from symsteer.bench.sim.capabilities import probe
 from symsteer.errors import UserError
@@ -79,7 +80,7 @@ def test_cameras_with_vulkan():
 @pytest.mark.parametrize("package", ["mani-skill", "sapien"])
 def test_other_release_is_refused(monkeypatch, package):
     """Another ManiSkill or SAPIEN than the one patched gives one sentence with the cure."""
-    monkeypatch.setitem(patches.PINNED, package, "9.9.9")
+    monkeypatch.setitem(versions.PINNED, package, "9.9.9")
     with pytest.raises(UserError, match=rf"{package} 9\.9\.9.*pip install {package}==9\.9\.9"):
         create(PickCubeEnv, 1)
 
@@ -165,10 +166,34 @@ def test_cuda():
 def test_probe_of_this_machine():
     """Every finding is one line, and what is required is there."""
     checks = probe()
-    assert len({check.name for check in checks}) == len(checks) == 10
+    assert len({check.name for check in checks}) == len(checks) == 11
     for check in checks:
         assert "\n" not in check.detail + check.cure
         assert check.ok or not check.required, check
+
+
+@pytest.mark.parametrize(
+    ("checkout", "cure", "extra"),
+    [(True, "make setup", "make setup"), (False, "pip install 'sapien==9.9'", "'symsteer[maths]'")],
+)
+def test_probe_of_an_installation(monkeypatch, checkout, cure, extra):
+    """A wrong version must be mended, an absent extra may stay; a wheel has no Makefile."""
+    wanted = ["sapien==9.9", "torch", 'escnnn; extra == "maths"', 'nothing; extra == "dev"']
+    monkeypatch.setattr(capabilities, "requires", lambda name: wanted)
+    extras = Message()
+    extras["Provides-Extra"], extras["Provides-Extra"] = "maths", "dev"
+    monkeypatch.setattr(capabilities, "metadata", lambda name: extras)
+    monkeypatch.setattr(capabilities, "_IN_CHECKOUT", checkout)
+    checks = {check.name: check for check in probe()}
+    versions = checks["package versions"]
+    assert versions.required
+    assert not versions.ok
+    assert (versions.detail, versions.cure) == ("wrong: sapien==9.9 (found: 3.0.3)", cure)
+    optional = checks["optional packages"]
+    assert not optional.ok
+    assert not optional.required
+    assert "absent: maths" in optional.detail
+    assert extra in optional.cure
 
 
 def test_probe_without_libraries():

@@ -1,4 +1,4 @@
-"""Environments in several processes against the same in one, and what becomes of the processes."""
+"""Environments in several processes equal those in one process; how the processes end."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from symsteer.bench.sim.shards import ShardedEnv
 from symsteer.bench.sim.shards.messages import divide
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make
-from symsteer.bench.variants import variant_names
+from symsteer.bench.variants import VARIANTS
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy, PolicyConfig
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 from tests.bench.steering.test_latent_env import NoiseIsAction
 
 TASK = "PickCube-v1"
@@ -153,7 +153,7 @@ def test_states(pair):
 
 def test_all_variants_and_the_arm():
     """Every variant at once, each with its own reset and forces, also for the panda arm."""
-    variant = "+".join(f"{name}:0.4" for name in variant_names())
+    variant = "+".join(f"{name}:0.4" for name in sorted(VARIANTS))
     one, two = both(3, task="StackCube-v1", embodiment="panda", variant=variant, workers=3)
     assert_same(one.reset(seed=1), two.reset(seed=1))
     for step, action in enumerate(actions(6, 3)):
@@ -216,8 +216,8 @@ def test_same_latent_noise_environment(solved):
 def test_same_with_a_policy():
     one, two = both(3, workers=3)
     torch.manual_seed(0)
-    config = PolicyConfig(channels=8, width=16, depth=1, execute=4, sampling_steps=2)
-    policy = ChunkPolicy(config, one.observation_layout, one.action_layout)
+    options = EquivariantOptions(channels=8, width=16, depth=1, execute=4, sampling_steps=2)
+    policy = EquivariantDiffusionPolicy(options, one.observation_layout, one.action_layout)
     envs = [LatentNoiseEnv(env, policy, ignore_terminations=True) for env in (one, two)]
     assert_same(*(env.reset([1, 2, 3]) for env in envs))
     for w in torch.randn(13, 3, policy.horizon, 7):
@@ -252,10 +252,10 @@ def test_stock_tasks_do_not_repeat_themselves():
     env.close()
 
 
-def test_what_lives_elsewhere(pair):
+def test_attributes_that_only_workers_have(pair):
     two = pair[1]
     for name in ("agent", "scene", "cube", "step_nothing"):
-        with pytest.raises(UserError, match=rf"env\.{name} lives in .* workers=1"):
+        with pytest.raises(UserError, match=rf"env\.{name} exists in .* workers=1"):
             getattr(two, name)
         assert not hasattr(two, name)
 
@@ -326,7 +326,7 @@ def test_local_classes_are_refused():
     class Mine(PickCubeEnv):
         pass
 
-    with pytest.raises(UserError, match="by its name"):
+    with pytest.raises(UserError, match="import the task class"):
         create(Mine, 2, workers=2)
 
 

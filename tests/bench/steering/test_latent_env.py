@@ -8,7 +8,8 @@ from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
-from symsteer.policies.base import ChunkPolicy, PolicyConfig
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 
 TASK = "PickCube-v1"
 
@@ -16,8 +17,8 @@ TASK = "PickCube-v1"
 def untrained_policy(execute: int = 4) -> ChunkPolicy:
     torch.manual_seed(0)
     task = task_class(TASK)
-    config = PolicyConfig(channels=8, width=16, depth=1, execute=execute, sampling_steps=2)
-    return ChunkPolicy(config, task.observation_layout, task.action_layout)
+    options = EquivariantOptions(channels=8, width=16, depth=1, execute=execute, sampling_steps=2)
+    return EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
 
 
 class NoiseIsAction(torch.nn.Module):

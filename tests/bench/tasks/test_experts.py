@@ -3,11 +3,12 @@
 import pytest
 import torch
 
-from symsteer.bench.tasks import make, task_names
+from symsteer.bench.tasks import TASKS as REGISTRY
+from symsteer.bench.tasks import make
 from symsteer.bench.tasks.experts import Expert
 from symsteer.policies.geometry import Group
 
-TASKS = task_names()
+TASKS = REGISTRY.names()
 
 
 def success_rate(task, embodiment, episodes, first_seed=0):

@@ -5,9 +5,7 @@ import math
 import pytest
 import torch
 
-from symsteer.bench.tasks import make
-from symsteer.bench.tasks.floating import ACTION_LAYOUT, PlanarPoseControllerConfig, bound_blocks
-from symsteer.bench.tasks.rotations import (
+from symsteer.bench.sim.rotations import (
     euler_rates_matrix,
     euler_to_matrix,
     matrix_to_euler_facing_down,
@@ -15,6 +13,8 @@ from symsteer.bench.tasks.rotations import (
     rotation_vector_to_matrix,
     transform_quaternion,
 )
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.floating import ACTION_LAYOUT, PlanarPoseControllerConfig, bound_blocks
 from symsteer.policies.geometry import Group
 
 

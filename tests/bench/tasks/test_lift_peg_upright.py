@@ -7,9 +7,9 @@ import torch
 from mani_skill.envs.tasks.tabletop.lift_peg_upright import LiftPegUprightEnv
 from mani_skill.utils.structs import Pose
 
+from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix, yaw_quaternion
 from symsteer.bench.tasks import make
-from symsteer.bench.tasks.embodiments import EMBODIMENTS
-from symsteer.bench.tasks.rotations import quaternion_multiply, quaternion_to_matrix, yaw_quaternion
+from symsteer.bench.tasks.embodiments import BODIES
 from symsteer.policies.geometry import Group
 
 COUNT = 64
@@ -121,7 +121,7 @@ def test_resets_lie_in_the_disc_and_point_everywhere():
 
 
 def test_the_pandas_wrist_takes_the_turn_that_its_joint_allows():
-    panda, floating = EMBODIMENTS["panda"], EMBODIMENTS["floating"]
+    panda, floating = BODIES["panda"], BODIES["floating"]
     qpos = torch.zeros(4, 9)
     qpos[:, 6] = torch.tensor([0.0, 2.0, 2.0, -2.0])
     turn = torch.tensor([1.5, 1.5, -1.5, 1.5])

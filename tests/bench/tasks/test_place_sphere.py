@@ -6,9 +6,9 @@ import pytest
 import torch
 from mani_skill.utils.structs import Pose
 
+from symsteer.bench.sim.rotations import quaternion_multiply, yaw_quaternion
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.experts import Expert
-from symsteer.bench.tasks.rotations import quaternion_multiply, yaw_quaternion
 
 
 @pytest.fixture(scope="module")

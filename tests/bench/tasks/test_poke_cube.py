@@ -7,14 +7,14 @@ import torch
 from mani_skill.envs.tasks.tabletop.poke_cube import PokeCubeEnv
 from mani_skill.utils.structs import Pose
 
-from symsteer.bench.tasks import make
-from symsteer.bench.tasks.experts import Expert
-from symsteer.bench.tasks.rotations import (
+from symsteer.bench.sim.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
     wrap,
     yaw_quaternion,
 )
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.experts import Expert
 
 COUNT = 24
 

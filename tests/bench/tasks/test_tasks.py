@@ -14,11 +14,12 @@ from sapien.physx import (
     PhysxRigidBaseComponent,
 )
 
-from symsteer.bench.tasks import embodiments, make, task_class, task_names
+from symsteer.bench.tasks import EMBODIMENTS, make, task_class
+from symsteer.bench.tasks import TASKS as REGISTRY
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 
-TASKS = task_names()
+TASKS = REGISTRY.names()
 # Stock evaluates these with Euler angles; their own tests compare.
 OWN_EVALUATE = {"LiftPegUpright-v1", "PokeCube-v1"}
 ELEMENTS = [*Group.parse("D4").elements, (0.3, False), (-2.0, True)]
@@ -54,7 +55,7 @@ def rows(tree, index):
 
 
 def test_names():
-    assert task_names() == [
+    assert REGISTRY.names() == [
         "PushCube-v1",
         "PullCube-v1",
         "PickCube-v1",
@@ -64,7 +65,7 @@ def test_names():
         "PokeCube-v1",
         "PushT-v1",
     ]
-    assert embodiments() == ["floating", "panda"]
+    assert list(EMBODIMENTS) == ["floating", "panda"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,237 @@
+"""The contract of a steering agent: what it is built from, and what the trainer calls.
+
+The trainer's loop is the same for every agent::
+
+    wanted = agent.prepare(make_env, budget)       # search or pre-training; 0: no training
+    while steps < wanted:
+        noise = agent.act(obs)
+        step = env.step(noise)
+        agent.observe(step)
+        for batch in agent.batches():              # as many as are due
+            scalars = agent.update(batch)
+    agent.diagnostics(played)                      # at every evaluation
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+
+import torch
+
+from symsteer.agents.episodes import Played
+from symsteer.agents.replay import Batch, ReplayBuffer, Transition
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Layout
+
+Role = Literal["reference", "learner", "control"]
+"""``reference``: what every learner must beat; ``control``: a learner that must not win."""
+
+Decode = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+Normalize = Callable[[torch.Tensor], torch.Tensor]
+
+
+@dataclass(frozen=True)
+class AgentContext:
+    """Everything that an agent is told about its problem.
+
+    Attributes:
+        obs_layout: geometry of an observation.
+        act_layout: geometry of one action, and of one noise vector of the chunk.
+        horizon: Tp, actions in a chunk.
+        execute: Ta, actions executed per decision.
+        decode: the frozen policy, ``(obs [B, obs_dim], noise [B, Tp, Da]) -> actions [B, Tp, Da]``.
+            Differentiable with respect to the noise.
+        normalize_obs: brings observations ``[B, obs_dim]`` to the networks' scale; commutes with
+            the group, as the base policy's normaliser does.
+        device, dtype: of all tensors.
+        seed: of initialisation and of the agent's own noise.
+    """
+
+    obs_layout: Layout
+    act_layout: Layout
+    horizon: int
+    execute: int
+    decode: Decode
+    normalize_obs: Normalize
+    device: torch.device = torch.device("cpu")  # noqa: RUF009 (immutable)
+    dtype: torch.dtype = torch.float32
+    seed: int = 0
+
+    @property
+    def noise_layout(self) -> Layout:
+        """Geometry of the flattened noise chunk, ``Tp * Da`` numbers."""
+        return self.act_layout.repeat(self.horizon)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a run offers to an agent.
+
+    Attributes:
+        env_steps: control steps, summed over the parallel environments.
+        num_envs: parallel training environments.
+        execute: control steps per decision.
+        max_episode_steps: time limit of an episode.
+    """
+
+    env_steps: int
+    num_envs: int
+    execute: int
+    max_episode_steps: int
+
+
+class NoiseEnv(Protocol):
+    """The training environments, as :meth:`Agent.prepare` sees them."""
+
+    num_envs: int
+    execute: int
+    max_episode_steps: int
+    control_steps: int
+
+    def training_seeds(self, start: int, count: int) -> list[int]:
+        """Seeds of ``count`` training episodes, for the ``start``-th fresh start."""
+        ...
+
+    def reset(self, seeds: list[int]) -> torch.Tensor:
+        """Start episodes; observations ``[N, obs_dim]``."""
+        ...
+
+    def step(self, noise: torch.Tensor) -> Any:
+        """Play noise ``[N, Tp, Da]``; a transition with ``episodes``, those that ended."""
+        ...
+
+
+MakeEnv = Callable[[bool], NoiseEnv]
+"""``make_env(ignore_terminations)``: training environments; the trainer closes them."""
+
+
+@dataclass(frozen=True)
+class AgentOptions:
+    """Options of an agent without any."""
+
+
+class Agent:
+    """Chooses noise for the frozen policy. Subclasses override what they need.
+
+    Attributes:
+        name: in configurations and records.
+        role: see :data:`Role`; the record holds it.
+        Options: a frozen dataclass, whose fields become ``--agent.X`` on the command line.
+        generator: of the agent's noise. An evaluation restores its state.
+        replay: kept transitions, saved with each checkpoint; None for agents that keep none.
+    """
+
+    name: ClassVar[str]
+    role: ClassVar[Role]
+    Options: ClassVar[type] = AgentOptions
+
+    def __init__(self, context: AgentContext, options: Any = None):
+        self.context = context
+        self.options = self.Options() if options is None else options
+        self.device, self.dtype = torch.device(context.device), context.dtype
+        self.obs_layout, self.act_layout = context.obs_layout, context.act_layout
+        self.horizon = context.horizon
+        self.generator = self._new_generator()
+        self.replay: ReplayBuffer | None = None
+
+    @classmethod
+    def check(cls, options: Any, budget: Budget) -> None:
+        """Refuse options that cannot work with a budget, before anything is built.
+
+        Raises:
+            UserError: one sentence on what to change.
+        """
+
+    def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
+        """Use a part of the budget before training: a search, or pre-training.
+
+        Returns:
+            Control steps to train for, counted from the start of the run; 0 for agents that do
+            not train.
+        """
+        return 0
+
+    def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
+        """Noise ``[B, Tp, Da]`` for observations ``[B, obs_dim]``.
+
+        Args:
+            obs: environment units.
+            deterministic: as in evaluations; without it as in training, exploration included.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must say how it acts")
+
+    def observe(self, transition: Transition) -> None:
+        """Take note of one decision of all training environments."""
+
+    def batches(self) -> Iterable[Batch]:
+        """Batches for the updates that are due now."""
+        return ()
+
+    def update(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """One gradient step; scalars by name (``losses/...``, ``train/...``) on the device."""
+        return {}
+
+    def diagnostics(self, played: Played) -> Mapping[str, float | None]:
+        """What an evaluation reports beside success (docs/metrics.md)."""
+        return {}
+
+    def parameter_counts(self) -> dict[str, int]:
+        """Trainable numbers: ``actor``, ``critic`` (all together), ``total``, ``width``."""
+        return dict.fromkeys(("actor", "critic", "total", "width"), 0)
+
+    def description(self) -> dict[str, Any]:
+        """What a checkpoint must agree with."""
+        return {
+            "agent": self.name,
+            "obs_layout": self.obs_layout.to_json(),
+            "act_layout": self.act_layout.to_json(),
+            "horizon": self.horizon,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and plain data, without the replay; loads with ``weights_only=True``."""
+        return {"description": self.description(), "generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where :meth:`state_dict` was taken.
+
+        Raises:
+            UserError: if the checkpoint is of another agent, layout or size.
+        """
+        saved = state.get("description", {})
+        for key, value in self.description().items():
+            if saved.get(key) != value:
+                raise UserError(
+                    f"this checkpoint has {key} {saved.get(key)!r}, the agent has {value!r}; "
+                    "load it with the run's own configuration"
+                )
+        self.generator.set_state(state["generator"].cpu())
+
+    def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
+        """``count`` chunks of N(0, I), ``[count, Tp, Da]``: what the base policy plays."""
+        return torch.randn(
+            count,
+            self.horizon,
+            self.act_layout.dim,
+            generator=generator or self.generator,
+            device=self.device,
+            dtype=self.dtype,
+        )
+
+    def _new_generator(self) -> torch.Generator:
+        return torch.Generator(device=self.device).manual_seed(self.context.seed)
+
+
+@runtime_checkable
+class HasCritic(Protocol):
+    """An agent whose Q-values an evaluation holds against on-policy returns."""
+
+    def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """A draw from the stochastic policy ``[B, Tp, Da]`` and its log-probability ``[B]``."""
+        ...
+
+    def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Every critic's value in the environment's reward units, ``[critics, B]``."""
+        ...

@@ -1,0 +1,135 @@
+"""The golden ticket: the best constant noise, found by search on training episodes.
+
+One noise chunk for all states, as in arXiv 2603.15757. The search is sequential halving (Karnin,
+Koren and Somekh, ICML 2013): every round plays the remaining candidates on the same initial
+states and keeps the better half.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from symsteer.agents.agent import Agent, AgentContext, AgentOptions, Budget, MakeEnv, NoiseEnv
+from symsteer.agents.episodes import Played
+from symsteer.errors import UserError
+
+
+@dataclass(frozen=True)
+class GoldenTicketOptions(AgentOptions):
+    """Options of the golden ticket."""
+
+    candidates: int = 64
+    """Constant noises in the first round, at most; halved until the budget suffices."""
+
+    def __post_init__(self) -> None:
+        if self.candidates < 2:
+            raise UserError(f"agent option candidates must be at least 2, not {self.candidates}")
+
+
+class GoldenTicketAgent(Agent):
+    """One constant noise for all states, the best of a search on training episodes."""
+
+    name = "golden-ticket"
+    role = "reference"
+    Options = GoldenTicketOptions
+    options: GoldenTicketOptions
+
+    def __init__(self, context: AgentContext, options: GoldenTicketOptions | None = None):
+        super().__init__(context, options)
+        self.ticket = torch.zeros(
+            self.horizon, self.act_layout.dim, device=self.device, dtype=self.dtype
+        )
+        self.searched: dict[str, float | None] = {}
+
+    @classmethod
+    def check(cls, options: GoldenTicketOptions, budget: Budget) -> None:
+        """Refuse a budget that does not suffice for two candidates."""
+        rounds(budget, options.candidates)
+
+    def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
+        """Search with the whole budget. The score is the mean return; on ties, the first wins."""
+        sizes = rounds(budget, self.options.candidates)
+        env = make_env(True)
+        left = self.gaussian_noise(sizes[0])
+        left[0] = 0  # zero is free, so it is always among the candidates
+        batch = env.num_envs * env.max_episode_steps
+        for number, size in enumerate(sizes):
+            batches = max(-(-size // env.num_envs), budget.env_steps // len(sizes) // batch)
+            starts = max(1, batches * env.num_envs // size)
+            seeds = [seed for seed in env.training_seeds(number, starts) for _ in range(size)]
+            played = play_constant(env, left.repeat(starts, 1, 1), seeds)
+            score = played["return"].double().view(starts, size).mean(0)
+            order = score.argsort(descending=True, stable=True)
+            best = order[: max(1, size // 2)].sort().values
+            success = played["success_once"].double().view(starts, size).mean(0)[order[0]].item()
+            if len(best) > 1:
+                left = left[best]
+        self.ticket = left[order[0]]
+        self.searched = {
+            "ticket_success": success,
+            "ticket_episodes": float(starts),
+            "ticket_candidates": float(sizes[0]),
+        }
+        return 0
+
+    def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
+        """The ticket for every observation, ``[B, Tp, Da]``."""
+        return self.ticket.expand(len(obs), *self.ticket.shape).clone()
+
+    def diagnostics(self, played: Played) -> Mapping[str, float | None]:
+        """The ticket's root mean square (of N(0, I): about 1), and the search's numbers."""
+        return {"ticket_rms": self.ticket.square().mean().sqrt().item(), **self.searched}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The generator, the ticket and the search's numbers."""
+        return {**super().state_dict(), "ticket": self.ticket.clone(), "searched": self.searched}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue with the ticket."""
+        super().load_state_dict(state)
+        self.ticket = state["ticket"].to(self.ticket)
+        self.searched = dict(state["searched"])
+
+
+def play_constant(env: NoiseEnv, noise: torch.Tensor, seeds: list[int]) -> dict[str, torch.Tensor]:
+    """Play one whole episode for each row of ``noise [M, Tp, Da]`` from ``seeds`` (M of them).
+
+    Returns:
+        ManiSkill's metrics of the episodes, each ``[M]``.
+    """
+    parts = []
+    for start in range(0, len(seeds), env.num_envs):
+        # The last batch may be short: its spare environments repeat a row and are dropped.
+        rows = torch.arange(start, start + env.num_envs).clamp(max=len(seeds) - 1)
+        env.reset([seeds[int(row)] for row in rows])
+        for _ in range(math.ceil(env.max_episode_steps / env.execute)):
+            step = env.step(noise[rows])
+        # All episodes end with the last decision, so the rows are the environments in order.
+        keep = min(env.num_envs, len(seeds) - start)
+        parts.append({name: value[:keep] for name, value in step.episodes.items()})
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def rounds(budget: Budget, candidates: int) -> list[int]:
+    """Candidates of every round: as many as the budget can play once in each round.
+
+    Raises:
+        UserError: if the budget does not suffice for two candidates.
+    """
+    batch = budget.num_envs * budget.max_episode_steps
+    while candidates >= 2:
+        sizes = [candidates >> i for i in range(int(math.log2(candidates)))]
+        share = budget.env_steps // len(sizes) // batch
+        if all(share >= -(-size // budget.num_envs) for size in sizes):
+            return sizes
+        candidates //= 2
+    raise UserError(
+        f"env_steps is {budget.env_steps}; a search of the best constant noise needs at least "
+        f"{batch}, one episode of {budget.max_episode_steps} steps in each of {budget.num_envs} "
+        "environments: raise env_steps or lower num_envs"
+    )

@@ -1,0 +1,49 @@
+"""Presets: named settings of agents as data, one TOML file each.
+
+The table ``[all]`` holds options of every agent that has them; a table with an agent's name holds
+that agent's own and wins.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from symsteer.errors import UserError
+from symsteer.names import unknown
+
+FOLDER = Path(__file__).parent
+
+
+def preset_names() -> list[str]:
+    """The presets that come with SymSteer."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
+    """What a preset sets for an agent.
+
+    Args:
+        name: one of :func:`preset_names`, or the path of a ``.toml`` file.
+        agent: name of the agent.
+        options: its dataclass of options.
+
+    Raises:
+        UserError: if there is no such preset, it is damaged, or it sets an option of the agent's
+            own table that the agent does not have.
+    """
+    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
+    try:
+        tables = tomllib.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise unknown("preset", name, preset_names()) from error
+    except (OSError, ValueError) as error:
+        raise UserError(f"the preset {path} cannot be read as TOML: {error}; correct it") from error
+    valid = [field.name for field in dataclasses.fields(options)]
+    own = tables.get(agent, {})
+    for key in own:
+        if key not in valid:
+            raise unknown(f"option of {agent}", key, valid, path.name)
+    return {key: value for key, value in tables.get("all", {}).items() if key in valid} | own

@@ -1,0 +1,129 @@
+"""The files of demonstrations: ManiSkill's trajectories, with a checksum of our own."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+
+from symsteer.bench.tasks import gym_id
+from symsteer.files import write_together
+
+if TYPE_CHECKING:
+    from symsteer.bench.demos.collect import Attempt, Diversity
+    from symsteer.bench.tasks.base import SymmetricTask
+
+FORMAT = 2
+"""Version of our files; 2 has a checksum."""
+
+SEAL = "sha256"
+"""Attribute of the .h5 file that holds the checksum."""
+
+
+def write(
+    path: Path,
+    env: SymmetricTask,
+    attempts: list[Attempt],
+    mode: str,
+    settings: Diversity,
+    seed: int,
+    tried: int,
+    variant: str,
+) -> None:
+    """Write episodes as a pair of .h5 and .json.
+
+    Args:
+        path: the .h5 file.
+        env: where they were recorded.
+        attempts: the episodes.
+        mode: the name of the kind of demonstrations.
+        settings: how they differ from one another.
+        seed: of the whole file.
+        tried: how many episodes the expert played.
+        variant: in which the expert acted.
+
+    Raises:
+        UserError: if the files cannot be written; earlier ones stay as they were.
+    """
+    description = {
+        "env_info": {
+            "env_id": gym_id(env.task_id),
+            "env_kwargs": {
+                "obs_mode": "state",
+                "control_mode": env.control_mode,
+                "embodiment": env.embodiment,
+                "variant": variant,
+                "reward_mode": env.reward_mode,
+                "sim_backend": "physx_cpu" if env.device.type == "cpu" else "physx_cuda",
+                "num_envs": 1,
+            },
+            "max_episode_steps": env.max_episode_steps,
+        },
+        "episodes": [
+            {
+                "episode_id": i,
+                "episode_seed": attempt.seed,
+                "control_mode": env.control_mode,
+                "elapsed_steps": len(attempt.actions),
+                "reset_kwargs": {"seed": attempt.seed},
+                "success": True,
+            }
+            for i, attempt in enumerate(attempts)
+        ],
+        "source_type": "scripted",
+        "source_desc": f"SymSteer's scripted expert, {mode} demonstrations",
+        "symsteer": {
+            "format": FORMAT,
+            "mode": mode,
+            "diversity": dataclasses.asdict(settings),
+            "seed": seed,
+            "attempts": tried,
+            "observation_layout": env.observation_layout.to_json(),
+            "action_layout": env.action_layout.to_json(),
+        },
+    }
+    # In memory first: on a full disk HDF5 would leave a damaged file.
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for i, attempt in enumerate(attempts):
+            group = file.create_group(f"traj_{i}", track_order=True)
+            end = len(attempt.actions)
+            last = np.arange(end) == end - 1
+            group.create_dataset("obs", data=attempt.obs, dtype=np.float32)
+            group.create_dataset("actions", data=attempt.actions, dtype=np.float32)
+            group.create_dataset("terminated", data=last)
+            group.create_dataset("truncated", data=last & (end >= env.max_episode_steps))
+            group.create_dataset("success", data=last)
+            group.create_dataset("rewards", data=attempt.rewards, dtype=np.float32)
+            _write_tree(group.create_group("env_states", track_order=True), attempt.states)
+        file.attrs[SEAL] = checksum(file, description)
+    text = json.dumps(description, indent=2) + "\n"
+    write_together({path.with_suffix(".json"): text.encode(), path: buffer.getvalue()})
+
+
+def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            _write_tree(group.create_group(key, track_order=True), value)
+        else:
+            group.create_dataset(key, data=value, dtype=np.float32)
+
+
+def checksum(file: h5py.File, description: dict[str, Any]) -> str:
+    """SHA-256 of every array of the .h5 file and of the content of its .json."""
+    found = hashlib.sha256(json.dumps(description, sort_keys=True).encode())
+
+    def add(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset):
+            array = np.asarray(item)
+            found.update(f"{name} {array.dtype} {array.shape}".encode())
+            found.update(array.tobytes())
+
+    file.visititems(add)
+    return found.hexdigest()

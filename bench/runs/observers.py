@@ -1,0 +1,386 @@
+"""Who writes down a run: the record, TensorBoard, progress, pictures.
+
+Each is an :class:`symsteer.bench.runs.trainer.Observer`. The record comes first: all others are
+views of what it holds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from tqdm import tqdm
+
+from symsteer.bench.runs.base_policy import describe_base
+from symsteer.bench.runs.config import RunConfig, content_key
+from symsteer.bench.runs.extensions import extensions_of
+from symsteer.bench.runs.folder import CHECKPOINT, PROGRESS, RECORD
+from symsteer.bench.runs.pictures import draw_paths, frames_of
+from symsteer.bench.runs.tensorboard import RunLog
+from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.steering.seeds import HELD_OUT_SEED
+from symsteer.errors import UserError
+from symsteer.files import write_atomically
+from symsteer.leaderboard.records import (
+    Budget,
+    Evaluation,
+    FeasibleQ,
+    Parameters,
+    Provenance,
+    RunRecord,
+    WallClock,
+    config_hash,
+    read_record,
+    write_record,
+)
+
+if TYPE_CHECKING:
+    from symsteer.bench.runs.trainer import Trainer
+
+LOG_EVERY = 10
+"""Vectorised decisions between two writes of training scalars."""
+
+PROGRESS_SECONDS = 2.0
+"""Least time between two writes of progress.json within a phase."""
+
+
+class Observe:
+    """An observer to which nothing matters; the others override what they need."""
+
+    def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None: ...
+    def entered(self, run: Trainer, phase: str) -> None: ...
+    def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None: ...
+    def paused(self, run: Trainer) -> None: ...
+    def evaluated(self, run: Trainer, evaluation: Evaluation) -> None: ...
+    def finished(self, run: Trainer) -> None: ...
+    def failed(self, run: Trainer, error: BaseException) -> None: ...
+
+    def saving(self, run: Trainer) -> Mapping[str, Any]:
+        return {}
+
+
+class RecordWriter(Observe):
+    """Keeps record.json: written at the start, after every evaluation, and at the end.
+
+    Args:
+        resolved: the configuration as the record holds it.
+    """
+
+    record: RunRecord
+
+    def __init__(self, resolved: dict[str, Any]):
+        self.resolved = resolved
+
+    def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
+        provenance = Provenance.collect(
+            device=_device_name(run.agent.device),
+            torch_threads=torch.get_num_threads(),
+            extensions=extensions_of(run.config),
+        )
+        if checkpoint:
+            self._continue(run, checkpoint, provenance)
+        else:
+            self._open(run, provenance)
+        self._write(run)
+
+    def _open(self, run: Trainer, provenance: Provenance) -> None:
+        config, counts, feasible = run.config, run.agent.parameter_counts(), run.feasible
+        self.record = RunRecord(
+            run_id=run.folder.name,
+            role=run.agent.role,
+            config=self.resolved,
+            provenance=provenance,
+            seeds={
+                "run": config.seed,
+                "policy": config.policy_seed,
+                "demonstrations": config.demonstrations.seed,
+                "first_held_out": HELD_OUT_SEED,
+            },
+            started=datetime.now(UTC),
+            parameters=Parameters(
+                actor=counts["actor"],
+                critic=counts["critic"],
+                total=counts["total"],
+                width=counts["width"] or None,
+            ),
+            base_policy=describe_base(run.base),
+            feasible_q=FeasibleQ(low=feasible[0], high=feasible[1]) if run.has_critic else None,
+        )
+
+    def _continue(
+        self, run: Trainer, checkpoint: Mapping[str, Any], provenance: Provenance
+    ) -> None:
+        """Take the record as it was at the checkpoint."""
+        self.record = record = read_record(run.folder / RECORD)
+        del record.evaluations[checkpoint["evaluations"] :]
+        mine = (run.folder.name, config_hash(self.resolved), checkpoint["history"])
+        if (record.run_id, record.config_hash, _history(record)) != mine:
+            raise UserError(
+                f"{run.folder / RECORD} is not the record that {CHECKPOINT} beside it "
+                "continues; restore both as they were, or delete the run's folder to start again"
+            )
+        if provenance not in (record.provenance, *record.continued):
+            record.continued = [*record.continued, provenance]
+        record.wall_clock.resumed += 1
+        record.ended, record.status, record.failure = None, "running", None
+
+    def evaluated(self, run: Trainer, evaluation: Evaluation) -> None:
+        self.record.evaluations.append(evaluation)
+        self.record.budget = Budget(
+            env_steps=run.env_steps, decisions=run.decisions, updates=run.updates
+        )
+        self.record.wall_clock = WallClock(**run.seconds, resumed=self.record.wall_clock.resumed)
+        self._write(run)
+
+    def saving(self, run: Trainer) -> Mapping[str, Any]:
+        return {"evaluations": len(self.record.evaluations), "history": _history(self.record)}
+
+    def finished(self, run: Trainer) -> None:
+        self._close(run, "finished")
+
+    def failed(self, run: Trainer, error: BaseException) -> None:
+        interrupted = isinstance(error, KeyboardInterrupt)
+        self.record.failure = (
+            "interrupted by the user" if interrupted else f"{type(error).__name__}: {error}"
+        )
+        # A folder that cannot be written is most likely what stopped the run.
+        with contextlib.suppress(UserError):
+            self._close(run, "interrupted" if interrupted else "failed")
+
+    def _close(self, run: Trainer, status: Literal["finished", "failed", "interrupted"]) -> None:
+        self.record.ended = datetime.now(UTC)
+        self.record.status = status
+        self.record.wall_clock.total = run.seconds["total"]
+        self._write(run)
+
+    def _write(self, run: Trainer) -> None:
+        write_record(self.record, run.folder / RECORD)
+
+
+class TensorBoard(Observe):
+    """Writes the events of a run: what the record holds, and scalars of training between.
+
+    Args:
+        records: the observer that keeps the record.
+    """
+
+    log: RunLog
+
+    def __init__(self, records: RecordWriter):
+        self.records = records
+        self.means = _Means()
+
+    def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
+        # Without a checkpoint an earlier process may still have left events.
+        purge = run.env_steps + 1 if checkpoint else 0
+        self.log = RunLog(run.folder, self.records.record, purge)
+        self.rounds = 0
+
+    def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None:
+        for values in scalars:
+            self.means.add(values)
+        self.rounds += 1
+        if self.rounds % LOG_EVERY == 0:
+            self._write_means(run)
+
+    def paused(self, run: Trainer) -> None:
+        self._write_means(run)
+        self.rounds = 0
+
+    def evaluated(self, run: Trainer, evaluation: Evaluation) -> None:
+        columns = evaluation.episodes.model_dump(by_alias=True)
+        names = ("success_once", "success_at_end", "return", "episode_len")
+        means = {
+            f"eval/{name}": torch.tensor(columns[name], dtype=torch.float64).mean().item()
+            for name in names
+            if None not in columns[name]
+        }
+        self.log.scalars(means, run.env_steps)
+        self.log.scalars({f"diag/{k}": v for k, v in evaluation.diagnostics.items()}, run.env_steps)
+
+    def saving(self, run: Trainer) -> Mapping[str, Any]:
+        # A continued run does not write again what lies before its checkpoint.
+        self.log.flush()
+        return {}
+
+    def finished(self, run: Trainer) -> None:
+        self.log.finish()
+
+    def failed(self, run: Trainer, error: BaseException) -> None:
+        self.log.close()
+
+    def _write_means(self, run: Trainer) -> None:
+        seconds = run.seconds
+        total = seconds.pop("total")
+        rate = {"time/env_steps_per_second": run.env_steps / total}
+        times = {f"time/{part}": value for part, value in seconds.items()}
+        self.log.scalars({**self.means.take(), **rate, **times}, run.env_steps)
+
+
+class Pictures(Observe):
+    """Pictures of the last evaluation in TensorBoard; the record is closed by then.
+
+    Args:
+        tensorboard: where they are written.
+        quiet: do not say why a picture is missing.
+    """
+
+    def __init__(self, tensorboard: TensorBoard, quiet: bool):
+        self.tensorboard, self.quiet = tensorboard, quiet
+
+    def finished(self, run: Trainer) -> None:
+        played = run.evaluator.played
+        if played is None:
+            return
+        try:
+            paths = draw_paths(played, run.base.obs_layout, run.title)
+            self.tensorboard.log.picture("eval/paths", paths, run.env_steps)
+            if rendering_works():
+                frames = frames_of(run.config, run.base, run.agent)
+                self.tensorboard.log.picture("eval/frames", frames, run.env_steps)
+        except Exception as error:
+            if not self.quiet:
+                tqdm.write(f"no picture of the evaluation: {type(error).__name__}: {error}")
+
+
+class Progress(Observe):
+    """A progress bar for the terminal, and progress.json for `symsteer status` and sweeps.
+
+    Args:
+        quiet: no bar and no lines.
+    """
+
+    def __init__(self, quiet: bool):
+        self.quiet = quiet
+        self.bar: tqdm | None = None
+        self.means = _Means()
+        self.rounds = 0
+        self.success: float | None = None
+
+    def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
+        self.file = ProgressFile(run.folder, run.config.env_steps, run.env_steps)
+
+    def entered(self, run: Trainer, phase: str) -> None:
+        self.file.write(phase, run.env_steps, self.success)
+
+    def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None:
+        budget = run.config.env_steps
+        if self.bar is None:
+            disable = True if self.quiet else None  # None: where the output is no terminal
+            self.bar = tqdm(total=budget, desc=run.title, unit="step", disable=disable)
+        self.bar.update(min(run.env_steps, budget) - self.bar.n)
+        self.means.add({k: v for k, v in scalars[0].items() if k == "train/success_once"})
+        self.rounds += 1
+        if self.rounds % LOG_EVERY == 0:
+            shown = {"success": self.means.take().get("train/success_once")}
+            shown["held_out"] = self.success
+            self.bar.set_postfix({k: f"{v:.2f}" for k, v in shown.items() if v is not None})
+        self.file.write("training", run.env_steps, self.success)
+
+    def evaluated(self, run: Trainer, evaluation: Evaluation) -> None:
+        self.success = evaluation.success_once
+        if not self.quiet:
+            count = len(evaluation.episodes.seed)
+            tqdm.write(
+                f"{run.title}: {run.env_steps:7d} steps, held-out success {self.success:.2f} "
+                f"({count} episodes{', final' if evaluation.final else ''})"
+            )
+
+    def finished(self, run: Trainer) -> None:
+        self._close()
+
+    def failed(self, run: Trainer, error: BaseException) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+
+class ProgressFile:
+    """progress.json: how far a running run is.
+
+    Args:
+        folder: of the run.
+        budget: control steps that the run may use.
+        env_steps: control steps that it has used already, if it continues.
+    """
+
+    def __init__(self, folder: Path, budget: int, env_steps: int = 0):
+        self._path, self._budget, self._first = folder / PROGRESS, budget, env_steps
+        self._start = time.monotonic()
+        self._last = -float("inf")
+        self._phase = ""
+
+    def write(self, phase: str, env_steps: int, success: float | None = None) -> None:
+        """Write at most every two seconds; a change of phase is written at once."""
+        now = time.monotonic()
+        if phase == self._phase and now - self._last < PROGRESS_SECONDS:
+            return
+        self._last, self._phase = now, phase
+        rate = (env_steps - self._first) / max(now - self._start, 1e-9)
+        data = {
+            "phase": phase,
+            "env_steps": env_steps,
+            "budget": self._budget,
+            "success": success,
+            "steps_per_second": rate,
+            "seconds_left": max(0, self._budget - env_steps) / rate if rate > 0 else None,
+            "updated": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        # A full disk is reported where results are written; progress is not worth a run.
+        with contextlib.suppress(UserError):
+            write_atomically(self._path, json.dumps(data).encode(), durable=False)
+
+
+class _Means:
+    """Means of named tensors since they were last taken; reads the device only then."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, torch.Tensor] = {}
+        self._counts: dict[str, int] = {}
+
+    def add(self, values: Mapping[str, torch.Tensor]) -> None:
+        for name, value in values.items():
+            if value.numel():
+                total = value.detach().double().sum()
+                self._sums[name] = self._sums.get(name, 0.0) + total
+                self._counts[name] = self._counts.get(name, 0) + value.numel()
+
+    def take(self) -> dict[str, float]:
+        means = {name: (total / self._counts[name]).item() for name, total in self._sums.items()}
+        self._sums.clear()
+        self._counts.clear()
+        return means
+
+
+def observers_of(config: RunConfig, resolved: dict[str, Any], progress: bool) -> list[Observe]:
+    """The observers of a run, in the order in which they are told.
+
+    Args:
+        config: of the run.
+        resolved: the configuration as the record holds it.
+        progress: whether to show progress.
+    """
+    records = RecordWriter(resolved)
+    tensorboard = TensorBoard(records)
+    pictures = Pictures(tensorboard, quiet=not progress)
+    # The record is closed before pictures are drawn, and TensorBoard after.
+    return [records, Progress(quiet=not progress), pictures, tensorboard]
+
+
+def _history(record: RunRecord) -> str:
+    """A key of all that the record says about the evaluations so far."""
+    return content_key(
+        [evaluation.model_dump(mode="json", by_alias=True) for evaluation in record.evaluations]
+    )
+
+
+def _device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"

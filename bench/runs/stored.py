@@ -1,0 +1,94 @@
+"""What a run's folder holds, read back: configuration, base policy, trained agent."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from symsteer.agents.agent import Agent
+from symsteer.bench.runs.checkpoint import load_checkpoint
+from symsteer.bench.runs.config import RunConfig, build_config
+from symsteer.bench.runs.folder import CONFIG, read_config, run_id
+from symsteer.bench.runs.trainer import new_agent
+from symsteer.bench.tasks import task_class
+from symsteer.errors import UserError
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.files import load_policy, policy_path
+
+
+@dataclass(frozen=True)
+class Restored:
+    """A run at its last checkpoint.
+
+    Attributes:
+        folder: of the run.
+        config: of the run.
+        policy: the frozen base policy.
+        agent: with the weights of the checkpoint.
+        state: the whole checkpoint.
+    """
+
+    folder: Path
+    config: RunConfig
+    policy: ChunkPolicy
+    agent: Agent
+    state: Mapping[str, Any]
+
+
+def restored(folder: Path) -> Restored:
+    """Read a run's last checkpoint.
+
+    Raises:
+        UserError: if the folder is not a run's, it has no checkpoint yet, or a file is damaged.
+    """
+    folder = named(folder)
+    config, _ = stored_config(folder)
+    state = load_checkpoint(folder)
+    if state is None:
+        raise UserError(
+            f"the run {folder.name} has no checkpoint yet; `symsteer resume` brings it to its end"
+        )
+    policy = stored_policy(folder, config)
+    if policy is None or policy.content_hash() != state["base_policy"]:
+        raise UserError(
+            f"{policy_path(folder)} is not the base policy that the checkpoint of {folder.name} "
+            "steers; restore it from where the run was made"
+        )
+    agent = new_agent(config, policy)
+    agent.load_state_dict(state["agent"])
+    return Restored(folder, config, policy, agent, state)
+
+
+def named(folder: Path) -> Path:
+    """The folder by its own name, which is the run's, also for ``.`` or a link."""
+    return Path(os.path.realpath(folder))
+
+
+def stored_config(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
+    """Configuration of a run's folder, and the content hashes of the files it began from.
+
+    Raises:
+        UserError: if the folder is not a run's, or its configuration is damaged or edited.
+    """
+    data = read_config(folder)
+    files = data.pop("files", {})
+    data.pop("evaluation_variant", None)
+    config = build_config(data, str(folder / CONFIG))
+    if not isinstance(files, dict) or run_id(config, files) != folder.name:
+        raise UserError(
+            f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or the "
+            "folder renamed; undo that"
+        )
+    return config, files
+
+
+def stored_policy(folder: Path, config: RunConfig) -> ChunkPolicy | None:
+    """The base policy in a run's folder; None if it is not there yet."""
+    if not policy_path(folder).is_file():
+        return None
+    task = task_class(config.task)
+    base = load_policy(folder, task.observation_layout, task.action_layout)
+    return base.to(config.device)

@@ -1,0 +1,122 @@
+"""Using what was trained: a finished run, or a saved base policy, as an object that acts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from symsteer.agents.agent import Agent, AgentContext
+from symsteer.agents.references import BaseAgent
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.folder import CONFIG
+from symsteer.bench.runs.stored import restored
+from symsteer.bench.tasks import make
+from symsteer.errors import UserError
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.files import load_policy
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A frozen base policy and the agent that steers it.
+
+    Attributes:
+        policy: the base policy.
+        agent: chooses its noise; for a policy file N(0, I).
+        config: of the run; None for a policy file.
+        world: ``task``, ``embodiment`` and ``variant`` that it was trained in; empty where a
+            policy file does not say.
+    """
+
+    policy: ChunkPolicy
+    agent: Agent
+    config: RunConfig | None
+    world: dict[str, str]
+
+    @torch.no_grad()
+    def act(self, obs: Any, deterministic: bool = True) -> torch.Tensor:
+        """The actions to execute next, steered.
+
+        Args:
+            obs: ``[N, obs_dim]``, tensor or array; what environments with ``obs_mode="state"``
+                return.
+            deterministic: as in evaluations; else drawn from the agent's distribution.
+
+        Returns:
+            ``[N, Ta, act_dim]`` on the device of ``obs``: execute them one after the other, then
+            ask again.
+
+        Raises:
+            UserError: if the observations have another width.
+        """
+        given = torch.as_tensor(obs)
+        if given.ndim != 2 or given.shape[1] != self.policy.obs_layout.dim:
+            raise UserError(
+                f"observations have the shape [N, {self.policy.obs_layout.dim}], not "
+                f"{list(given.shape)}; make the environments with make_env()"
+            )
+        own = given.to(self.agent.device, torch.float32)
+        chunk = self.policy.decode(own, self.agent.act(own, deterministic))
+        return chunk[:, : self.policy.execute].to(given.device)
+
+    def make_env(self, num_envs: int = 1, variant: str | None = None, **options: Any) -> Any:
+        """Environments in which it can act.
+
+        Args:
+            num_envs: how many in parallel.
+            variant: how the world is broken, e.g. ``action_gain:0.5`` or ``none``; default: as in
+                training.
+            options: further ones of :func:`symsteer.make`.
+
+        Raises:
+            UserError: for an unknown variant, or if a policy file does not name its task.
+        """
+        if not self.world:
+            raise UserError(
+                "this policy file does not name its task; make the environments with symsteer.make"
+            )
+        return make(
+            self.world["task"],
+            num_envs=num_envs,
+            embodiment=self.world["embodiment"],
+            variant=self.world["variant"] if variant is None else variant,
+            **options,
+        )
+
+
+def load(path: str | Path, device: str = "cpu") -> Trained:
+    """Load a run's folder at its last checkpoint, or a saved base policy.
+
+    Args:
+        path: folder of a run, or a policy file (``policy.safetensors``).
+        device: for a policy file; a run comes back on its own device.
+
+    Raises:
+        UserError: if the path is neither, or a file is damaged.
+    """
+    path = Path(path)
+    if (path / CONFIG).is_file() or (path.is_dir() and not (path / "policy.safetensors").is_file()):
+        run = restored(path)
+        config = run.config
+        world = {
+            "task": config.task,
+            "embodiment": config.embodiment,
+            "variant": config.variant,
+        }
+        return Trained(run.policy, run.agent, config, world)
+    policy = load_policy(path, device=device)
+    context = AgentContext(
+        policy.obs_layout,
+        policy.act_layout,
+        policy.horizon,
+        policy.execute,
+        policy.decode,
+        policy.normalized_observation,
+        torch.device(device),
+    )
+    known = policy.report.get("world", {})
+    world = {key: known[key] for key in ("task", "embodiment") if key in known}
+    return Trained(policy, BaseAgent(context), None, {**world, "variant": "none"} if world else {})

@@ -1,0 +1,312 @@
+"""The loop of one run: the same for every agent.
+
+A checkpoint falls where all environments begin new episodes in fresh scenes. It holds everything
+that the rest of the run depends on, so that a run that was killed and continued ends with the
+record of an undisturbed one but for the clock (on the CPU; CUDA's sums are not repeatable).
+
+Observers write down what happens (:mod:`symsteer.bench.runs.observers`); the loop does not know
+which there are.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from symsteer.agents import AGENTS
+from symsteer.agents.agent import Agent, AgentContext, Budget, HasCritic
+from symsteer.bench.runs.checkpoint import save_checkpoint
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.evaluator import Evaluator, make_env
+from symsteer.bench.runs.folder import CHECKPOINT
+from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
+from symsteer.bench.tasks import task_class
+from symsteer.bench.variants import build, evaluated, highest_cost
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import Episodes, Evaluation
+from symsteer.policies.contract import ChunkPolicy
+
+
+def budget_of(config: RunConfig) -> Budget:
+    """What a run offers to its agent."""
+    return Budget(
+        config.env_steps,
+        config.num_envs,
+        config.policy.execute,
+        task_class(config.task).max_episode_steps,
+    )
+
+
+def new_agent(config: RunConfig, base: ChunkPolicy) -> Agent:
+    """An untrained agent for a run's base policy."""
+    context = AgentContext(
+        obs_layout=base.obs_layout,
+        act_layout=base.act_layout,
+        horizon=base.horizon,
+        execute=base.execute,
+        decode=base.decode,
+        normalize_obs=base.normalized_observation,
+        device=torch.device(config.device),
+        seed=config.seed,
+    )
+    return AGENTS.get(config.agent)(context, config.agent_options)
+
+
+def feasible_return(config: RunConfig, agent: Agent, base: ChunkPolicy) -> tuple[float, float]:
+    """Lowest and highest discounted return that the run's reward allows, per decision.
+
+    The discount is the agent's; 0 for an agent without one.
+    """
+    return task_class(config.task).feasible_return(
+        getattr(agent.options, "gamma", 0.0),
+        base.execute,
+        step_cost=highest_cost(build(config.variants)),
+    )
+
+
+class Observer(Protocol):
+    """What is told about a run; every method is optional in effect."""
+
+    def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
+        """The run was built; nothing has been simulated in this process."""
+
+    def entered(self, run: Trainer, phase: str) -> None:
+        """A phase begins: ``preparing``, ``evaluation``."""
+
+    def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None:
+        """All training environments took one decision."""
+
+    def paused(self, run: Trainer) -> None:
+        """All environments are about to begin new episodes in fresh scenes."""
+
+    def evaluated(self, run: Trainer, evaluation: Evaluation) -> None:
+        """Held-out episodes were played."""
+
+    def saving(self, run: Trainer) -> Mapping[str, Any]:
+        """A checkpoint is about to be written; returns what to add to it."""
+
+    def finished(self, run: Trainer) -> None:
+        """The run came to its end."""
+
+    def failed(self, run: Trainer, error: BaseException) -> None:
+        """The run did not finish; its last checkpoint stays."""
+
+
+class Trainer:
+    """State of a run; :meth:`play` brings it to its end.
+
+    Args:
+        config: what to run.
+        folder: the run's folder.
+        base: the frozen policy.
+        checkpoint: a state to continue from.
+        observers: called in this order.
+        workers: processes that share the environments.
+
+    Raises:
+        UserError: if the checkpoint was made with another base policy or agent.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        folder: Path,
+        base: ChunkPolicy,
+        checkpoint: Mapping[str, Any] | None,
+        observers: Sequence[Observer],
+        workers: int = 1,
+    ):
+        self.config, self.folder, self.base = config, folder, base
+        self.observers, self.workers = observers, workers
+        self.agent = new_agent(config, base)
+        self.feasible = feasible_return(config, self.agent, base)
+        self.env_steps = self.decisions = self.updates = 0
+        self.train_until: int | None = None
+        self.next_evaluation = 0
+        self.fresh_starts = 0
+        self.final = False
+        self.clock = Clock()
+        self.update_seconds = self.evaluate_seconds = 0.0
+        earlier = self._restore(checkpoint) if checkpoint else 0.0
+        self.start = time.perf_counter() - earlier
+        for observer in observers:
+            observer.began(self, checkpoint)
+        try:
+            self.evaluator = Evaluator(
+                config, base, self.agent, self.feasible, evaluated(config.variant), workers
+            )
+        except BaseException as error:
+            self.stop(error)
+            raise
+
+    @property
+    def title(self) -> str:
+        """The run in words."""
+        config = self.config
+        return f"{config.agent} on {config.task} ({config.variant}), seed {config.seed}"
+
+    @property
+    def has_critic(self) -> bool:
+        """Whether the agent has Q-values to diagnose."""
+        return isinstance(self.agent, HasCritic)
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Seconds spent so far, by part, and in all."""
+        return {
+            "simulate": self.clock.simulate,
+            "decode": self.clock.decode,
+            "update": self.update_seconds,
+            "evaluate": self.evaluate_seconds,
+            "total": time.perf_counter() - self.start,
+        }
+
+    def play(self) -> None:
+        """Train to the end of the budget, evaluate the last checkpoint, close."""
+        if not self.final:
+            if self.train_until is None:
+                self._prepare()
+            self._train()
+            self.evaluate(final=True)
+            self.final = True
+            self._checkpoint()
+        self.evaluator.close()
+        for observer in self.observers:
+            observer.finished(self)
+
+    def stop(self, error: BaseException) -> None:
+        """Tell that the run did not finish."""
+        for observer in self.observers:
+            observer.failed(self, error)
+
+    def evaluate(self, final: bool = False) -> None:
+        """Held-out episodes of the deterministic actor, and diagnostics."""
+        begin = time.perf_counter()
+        for observer in self.observers:
+            observer.entered(self, "evaluation")
+        wanted = self.config.evaluation
+        count = wanted.final_episodes if final else wanted.episodes
+        columns, diagnostics = self.evaluator.measure(count)
+        self.evaluate_seconds += time.perf_counter() - begin
+        evaluation = Evaluation(
+            env_steps=self.env_steps,
+            decisions=self.decisions,
+            updates=self.updates,
+            wall_clock=time.perf_counter() - self.start,
+            final=final,
+            episodes=Episodes.model_validate(columns),
+            diagnostics=dict(diagnostics),
+        )
+        for observer in self.observers:
+            observer.evaluated(self, evaluation)
+
+    def _prepare(self) -> None:
+        """Let the agent search or train beforehand, with environments that it asks for."""
+        for observer in self.observers:
+            observer.entered(self, "preparing")
+        made: list[LatentNoiseEnv] = []
+
+        def make(ignore_terminations: bool) -> LatentNoiseEnv:
+            made.append(self._make_env(ignore_terminations))
+            return made[-1]
+
+        self.train_until = self.agent.prepare(make, budget_of(self.config))
+        for env in made:
+            self.env_steps += env.control_steps
+            self.decisions += env.decisions
+            env.close()
+
+    def _train(self) -> None:
+        assert self.train_until is not None
+        end = min(self.train_until, self.config.env_steps)
+        if self.env_steps >= end:
+            return
+        env = self._make_env(ignore_terminations=False)
+        env.control_steps, env.decisions = self.env_steps, self.decisions
+        while self.env_steps < end:
+            self._train_until_checkpoint(env, end)
+        env.close()
+
+    def _train_until_checkpoint(self, env: LatentNoiseEnv, end: int) -> None:
+        """From a fresh start of all environments to the next one, or to the end of training."""
+        config, agent = self.config, self.agent
+        if self.next_evaluation == 0:
+            self.evaluate()
+            self.next_evaluation = config.evaluation.every
+        obs = env.reset(env.training_seeds(self.fresh_starts, config.num_envs))
+        pause = self.env_steps + config.checkpoint_every * config.num_envs
+        while self.env_steps < min(pause, end):
+            step = env.step(agent.act(obs))
+            obs = step.obs_after
+            self.env_steps, self.decisions = env.control_steps, env.decisions
+            scalars: list[Mapping[str, torch.Tensor]] = [
+                {f"train/{key}": value for key, value in step.episodes.items()}
+            ]
+            begin = time.perf_counter()
+            agent.observe(step)
+            for batch in agent.batches():
+                scalars.append(agent.update(batch))
+                self.updates += 1
+            self.update_seconds += time.perf_counter() - begin
+            for observer in self.observers:
+                observer.stepped(self, scalars)
+            if self.next_evaluation <= self.env_steps < end:
+                self.evaluate()
+                self.next_evaluation += config.evaluation.every
+        for observer in self.observers:
+            observer.paused(self)
+        self.fresh_starts += 1
+        if self.env_steps < end:
+            self._checkpoint()
+
+    def _make_env(self, ignore_terminations: bool) -> LatentNoiseEnv:
+        config = self.config
+        env = make_env(
+            config, self.base, config.num_envs, config.variant, ignore_terminations, self.workers
+        )
+        env.clock = self.clock
+        return env
+
+    def _checkpoint(self) -> None:
+        """Everything that the rest of the run depends on; the replay only while it is needed."""
+        replay = None if self.final else self.agent.replay
+        state: dict[str, Any] = {
+            "base_policy": self.base.content_hash(),
+            "agent": self.agent.state_dict(),
+            "replay": replay.state_dict() if replay else None,
+            "env_steps": self.env_steps,
+            "decisions": self.decisions,
+            "updates": self.updates,
+            "train_until": self.train_until,
+            "next_evaluation": self.next_evaluation,
+            "fresh_starts": self.fresh_starts,
+            "final": self.final,
+        }
+        for observer in self.observers:
+            state |= observer.saving(self)
+        save_checkpoint(self.folder, {**state, "seconds": self.seconds})
+
+    def _restore(self, state: Mapping[str, Any]) -> float:
+        """Take a checkpoint's state; returns the seconds that the run had taken then."""
+        if state["base_policy"] != self.base.content_hash():
+            raise UserError(
+                f"{self.folder / CHECKPOINT} steers another base policy than "
+                f"{self.folder / 'policy.safetensors'}; restore that file, or delete the run's "
+                "folder to start again"
+            )
+        self.agent.load_state_dict(state["agent"])
+        if self.agent.replay is not None and state["replay"] is not None:
+            self.agent.replay.load_state_dict(state["replay"])
+        for name in (
+            *("env_steps", "decisions", "updates", "train_until"),
+            *("next_evaluation", "fresh_starts", "final"),
+        ):
+            setattr(self, name, state[name])
+        seconds = state["seconds"]
+        self.clock.simulate, self.clock.decode = seconds["simulate"], seconds["decode"]
+        self.update_seconds, self.evaluate_seconds = seconds["update"], seconds["evaluate"]
+        return seconds["total"]

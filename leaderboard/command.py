@@ -1,0 +1,117 @@
+"""`symsteer report`: generate the leaderboard from records, verify it, or check records."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TextIO
+
+import tyro
+
+from symsteer.errors import UserError
+from symsteer.leaderboard.admission import check as judge
+from symsteer.leaderboard.report import PAGE_FOLDER, RECORDS, Verification, generate
+from symsteer.leaderboard.report import verify as compare
+from symsteer.leaderboard.verification import other_versions
+
+FEW = 10
+"""`--check` lists up to this many records; of more, only those with problems or notes."""
+
+
+def report(
+    records: tyro.conf.Positional[tuple[Path, ...]] = (),
+    out: Path | None = None,
+    audit: Path | None = None,
+    verify: bool = False,
+    check: bool = False,
+) -> int:
+    """Write the leaderboard (markdown, CSV, figures) from run records.
+
+    Args:
+        records: Record files, run folders or folders of runs; default: the committed records.
+        out: Where to write; default: RECORDS/leaderboard, in the first folder that is named; of
+            the committed records: the committed leaderboard.
+        audit: The summary.json of an audit, for the map; default: the committed one.
+        verify: Write nothing; fail if OUT is not, byte for byte, what the records give.
+        check: Write nothing; say of each record whether the leaderboard admits it, and why not.
+
+    Returns:
+        0: done, or no difference and no problem; 1: --verify found a difference; 2: --check found
+        a record that is not admissible.
+
+    Raises:
+        UserError: for paths that cannot be read or written, and for records that are not valid.
+    """
+    if verify and check:
+        raise UserError("--verify and --check cannot be given together; give one of them")
+    # A path may hold bytes that are not text.
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    if not records and not RECORDS.is_dir():
+        raise UserError(
+            "the committed records exist only in a checkout of the repository; name run folders: "
+            "symsteer report RUNS"
+        )
+    paths = records or (RECORDS,)
+    if check:
+        return _show_verdicts(paths)
+    out = out or _folder_for(records)
+    if verify:
+        return _show_differences(compare(paths, out, audit))
+    files = generate(paths, out, audit)
+    page = next(file for file in files if file.name == "LEADERBOARD.md")
+    _say(f"wrote {page} and {len(files) - 1} files beside it")
+    return 0
+
+
+def _folder_for(records: Sequence[Path]) -> Path:
+    """Where the leaderboard of records goes for which no folder was named."""
+    if not records:
+        return PAGE_FOLDER
+    first = records[0]
+    out = (first.parent if first.is_file() else first) / "leaderboard"
+    if out.resolve() == PAGE_FOLDER:
+        raise UserError(
+            f"{out} holds the committed leaderboard; name another folder, or this one, with --out"
+        )
+    return out
+
+
+def _show_differences(result: Verification) -> int:
+    if not result.differences:
+        _say(f"{result.records} records and {result.files} files of the leaderboard agree")
+        return 0
+    for line in result.differences:
+        _say(line)
+    for package in other_versions():
+        _say(f"note: bytes are equal only with the pinned versions; here is {package}")
+    number = len(result.differences)
+    _say(
+        f"error: {number} file{'s'[: number != 1]} of the leaderboard did not come from these "
+        f"{result.records} records; run `symsteer report` with the same arguments",
+        sys.stderr,
+    )
+    return 1
+
+
+def _show_verdicts(paths: Sequence[Path]) -> int:
+    verdicts = judge(paths, RECORDS)
+    for verdict in verdicts:
+        if verdict.is_admissible and not verdict.notes and len(verdicts) > FEW:
+            continue
+        _say(f"{verdict.path}: {'admissible' if verdict.is_admissible else 'NOT ADMISSIBLE'}")
+        for problem in verdict.problems:
+            _say(f"  problem: {problem}")
+        for note in verdict.notes:
+            _say(f"  note: {note}")
+    admitted = sum(verdict.is_admissible for verdict in verdicts)
+    _say(f"{admitted} of {len(verdicts)} records are admissible")
+    return 0 if admitted == len(verdicts) else 2
+
+
+def _say(text: str, stream: TextIO | None = None) -> None:
+    """Print one line; control characters that a record or path brought into it become `?`."""
+    line = "".join(c if c.isprintable() or "\udc80" <= c <= "\udcff" else "?" for c in text)
+    print(line, file=stream or sys.stdout)

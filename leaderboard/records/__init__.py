@@ -1,0 +1,56 @@
+"""The run record: one strict JSON document per run, the only source of the leaderboard.
+
+A record says what was run (`config`, `role`, `provenance`, `seeds`), how it went (`status`,
+`wall_clock`, `budget`, `parameters`) and what came out: every episode of every evaluation with its
+seed, and the diagnostics measured at that evaluation. docs/metrics.md defines every number.
+
+`schema` defines the blocks, `migrations` reads older versions, `provenance` finds commit and
+packages, `files` reads and writes. This package imports nothing of the leaderboard above it.
+"""
+
+from symsteer.leaderboard.records.files import dump_record, read_record, write_record
+from symsteer.leaderboard.records.provenance import Provenance, RecordedExtension
+from symsteer.leaderboard.records.schema import (
+    DIVERGED_EVALUATIONS,
+    DIVERGED_SHARE,
+    HELD_OUT_SEED,
+    ROLES,
+    SCHEMA_VERSION,
+    BasePolicy,
+    Budget,
+    Episodes,
+    Evaluation,
+    FeasibleQ,
+    Parameters,
+    Role,
+    RunRecord,
+    RunSettings,
+    WallClock,
+)
+from symsteer.leaderboard.records.values import canonical_json, config_hash, portable
+
+__all__ = [
+    "DIVERGED_EVALUATIONS",
+    "DIVERGED_SHARE",
+    "HELD_OUT_SEED",
+    "ROLES",
+    "SCHEMA_VERSION",
+    "BasePolicy",
+    "Budget",
+    "Episodes",
+    "Evaluation",
+    "FeasibleQ",
+    "Parameters",
+    "Provenance",
+    "RecordedExtension",
+    "Role",
+    "RunRecord",
+    "RunSettings",
+    "WallClock",
+    "canonical_json",
+    "config_hash",
+    "dump_record",
+    "portable",
+    "read_record",
+    "write_record",
+]

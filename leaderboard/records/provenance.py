@@ -1,0 +1,127 @@
+"""Which code a run used: commit or hash, packages, and extensions of other distributions."""
+
+from __future__ import annotations
+
+import functools
+import platform
+import subprocess
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from symsteer import registry
+from symsteer.leaderboard.records.values import Block, Count, Name, Sha256
+
+CODE = ("agents", "bench", "leaderboard", "policies", "symsteer")
+"""Folders of a checkout that hold code; those in `symsteer/` are links to the others."""
+
+PACKAGES = ("torch", "mani-skill", "sapien", "escnn", "gymnasium", "numpy")
+"""Packages whose versions a record names, where they are installed."""
+
+
+class RecordedExtension(Block):
+    """Code from outside SymSteer that a run used (`symsteer.registry.Extension`).
+
+    `distribution` and `version` are null for code that was not installed.
+    """
+
+    kind: Literal["agent", "policy", "variant", "task"]
+    name: Name
+    target: Name
+    distribution: Name | None
+    version: Name | None
+    sha256: Sha256
+
+
+class Provenance(Block):
+    """The code and the machine that the numbers come from.
+
+    `version` is SymSteer's (null in records before schema version 4). In a git checkout of the
+    project `commit` names the code, and `dirty` says whether tracked files differ from it or git
+    does not track some of the code. Elsewhere both are null and `sha256` names the code: the hash
+    of all Python files of the installed package.
+    """
+
+    commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
+    dirty: bool | None
+    version: Name | None
+    sha256: Sha256 | None
+    extensions: list[RecordedExtension]
+    packages: dict[Name, Name]
+    python: Name
+    platform: Name
+    device: Name
+    torch_threads: Annotated[Count, Field(ge=1)]
+
+    @classmethod
+    def collect(
+        cls, device: str, torch_threads: int, extensions: Iterable[registry.Extension] = ()
+    ) -> Provenance:
+        """Describe this machine and the code that runs on it."""
+        root = checkout()
+        commit, dirty = commit_of(root) if root else (None, None)
+        return cls(
+            commit=commit,
+            dirty=dirty,
+            version=_version("symsteer"),
+            sha256=None if commit else registry.code_hash("symsteer"),
+            extensions=[RecordedExtension(**extension.to_json()) for extension in extensions],
+            packages={name: found for name in PACKAGES if (found := _version(name))},
+            python=platform.python_version(),
+            platform=f"{platform.system()} {platform.machine()}",
+            device=device,
+            torch_threads=torch_threads,
+        )
+
+
+@functools.cache
+def checkout() -> Path | None:
+    """The top folder of the git checkout that this code runs from; None for an installed copy."""
+    return _checkout_of(Path(str(registry.__file__)).resolve())
+
+
+def _checkout_of(code: Path) -> Path | None:
+    # An installed copy may lie inside of a checkout, in its virtual environment, but git does not
+    # track it there.
+    root = code.parent.parent
+    top = git(code.parent, "rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() != root:
+        return None
+    return root if git(code.parent, "ls-files", "--error-unmatch", code.name) else None
+
+
+def commit_of(root: Path) -> tuple[str | None, bool | None]:
+    """Commit of a checkout, and whether its code differs; (None, None) if git cannot say."""
+    commit = git(root, "rev-parse", "HEAD")
+    changes = git(root, "status", "--porcelain", "--untracked-files=no")
+    # A file that git does not track runs as well, such as a new agent.
+    code = (f"{folder}/*.py" for folder in CODE)
+    untracked = git(root, "ls-files", "--others", "--exclude-standard", *code)
+    if commit is None or changes is None or untracked is None:
+        return None, None
+    return commit, bool(changes or untracked)
+
+
+def git(folder: Path, *arguments: str) -> str | None:
+    """What a git command prints; None if it fails or takes longer than 20 s."""
+    try:
+        result = subprocess.run(
+            ["git", "-C", str(folder), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=20,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return result.stdout.strip()
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None

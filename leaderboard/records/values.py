@@ -1,0 +1,194 @@
+"""The values that blocks of a record are made of: types with limits, and how they become JSON.
+
+JSON has no NaN and no infinity. A measured number that is not finite is stored as null and named
+in the `nonfinite` table of its block; null without an entry means "not measured".
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    ValidationError,
+    model_validator,
+)
+
+MAX_TEXT = 2000
+
+LARGEST_COUNT = 2**53
+"""Counts and seeds up to this are exact as floating point numbers."""
+
+LARGEST_NUMBER = 1e39
+"""Measurements are in single precision, which ends before; larger numbers count as infinite."""
+
+_PLAIN = frozenset({bool, int, float, str, type(None)})
+
+
+def plain(value: Any) -> Any:
+    """Turn arrays, tensors and their scalars into Python numbers and lists (no torch import)."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        if all(type(item) in _PLAIN for item in value):
+            return list(value)
+        return [plain(item) for item in value]
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _moment(value: Any) -> Any:
+    """Read an ISO 8601 time as UTC in whole seconds; times without a zone are refused."""
+    if isinstance(value, str):
+        value = datetime.fromisoformat(value)
+    if not isinstance(value, datetime) or value.tzinfo is None:
+        raise ValueError("expected an ISO 8601 time with a zone, such as 2026-01-31T12:00:00+00:00")
+    return value.astimezone(UTC).replace(microsecond=0)
+
+
+def _flags(value: Any) -> Any:
+    """Read flags stored as 0/1 (half the size of false/true in a file of many episodes)."""
+    value = plain(value)
+    if not isinstance(value, list):
+        return value
+    if any(type(flag) not in (bool, int, float) or flag not in (0, 1) for flag in value):
+        raise ValueError("expected a list of 0 and 1")
+    return [bool(flag) for flag in value]
+
+
+def _nonfinite(value: Any) -> str | None:
+    if isinstance(value, float) and not abs(value) <= LARGEST_NUMBER:
+        return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
+    return None
+
+
+Moment = Annotated[
+    datetime,
+    BeforeValidator(_moment),
+    PlainSerializer(lambda moment: moment.isoformat(), return_type=str),
+]
+Flags = Annotated[
+    list[bool],
+    BeforeValidator(_flags),
+    PlainSerializer(lambda flags: [int(flag) for flag in flags], return_type=list[int]),
+]
+Count = Annotated[int, Field(ge=0, le=LARGEST_COUNT)]
+Finite = Annotated[float, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, le=LARGEST_COUNT, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1, max_length=120)]
+Text = Annotated[str, Field(max_length=MAX_TEXT)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+MetricName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,63}(/[a-z0-9_]{1,63})*$")]
+
+
+class Block(BaseModel):
+    """Common rules: unknown keys are errors, strings are not numbers, arrays become lists."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        populate_by_name=True,
+        validate_assignment=True,
+        ser_json_inf_nan="null",
+    )
+
+    @classmethod
+    def _own(cls, data: Mapping[str, Any]) -> list[str]:
+        """The keys of `data` that are not blocks themselves: those look after their own values."""
+        blocks = {
+            name
+            for name, field in cls.model_fields.items()
+            if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+        }
+        return [key for key in data if key not in blocks and key != "evaluations"]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _toplain(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        return {**data, **{key: plain(data[key]) for key in cls._own(data)}}
+
+
+class Measured(Block):
+    """A block of measured numbers: non-finite ones become null and are named in `nonfinite`."""
+
+    nonfinite: dict[str, Literal["nan", "inf", "-inf"]] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flag_nonfinite(cls, data: Any) -> Any:
+        flags = data.get("nonfinite", {}) if isinstance(data, Mapping) else None
+        if not isinstance(flags, Mapping):
+            return data
+        flags = dict(flags)
+
+        def clean(value: Any, path: str) -> Any:
+            if isinstance(value, dict):
+                return {key: clean(item, f"{path}/{key}") for key, item in value.items()}
+            if isinstance(value, list):
+                if all(_nonfinite(item) is None for item in value):
+                    return value
+                return [clean(item, f"{path}/{index}") for index, item in enumerate(value)]
+            kind = _nonfinite(value)
+            if kind is None:
+                return value
+            flags[path] = kind
+            return None
+
+        own = {key: clean(plain(data[key]), key) for key in cls._own(data) if key != "nonfinite"}
+        return {**data, **own, "nonfinite": flags}
+
+    @model_validator(mode="after")
+    def _flags_point_at_null(self) -> Self:
+        data = self.model_dump(by_alias=True) if self.nonfinite else {}
+        for path in self.nonfinite:
+            value: Any = data
+            for key in path.split("/"):
+                if isinstance(value, list) and key.isdigit() and int(key) < len(value):
+                    value = value[int(key)]
+                elif isinstance(value, dict) and key in value:
+                    value = value[key]
+                else:
+                    raise ValueError(f"nonfinite names {path!r}, which does not exist")
+            if value is not None:
+                raise ValueError(f"nonfinite names {path!r}, whose value is not null")
+        return self
+
+
+def canonical_json(data: Any) -> str:
+    """One text for one value: sorted keys, no spaces, ASCII. Raises ValueError on NaN, infinity."""
+    return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def config_hash(config: Mapping[str, Any]) -> str:
+    """sha256 over the canonical JSON of a resolved configuration, in hexadecimal."""
+    return hashlib.sha256(canonical_json(config).encode()).hexdigest()
+
+
+def portable(text: str) -> str:
+    """Shorten absolute paths in `text` to their last part, so that records name no machine."""
+    return re.sub(r"(?<![\w.:/])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:'\",;()]+[/\\])+", "", text)
+
+
+def first_problem(error: Exception) -> str:
+    """The first validation error as a phrase: where, what, how many more."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors(include_url=False, include_input=False)[0]
+    where = ".".join(str(part) for part in first["loc"])[:120]
+    what = first["msg"].removeprefix("Value error, ")
+    more = error.error_count() - 1
+    return (
+        f"{where}: {what}" * bool(where) + what * (not where) + f" (and {more} more)" * bool(more)
+    )

@@ -1,0 +1,180 @@
+"""The file format of base policies: safetensors with a JSON description as metadata."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as serialize
+
+from symsteer.errors import UserError
+from symsteer.files import write_atomically
+from symsteer.policies import POLICIES
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.geometry import Layout
+
+FORMAT = "symsteer-policy"
+VERSION = 3
+READABLE = ("1", "2", "3")
+FILE_NAME = "policy.safetensors"
+
+
+def policy_path(folder_or_path: str | Path) -> Path:
+    """The policy file meant by a path: itself, or ``policy.safetensors`` in a folder."""
+    path = Path(folder_or_path)
+    return path if path.suffix == ".safetensors" else path / FILE_NAME
+
+
+def save_policy(
+    policy: ChunkPolicy, folder_or_path: str | Path, extra: dict[str, Any] | None = None
+) -> Path:
+    """Write a policy; the file appears whole or not at all.
+
+    Args:
+        policy: with its training record and report.
+        folder_or_path: a ``.safetensors`` file, or a folder that gets ``policy.safetensors``.
+        extra: JSON-ready additions to the report.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        UserError: if the file cannot be written (an earlier one stays as it was), or the policy's
+            class cannot be imported by name.
+    """
+    path = policy_path(folder_or_path)
+    name = POLICIES.name_of(type(policy))
+    extension = POLICIES.extension(name)
+    description = json.dumps(
+        {
+            "name": name,
+            "extension": extension and extension.to_json(),
+            "options": policy.options.to_json(),
+            "obs_layout": policy.obs_layout.to_json(),
+            "act_layout": policy.act_layout.to_json(),
+            "training_record": policy.training_record,
+            "report": {**policy.report, **(extra or {})},
+            "content_hash": policy.content_hash(),
+        }
+    )
+    metadata = {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "policy": description,
+        "policy_sha256": _sha256(description),
+    }
+    tensors = {key: value.cpu().contiguous() for key, value in policy.state_dict().items()}
+    write_atomically(path, serialize(tensors, metadata))
+    return path
+
+
+def load_policy(
+    folder_or_path: str | Path,
+    expect_obs_layout: Layout | None = None,
+    expect_act_layout: Layout | None = None,
+    device: torch.device | str = "cpu",
+) -> ChunkPolicy:
+    """Read a policy that :func:`save_policy` wrote, in this format version or an earlier one.
+
+    Args:
+        folder_or_path: the file or its folder.
+        expect_obs_layout: the environment's observation layout, if it must match.
+        expect_act_layout: the environment's action layout, if it must match.
+        device: where the policy goes.
+
+    Raises:
+        UserError: if the file is missing, damaged, no policy, of another version or layout, or if
+            its class is not installed.
+    """
+    path = policy_path(folder_or_path)
+    if not path.is_file():
+        raise UserError(f"no policy at {path}; train one, or give the path of a saved policy")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise UserError(
+            f"{path} is truncated or no safetensors file ({error}); train or copy it again"
+        ) from error
+    if metadata.get("format") != FORMAT:
+        raise UserError(f"{path} holds no SymSteer policy; give a file that SymSteer wrote")
+    if metadata.get("version") not in READABLE:
+        raise UserError(
+            f"{path} has policy format version {metadata.get('version')}, and this SymSteer reads "
+            f"versions up to {VERSION}; train the policy again or use the SymSteer that wrote it"
+        )
+    # Version 1 had a checksum of the tensors alone.
+    wanted = metadata.get("policy_sha256", None if metadata["version"] == "1" else "")
+    if wanted is not None and wanted != _sha256(metadata.get("policy", "")):
+        raise UserError(
+            f"{path} is damaged: its description does not match its checksum; copy it again"
+        )
+    try:
+        description = json.loads(metadata["policy"])
+        if "config" in description:
+            description |= _described_by_config(description["config"])
+        _require_installed(path, description["name"], description["extension"])
+        kind = POLICIES.get(description["name"])
+        obs_layout = Layout.from_json(description["obs_layout"])
+        act_layout = Layout.from_json(description["act_layout"])
+        policy = kind(kind.Options.from_json(description["options"]), obs_layout, act_layout)
+        policy.to(next(t.dtype for t in tensors.values() if t.is_floating_point()))
+        policy.load_state_dict(tensors)
+        stored_hash = description["content_hash"]
+        policy.training_record = description["training_record"]
+        policy.report = description["report"]
+    except _NotInstalledError:
+        raise
+    except (KeyError, TypeError, ValueError, RuntimeError, StopIteration, UserError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(
+            f"{path} is a damaged SymSteer policy ({reason}); train it again"
+        ) from error
+    for what, found, expected in (
+        ("observation", obs_layout, expect_obs_layout),
+        ("action", act_layout, expect_act_layout),
+    ):
+        if expected is not None and found != expected:
+            raise UserError(
+                f"{path} was trained for another {what} layout: it has {found}, but the "
+                f"environment has {expected}; use a policy of the same task and embodiment"
+            )
+    if policy.content_hash() != stored_hash:
+        raise UserError(f"{path} is damaged: its contents do not match its checksum; copy it again")
+    return policy.freeze().to(device)
+
+
+class _NotInstalledError(UserError):
+    """The file is whole, but its policy's class is missing."""
+
+
+def _require_installed(path: Path, name: str, extension: dict[str, Any] | None) -> None:
+    """Check that the class of a policy from another package can be found."""
+    if extension is None or name in POLICIES:
+        return
+    package = extension["target"].partition(":")[0].partition(".")[0]
+    if name != extension["target"] or importlib.util.find_spec(package) is None:
+        distribution = extension["distribution"]
+        source = f"distribution {distribution}" if distribution else f"package {package}"
+        raise _NotInstalledError(
+            f"{path} holds a policy {name!r} of the {source}, which is not installed; install it"
+        )
+
+
+def _described_by_config(config: dict[str, Any]) -> dict[str, Any]:
+    """Name and options of files up to version 2, where one table held the options of all kinds."""
+    fields = {"group", "match_parameters", "match_compute", "augmentation"}
+    own = POLICIES.get(config["name"]).Options.__dataclass_fields__
+    unused = {"name"} | (fields - set(own))
+    options = {key: value for key, value in config.items() if key not in unused}
+    return {"name": config["name"], "extension": None, "options": options}
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

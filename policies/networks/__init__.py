@@ -1,0 +1,1 @@
+"""Networks that policies are made of: dense equivariant layers and networks for one slice."""

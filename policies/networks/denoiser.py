@@ -1,0 +1,46 @@
+"""What a diffusion policy needs of its network."""
+
+from __future__ import annotations
+
+import abc
+import copy
+from typing import Self
+
+import torch
+from torch import nn
+
+from symsteer.policies.geometry import Group
+
+
+class Denoiser(nn.Module, abc.ABC):
+    """Predicts a clean chunk (or its noise) from a noisy one.
+
+    The observation is encoded once per decision, the noise levels once per call of the sampler;
+    the condition of :meth:`forward` is the sum of both.
+
+    Attributes:
+        group: the finite group with which the network commutes exactly; C1 for none.
+    """
+
+    group: Group
+
+    @abc.abstractmethod
+    def encode(self, obs: torch.Tensor) -> torch.Tensor:
+        """The observation's part of the condition; ``[B, obs_dim] -> [B, ...]``."""
+
+    @abc.abstractmethod
+    def encode_time(self, t: torch.Tensor) -> torch.Tensor:
+        """The noise level's part of the condition; ``[B] -> [B, ...]``."""
+
+    @abc.abstractmethod
+    def forward(self, x: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+        """Predict; ``x [B, Tp, Da]``, ``condition [B, ...]`` -> ``[B, Tp, Da]``."""
+
+    def expanded(self) -> Self:
+        """A copy for inference; subclasses compute here what is the same in every call."""
+        return copy.deepcopy(self).requires_grad_(False).eval()
+
+
+def parameter_count(module: nn.Module) -> int:
+    """Trainable numbers of a module."""
+    return sum(p.numel() for p in module.parameters())

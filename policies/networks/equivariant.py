@@ -1,0 +1,101 @@
+"""Dense layers that commute with a finite planar group, exact by construction.
+
+Features live in regular fields: tensors ``[..., order, channels]`` on which the group permutes
+the ``order`` axis, (u f)(g) = f(u^-1 g). Any linear equivariant map between irreps and regular
+fields has one of the three forms below (group convolution; Cohen & Welling, arXiv 1602.07576;
+the lift per group element follows EDP, arXiv 2407.01812). ``tests/policies`` compares their
+number of free parameters with escnn's basis.
+
+Every layer can be written as one ordinary matrix, ``dense()``. Inference computes it once, and
+several networks can be stacked into one matrix product.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+from symsteer.policies.geometry import Group, Layout
+
+
+class Lift(nn.Module):
+    """Vector to regular fields: f(g) = W rho(g)^-1 x + b.
+
+    Shapes: ``[..., dim] -> [..., order, channels]``.
+    """
+
+    def __init__(self, layout: Layout, group: Group, channels: int):
+        super().__init__()
+        self.layout, self.group, self.channels = layout, group, channels
+        bound = 1 / math.sqrt(layout.dim)
+        self.weight = nn.Parameter(torch.empty(channels, layout.dim).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(channels).uniform_(-bound, bound))
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The map as (matrix ``[order * channels, dim]``, bias ``[order * channels]``)."""
+        # rho is orthogonal, so rho(g)^-1 is its transpose.
+        rho = self.group.representation(self.layout, self.weight.dtype, self.weight.device)
+        stacked = torch.einsum("cd,ged->gce", self.weight, rho).flatten(0, 1)
+        return stacked, self.bias.repeat(self.group.order)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        out = nn.functional.linear(x, *self.dense())
+        return out.unflatten(-1, (self.group.order, self.channels))
+
+
+class RegularLinear(nn.Module):
+    """Group convolution: f'(g) = sum_h W(g^-1 h) f(h) + b.
+
+    Shapes: ``[..., order, in] -> [..., order, out]``.
+    """
+
+    index: torch.Tensor
+
+    def __init__(self, group: Group, in_channels: int, out_channels: int):
+        super().__init__()
+        self.group, self.in_channels, self.out_channels = group, in_channels, out_channels
+        bound = 1 / math.sqrt(group.order * in_channels)
+        self.weight = nn.Parameter(
+            torch.empty(group.order, out_channels, in_channels).uniform_(-bound, bound)
+        )
+        self.bias = nn.Parameter(torch.empty(out_channels).uniform_(-bound, bound))
+        # index[g, h] = g^-1 h
+        self.register_buffer("index", group.multiplication[group.inverse], persistent=False)
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The map as (matrix ``[order * out, order * in]``, bias ``[order * out]``)."""
+        order = self.group.order
+        blocks = self.weight.index_select(0, self.index.flatten()).unflatten(0, (order, order))
+        circulant = blocks.permute(0, 2, 1, 3).reshape(
+            order * self.out_channels, order * self.in_channels
+        )
+        return circulant, self.bias.repeat(order)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        out = nn.functional.linear(x.flatten(-2), *self.dense())
+        return out.unflatten(-1, (self.group.order, self.out_channels))
+
+
+class Project(nn.Module):
+    """Regular fields to a vector: y = mean_g rho(g) (V f(g) + b).
+
+    Shapes: ``[..., order, in] -> [..., dim]``. The mean keeps only the invariant part of the bias.
+    """
+
+    def __init__(self, group: Group, channels: int, layout: Layout):
+        super().__init__()
+        self.layout, self.group = layout, group
+        bound = 1 / math.sqrt(channels)
+        self.weight = nn.Parameter(torch.empty(layout.dim, channels).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(layout.dim).uniform_(-bound, bound))
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The map as (matrix ``[dim, order * in]``, bias ``[dim]``)."""
+        rho = self.group.representation(self.layout, self.weight.dtype, self.weight.device)
+        stacked = torch.einsum("gde,ec->dgc", rho, self.weight).flatten(1) / self.group.order
+        return stacked, rho.mean(0) @ self.bias
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return nn.functional.linear(x.flatten(-2), *self.dense())

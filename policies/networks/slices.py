@@ -1,0 +1,101 @@
+"""Networks for one slice of a chunk: a residual MLP and a temporal U-Net.
+
+They have no symmetry of their own: :class:`symsteer.policies.symmetry.lifted.LiftedDenoiser` runs
+the same network on every group element's slice, with the group axis folded into the batch. Both
+take the chunk's features and one vector of conditioning numbers, which scale and shift the hidden
+features (FiLM, arXiv 1709.07871). The U-Net follows the conditional one of Diffusion Policy (arXiv
+2303.04137), two levels deep.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from symsteer.errors import UserError
+
+
+class ResidualMLP(nn.Module):
+    """Residual blocks on the features of the whole chunk.
+
+    h <- h + V silu((1 + scale) U norm(h) + shift), ``depth`` times.
+
+    Shapes: ``h [N, width]``, ``condition [N, condition_dim]`` -> ``[N, width]``.
+    """
+
+    def __init__(self, width: int, depth: int):
+        super().__init__()
+        self.width = width
+        self.condition_dim = 2 * width * depth
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(depth))
+        self.inner = nn.ModuleList(nn.Linear(width, width) for _ in range(depth))
+        self.outer = nn.ModuleList(nn.Linear(width, width) for _ in range(depth))
+        self.out_norm = nn.LayerNorm(width)
+
+    def forward(self, h: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+        films = condition.split(2 * self.width, dim=-1)
+        for film, norm, inner, outer in zip(films, self.norms, self.inner, self.outer, strict=True):
+            scale, shift = film.chunk(2, dim=-1)
+            u = inner(norm(h))
+            h = h + outer(functional.silu(torch.addcmul(u + shift, u, scale)))
+        return functional.silu(self.out_norm(h))
+
+
+class _TemporalBlock(nn.Module):
+    """Two convolutions over time with FiLM after the first; ``[N, in, T] -> [N, out, T]``."""
+
+    def __init__(self, in_channels: int, out_channels: int):
+        super().__init__()
+        self.condition_dim = 2 * out_channels
+        groups = _norm_groups(out_channels)
+        self.first = nn.Conv1d(in_channels, out_channels, 3, padding=1)
+        self.first_norm = nn.GroupNorm(groups, out_channels)
+        self.second = nn.Conv1d(out_channels, out_channels, 3, padding=1)
+        self.second_norm = nn.GroupNorm(groups, out_channels)
+        self.skip = (
+            nn.Identity()
+            if in_channels == out_channels
+            else nn.Conv1d(in_channels, out_channels, 1)
+        )
+
+    def forward(self, h: torch.Tensor, film: torch.Tensor) -> torch.Tensor:
+        scale, shift = film.unsqueeze(-1).chunk(2, dim=1)
+        u = self.first_norm(self.first(h))
+        u = functional.silu(torch.addcmul(u + shift, u, scale))
+        return self.skip(h) + functional.silu(self.second_norm(self.second(u)))
+
+
+class TemporalUNet(nn.Module):
+    """A conditional 1-D U-Net over the steps of the chunk: full rate, half rate, full rate.
+
+    Shapes: ``h [N, T, width]``, ``condition [N, condition_dim]`` -> ``[N, T, width]``; T even.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.down = _TemporalBlock(width, width)
+        self.shrink = nn.Conv1d(width, width, 4, stride=2, padding=1)
+        self.middle = nn.ModuleList(
+            [_TemporalBlock(width, 2 * width), _TemporalBlock(2 * width, 2 * width)]
+        )
+        self.grow = nn.ConvTranspose1d(2 * width, width, 4, stride=2, padding=1)
+        self.up = _TemporalBlock(2 * width, width)
+        self._film_sizes = [block.condition_dim for block in (self.down, *self.middle, self.up)]
+        self.condition_dim = sum(self._film_sizes)
+
+    def forward(self, h: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+        if h.shape[1] % 2:
+            raise UserError(f"the U-Net halves the chunk: choose an even horizon, not {h.shape[1]}")
+        films = condition.split(self._film_sizes, dim=-1)
+        full = self.down(h.transpose(1, 2), films[0])
+        half = self.shrink(full)
+        for block, film in zip(self.middle, films[1:-1], strict=True):
+            half = block(half, film)
+        out = self.up(torch.cat([self.grow(half), full], dim=1), films[-1])
+        return out.transpose(1, 2)
+
+
+def _norm_groups(channels: int) -> int:
+    """The largest divisor of ``channels`` up to 8."""
+    return next(n for n in range(8, 0, -1) if channels % n == 0)

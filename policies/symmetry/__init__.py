@@ -1,0 +1,1 @@
+"""How a policy is made symmetric: one file for each way, with its policy."""

@@ -1,0 +1,175 @@
+"""Symmetry by lifting: the Equivariant Diffusion Policy (EDP, arXiv 2407.01812).
+
+    observation --Lift--> regular fields --group convolution--> one embedding per group element
+    noisy chunk --Lift--> one slice per group element
+    every slice: the same denoising network, conditioned on its embedding and the noise level
+    slices --Project--> chunk
+
+Acting with the group on observation and chunk permutes the slices. The shared network keeps the
+permutation, and ``Project`` turns it back into the group's action. This is exact for any network
+in the middle. With the trivial group C1 there is one slice: an ordinary diffusion policy.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from symsteer.policies.geometry import Group, Layout
+from symsteer.policies.networks.denoiser import Denoiser
+from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
+from symsteer.policies.networks.slices import ResidualMLP, TemporalUNet
+from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
+
+TIME_FEATURES = 64
+
+
+class LiftedDenoiser(Denoiser):
+    """A denoiser that commutes with a finite group.
+
+    Args:
+        obs_layout: geometry of one (normalised) observation.
+        act_layout: geometry of one (normalised) action.
+        horizon: actions in a chunk, Tp.
+        group: a finite group.
+        network: ``mlp`` (residual MLP on the whole chunk) or ``unet`` (temporal U-Net).
+        channels: regular fields of the observation embedding.
+        width: features in each slice of the chunk.
+        depth: residual blocks of the MLP.
+    """
+
+    def __init__(
+        self,
+        obs_layout: Layout,
+        act_layout: Layout,
+        horizon: int,
+        group: Group,
+        network: str = "mlp",
+        channels: int = 64,
+        width: int = 64,
+        depth: int = 3,
+    ):
+        super().__init__()
+        self.horizon, self.group = horizon, group
+        # The MLP sees the chunk as one long vector, the U-Net as a sequence of actions.
+        self.flat = network == "mlp"
+        layout = act_layout.repeat(horizon) if self.flat else act_layout
+        self.obs_lift = Lift(obs_layout, group, channels)
+        self.obs_mix = RegularLinear(group, channels, channels)
+        self.chunk_lift = Lift(layout, group, width)
+        self.slice_network = ResidualMLP(width, depth) if self.flat else TemporalUNet(width)
+        self.project = Project(group, width, layout)
+        self.condition = nn.Linear(channels, self.slice_network.condition_dim)
+        self.time_in = nn.Linear(TIME_FEATURES, TIME_FEATURES)
+        self.time_out = nn.Linear(TIME_FEATURES, self.slice_network.condition_dim, bias=False)
+
+    def encode(self, obs: torch.Tensor) -> torch.Tensor:
+        """The observation's part of the condition; ``[B, obs_dim] -> [B, order, condition]``."""
+        embedding = functional.silu(self.obs_mix(functional.silu(self.obs_lift(obs))))
+        return self.condition(embedding)
+
+    def encode_time(self, t: torch.Tensor) -> torch.Tensor:
+        """The noise level's part of the condition; ``[B] -> [B, 1, condition]``."""
+        half = TIME_FEATURES // 2
+        rates = torch.exp(
+            torch.arange(half, device=t.device, dtype=torch.float64) * (-math.log(1e4) / half)
+        )
+        phases = t[:, None].double() * rates
+        features = torch.cat([phases.sin(), phases.cos()], dim=-1).to(self.time_in.weight.dtype)
+        return self.time_out(functional.silu(self.time_in(features)))[:, None]
+
+    def forward(self, x: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+        """Predict; ``x [B, Tp, Da]``, ``condition [B, order, c]`` -> ``[B, Tp, Da]``."""
+        batch, order = len(x), self.group.order
+        if self.flat:
+            slices = self.chunk_lift(x.flatten(1)).flatten(0, 1)
+        else:
+            # [B, T, order, width] -> [B * order, T, width]
+            slices = self.chunk_lift(x).transpose(1, 2).flatten(0, 1)
+        slices = self.slice_network(slices, condition.flatten(0, 1)).unflatten(0, (batch, order))
+        if self.flat:
+            return self.project(slices).view_as(x)
+        return self.project(slices.transpose(1, 2))
+
+    def expanded(self) -> LiftedDenoiser:
+        """A copy for inference whose equivariant layers hold their dense matrices ready."""
+        fast = super().expanded()
+        order = self.group.order
+        fast.register_module("obs_lift", _Dense(self.obs_lift, 1, (order, self.obs_lift.channels)))
+        fast.register_module("obs_mix", _Dense(self.obs_mix, 2, (order, self.obs_mix.out_channels)))
+        fast.register_module(
+            "chunk_lift", _Dense(self.chunk_lift, 1, (order, self.chunk_lift.channels))
+        )
+        fast.register_module("project", _Dense(self.project, 2, (self.project.layout.dim,)))
+        return fast
+
+
+class _Dense(nn.Module):
+    """A fixed equivariant layer as one matrix; the last ``in_rank`` axes are its input.
+
+    The matrix is computed in float64 and rounded once, so that it is as equivariant as the layer.
+    """
+
+    weight: torch.Tensor
+    bias: torch.Tensor
+
+    def __init__(
+        self, layer: Lift | RegularLinear | Project, in_rank: int, out_shape: tuple[int, ...]
+    ):
+        super().__init__()
+        self.in_rank, self.out_shape = in_rank, out_shape
+        with torch.no_grad():
+            weight, bias = copy.deepcopy(layer).double().dense()
+        self.register_buffer("weight", weight.to(layer.weight.dtype).contiguous())
+        self.register_buffer("bias", bias.to(layer.weight.dtype))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        out = functional.linear(x.flatten(-self.in_rank), self.weight, self.bias)
+        return out.unflatten(-1, self.out_shape)
+
+
+@dataclass(frozen=True)
+class EquivariantOptions(DenoisingOptions):
+    """Options of the equivariant diffusion policy."""
+
+    group: str = "C8"
+    """The finite symmetry group: C_n or D_n."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = Group.parse(self.group).order
+
+
+class EquivariantDiffusionPolicy(DiffusionPolicy):
+    """Equivariant Diffusion Policy (arXiv 2407.01812): symmetric by construction."""
+
+    name = "edp"
+    Options = EquivariantOptions
+    options: EquivariantOptions
+
+    def make_denoiser(self) -> LiftedDenoiser:
+        """The lifted network over the options' group."""
+        return lifted_denoiser(
+            self.options, self.obs_layout, self.act_layout, Group.parse(self.options.group)
+        )
+
+
+def lifted_denoiser(
+    options: DenoisingOptions, obs_layout: Layout, act_layout: Layout, group: Group
+) -> LiftedDenoiser:
+    """The network that the options describe, over ``group``."""
+    return LiftedDenoiser(
+        obs_layout,
+        act_layout,
+        options.horizon,
+        group,
+        options.network,
+        options.channels,
+        options.width,
+        options.depth,
+    )

@@ -1,0 +1,222 @@
+"""Training by denoising, decoding by DDIM: what all diffusion policies share.
+
+A subclass says in :meth:`DiffusionPolicy.make_denoiser` which network predicts the clean chunk,
+and may change the training batches in :meth:`DiffusionPolicy.augment`.
+"""
+
+from __future__ import annotations
+
+import abc
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Self, get_args
+
+import torch
+
+from symsteer.errors import UserError
+from symsteer.names import unknown
+from symsteer.policies.contract import ChunkPolicy, Episode, Progress
+from symsteer.policies.geometry import Layout
+from symsteer.policies.networks.denoiser import Denoiser
+from symsteer.policies.normalizer import Normalizer, clip_blocks
+from symsteer.policies.training.demonstrations import check_episodes, make_chunks
+from symsteer.policies.training.diffusion import Diffusion, Prediction
+from symsteer.policies.training.optimizer import GradientOptions, optimize
+
+Network = Literal["mlp", "unet"]
+
+DECODE_FIELDS = (
+    "group",
+    "network",
+    "channels",
+    "width",
+    "depth",
+    "horizon",
+    "execute",
+    "diffusion_steps",
+    "sampling_steps",
+    "prediction",
+)
+"""Options that a trained policy's behaviour depends on."""
+
+
+@dataclass(frozen=True)
+class DenoisingOptions(GradientOptions):
+    """Options of all diffusion policies."""
+
+    network: Network = "mlp"
+    """The network inside: residual MLP on the flattened chunk, or temporal U-Net."""
+    channels: int = 64
+    """Features of the observation embedding per group element."""
+    width: int = 64
+    """Features of the chunk per group element."""
+    depth: int = 3
+    """Residual blocks of the MLP."""
+    diffusion_steps: int = 100
+    """K: noise levels in training."""
+    sampling_steps: int = 4
+    """DDIM steps of the sampler."""
+    prediction: Prediction = "sample"
+    """What the network predicts: the clean chunk (sample) or the noise (epsilon)."""
+    snr_cap: float = 5.0
+    """Largest weight of a noise level in the loss of sample prediction (Min-SNR); larger values
+    spread the actions more over the noise, values of 0.05 or less weigh all levels alike."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_positive("channels", "width", "depth")
+        if self.network not in get_args(Network):
+            raise unknown("network", self.network, get_args(Network))
+        if self.network == "unet" and self.horizon % 2:
+            raise UserError(
+                f"the unet halves the chunk; choose an even horizon, not {self.horizon}"
+            )
+        Diffusion(self.diffusion_steps, self.prediction, self.snr_cap).timesteps(
+            self.sampling_steps
+        )
+
+    def resolved(self, obs_layout: Layout, act_layout: Layout) -> Self:
+        """Options in which everything that depends on the layouts is filled in."""
+        return self
+
+
+class DiffusionPolicy(ChunkPolicy):
+    """A diffusion policy: the denoiser of a subclass, trained and sampled in the same way.
+
+    Args:
+        options: as given or resolved; ``self.options`` are the resolved ones.
+
+    Raises:
+        UserError: if an option is out of range.
+    """
+
+    Options = DenoisingOptions
+    options: Any
+
+    def __init__(
+        self,
+        options: DenoisingOptions,
+        obs_layout: Layout,
+        act_layout: Layout,
+        obs_normalizer: Normalizer | None = None,
+        act_normalizer: Normalizer | None = None,
+    ):
+        options = options.resolved(obs_layout, act_layout)
+        super().__init__(options, obs_layout, act_layout, obs_normalizer, act_normalizer)
+        self.diffusion = Diffusion(options.diffusion_steps, options.prediction, options.snr_cap)
+        self.denoiser = self.make_denoiser()
+        self.group = self.denoiser.group
+        self._expanded: Denoiser | None = None
+        self.freeze()
+
+    @abc.abstractmethod
+    def make_denoiser(self) -> Denoiser:
+        """The network, untrained; it may read ``self.options`` and the layouts."""
+
+    def augment(
+        self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Change a training batch; ``obs [B, obs_dim]`` as it is, ``chunks`` normalised."""
+        return obs, chunks
+
+    @classmethod
+    def fit(
+        cls,
+        options: Any,
+        episodes: Sequence[Episode],
+        obs_layout: Layout,
+        act_layout: Layout,
+        seed: int = 0,
+        progress: Progress | None = None,
+        device: torch.device | str = "cpu",
+    ) -> Self:
+        """Train on demonstrations; see :meth:`ChunkPolicy.fit`.
+
+        Batches of chunks drawn with replacement, the denoising loss at uniformly drawn noise
+        levels; optimiser: :func:`symsteer.policies.training.optimizer.optimize`.
+        """
+        check_episodes(episodes, obs_layout, act_layout)
+        start = time.perf_counter()
+        options = options.resolved(obs_layout, act_layout)
+        obs, chunks = make_chunks(episodes, act_layout, options.horizon, options.hold)
+        # The environment bounds actions block by block: train on what it executes.
+        chunks = clip_blocks(chunks, act_layout, 1.0)
+        # CPU draws, so that a seed means the same on every device.
+        generator = torch.Generator().manual_seed(seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            policy = cls(
+                options,
+                obs_layout,
+                act_layout,
+                Normalizer.fit(obs_layout, obs),
+                Normalizer.fit(act_layout, chunks),
+            )
+        policy.to(device)
+        obs, chunks = obs.to(device), policy.act_normalizer.normalize(chunks.to(device))
+        network, count = policy.denoiser, options.batch_size
+
+        def batch_loss() -> torch.Tensor:
+            rows = torch.randint(len(obs), (count,), generator=generator).to(device)
+            levels = torch.randint(options.diffusion_steps, (count,), generator=generator)
+            noise = torch.randn(count, options.horizon, act_layout.dim, generator=generator)
+            levels, noise = levels.to(device), noise.to(device)
+            seen, clean = policy.augment(obs[rows], chunks[rows], generator)
+            noisy = policy.diffusion.add_noise(clean, noise, levels)
+            condition = network.encode(policy.normalized_observation(seen))
+            output = network(noisy, condition + network.encode_time(levels))
+            return policy.diffusion.loss(output, clean, noise, levels)
+
+        losses = optimize(network, batch_loss, options, progress)
+        policy.training_record = {
+            "seed": seed,
+            "episodes": len(episodes),
+            "chunks": len(obs),
+            "steps": options.steps,
+            "losses": losses,
+            "seconds": time.perf_counter() - start,
+            "threads": torch.get_num_threads(),
+            "device": str(device),
+            "parameters": policy.parameter_count(),
+        }
+        return policy.freeze()
+
+    def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Follow the deterministic sampler from ``noise``; see :meth:`ChunkPolicy.decode`."""
+        denoiser = self._inference_denoiser()
+        context = denoiser.encode(self.normalized_observation(obs))
+        levels = self.diffusion.timesteps(self.options.sampling_steps)
+        times = denoiser.encode_time(torch.tensor(levels, device=obs.device))
+        by_level = dict(zip(levels, times, strict=True))
+        clean = self.diffusion.sample(
+            lambda x, t: denoiser(x, context + by_level[t]),
+            noise,
+            self.options.sampling_steps,
+            # Normalised demonstrations lie within radius 1, block by block.
+            bound=lambda x: clip_blocks(x, self.act_layout, 1.0),
+        )
+        return clip_blocks(self.act_normalizer.unnormalize(clean), self.act_layout, 1.0)
+
+    def freeze(self) -> Self:
+        """Evaluation mode, no gradients; drops cached matrices after a change of weights."""
+        self.__dict__["_expanded"] = None
+        return super().freeze()
+
+    def decode_settings(self) -> dict[str, Any]:
+        """The options that decoding uses."""
+        return {key: getattr(self.options, key) for key in DECODE_FIELDS}
+
+    def _inference_denoiser(self) -> Denoiser:
+        if self._expanded is None:
+            # Not registered as a submodule: it is a cache, not part of the state.
+            self.__dict__["_expanded"] = self.denoiser.expanded()
+        return self.__dict__["_expanded"]
+
+    def _apply(self, fn, recurse=True):
+        self.__dict__["_expanded"] = None
+        return super()._apply(fn, recurse)
+
+    def _load_from_state_dict(self, *args, **kwargs):
+        self.__dict__["_expanded"] = None
+        super()._load_from_state_dict(*args, **kwargs)

@@ -1,0 +1,98 @@
+"""SymSteer installed from its wheel and used in an empty folder, far from any checkout."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from symsteer.registry import code_hash
+
+SUITE = """
+description = "one frozen policy"
+
+[grid]
+agent = ["base"]
+
+[run]
+task = "PickCube-v1"
+env_steps = 160
+num_envs = 4
+
+[run.demonstrations]
+count = 3
+
+[run.policy]
+channels = 8
+width = 16
+depth = 1
+steps = 20
+
+[run.evaluation]
+every = 160
+episodes = 2
+final_episodes = 3
+diagnostic_episodes = 2
+steerability_states = 2
+"""
+
+FOREIGN = 'raise ImportError("another project\'s package")\n'
+
+
+def sweep_and_report(installed, folder: Path, suite: str) -> list[dict]:
+    """The records that a sweep of a suite leaves, after a report on them."""
+    installed.run(folder, "symsteer", "sweep", suite, "--workers", "2")
+    installed.run(folder, "symsteer", "report", "runs")
+    page = folder / "runs" / "leaderboard" / "LEADERBOARD.md"
+    assert "PickCube-v1" in page.read_text()
+    assert list((page.parent / "figures").glob("*.svg"))
+    return [json.loads(file.read_text()) for file in folder.glob("runs/*/record.json")]
+
+
+def check_provenance(record: dict, version: str) -> None:
+    """Version and hash stand for the commit, though the environment lies in a repository."""
+    provenance = record["provenance"]
+    assert record["schema_version"] == 4
+    assert provenance["commit"] is None
+    assert provenance["version"] == version
+    assert provenance["sha256"] == code_hash("symsteer")  # of the checkout: the same files
+    assert provenance["extensions"] == []
+
+
+@pytest.fixture
+def version(installed, tmp_path) -> str:
+    where = "import symsteer; print(symsteer.__file__, symsteer.__version__)"
+    file, version = installed.run(tmp_path, "python", "-c", where).split()
+    assert Path(file).is_relative_to(installed.folder)
+    return version
+
+
+def test_list_sweep_and_report_in_an_empty_folder(installed, version, tmp_path):
+    names = installed.run(tmp_path, "symsteer", "list")
+    for name in ("PickCube-v1", "action_gain", "equivariant", "golden-ticket", "smoke", "demo"):
+        assert re.search(rf"^  {name} ", names, re.MULTILINE), names
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "tiny.toml").write_text(SUITE)
+    (record,) = sweep_and_report(installed, tmp_path, "tiny.toml")
+    check_provenance(record, version)
+
+
+def test_a_foreign_package_of_the_same_name_is_never_imported(installed, tmp_path):
+    """Packages ``agents`` exist: that of ``openai-agents``, for one."""
+    foreign, folder = tmp_path / "foreign", tmp_path / "empty"
+    folder.mkdir()
+    for name in ("agents", "bench", "leaderboard", "policies"):
+        (foreign / name).mkdir(parents=True)
+        (foreign / name / "__init__.py").write_text(FOREIGN)
+    (folder / "tiny.toml").write_text(SUITE)
+    assert "equivariant" in installed.run(folder, "symsteer", "list", path=foreign)
+    installed.run(folder, "symsteer", "sweep", "tiny.toml", "--workers", "1", path=foreign)
+    assert len(list(folder.glob("runs/*/record.json"))) == 1
+
+
+@pytest.mark.slow
+def test_smoke_in_an_empty_folder(installed, version, tmp_path):
+    records = sweep_and_report(installed, tmp_path, "smoke")
+    assert len(records) == 4
+    for record in records:
+        check_provenance(record, version)

@@ -1,0 +1,49 @@
+"""What the wheel holds."""
+
+import tomllib
+import zipfile
+from pathlib import PurePosixPath
+
+from tests.packaging.conftest import ROOT, build_wheel, python
+
+AUDIT = "leaderboard/results/audit/summary.json"
+"""What `report` needs for the map of advantage against measured defect."""
+
+
+def contents(wheel):
+    """Bytes by name, without the lists that the build itself writes."""
+    with zipfile.ZipFile(wheel) as file:
+        return {name: file.read(name) for name in file.namelist() if not name.endswith("/RECORD")}
+
+
+def test_the_wheel_is_complete_and_installs_one_name(wheel, source):
+    names = {name for name in contents(wheel) if ".dist-info/" not in name}
+    wanted = {f"symsteer/{AUDIT}", "symsteer/py.typed"}
+    for folder in ("symsteer", "agents", "bench", "leaderboard", "policies"):
+        inside = "" if folder == "symsteer" else "symsteer/"
+        for suffix in ("py", "toml"):
+            found = (source / folder).rglob(f"*.{suffix}")
+            wanted |= {inside + file.relative_to(source).as_posix() for file in found}
+    assert names == wanted
+
+
+def test_the_version_is_that_of_the_newest_entry_in_the_changelog(wheel):
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    entries = [
+        line.split("[")[1].split("]")[0]
+        for line in (ROOT / "CHANGELOG.md").read_text().splitlines()
+        if line.startswith("## [")
+    ]
+    citation = (ROOT / "CITATION.cff").read_text().splitlines()
+    assert f"version: {version}" in citation
+    assert entries[0] == version
+    assert PurePosixPath(wheel.name).name.startswith(f"symsteer-{version}-")
+
+
+def test_a_source_distribution_gives_the_same_wheel(wheel, source, tmp_path):
+    build = "import sys; from setuptools import build_meta; build_meta.build_sdist(sys.argv[1])"
+    python("-c", build, str(tmp_path), cwd=source)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    python("-m", "tarfile", "-e", str(archive), str(tmp_path), cwd=tmp_path)
+    unpacked = tmp_path / archive.name.removesuffix(".tar.gz")
+    assert contents(build_wheel(unpacked, tmp_path)) == contents(wheel)

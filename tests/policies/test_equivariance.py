@@ -1,0 +1,206 @@
+"""decode(g s, g w) = g decode(s, w): exactly, for every element; and not for wrong layouts."""
+
+import math
+
+import pytest
+import torch
+
+from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
+from symsteer.policies.normalizer import Normalizer
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
+
+
+def decode_error(policy, world, group, dtype, obs_layout=None, act_layout=None):
+    """Relative equivariance error of decode; inputs are transformed in float64.
+
+    ``obs_layout`` and ``act_layout`` say how the world turns; by default as the policy believes.
+    """
+    obs_layout, act_layout = obs_layout or policy.obs_layout, act_layout or policy.act_layout
+    generator = torch.Generator().manual_seed(1)
+    obs = world.observations(16) * 1.5
+    noise = 1.5 * torch.randn(16, policy.horizon, act_layout.dim, generator=generator)
+    return equivariance_error(
+        lambda *inputs: policy.decode(*(x.to(dtype) for x in inputs)),
+        (obs.double(), noise.double()),
+        (obs_layout, act_layout),
+        act_layout,
+        group,
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("network", ["mlp", "unet"])
+@pytest.mark.parametrize("name", ["C4", "C8", "D4"])
+class TestEquivariance:
+    def test_at_initialization(self, world, name, network, dtype):
+        policy = world.untrained(group=name, network=network).to(dtype)
+        error = decode_error(policy, world, Group.parse(name), dtype)
+        assert error <= TOLERANCE[dtype]
+
+    def test_after_training(self, trained, world, name, network, dtype):
+        policy = trained(group=name, network=network)
+        policy.to(dtype)
+        try:
+            error = decode_error(policy, world, Group.parse(name), dtype)
+        finally:
+            policy.float()
+        assert error <= TOLERANCE[dtype]
+
+
+@pytest.mark.parametrize("network", ["mlp", "unet"])
+def test_bounds_are_active_in_these_tests(trained, world, network):
+    """Equivariance of bounds means nothing where nothing is bounded."""
+    policy = trained(group="C8", network=network)
+    obs = world.observations(16) * 1.5
+    noise = 1.5 * torch.randn(16, policy.horizon, 7, generator=torch.Generator().manual_seed(1))
+    actions = policy.decode(obs, noise)
+    norms = actions[..., world.act_layout.slice("xy")].norm(dim=-1)
+    assert (norms > 0.999).float().mean() > 0.1
+    assert norms.max() <= 1 + 1e-6
+    assert actions.abs().max() <= 1
+
+
+def test_epsilon_prediction_is_equivariant_too(trained, world):
+    policy = trained(group="C8", prediction="epsilon")
+    # sqrt(a_t) = 5e-4 at the first level divides the rounding errors.
+    assert decode_error(policy, world, policy.group, torch.float32) <= 5e-3
+    policy.double()
+    try:
+        assert decode_error(policy, world, policy.group, torch.float64) <= 1e-10
+    finally:
+        policy.float()
+
+
+@pytest.mark.parametrize("name", ["C8", "D4"])
+def test_other_angles_are_not_symmetries(trained, world, name):
+    """The group is all that is built in; so the error of other angles is not zero."""
+    policy = trained(group=name)
+    assert decode_error(policy, world, Group.parse("C5"), torch.float32) > 1e-3
+
+
+def swapped_frequency(layout, name, frequency):
+    return Layout(
+        [
+            Field(f.name, frequency if f.name == name else f.frequency, f.multiplicity, f.odd)
+            for f in layout.fields
+        ]
+    )
+
+
+def as_scalars(layout, name):
+    return Layout([Field(f.name, 0, 2) if f.name == name else f for f in layout.fields])
+
+
+def without_odd(layout, name):
+    return Layout(
+        [
+            Field(f.name, f.frequency, f.multiplicity, f.odd and f.name != name)
+            for f in layout.fields
+        ]
+    )
+
+
+WRONG_LAYOUTS = {
+    "observation's rod turns twice as fast": ("obs", lambda o: swapped_frequency(o, "rod", 1)),
+    "observation's goal is a vector": ("obs", lambda o: as_scalars(o, "goal")),
+    "action's tilt turns once": ("act", lambda a: swapped_frequency(a, "tilt", 2)),
+    "action's xy is a vector": ("act", lambda a: as_scalars(a, "xy")),
+    "action's yaw is odd": ("act", lambda a: without_odd(a, "yaw")),
+    "action's tilt is odd": ("act", lambda a: without_odd(a, "tilt")),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG_LAYOUTS)
+def test_a_wrong_layout_shows(world, mistake):
+    """The policy believes one layout; the world turns by the right one."""
+    which, wrong = WRONG_LAYOUTS[mistake]
+    layouts = {"obs": world.obs_layout, "act": world.act_layout}
+    layouts[which] = wrong(layouts[which])
+    torch.manual_seed(0)
+    options = world.options(group="D4")
+    policy = EquivariantDiffusionPolicy(options, layouts["obs"], layouts["act"])
+    # At initialisation outputs are small against what the noise could do: scale them up.
+    policy.denoiser.project.weight.mul_(5)
+    policy.freeze()
+    right = {"obs_layout": world.obs_layout, "act_layout": world.act_layout}
+    error = decode_error(policy, world, policy.group, torch.float32, **right)
+    assert error > 1e-2
+    # The very same measure vanishes for the layout that the policy believes.
+    assert decode_error(policy, world, policy.group, torch.float32) <= 1e-5
+
+
+def test_a_per_axis_bound_shows(trained, world, monkeypatch):
+    policy = trained(group="C8")
+    per_axis = "symsteer.policies.training.denoising.clip_blocks"
+    monkeypatch.setattr(per_axis, lambda x, layout, r: x.clamp(-r, r))
+    assert decode_error(policy, world, policy.group, torch.float32) > 1e-2
+
+
+@pytest.mark.parametrize("which", ["obs", "act"])
+@pytest.mark.parametrize("statistic", ["scale", "offset"])
+def test_per_dimension_statistics_show(trained, world, which, statistic):
+    policy = trained(group="C8")
+    normalizer = getattr(policy, f"{which}_normalizer")
+    name = "goal" if which == "obs" else "xy"
+    before = getattr(normalizer, statistic)
+    broken = before.clone()
+    broken[normalizer.layout.slice(name)] += torch.tensor([0.3, 0.0])
+    setattr(normalizer, statistic, broken)
+    try:
+        assert decode_error(policy, world, policy.group, torch.float32) > 1e-2
+    finally:
+        setattr(normalizer, statistic, before)
+
+
+@pytest.mark.parametrize("network", ["mlp", "unet"])
+def test_expanded_layers_equal_the_originals(trained, network, world):
+    policy = trained(group="D4", network=network)
+    policy.double()
+    try:
+        obs = policy.normalized_observation(world.observations(4).double())
+        x = torch.randn(4, policy.horizon, 7, dtype=torch.float64)
+        fast = policy.denoiser.expanded()
+        time = policy.denoiser.encode_time(torch.tensor([7]))
+        slow_context = policy.denoiser.encode(obs)
+        assert torch.allclose(fast.encode(obs), slow_context, atol=1e-12)
+        slow, quick = (net(x, slow_context + time) for net in (policy.denoiser, fast))
+        assert torch.allclose(slow, quick, atol=1e-12)
+    finally:
+        policy.float()
+
+
+def test_new_weights_reach_decode(world):
+    """The matrices cached for decoding follow the weights."""
+    policy = world.untrained(group="C4")
+    obs, noise = world.observations(2), torch.randn(2, policy.horizon, 7)
+    before = policy.decode(obs, noise)
+    other = world.untrained(group="C4")
+    torch.manual_seed(3)
+    for parameter in other.parameters():
+        parameter.normal_(std=0.1)
+    policy.load_state_dict(other.state_dict())
+    after = policy.decode(obs, noise)
+    assert not torch.allclose(before, after, atol=1e-3)
+    assert torch.equal(after, other.decode(obs, noise))
+
+
+def test_the_network_sees_its_condition_and_noise_level(trained, world):
+    policy = trained(group="C8")
+    noise = torch.randn(8, policy.horizon, 7, generator=torch.Generator().manual_seed(0))
+    obs = world.observations(8)
+    assert (policy.decode(obs, noise) - policy.decode(obs.flip(0), noise)).abs().max() > 0.1
+    assert (policy.decode(obs, noise) - policy.decode(obs, noise.flip(0))).abs().max() > 0.01
+    times = policy.denoiser.encode_time(torch.tensor([0, 50, 99]))
+    assert (times[0] - times[1]).abs().max() > 1e-2
+
+
+def test_angles_of_a_normalizer_fit_do_not_matter(world):
+    """Statistics of turned demonstrations are those of the demonstrations (vectors only)."""
+    obs = torch.cat([o for o, _ in world.episodes(4)]).double()
+    angle = math.radians(37)
+    first = Normalizer.fit(world.obs_layout, obs)
+    second = Normalizer.fit(world.obs_layout, world.obs_layout.transform(obs, angle))
+    assert torch.allclose(first.scale, second.scale, atol=1e-6)
+    assert torch.allclose(first.offset, second.offset, atol=1e-6)

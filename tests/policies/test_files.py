@@ -1,0 +1,229 @@
+"""Saving and loading policies: bit-equal round trip, checksums, one-sentence errors."""
+
+import errno
+import hashlib
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from symsteer.errors import UserError
+from symsteer.policies import POLICIES
+from symsteer.policies.files import load_policy, save_policy
+from symsteer.policies.geometry import Field, Layout
+
+
+def decode(policy, world):
+    noise = torch.randn(6, policy.horizon, 7, generator=torch.Generator().manual_seed(2))
+    kind = policy.obs_normalizer.scale.dtype
+    return policy.decode(world.observations(6).to(kind), noise.to(kind))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"group": "C8"},
+        {"group": "D4", "network": "unet"},
+        {"name": "plain", "network": "unet"},
+        {"name": "plain-augmented", "augmentation": "SO2", "hold": ("gripper", "z")},
+    ],
+)
+def test_round_trip_is_bit_equal(trained, world, tmp_path, fields):
+    policy = trained(**fields)
+    policy.report = {"success": 0.25}
+    path = save_policy(policy, tmp_path / "run", extra={"note": [1, "two"]})
+    assert path == tmp_path / "run" / "policy.safetensors"
+    loaded = load_policy(tmp_path / "run", policy.obs_layout, policy.act_layout)
+    assert torch.equal(decode(loaded, world), decode(policy, world))
+    assert loaded.content_hash() == policy.content_hash()
+    assert type(loaded) is type(policy)
+    assert loaded.options == policy.options
+    assert loaded.report == {"success": 0.25, "note": [1, "two"]}
+    assert loaded.training_record == json.loads(json.dumps(policy.training_record))
+    assert not any(p.requires_grad for p in loaded.parameters())
+    assert not loaded.training
+    assert os.listdir(tmp_path / "run") == ["policy.safetensors"]
+
+
+def test_double_precision_survives(trained, world, tmp_path):
+    policy = trained(group="C8")
+    policy.double()
+    try:
+        loaded = load_policy(save_policy(policy, tmp_path / "p.safetensors"))
+        assert decode(loaded, world).dtype == torch.float64
+        assert torch.equal(decode(loaded, world), decode(policy, world))
+    finally:
+        policy.float()
+
+
+def test_hash_follows_what_decides_decoding(trained, tmp_path):
+    policy = trained(group="C8")
+    before = policy.content_hash()
+    policy.report = {"anything": 1}
+    assert policy.content_hash() == before
+    scale = policy.act_normalizer.scale.clone()
+    policy.act_normalizer.scale[0] += 1e-6
+    changed = policy.content_hash()
+    policy.act_normalizer.scale.copy_(scale)
+    assert changed != before == policy.content_hash()
+
+
+def test_a_failed_write_leaves_the_old_file(trained, tmp_path, monkeypatch):
+    policy = trained(group="C8")
+    path = save_policy(policy, tmp_path)
+    old = path.read_bytes()
+
+    def full_disk(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full_disk)
+    with pytest.raises(UserError, match=r"policy\.safetensors cannot be written: No space"):
+        save_policy(policy, tmp_path)
+    assert path.read_bytes() == old
+    assert os.listdir(tmp_path) == [path.name]
+
+
+@pytest.fixture
+def saved(trained, tmp_path):
+    return save_policy(trained(group="C8"), tmp_path)
+
+
+def rewrite(path, metadata=None, drop=None, scale=None):
+    """The same file with other metadata or tensors."""
+    with safe_open(path, framework="pt") as file:
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        meta = {**file.metadata(), **(metadata or {})}
+    if drop:
+        del tensors[drop]
+    if scale:
+        tensors[scale] = tensors[scale] * 1.5
+    save_file(tensors, path, meta)
+
+
+def refuse(path, *words, **expectations):
+    with pytest.raises(UserError) as error:
+        load_policy(path, **expectations)
+    message = str(error.value)
+    assert "\n" not in message
+    assert all(word in message for word in words), message
+
+
+def test_missing_file(tmp_path):
+    refuse(tmp_path / "nothing", "no policy at")
+
+
+@pytest.mark.parametrize("keep", [0, 5, 200, -100])
+def test_truncated_file(saved, keep):
+    saved.write_bytes(saved.read_bytes()[:keep])
+    refuse(saved, "truncated")
+
+
+def test_other_files(saved, tmp_path):
+    foreign = tmp_path / "foreign.safetensors"
+    save_file({"x": torch.zeros(3)}, foreign)
+    refuse(foreign, "no SymSteer policy")
+    text = tmp_path / "text.safetensors"
+    text.write_text("not tensors at all, just a long enough text")
+    refuse(text, "no safetensors file")
+
+
+def test_other_version(saved):
+    rewrite(saved, {"version": "99"})
+    refuse(saved, "version 99", "up to 3")
+
+
+@pytest.mark.parametrize(
+    "description",
+    ["{", "{}", "[]", '{"config": {"name": "edp"}}', '{"name": "quantum", "extension": null}'],
+)
+def test_damaged_description(saved, description):
+    digest = hashlib.sha256(description.encode()).hexdigest()
+    rewrite(saved, {"policy": description, "policy_sha256": digest})
+    refuse(saved, "damaged")
+
+
+def test_an_edited_report_is_noticed(trained, tmp_path):
+    path = save_policy(trained(group="C8"), tmp_path, extra={"success": 0.25})
+    with safe_open(path, framework="pt") as file:
+        description = file.metadata()["policy"]
+    rewrite(path, {"policy": description.replace('"success": 0.25', '"success": 0.95')})
+    refuse(path, "does not match its checksum")
+
+
+def test_damaged_tensors(saved):
+    rewrite(saved, drop="denoiser.project.weight")
+    refuse(saved, "damaged", "project.weight")
+
+
+def test_altered_tensors(saved):
+    rewrite(saved, scale="denoiser.project.weight")
+    refuse(saved, "checksum")
+
+
+def test_other_layouts(saved, world):
+    other = Layout([Field("tcp", 1), Field("else", 0)])
+    refuse(saved, "observation layout", "else", expect_obs_layout=other)
+    refuse(saved, "action layout", "else", expect_act_layout=other)
+    load_policy(saved, expect_obs_layout=world.obs_layout, expect_act_layout=world.act_layout)
+
+
+def test_a_file_of_version_2():
+    """Written by SymSteer 0.1 with this policy's tiny configuration."""
+    folder = Path(__file__).parent / "data"
+    expected = json.loads((folder / "version-2.json").read_text())
+    policy = load_policy(folder / "version-2.safetensors")
+    assert (policy.name, str(policy.group), policy.execute) == ("edp", "D4", 2)
+    assert policy.content_hash() == expected["content_hash"]
+    assert policy.report == {"steerability": {"success": 0.25}}
+    obs, noise, actions = (torch.tensor(expected[key]) for key in ("obs", "noise", "actions"))
+    assert torch.allclose(policy.decode(obs, noise), actions, atol=1e-5)
+
+
+STRANGER = """
+import torch
+from symsteer.policies.contract import ChunkPolicy, PolicyOptions
+
+
+class Echo(ChunkPolicy):
+    name = "echo"
+
+    @classmethod
+    def fit(cls, options, episodes, obs_layout, act_layout, seed=0, progress=None, device="cpu"):
+        return cls(options, obs_layout, act_layout).to(device).freeze()
+
+    def decode(self, obs, noise):
+        return noise.clamp(-1, 1)
+"""
+
+
+def test_a_policy_from_another_package(world, tmp_path, monkeypatch):
+    (tmp_path / "stranger.py").write_text(STRANGER)
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(tmp_path)
+        kind = POLICIES.get("stranger:Echo")
+        options = kind.Options(horizon=4, execute=1)
+        policy = kind.fit(options, world.episodes(1), world.obs_layout, world.act_layout)
+        path = save_policy(policy, tmp_path)
+        loaded = load_policy(path)
+        assert type(loaded) is kind
+        assert loaded.options == options
+        assert loaded.content_hash() == policy.content_hash()
+        other = kind(kind.Options(horizon=4, execute=2), world.obs_layout, world.act_layout)
+        assert other.content_hash() != policy.content_hash()
+        assert torch.equal(decode(loaded, world), decode(policy, world))
+    monkeypatch.delitem(sys.modules, "stranger")
+    refuse(path, "stranger", "not installed")
+
+
+def test_a_policy_that_no_other_program_can_import_is_not_saved(world, tmp_path):
+    class Local(type(world.untrained())):
+        pass
+
+    policy = Local(world.options(), world.obs_layout, world.act_layout)
+    with pytest.raises(UserError, match="Local cannot be found"):
+        save_policy(policy, tmp_path)
