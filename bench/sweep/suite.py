@@ -12,9 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from symsteer.agents.presets import preset_options
-
 from symsteer.agents import AGENTS
+from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.sweep.grid import SuiteData, read_suite, split_key
 from symsteer.errors import UserError
@@ -107,7 +106,9 @@ class _Options:
 
     def _text(self, value: Any, key: str) -> str:
         if not isinstance(value, str):
-            raise UserError(f"{self.source}: {self.kind}.{key} must be a text in quotes, not {value!r}")
+            raise UserError(
+                f"{self.source}: {self.kind}.{key} must be a text in quotes, not {value!r}"
+            )
         return value
 
     def _check(self, path: list[str], names: list[str]) -> None:

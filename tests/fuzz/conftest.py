@@ -7,10 +7,10 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+from symsteer.bench.runs.loop import Loop
 
 from symsteer.bench.runs.config import RunConfig, flat
 from symsteer.bench.runs.folder import load_checkpoint
-from symsteer.bench.runs.loop import Loop
 from symsteer.bench.runs.run import execute
 from symsteer.bench.sweep.plan import make_plan, write_manifest
 from symsteer.bench.sweep.suite import Suite

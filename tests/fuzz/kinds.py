@@ -30,13 +30,13 @@ import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from symsteer.bench.runs.loop import Loop
 
 from symsteer import cli
 from symsteer.bench.runs import base_policy
 from symsteer.bench.runs import run as run_module
 from symsteer.bench.runs.config import RunConfig, flat
 from symsteer.bench.runs.folder import load_checkpoint
-from symsteer.bench.runs.loop import Loop
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.bench.tasks import task_class
 from symsteer.leaderboard.records import config_hash, read_record

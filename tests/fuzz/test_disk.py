@@ -14,11 +14,11 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import pytest
+from symsteer.bench.runs.loop import Loop
 
 from symsteer import cli
 from symsteer.bench.demos import load
 from symsteer.bench.runs.folder import load_checkpoint, state_of
-from symsteer.bench.runs.loop import Loop
 from symsteer.bench.runs.run import execute, resume
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import without_clock

@@ -5,10 +5,10 @@ import sys
 
 import pytest
 import torch
-from symsteer.bench.cli import main
 
 from symsteer.bench.audit import page
 from symsteer.bench.audit.study import variant_texts
+from symsteer.bench.cli import main
 from symsteer.bench.tasks import task_class
 from symsteer.bench.variants import VARIANTS
 from symsteer.errors import UserError

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from symsteer.bench.runs.loop import new_agent
 
 from symsteer.bench.runs.base_policy import prepare_base
-from symsteer.bench.runs.loop import new_agent
 from symsteer.bench.runs.pictures import FAILURE, FRAMES, SUCCESS, draw_paths, film, positions
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.evaluation import Rollout

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from symsteer.bench.runs.loop import Loop
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, metadata
 
 from symsteer.bench.runs import loop
 from symsteer.bench.runs.folder import run_id, state_of
-from symsteer.bench.runs.loop import Loop
 from symsteer.bench.runs.run import execute, resume
 from symsteer.bench.runs.tensorboard import FINAL_METRICS, IDENTITY, RunLog
 from symsteer.bench.sim.headless import rendering_works

@@ -11,7 +11,6 @@ from datetime import UTC, datetime
 import pytest
 from filelock import FileLock
 from rich.console import Console
-from symsteer.cli import main
 
 from symsteer.bench.runs.folder import CONFIG, LOCK, PROGRESS, RECORD
 from symsteer.bench.sweep.display import Display, LiveDisplay
@@ -21,6 +20,7 @@ from symsteer.bench.sweep.schedule import Outcome, Task, tasks_of
 from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite
 from symsteer.bench.sweep.work import Result
+from symsteer.cli import main
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG
@@ -259,7 +259,7 @@ def test_equal_demonstrations_and_bases_are_built_once(tmp_path):
         one,
         replace(one, seed=1),
         replace(one, variant="wind:1"),
-        replace(one, policy=replace(one.policy, name="plain")),
+        tiny_config(policy_name="plain"),
         replace(one, task="PushCube-v1"),
     )
     plan = make_plan(Suite("shared", "", configs), tmp_path)

@@ -13,7 +13,6 @@ import threading
 
 import psutil
 import pytest
-from symsteer.cli import main
 
 from symsteer.bench.runs.base_policy import demonstration_path
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
@@ -24,6 +23,7 @@ from symsteer.bench.sweep.schedule import Outcome, Task, execute_plan
 from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite, load_suite
 from symsteer.bench.sweep.work import Result
+from symsteer.cli import main
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import tiny_config, without_clock
