@@ -96,9 +96,9 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
         own["policy_seed"] = world["policy_seed"]
     told = build_config(config.to_json() | own, str(path))
     # What has its default value was not asked for: the file decides.
-    plain = build_config({"policy": {"name": config.policy.name}}, "defaults")
+    plain = RunConfig(agent=config.agent, policy_name=config.policy_name)
     default, asked, found = (flat(c.to_json()) for c in (plain, config, told))
-    default["policy.name"] = RunConfig().policy.name
+    default["policy.name"] = RunConfig.policy_name
     for key, value in asked.items():
         if value not in (default[key], found.get(key)):
             raise UserError(

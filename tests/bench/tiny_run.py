@@ -4,11 +4,7 @@ import dataclasses
 import json
 
 from symsteer.agents import AGENTS
-from symsteer.bench.runs.config import (
-    DemonstrationConfig,
-    EvaluationConfig,
-    RunConfig,
-)
+from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
 from symsteer.policies import POLICIES
 
 AGENT = {"width": 16, "batch_size": 16, "warmup": 16, "utd": 1.0, "group": "C4"}
