@@ -264,7 +264,7 @@ def test_no_crossing_is_said_in_words() -> None:
     )
     assert text(-1, -0.1, [-1.0] * 20, [-0.1] * 20).startswith("none: the line stays below 0 from")
     assert text(1, -0.1, [1.0] * 20, [-0.1] * 20) == (
-        "none: the line rises through 0 from 0.00 to 0.40; the data leave open where"
+        "none: the line rises through 0 from 0.00 to 0.40; the data do not say where"
     )
     assert text(-1, 0.5, [-1.0] * 19 + [-2.0], [0.5] * 20).endswith("it does not lie below 0.25")
     assert text(-1, -0.1, [-1.0] * 20, [-0.1] * 19 + [0.3]).endswith("does not lie beyond 0.30")
