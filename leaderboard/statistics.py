@@ -58,10 +58,8 @@ class Block:
 
     def draw(self, resamples: int) -> Array:
         """The value under each resample's weights of episodes: [resamples]."""
-        weights = np.stack([episode_weights(seed, resamples) for seed in self.seeds])
-        # Not `@`: matrix products would start threads for these small sums.
-        totals = (weights * self.totals[:, None]).sum(axis=0)
-        return totals / (weights * self.counts[:, None]).sum(axis=0)
+        totals = _weighted_sum(self.seeds, tuple(self.totals), resamples)
+        return totals / _weighted_counts(self.seeds, tuple(self.counts), resamples)
 
 
 @dataclass(frozen=True)
@@ -114,6 +112,21 @@ def episode_weights(seed: int, resamples: int) -> Array:
     weights = np.random.default_rng([_EPISODES, seed]).exponential(size=resamples)
     weights.flags.writeable = False
     return weights
+
+
+@lru_cache(maxsize=4)
+def _stacked_weights(seeds: tuple[int, ...], resamples: int) -> Array:
+    """`episode_weights` of several episodes: [seeds, resamples]."""
+    return np.stack([episode_weights(seed, resamples) for seed in seeds])
+
+
+def _weighted_sum(seeds: tuple[int, ...], values: tuple[float, ...], resamples: int) -> Array:
+    # Not `@`: matrix products would start threads for these small sums.
+    return (_stacked_weights(seeds, resamples) * np.array(values)[:, None]).sum(axis=0)
+
+
+_weighted_counts = lru_cache(maxsize=64)(_weighted_sum)
+"""The same, kept: most blocks of a leaderboard have equal episodes and counts."""
 
 
 def iqm(values: Sequence[float] | Array, axis: int = -1) -> Array:

@@ -54,7 +54,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for variant, defect in (DEFECTS | {"wind:0.75": 0.3}).items():
         rates = {"base": 0.3, "zero": 0.4, "golden-ticket": 0.45, "standard": 0.5}
         rates |= {"standard-matched": 0.5, "equivariant": 0.8 - defect, "approximate": 0.7}
-        records += make_cell(rates, episodes=100, variant=variant)
+        records += make_cell(rates, variant=variant)
     for record in records:
         if record.settings.agent == "golden-ticket":
             record.budget.env_steps = 12_800
