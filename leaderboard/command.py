@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,8 +72,8 @@ def _folder_for(records: Sequence[Path]) -> Path:
     if not records:
         return PAGE_FOLDER
     first = records[0]
-    out = (first.parent if first.is_file() else first) / "leaderboard"
-    if out.resolve() == PAGE_FOLDER:
+    out = (first.parent if os.path.isfile(first) else first) / "leaderboard"
+    if Path(os.path.realpath(out)) == PAGE_FOLDER:
         raise UserError(
             f"{out} holds the committed leaderboard; name another folder, or this one, with --out"
         )

@@ -11,7 +11,6 @@ import h5py
 import pytest
 import torch
 
-from symsteer.bench.cli import _threads, main
 from symsteer.bench.demos import collect
 from symsteer.bench.tasks import task_class
 from symsteer.cli import VERBS, _threads, main
