@@ -284,7 +284,9 @@ class Replay:
         return wall, cpu
 
 
-_replay = cache(Replay)
+@cache
+def _replay(env_cls: Any, num_envs: int) -> Replay:
+    return Replay(env_cls, num_envs)
 
 
 def _replay_episodes(env_cls: type[BaseEnv], num_envs: int, episodes: int) -> tuple[float, float]:
@@ -394,8 +396,10 @@ def measure(
             for contender in contenders:
                 contender.turn()
     finally:
-        for started in (*helpers, *contenders):
-            started.close()
+        for helper in helpers:
+            helper.close()
+        for contender in contenders:
+            contender.close()
     rows = [contender.row for contender in contenders]
     report("timing the parts of a step")
     size = min((n for n in num_envs if n >= 64), default=max(num_envs))

@@ -1,7 +1,7 @@
 """Estimators of the audit: bootstrap intervals, energy distance, distance of Gaussians.
 
-All are pure functions of numbers and a seed. Resampling draws whole states (one per episode) or whole
-resets, never single numbers of a state.
+All are pure functions of numbers and a seed. Resampling draws whole states (one per episode) or
+whole resets, never single numbers of a state.
 """
 
 from __future__ import annotations

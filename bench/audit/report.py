@@ -1,4 +1,4 @@
-"""What the audit prints and writes: a readable page a result, tables of many, a map."""
+"""Output of the audit: a text page of one result, tables of many, a map."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from matplotlib.patches import Rectangle
 from symsteer.bench.audit.estimates import Estimate
 from symsteer.bench.audit.result import BIN, AuditResult, Defect
 from symsteer.errors import UserError
-from symsteer.files import write_atomically, write_together
+from symsteer.files import write_together
 
 EXACT = 1e-3
-"""Reward and observation defects below this are rounding."""
+"""Reward and observation defects below this are rounding errors."""
 
 SIGNIFICANT = 0.01
 """Resets differ from their turned copies below this p-value."""
@@ -28,7 +28,7 @@ MIN_COPIES = 3
 
 
 def text(result: AuditResult) -> str:
-    """A cell as a page for the terminal."""
+    """A result as a page for the terminal."""
     s = result.settings
     visitors = " and ".join(f"{s.count} of the {v}" for v in s.visitors)
     lines = [
@@ -81,19 +81,20 @@ def text(result: AuditResult) -> str:
 
 
 def meaning(result: AuditResult) -> str:
-    """One sentence."""
+    """A result in one sentence."""
     tool, thing = result.defect("tool", "step"), result.defect("object", "chunk")
     parts = []
     if tool is not None and tool.relative is not None:
         parts.append(
-            f"turned with the world, a step takes the tool elsewhere by "
-            f"{tool.relative.value:.2g} of its length"
-            if tool.relative.value >= 1
-            else f"turned with the world, a step takes the tool elsewhere by "
-            f"{100 * tool.relative.value:.2g} % of its length"
+            "turned copies of a step move the tool to places that differ by "
+            + (
+                f"{tool.relative.value:.2g} of its length"
+                if tool.relative.value >= 1
+                else f"{100 * tool.relative.value:.2g} % of its length"
+            )
         )
     if thing is not None and thing.relative is not None:
-        parts.append(f"a chunk the object by {100 * thing.relative.value:.2g} %")
+        parts.append(f"copies of a chunk move the object by {100 * thing.relative.value:.2g} %")
     broken: list[str] = []
     kept: list[str] = []
     reward = max(result.reward["cost"].value, result.reward["dense"].value)
@@ -182,7 +183,7 @@ ESTIMATES = {
     "field_mm": lambda c: c.worst_field.value if c.worst_field else None,
     "resets": lambda c: c.resets,
 }
-"""Columns of the table, each a number with its interval."""
+"""Columns of the table that are numbers with an interval."""
 
 PLAIN = {
     "task": lambda c: c.settings.task,
@@ -208,7 +209,7 @@ def _short(value: float | None) -> float | None:
 
 
 def summary(result: AuditResult) -> dict[str, Any]:
-    """A row of the table: numbers to three digits, an interval as [value, low, high]."""
+    """A row of the table: numbers with three digits, an interval as [value, low, high]."""
     row: dict[str, Any] = {name: get(result) for name, get in PLAIN.items()}
     for name, get in ESTIMATES.items():
         estimate = get(result)
@@ -237,7 +238,7 @@ def to_csv(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows of :func:`summary` as a table for readers, one row a result."""
+    """Rows of :func:`summary` as a markdown table."""
     several = len({(r["task"], r["embodiment"], r["group"]) for r in rows}) > 1
     head = ["variant", "tool, step", "tool, chunk", "object, chunk", "object, mm", "cost", "dense"]
     head += ["observed", "field, mm", "resets", "p"]
@@ -264,7 +265,7 @@ def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
 def _interval(
     interval: list[float] | None, scale: float, unit: str = "", exact: float = 0.0
 ) -> str:
-    """``value [low, high]``; a plain 0 where all three are below ``exact``."""
+    """``value [low, high]``; just 0 if all three are below ``exact``."""
     if interval is None:
         return "at rest"
     if all(abs(v) < exact for v in interval):
@@ -279,7 +280,7 @@ def percent(interval: list[float] | None) -> str:
 
 
 def percent_range(intervals: Sequence[list[float] | None], exact: float) -> str:
-    """Smallest to largest value in per cent; a plain 0 where all are below ``exact``."""
+    """Smallest to largest value in per cent; just 0 if all are below ``exact``."""
     values = [i[0] for i in intervals if i is not None]
     if not values:
         return "at rest"
@@ -306,17 +307,19 @@ def write_result(result: AuditResult, folder: Path) -> None:
     """Write ``audit.json``, ``map.csv`` and ``map.png``.
 
     Raises:
-        RecordError: if the folder cannot be written.
+        UserError: the folder cannot be written.
     """
     rows = ["body,x_mm,y_mm,copies,mm"]
     rows += [f"{b.body},{b.x_mm:g},{b.y_mm:g},{b.copies},{b.mm:.4g}" for b in result.map]
     picture = io.BytesIO()
     map_figure(result).savefig(picture, format="png", dpi=110, metadata={"Software": None})
-    write_atomically(folder / "map.csv", ("\n".join(rows) + "\n").encode())
-    write_atomically(folder / "map.png", picture.getvalue())
-    # Last: a cell with this file is complete, and is not measured again.
-    write_atomically(
-        folder / "audit.json", (json.dumps(result.to_json(), indent=1) + "\n").encode()
+    write_together(
+        {
+            folder / "map.csv": ("\n".join(rows) + "\n").encode(),
+            folder / "map.png": picture.getvalue(),
+            # Last: a folder with this file is complete, and is not measured again.
+            folder / "audit.json": (json.dumps(result.to_json(), indent=1) + "\n").encode(),
+        }
     )
 
 
@@ -324,7 +327,7 @@ def read_result(path: Path) -> AuditResult:
     """Read an ``audit.json``.
 
     Raises:
-        UserError: if it is missing or damaged.
+        UserError: the file is missing or damaged.
     """
     try:
         return AuditResult.from_json(json.loads(path.read_text()))
@@ -333,28 +336,34 @@ def read_result(path: Path) -> AuditResult:
             f"cannot read the audit {path}: {error.strerror}; name another, or run it again"
         ) from error
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is no audit ({error}); run the audit again") from error
+        raise UserError(
+            f"{path} is not the file of an audit ({error}); run the audit again"
+        ) from error
 
 
 def write_table(results: Sequence[AuditResult], folder: Path) -> None:
-    """Write ``table.csv``, ``table.md`` and ``summary.json`` of many cells.
+    """Write ``table.csv``, ``table.md`` and ``summary.json`` of many results.
 
     Raises:
-        RecordError: if the folder cannot be written.
+        UserError: the folder cannot be written.
     """
     rows = [summary(result) for result in results]
-    write_atomically(folder / "table.csv", to_csv(rows).encode())
-    write_atomically(folder / "table.md", to_markdown(rows).encode())
-    write_atomically(folder / "summary.json", summary_json(rows).encode())
+    write_together(
+        {
+            folder / "table.csv": to_csv(rows).encode(),
+            folder / "table.md": to_markdown(rows).encode(),
+            folder / "summary.json": summary_json(rows).encode(),
+        }
+    )
 
 
 def summary_json(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows of :func:`summary`, a line each."""
+    """JSON of rows of :func:`summary`, one per line."""
     return "[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n"
 
 
 def map_figure(result: AuditResult) -> Figure:
-    """Where in the workspace copies depart from the majority, for tool and object."""
+    """Map of the workspace: distance of copies from the majority, for tool and object."""
     figure = Figure(figsize=(9, 4.2), layout="constrained")
     axes = figure.subplots(1, 2)
     side = 1e3 * BIN

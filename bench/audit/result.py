@@ -1,8 +1,4 @@
-"""AuditSettings and result of an audit; docs/audit.md defines every number.
-
-They are plain data: :meth:`AuditResult.to_json` writes a result, :meth:`AuditResult.from_json` reads
-it.
-"""
+"""Settings and result of an audit, as plain data; docs/audit.md defines every number."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from symsteer.bench.audit.measure import check_group
+from symsteer.bench.audit.result import check_group
 from symsteer.bench.audit.states import Turner, visit
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.rotations import planar_matrix, transform_quaternion
