@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import version
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -284,14 +284,15 @@ class Replay:
         return wall, cpu
 
 
-@cache
-def _replay(env_cls: Any, num_envs: int) -> Replay:
-    return Replay(env_cls, num_envs)
+_REPLAYS: dict[tuple[type[BaseEnv], int], Replay] = {}
 
 
 def _replay_episodes(env_cls: type[BaseEnv], num_envs: int, episodes: int) -> tuple[float, float]:
     """Wall and processor seconds of the substeps of some episodes, in this process."""
-    times = [_replay(env_cls, num_envs).play() for _ in range(episodes)]
+    key = env_cls, num_envs
+    if key not in _REPLAYS:
+        _REPLAYS[key] = Replay(*key)
+    times = [_REPLAYS[key].play() for _ in range(episodes)]
     return sum(wall for wall, _ in times), sum(cpu for _, cpu in times)
 
 

@@ -1,4 +1,4 @@
-"""`symsteer audit` as a user meets it, and the page that is made from its results."""
+"""The command `symsteer audit`, and the pages that are made from its results."""
 
 import json
 import sys

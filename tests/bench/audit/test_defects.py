@@ -1,4 +1,4 @@
-"""The audit calls the unbroken task unbroken, and sees what is broken, where it claims to be."""
+"""The audit finds no defect in the unbroken task, and finds what variants claim to break."""
 
 import dataclasses
 import json
@@ -49,7 +49,7 @@ def place():
 
 
 def broken(result: AuditResult, unbroken: AuditResult) -> set[str]:
-    """The components in which a result differs from the unbroken one beyond both intervals."""
+    """The components in which a result differs from the unbroken one: intervals do not overlap."""
     found = set()
     for row, other in zip(result.dynamics, unbroken.dynamics, strict=True):
         for measure in ("mm", "degrees"):
@@ -101,7 +101,7 @@ def test_action_gain_is_seen_in_proportion(place):
 
 
 def test_action_gain_has_the_size_that_it_must_have(place):
-    """Turning by t changes what an axis scaled by k makes of a step d by (1 - k) |sin t| |d|."""
+    """With one axis scaled by k, turning a step d by t changes the result by (1 - k) |sin t| |d|."""
     experiment = Experiment(place.reference, "none", check_group("C8"), place.visited, 0)
     positions = experiment.copies().positions["tool"]
     experiment.close()
@@ -114,7 +114,7 @@ def test_action_gain_has_the_size_that_it_must_have(place):
 
 
 def test_perception_bias_has_the_size_that_it_must_have(place):
-    """A constant b against its turned image: root mean square over C8 is b sqrt(2 + 2/7)."""
+    """Root mean square over C8 of the difference of b and its turned image: b sqrt(2 + 2/7)."""
     result = place("perception_bias:1")
     assert broken(result, place()) == {"observation"}
     assert result.worst_field.value.value == pytest.approx(20 * np.sqrt(16 / 7), rel=1e-4)

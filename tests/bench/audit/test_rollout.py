@@ -1,4 +1,4 @@
-"""The unbroken floating task has the symmetry; a variant breaks it, and the audit sees that."""
+"""Episodes of the unbroken floating task are symmetric; those with a variant are not."""
 
 import pytest
 import torch
