@@ -101,7 +101,7 @@ def test_action_gain_is_seen_in_proportion(place):
 
 
 def test_action_gain_has_the_size_that_it_must_have(place):
-    """With one axis scaled by k, turning a step d by t changes the result by (1 - k) |sin t| |d|."""
+    """With one axis scaled by k, turning a step d by t moves its end by (1 - k) |sin t| |d|."""
     experiment = Experiment(place.reference, "none", check_group("C8"), place.visited, 0)
     positions = experiment.copies().positions["tool"]
     experiment.close()
