@@ -1,8 +1,8 @@
 """States that an expert or a base policy visits, and their turned copies.
 
-Visited are states of the unbroken task, one of each episode, so that they are independent of one
-another. Copies are made by a planar group that acts about a given centre on the whole simulation
-state: bodies, robot, controller targets.
+States are taken from the unbroken task, one from each episode, so they are independent. Their
+copies are turned about a given centre by the elements of a planar group, which act on the whole
+simulation state: bodies, robot, controller targets.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ Element = tuple[float, bool]
 """A planar symmetry: angle in radians, and whether the reflection of y comes first."""
 
 MOVED = 1e-4
-"""An object that is further than this from where it was (metres) is in motion."""
+"""An object that moves further than this (metres) counts as moving."""
 
 
 @dataclass(frozen=True)
 class Visited:
-    """S states on the way, with what was done there; tensors on the CPU.
+    """S visited states with the actions that followed; tensors on the CPU.
 
     Attributes:
         state: simulation states, a tree of ``[S, ...]``.
-        actions: the visitor's next actions from there on, ``[S, T, 7]``.
+        actions: the next T actions of the visitor, ``[S, T, 7]``.
         after: the states one control step later.
-        moving: whether the manipulated object moves during these T steps (in the unbroken task:
-            it is pushed, carried, falling), ``[S]`` bool.
-        policy: whether the base policy came by, and not the expert, ``[S]`` bool.
+        moving: whether the manipulated object moves during these T steps of the unbroken task
+            (pushed, carried or falling), ``[S]`` bool.
+        policy: whether the visitor was the base policy, not the expert, ``[S]`` bool.
     """
 
     state: dict[str, Any]
@@ -52,7 +52,7 @@ class Visited:
 
     @staticmethod
     def join(parts: Sequence[Visited]) -> Visited:
-        """All states of several visits."""
+        """Concatenate several sets of states."""
         return Visited(
             **{f.name: join_trees([getattr(p, f.name) for p in parts]) for f in fields(Visited)}
         )
@@ -66,15 +66,15 @@ def visit(
     seed: int,
     policy: ChunkPolicy | None = None,
 ) -> Visited:
-    """Sample a state from each of ``count`` episodes, uniformly in time until its success.
+    """Sample one state from each of ``count`` episodes, uniformly in time before success.
 
     Args:
-        env: the unbroken task; its parallel environments play an episode each at a time.
+        env: the unbroken task; each of its environments plays one episode at a time.
         visitor: ``expert`` acts in closed loop; ``policy`` decodes standard normal noise and
-            executes its chunks, and its states are those in which it decides.
+            executes its chunks, and only states at the start of a chunk are sampled.
         count: number of states.
         steps: number T of following actions to keep.
-        seed: of episodes, noise and choice.
+        seed: of episodes, noise and sampled times.
         policy: the base policy.
     """
     parts = []
@@ -145,7 +145,7 @@ def _pick(trail: list[Any], time: torch.Tensor) -> Any:
 
 
 def task_state(env: SymmetricTask) -> dict[str, Any]:
-    """The simulation state of all environments on the CPU, without what stands still."""
+    """The simulation state of all environments on the CPU, without the table."""
     state = env.get_state_dict()
     actors = {k: v for k, v in state["actors"].items() if k != env.table_scene.table.name}
     return _to_cpu({**state, "actors": actors})
@@ -158,10 +158,10 @@ def _to_cpu(tree: Any) -> Any:
 
 
 class Turner:
-    """Acts with planar symmetries on simulation states, about any centre.
+    """Applies planar symmetries about any centre to simulation states.
 
     Args:
-        env: a task that knows how its states turn; it is asked, not stepped.
+        env: a task whose ``transform_state`` is used; it is not stepped.
     """
 
     def __init__(self, env: SymmetricTask) -> None:
@@ -171,12 +171,15 @@ class Turner:
     def turn(
         self, state: dict[str, Any], element: Element, centre: torch.Tensor
     ) -> tuple[dict[str, Any], torch.Tensor]:
-        """Turn states; which of them the robot can take, ``[S]`` bool, comes along.
+        """Transform states.
 
         Args:
             state: tree of ``[S, ...]``.
-            element: what acts; the identity returns the states to the bit.
-            centre: about which it acts, ``[2]`` metres from the workspace centre.
+            element: the symmetry; the identity does not change a bit of the states.
+            centre: fixed point of the symmetry, ``[2]`` metres from the workspace centre.
+
+        Returns:
+            The states, and which of them the robot can reach, ``[S]`` bool.
         """
         count = len(next(iter(state["actors"].values())))
         reached = torch.ones(count, dtype=torch.bool)
@@ -209,9 +212,9 @@ class Turner:
 
 
 def seen_from(state: dict[str, Any], centre: torch.Tensor) -> dict[str, Any]:
-    """The same states with ``centre [2]`` moved to the workspace centre, for observing only.
+    """Shift states so that ``centre [2]`` is at the workspace centre, only to observe them.
 
-    The robot's base moves too, which leaves joint angles as they are but is no state of the task.
+    The robot's base moves with everything else, so the result is not a state of the task.
     """
     offset = -centre.expand(len(next(iter(state["actors"].values()))), 2)
     moved = {
@@ -222,7 +225,7 @@ def seen_from(state: dict[str, Any], centre: torch.Tensor) -> dict[str, Any]:
 
 
 def _shift(state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
-    """Move bodies or robot bases, whose first two numbers are x and y, by ``offset [S, 2]``."""
+    """Move bodies or robot bases by ``offset [S, 2]``; their first two numbers are x and y."""
     moved = state.clone()
     moved[:, :2] += offset
     return moved
