@@ -1,7 +1,6 @@
 """Environments for others: gymnasium's API, ManiSkill's wrappers, NumPy."""
 
 import json
-import logging
 import re
 import subprocess
 import sys
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from mani_skill import logger
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.wrappers import CachedResetWrapper
 from mani_skill.utils.wrappers.action_repeat import ActionRepeatWrapper
@@ -222,12 +222,12 @@ def test_rewards_are_dense_where_the_id_says_so():
 @pytest.mark.parametrize("mode", ["pd_ee_delta_pose", "pd_joint_delta_pos", "pd_joint_pos"])
 def test_no_control_mode_leaves_out_which_finger_follows(mode, caplog):
     """ManiSkill warns where it has to assume it, at every reconfiguration."""
-    logging.getLogger("mani_skill").addHandler(caplog.handler)
+    logger.addHandler(caplog.handler)
     try:
         env = gym.make(BATCHED, control_mode=mode)
         env.reset(seed=0, options={"reconfigure": True})
     finally:
-        logging.getLogger("mani_skill").removeHandler(caplog.handler)
+        logger.removeHandler(caplog.handler)
     assert "Mimic" not in caplog.text
 
 
