@@ -45,7 +45,7 @@ def sentence(capsys) -> str:
     [
         (["--task", "PickCub-v1"], "PickCube-v1"),
         (["--embodiment", "hand"], "floating, panda"),
-        (["--variant", "gravity"], "action_gain"),
+        (["--variant", "gravity:1"], "gravity_tilt"),
         (["--variant", "action_gain:2"], "[0, 1]"),
         (["--variant", "action_gain:much"], "action_gain:0.5"),
         (["--agent", "ppo"], "equivariant"),

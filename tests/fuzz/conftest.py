@@ -22,7 +22,7 @@ from tests.leaderboard.record_factory import make_record
 CHECKPOINT_EVERY = 20
 
 CONFIG = replace(tiny_config(agent="standard"), checkpoint_every=CHECKPOINT_EVERY)
-OTHER = replace(CONFIG, agent="zero")
+OTHER = tiny_config(agent="zero", checkpoint_every=CHECKPOINT_EVERY)
 
 
 def stop_after(config, out, checkpoints, progress=False):

@@ -65,7 +65,10 @@ def test_lengths_of_time():
 @pytest.fixture
 def sweep(undisturbed, tmp_path):
     """A sweep of which one run is finished, one runs, one was stopped, one failed, one is to do."""
-    configs = [replace(LONG, agent=agent) for agent in AGENTS]
+    configs = [
+        replace(LONG, agent=agent, agent_options=tiny_config(agent=agent).agent_options)
+        for agent in AGENTS
+    ]
     plan = make_plan(Suite("tiny", "five", tuple(configs)), tmp_path)
     folders = [tmp_path / one.run_id for one in plan.runs]
     shutil.copytree(undisturbed, folders[0])

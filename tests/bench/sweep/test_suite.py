@@ -51,13 +51,15 @@ def test_the_grid_is_a_product_over_shared_settings(tmp_path):
     assert standard.agent_options.width == build_config({}, "").agent_options.width
 
 
-def test_every_suite_that_ships_can_be_read():
-    assert "demo" in suite_names()
-    for name in suite_names():
-        suite = load_suite(name)
-        assert suite.description
-        # `symsteer list` counts the runs without building them.
-        assert len(suite.runs) == len(read_suite(name).runs) > 0
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in ("cpu", "full"))) for n in suite_names()],
+)
+def test_every_suite_that_ships_can_be_read(name):
+    suite = load_suite(name)
+    assert suite.description
+    # `symsteer list` counts the runs without building them.
+    assert len(suite.runs) == len(read_suite(name).runs) > 0
 
 
 def test_an_option_applies_to_the_agents_that_have_it(tmp_path):
