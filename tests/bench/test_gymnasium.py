@@ -136,8 +136,9 @@ def test_one_environment_alone_is_the_one_of_a_batch(embodiment):
     for expected in trace[1:]:
         action = np.stack([np.zeros(7), env.action_space.sample(), np.ones(7)])
         obs, reward, *_ = batch.step(torch.as_tensor(action, dtype=torch.float32))
-        np.testing.assert_allclose(obs[1].numpy(), expected[:-3], atol=1e-5)
-        np.testing.assert_allclose(reward[1].item(), expected[-3], atol=1e-5)
+        # The arm's inverse kinematics rounds differently in a batch, depending on the CPU.
+        np.testing.assert_allclose(obs[1].numpy(), expected[:-3], atol=5e-5)
+        np.testing.assert_allclose(reward[1].item(), expected[-3], atol=5e-5)
 
 
 def test_states_of_one_environment_can_be_set():
