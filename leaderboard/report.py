@@ -20,12 +20,6 @@ from symsteer.leaderboard.tables import render_csv
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
 
-PAGE_FOLDER = Path(__file__).resolve().parent
-"""The folder of the committed leaderboard, in a checkout of the repository."""
-
-RECORDS = PAGE_FOLDER / "results" / "records"
-"""The committed records; an installed package has none."""
-
 FIGURE_NAME = re.compile(r"(map|profiles|improvement|(success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
 
 

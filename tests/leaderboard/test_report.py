@@ -15,8 +15,9 @@ import pytest
 from symsteer.leaderboard import command
 from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.paths import RECORDS
 from symsteer.leaderboard.records import read_record, write_record
-from symsteer.leaderboard.report import RECORDS, generate, slug
+from symsteer.leaderboard.report import generate, slug
 from symsteer.leaderboard.summary import Run, summarize
 from symsteer.leaderboard.text import code, compact, count, number, relative_link
 from tests.leaderboard.command_line import main
