@@ -33,7 +33,7 @@ from symsteer.bench.audit.result import (
     FieldDefect,
     check_group,
 )
-from symsteer.bench.audit.states import Visited, visit
+from symsteer.bench.audit.states import Visited, join_trees, visit
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.policies.contract import ChunkPolicy
@@ -50,7 +50,7 @@ def visit_all(
     reference: SymmetricTask, settings: AuditSettings, policy: ChunkPolicy | None
 ) -> Visited:
     """Sample the states of all visitors of ``settings``, in the unbroken task."""
-    return Visited.join(
+    return join_trees(
         [
             visit(
                 reference,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import gc
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -82,17 +82,6 @@ class Copies:
     observations: torch.Tensor
     observations_again: torch.Tensor
 
-    @staticmethod
-    def join(parts: list[Copies]) -> Copies:
-        """Concatenate batches of states."""
-        columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Copies)}
-        return Copies(**{name: join_trees(values) for name, values in columns.items()})
-
-    def first(self, count: int) -> Copies:
-        """The first ``count`` states."""
-        rows = torch.arange(count)
-        return Copies(**{f.name: rows_of(getattr(self, f.name), rows) for f in fields(Copies)})
-
 
 @dataclass(frozen=True)
 class Resets:
@@ -156,9 +145,8 @@ class Experiment:
             # A short last batch is filled with copies of the last state, which are dropped.
             rows = torch.arange(start, start + self.batch).clamp(max=len(self.visited) - 1)
             keep = min(self.batch, len(self.visited) - start)
-            part = self._batch(rows, random)
-            parts.append(part.first(keep))
-        return Copies.join(parts)
+            parts.append(rows_of(self._batch(rows, random), torch.arange(keep)))
+        return join_trees(parts)
 
     def _batch(self, rows: torch.Tensor, random: bool) -> Copies:
         env, visited, elements = self.env, self.visited, self.elements

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+from pydantic import TypeAdapter, ValidationError
 
 from symsteer.bench.audit.estimates import Estimate
 from symsteer.bench.sim.environment import Simulator
@@ -183,35 +184,20 @@ class AuditResult:
         Raises:
             UserError: the data are damaged or have another version.
         """
-        try:
-            if data["version"] != VERSION:
-                raise UserError(
-                    f"the audit has version {data['version']}, but this SymSteer reads version "
-                    f"{VERSION}; run the audit again"
-                )
-            estimate = lambda d: None if d is None else Estimate(**d)  # noqa: E731
-            numbers = ("relative", "mm", "degrees")
-            return cls(
-                **{
-                    **data,
-                    "settings": AuditSettings(**data["settings"]),
-                    "origin_mm": tuple(data["origin_mm"]),
-                    "dynamics": tuple(
-                        Defect(**{**d, **{k: estimate(d[k]) for k in numbers}})
-                        for d in data["dynamics"]
-                    ),
-                    "reward": {k: Estimate(**v) for k, v in data["reward"].items()},
-                    "observation": Estimate(**data["observation"]),
-                    "fields": tuple(
-                        FieldDefect(**{**f, "value": Estimate(**f["value"])})
-                        for f in data["fields"]
-                    ),
-                    "resets": Estimate(**data["resets"]),
-                    "map": tuple(Bin(**b) for b in data["map"]),
-                }
+        version = data.get("version") if isinstance(data, dict) else None
+        if version not in (None, VERSION):
+            raise UserError(
+                f"the audit has version {version}, but this SymSteer reads version {VERSION}; run "
+                "the audit again"
             )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise UserError(f"an audit file is damaged ({error!r}); run the audit again") from error
+        try:
+            return TypeAdapter(cls).validate_python(data)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, first["loc"]))
+            raise UserError(
+                f"an audit file is damaged ({where}: {first['msg']}); run the audit again"
+            ) from error
 
 
 def _rounded(tree: Any) -> Any:

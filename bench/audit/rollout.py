@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 
+from symsteer.bench.audit.states import MOVED, map_trees
 from symsteer.bench.sim.rotations import planar_matrix
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
@@ -22,9 +23,6 @@ from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
 
 Actions = Literal["random", "expert", "policy"]
-
-MOVED = 1e-4
-"""An object that is further than this from its initial position (metres) has been touched."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,12 @@ def _rollout(
     env.reset(seed=[start + i for i in range(count)] * order)
     state = env.get_state_dict()
     copies = [env.transform_state(state, angle, reflect) for angle, reflect in elements]
-    env.set_state_dict(_interleave(copies, count))
+    # Rows g * count ... of copy g.
+    env.set_state_dict(
+        map_trees(
+            lambda *c: torch.cat([x[g * count : (g + 1) * count] for g, x in enumerate(c)]), *copies
+        )
+    )
     if policy is not None:
         choose = _policy_actions(env, policy, start, count, elements)
     elif kind == "expert":
@@ -270,13 +273,6 @@ def _noise(env: SymmetricTask, start: int, count: int, steps: int) -> Callable[[
         return env.body.bound(action)
 
     return choose
-
-
-def _interleave(copies: list[Any], count: int) -> Any:
-    """Rows ``g * count ...`` of copy g, for every tensor of the state."""
-    if isinstance(copies[0], dict):
-        return {key: _interleave([copy[key] for copy in copies], count) for key in copies[0]}
-    return torch.cat([c[g * count : (g + 1) * count] for g, c in enumerate(copies)])
 
 
 def _tcp(env: SymmetricTask) -> torch.Tensor:

@@ -7,8 +7,8 @@ simulation state: bodies, robot, controller targets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -50,13 +50,6 @@ class Visited:
     def __len__(self) -> int:
         return len(self.actions)
 
-    @staticmethod
-    def join(parts: Sequence[Visited]) -> Visited:
-        """Concatenate several sets of states."""
-        return Visited(
-            **{f.name: join_trees([getattr(p, f.name) for p in parts]) for f in fields(Visited)}
-        )
-
 
 def visit(
     env: SymmetricTask,
@@ -80,11 +73,8 @@ def visit(
     parts = []
     for start in range(0, count, env.num_envs):
         part = _visit_batch(env, visitor, steps, [seed, start], policy)
-        keep = torch.arange(min(env.num_envs, count - start))
-        parts.append(
-            Visited(**{f.name: rows_of(getattr(part, f.name), keep) for f in fields(Visited)})
-        )
-    return Visited.join(parts)
+        parts.append(rows_of(part, torch.arange(min(env.num_envs, count - start))))
+    return join_trees(parts)
 
 
 def _visit_batch(
@@ -139,22 +129,16 @@ def _visit_batch(
 
 def _pick(trail: list[Any], time: torch.Tensor) -> Any:
     """Row i of the tree at ``time[i]``."""
-    if isinstance(trail[0], dict):
-        return {key: _pick([tree[key] for tree in trail], time) for key in trail[0]}
-    return torch.stack([trail[int(t)][i] for i, t in enumerate(time)])
+    return map_trees(
+        lambda *steps: torch.stack([steps[int(t)][i] for i, t in enumerate(time)]), *trail
+    )
 
 
 def task_state(env: SymmetricTask) -> dict[str, Any]:
     """The simulation state of all environments on the CPU, without the table."""
     state = env.get_state_dict()
     actors = {k: v for k, v in state["actors"].items() if k != env.table_scene.table.name}
-    return _to_cpu({**state, "actors": actors})
-
-
-def _to_cpu(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return {key: _to_cpu(value) for key, value in tree.items()}
-    return tree.detach().cpu().clone()
+    return map_trees(lambda x: x.detach().cpu().clone(), {**state, "actors": actors})
 
 
 class Turner:
@@ -231,15 +215,23 @@ def _shift(state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
     return moved
 
 
+def map_trees(function: Callable[..., torch.Tensor], *trees: Any) -> Any:
+    """Apply a function to the corresponding tensors of trees (dictionaries and dataclasses)."""
+    first = trees[0]
+    if isinstance(first, dict):
+        return {key: map_trees(function, *(tree[key] for tree in trees)) for key in first}
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [f.name for f in fields(first)]
+        parts = {n: map_trees(function, *(getattr(tree, n) for tree in trees)) for n in names}
+        return type(first)(**parts)
+    return function(*trees)
+
+
 def join_trees(trees: Sequence[Any]) -> Any:
     """Concatenate trees of ``[S_i, ...]``."""
-    if isinstance(trees[0], dict):
-        return {key: join_trees([tree[key] for tree in trees]) for key in trees[0]}
-    return torch.cat(list(trees))
+    return map_trees(lambda *tensors: torch.cat(tensors), *trees)
 
 
 def rows_of(tree: Any, rows: torch.Tensor) -> Any:
     """Some rows of a tree of ``[S, ...]``."""
-    if isinstance(tree, dict):
-        return {key: rows_of(value, rows) for key, value in tree.items()}
-    return tree[rows]
+    return map_trees(lambda tensor: tensor[rows], tree)
