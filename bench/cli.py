@@ -105,6 +105,32 @@ def evaluate(
     return 0 if found.recorded is not False else 1
 
 
+def film(
+    folder: Path,
+    /,
+    variant: str | None = None,
+    episodes: int = 3,
+) -> int:
+    """Film held-out episodes with the last checkpoint of a run (mp4).
+
+    Where no Vulkan driver works, a picture of the paths seen from above is written instead.
+
+    Args:
+        folder: The run's folder; the file is written there.
+        variant: How the symmetry is broken, e.g. action_gain:0.5, or none; default: as in the run.
+        episodes: Number of held-out episodes.
+    """
+    from symsteer.bench.runs.film import film
+    from symsteer.bench.sim.capabilities import RENDERING_CURE
+    from symsteer.bench.sim.headless import rendering_works
+
+    path = film(folder, variant, episodes)
+    if not rendering_works():
+        print(f"no video: no Vulkan driver was found; {RENDERING_CURE}", file=sys.stderr)
+    print(f"wrote {path}")
+    return 0
+
+
 def sweep(
     suite: Annotated[str, tyro.conf.arg(metavar="SUITE")],
     /,

@@ -54,6 +54,7 @@ VERBS = {
     "run": Verb(f"{BENCH}:run", "Steer a base policy with one agent on one task.", parses=True),
     "resume": Verb(f"{BENCH}:resume", "Continue a run that was stopped."),
     "evaluate": Verb(f"{BENCH}:evaluate", "Play held-out episodes with the checkpoint of a run."),
+    "film": Verb(f"{BENCH}:film", "Film episodes with the checkpoint of a run."),
     "sweep": Verb(f"{BENCH}:sweep", "Run all runs of a suite that are not finished."),
     "status": Verb(f"{BENCH}:status", "Show how far the runs of a folder are.", computes=False),
     "demo": Verb("symsteer.cli:demo", "Run a small suite and write its leaderboard, in minutes."),

@@ -70,8 +70,9 @@ def parse(arguments: Sequence[str], defaults: RunConfig) -> tuple[RunConfig, Exe
         arguments: of ``symsteer run``.
         defaults: values of the options that are not given.
     """
-    interface = _interface(defaults)
-    found = tyro.cli(interface, prog="symsteer run", description=ABOUT, args=arguments)
+    found: Any = tyro.cli(
+        _interface(defaults), prog="symsteer run", description=ABOUT, args=arguments
+    )
     values = {field.name: getattr(found.config, field.name) for field in fields(RunConfig)}
     values |= {
         "agent": defaults.agent,
@@ -120,8 +121,8 @@ def _interface(defaults: RunConfig) -> type:
         [
             ("agent", agent_part, agent_part()),
             ("policy", policy_part, policy_part()),
-            ("agent_options", tyro.conf.Suppress[Any], None),
-            ("policy_name", tyro.conf.Suppress[Any], None),
+            ("agent_options", Annotated[Any, tyro.conf.Suppress], None),
+            ("policy_name", Annotated[Any, tyro.conf.Suppress], None),
         ],
         bases=(RunConfig,),
         frozen=True,

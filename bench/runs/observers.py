@@ -195,14 +195,16 @@ class TensorBoard(Observe):
 
     def evaluated(self, run: Trainer, evaluation: Evaluation) -> None:
         columns = evaluation.episodes.model_dump(by_alias=True)
-        names = ("success_once", "success_at_end", "return", "episode_len")
-        means = {
-            f"eval/{name}": torch.tensor(columns[name], dtype=torch.float64).mean().item()
-            for name in names
+        values = {
+            f"eval/{name}": sum(columns[name]) / len(columns[name])
+            for name in ("success_once", "success_at_end", "return", "episode_len")
             if None not in columns[name]
         }
-        self.log.scalars(means, run.env_steps)
-        self.log.scalars({f"diag/{k}": v for k, v in evaluation.diagnostics.items()}, run.env_steps)
+        for name, value in evaluation.diagnostics.items():
+            # The record holds null for a number that is not finite, and says which.
+            kind = evaluation.nonfinite.get(f"diagnostics/{name}")
+            values[f"diag/{name}"] = float(kind) if kind else value
+        self.log.scalars(values, run.env_steps)
 
     def saving(self, run: Trainer) -> Mapping[str, Any]:
         # A continued run does not write again what lies before its checkpoint.

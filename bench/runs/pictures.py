@@ -7,6 +7,7 @@ a Vulkan driver and simulate one episode anew, in a scene of its own.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import matplotlib as mpl
@@ -23,7 +24,7 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA, SIZE
-from symsteer.bench.variants import evaluated
+from symsteer.bench.variants import evaluation_variant
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Layout
 
@@ -154,7 +155,7 @@ def _draw_rose(axes: Axes, direction: np.ndarray, success: np.ndarray) -> None:
 
 
 def frames_of(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> np.ndarray:
-    """Frames of the first held-out episode, from its start to its first success or its time limit.
+    """Frames of the first held-out episode, from its start to its first success or time limit.
 
     Args:
         config: says which world, as it is in evaluations.
@@ -167,37 +168,60 @@ def frames_of(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> np.ndarra
     Raises:
         UserError: if there is no Vulkan driver.
     """
+    variant, seed = evaluation_variant(config.variant), held_out_seeds(1)[0]
+    frames = list(episode_frames(config, policy, agent, variant, seed, every_step=False))
+    chosen = np.linspace(0, len(frames) - 1, FRAMES).round().astype(int)
+    rows = np.split(np.stack([frames[i] for i in chosen]), 2)
+    return np.concatenate([np.concatenate(row, axis=1) for row in rows])
+
+
+def episode_frames(
+    config: RunConfig,
+    policy: ChunkPolicy,
+    agent: Agent,
+    variant: str,
+    seed: int,
+    every_step: bool = True,
+) -> Iterator[np.ndarray]:
+    """Frames ``[height, width, 3]`` uint8 of an episode up to its first success or time limit.
+
+    Args:
+        config: task, embodiment and simulator.
+        policy, agent: the deterministic actor plays.
+        variant: how the symmetry is broken.
+        seed: of the episode.
+        every_step: a frame after each control step, else one after each decision.
+
+    Raises:
+        UserError: if there is no Vulkan driver.
+    """
     env = make(
         config.task,
         num_envs=1,
         embodiment=config.embodiment,
-        variant=evaluated(config.variant),
+        variant=variant,
         sim=config.sim,
         render=True,
         render_mode="rgb_array",
         human_render_camera_configs=CAMERA,
     )
-    # Not through the latent-noise environment, which starts a new episode before the last frame.
+    # Not through the latent-noise environment: it starts a new episode before the last frame.
     try:
-        obs, _ = env.reset(seed=held_out_seeds(1))
-        frames = [_frame(env)]
-        for _ in range(math.ceil(env.max_episode_steps / policy.execute)):
+        obs, _ = env.reset(seed=[seed])
+        yield _frame(env)
+        done = False
+        while not done:
             obs = obs.to(config.device)
             actions = policy.decode(obs, agent.act(obs, deterministic=True)).to(env.device)
-            done = False
             for t in range(policy.execute):
                 obs, _, _, truncated, info = env.step(actions[:, t])
                 done = bool(info["success"] | truncated)
+                if every_step or done or t == policy.execute - 1:
+                    yield _frame(env)
                 if done:
                     break
-            frames.append(_frame(env))
-            if done:
-                break
     finally:
         env.close()
-    chosen = np.linspace(0, len(frames) - 1, FRAMES).round().astype(int)
-    rows = np.split(np.stack([frames[i] for i in chosen]), 2)
-    return np.concatenate([np.concatenate(row, axis=1) for row in rows])
 
 
 def _frame(env: Any) -> np.ndarray:

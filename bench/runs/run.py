@@ -28,7 +28,7 @@ from symsteer.bench.runs.observers import ProgressFile, observers_of
 from symsteer.bench.runs.stored import named, restored, stored_config, stored_policy
 from symsteer.bench.runs.trainer import Trainer, budget_of, feasible_return
 from symsteer.bench.tasks import check_embodiment, task_class
-from symsteer.bench.variants import evaluated, read
+from symsteer.bench.variants import evaluation_variant, read
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, read_record
 from symsteer.policies.contract import ChunkPolicy
@@ -129,7 +129,7 @@ def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluated:
+class EvaluationResult:
     """Held-out episodes of a run's last checkpoint.
 
     Attributes:
@@ -157,7 +157,7 @@ class Evaluated:
 
 def evaluate(
     folder: Path, variant: str | None = None, episodes: int | None = None, workers: int = 1
-) -> Evaluated:
+) -> EvaluationResult:
     """Evaluate a run's last checkpoint again, in its own world or in one broken otherwise.
 
     Args:
@@ -172,7 +172,7 @@ def evaluate(
     run = restored(folder)
     config, folder = run.config, run.folder
     _check_all(config, workers)
-    own = evaluated(config.variant)
+    own = evaluation_variant(config.variant)
     variant = own if variant is None else variant_text(read(variant))
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:
@@ -192,7 +192,7 @@ def evaluate(
     )
     final = read_record(folder / RECORD).final if is_finished(folder) else None
     comparable = final and variant == own and len(final.episodes.seed) == count
-    return Evaluated(
+    return EvaluationResult(
         run_id=folder.name,
         variant=variant,
         evaluation=evaluation,
@@ -221,7 +221,7 @@ def _play(
 ) -> Path:
     resolved = {
         **config.to_json(),
-        "evaluation_variant": evaluated(config.variant),
+        "evaluation_variant": evaluation_variant(config.variant),
         "files": files,
     }
     with claimed(folder):

@@ -25,7 +25,7 @@ from symsteer.bench.runs.evaluator import Evaluator, make_env
 from symsteer.bench.runs.folder import CHECKPOINT
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import task_class
-from symsteer.bench.variants import build, evaluated, highest_cost
+from symsteer.bench.variants import build, evaluation_variant, highest_cost
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation
 from symsteer.policies.contract import ChunkPolicy
@@ -137,7 +137,7 @@ class Trainer:
             observer.began(self, checkpoint)
         try:
             self.evaluator = Evaluator(
-                config, base, self.agent, self.feasible, evaluated(config.variant), workers
+                config, base, self.agent, self.feasible, evaluation_variant(config.variant), workers
             )
         except BaseException as error:
             self.stop(error)

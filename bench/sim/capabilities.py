@@ -25,6 +25,12 @@ _RENDER_PROBE = (
 )
 _PROBE_SECONDS = 60
 
+RENDERING_CURE = (
+    "install your GPU's Vulkan driver, or (software rendering) apt install chromium and set "
+    "VK_ICD_FILENAMES to /usr/lib/chromium/vk_swiftshader_icd.json"
+)
+"""How to get pictures and videos."""
+
 _ROOT = Path(__file__).resolve().parents[2]
 _IN_CHECKOUT = (_ROOT / "Makefile").is_file() and (_ROOT / "pyproject.toml").is_file()
 _REINSTALL = "make setup" if _IN_CHECKOUT else "pip install --force-reinstall symsteer"
@@ -252,8 +258,7 @@ def _check_rendering() -> Check:
         "rendering",
         False,
         f"{reason}; pictures and videos need a Vulkan device, state-only runs do not",
-        "optional: your GPU's Vulkan driver, or apt install chromium and set VK_ICD_FILENAMES to "
-        "/usr/lib/chromium/vk_swiftshader_icd.json for software rendering",
+        f"optional: {RENDERING_CURE}",
     )
 
 

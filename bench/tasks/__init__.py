@@ -6,17 +6,13 @@
 - `gym.make("SymSteer/PickCube-single-v1")`: one environment on NumPy arrays.
 - `task_class(task)`: layouts, limits and feasible returns without making an environment.
 
-Importing this package registers the tasks with gymnasium. It is cheap: gymnasium, torch and
-ManiSkill are not imported here. If gymnasium is imported later, the ids are registered then.
+Importing this package registers the tasks with gymnasium. It is cheap: torch and ManiSkill are not
+imported here.
 """
 
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import sys
-from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec
 from typing import TYPE_CHECKING, Any
 
 from symsteer.names import unknown
@@ -107,32 +103,5 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
 
 
-def _register() -> None:
-    from symsteer.bench.tasks.registration import register
-
-    register()
-
-
-class _AfterGymnasium(MetaPathFinder):
-    """Registers the tasks as soon as gymnasium has been imported."""
-
-    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        if fullname != "gymnasium":
-            return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(fullname)
-        if spec is not None and spec.loader is not None:
-            load = spec.loader.exec_module
-
-            def load_and_register(module: Any) -> None:
-                load(module)
-                _register()
-
-            spec.loader.exec_module = load_and_register  # type: ignore[method-assign]
-        return spec
-
-
-if "gymnasium" in sys.modules:
-    _register()
-else:
-    sys.meta_path.insert(0, _AfterGymnasium())
+# At the end: it needs the names above.
+importlib.import_module(f"{__name__}.registration").register()

@@ -3,7 +3,7 @@
 - `VARIANTS`: all of them by name.
 - `read(...)`: a text such as ``wind:0.5`` as frozen data, names checked.
 - `build(...)`, `parse(...)`: the objects that act in an environment.
-- `evaluated(...)`, `highest_cost(...)`: what evaluation and returns need to know.
+- `evaluation_variant(...)`, `highest_cost(...)`: what evaluation and returns need to know.
 
 Importing this package is cheap: classes are imported when they are first used.
 """
@@ -21,7 +21,7 @@ from symsteer.variant import UNBROKEN, VariantSpec, parse_variant, variant_text
 if TYPE_CHECKING:
     from symsteer.bench.variants.base import Variant
 
-__all__ = ["VARIANTS", "build", "evaluated", "highest_cost", "parse", "read"]
+__all__ = ["VARIANTS", "build", "evaluation_variant", "highest_cost", "parse", "read"]
 
 VARIANTS: Registry[type[Variant]] = Registry(
     "variant",
@@ -85,7 +85,7 @@ def parse(variant: str | Sequence[VariantSpec], strength: Any = None) -> tuple[V
     return build(read(variant, strength))
 
 
-def evaluated(variant: str | Sequence[VariantSpec]) -> str:
+def evaluation_variant(variant: str | Sequence[VariantSpec]) -> str:
     """The variants in which agents are evaluated, as text: those of training alone left out.
 
     Raises:

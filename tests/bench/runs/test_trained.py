@@ -1,0 +1,93 @@
+"""Using what was trained: a run as an object that acts, and its videos."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import symsteer
+from symsteer.bench.runs.film import film
+from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.steering.seeds import held_out_seeds
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import read_record
+
+
+def success(run, count, **options):
+    """Play held-out episodes by hand, as the README does; whether each had a success."""
+    env = run.make_env(num_envs=count, **options)
+    obs, _ = env.reset(seed=held_out_seeds(count))
+    found = torch.zeros(count, dtype=torch.bool)
+    length = torch.zeros(count)
+    while not (found | (env.elapsed_steps >= env.max_episode_steps)).all():
+        for action in run.act(obs).unbind(1):
+            obs, _, _, _, info = env.step(action)
+            length += ~found
+            found |= info["success"]
+    env.close()
+    return found
+
+
+def test_a_loaded_run_plays_what_its_record_says(finished):
+    config, folder = finished
+    run = symsteer.load(folder)
+    assert run.config == config
+    final = read_record(folder / "record.json").final
+    assert success(run, 5).tolist() == final.episodes.success_once
+    obs = torch.randn(3, run.policy.obs_layout.dim)
+    actions = run.act(obs)
+    assert actions.shape == (3, run.policy.execute, run.policy.act_layout.dim)
+    steered = run.policy.decode(obs, run.agent.act(obs, deterministic=True))
+    assert torch.equal(actions, steered[:, : run.policy.execute])
+    assert torch.equal(run.act(obs.numpy()), actions)
+    assert not torch.equal(run.act(obs, deterministic=False), actions)
+
+
+def test_a_loaded_run_acts_in_another_variant(finished):
+    run = symsteer.load(str(finished[1]))
+    env = run.make_env(num_envs=2, variant="action_gain:1")
+    assert [variant.name for variant in env.variants] == ["action_gain"]
+    env.close()
+    env = run.make_env(num_envs=2)
+    assert env.variants == ()
+    env.close()
+
+
+def test_a_policy_file_plays_with_random_noise(finished):
+    loaded = symsteer.load(finished[1] / "policy.safetensors")
+    assert loaded.config is None
+    assert loaded.agent.name == "base"
+    assert loaded.world == {"task": "PickCube-v1", "embodiment": "floating", "variant": "none"}
+    obs = torch.randn(3, loaded.policy.obs_layout.dim)
+    assert not torch.equal(loaded.act(obs), loaded.act(obs))
+
+
+def test_mistakes_in_loading(finished, tmp_path):
+    with pytest.raises(UserError, match=r"no config\.json"):
+        symsteer.load(tmp_path)
+    with pytest.raises(UserError, match="no policy at"):
+        symsteer.load(tmp_path / "policy.safetensors")
+    with pytest.raises(UserError, match=r"have the shape \[N, \d+\], not \[3\]"):
+        symsteer.load(finished[1]).act(torch.zeros(3))
+
+
+def test_the_public_names_are_those_of_the_page():
+    assert symsteer.__all__ == ["UserError", "__version__", "load", "make"]
+    assert all(hasattr(symsteer, name) for name in symsteer.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'mkae'"):
+        _ = symsteer.mkae
+
+
+def test_a_film_is_a_video_or_the_picture_of_paths(finished):
+    path = film(finished[1], "action_gain:1", episodes=2)
+    if rendering_works():
+        assert path.name == "film-action_gain=1.mp4"
+        assert path.stat().st_size > 5000
+    else:
+        assert path.name == "paths-action_gain=1.png"
+        assert np.asarray(Image.open(path)).std() > 10
+    path.unlink()
+    with pytest.raises(UserError, match="--episodes is 0"):
+        film(finished[1], episodes=0)
+    with pytest.raises(UserError, match="did you mean 'action_gain'"):
+        film(finished[1], variant="action_gian:1")
