@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
@@ -44,7 +45,7 @@ def film(folder: Path, variant: str | None = None, episodes: int = 3) -> Path:
     name = file_name(text)
     if rendering_works():
         path = run.folder / f"film-{name}.mp4"
-        frames = [
+        frames: list[Any] = [
             frame
             for seed in held_out_seeds(episodes)
             for frame in episode_frames(run.config, run.policy, run.agent, text, seed)
