@@ -1,7 +1,6 @@
 """Who writes down a run: the record, TensorBoard, progress, pictures.
 
-Each is an :class:`symsteer.bench.runs.trainer.Observer`. The record comes first: all others are
-views of what it holds.
+The record comes first; the others show what it holds.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from tqdm import tqdm
@@ -23,6 +22,7 @@ from symsteer.bench.runs.extensions import extensions_of
 from symsteer.bench.runs.folder import CHECKPOINT, PROGRESS, RECORD
 from symsteer.bench.runs.pictures import draw_paths, frames_of
 from symsteer.bench.runs.tensorboard import RunLog
+from symsteer.bench.runs.trainer import Observer, Trainer
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import HELD_OUT_SEED
 from symsteer.errors import UserError
@@ -40,9 +40,6 @@ from symsteer.leaderboard.records import (
     write_record,
 )
 
-if TYPE_CHECKING:
-    from symsteer.bench.runs.trainer import Trainer
-
 LOG_EVERY = 10
 """Vectorised decisions between two writes of training scalars."""
 
@@ -50,22 +47,7 @@ PROGRESS_SECONDS = 2.0
 """Least time between two writes of progress.json within a phase."""
 
 
-class Observe:
-    """An observer to which nothing matters; the others override what they need."""
-
-    def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None: ...
-    def entered(self, run: Trainer, phase: str) -> None: ...
-    def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None: ...
-    def paused(self, run: Trainer) -> None: ...
-    def evaluated(self, run: Trainer, evaluation: Evaluation) -> None: ...
-    def finished(self, run: Trainer) -> None: ...
-    def failed(self, run: Trainer, error: BaseException) -> None: ...
-
-    def saving(self, run: Trainer) -> Mapping[str, Any]:
-        return {}
-
-
-class RecordWriter(Observe):
+class RecordWriter(Observer):
     """Keeps record.json: written at the start, after every evaluation, and at the end.
 
     Args:
@@ -163,7 +145,7 @@ class RecordWriter(Observe):
         write_record(self.record, run.folder / RECORD)
 
 
-class TensorBoard(Observe):
+class TensorBoard(Observer):
     """Writes the events of a run: what the record holds, and scalars of training between.
 
     Args:
@@ -225,7 +207,7 @@ class TensorBoard(Observe):
         self.log.scalars({**self.means.take(), **rate, **times}, run.env_steps)
 
 
-class Pictures(Observe):
+class Pictures(Observer):
     """Pictures of the last evaluation in TensorBoard; the record is closed by then.
 
     Args:
@@ -251,7 +233,7 @@ class Pictures(Observe):
                 tqdm.write(f"no picture of the evaluation: {type(error).__name__}: {error}")
 
 
-class Progress(Observe):
+class Progress(Observer):
     """A progress bar for the terminal, and progress.json for `symsteer status` and sweeps.
 
     Args:
@@ -362,7 +344,7 @@ class _Means:
         return means
 
 
-def observers_of(config: RunConfig, resolved: dict[str, Any], progress: bool) -> list[Observe]:
+def observers_of(config: RunConfig, resolved: dict[str, Any], progress: bool) -> list[Observer]:
     """The observers of a run, in the order in which they are told.
 
     Args:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -68,8 +68,8 @@ def feasible_return(config: RunConfig, agent: Agent, base: ChunkPolicy) -> tuple
     )
 
 
-class Observer(Protocol):
-    """What is told about a run; every method is optional in effect."""
+class Observer:
+    """Is told what happens in a run. Subclasses override what they need."""
 
     def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
         """The run was built; nothing has been simulated in this process."""
@@ -78,7 +78,11 @@ class Observer(Protocol):
         """A phase begins: ``preparing``, ``evaluation``."""
 
     def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None:
-        """All training environments took one decision."""
+        """All training environments took one decision.
+
+        Args:
+            scalars: metrics of the episodes that ended, then those of each update.
+        """
 
     def paused(self, run: Trainer) -> None:
         """All environments are about to begin new episodes in fresh scenes."""
@@ -88,6 +92,7 @@ class Observer(Protocol):
 
     def saving(self, run: Trainer) -> Mapping[str, Any]:
         """A checkpoint is about to be written; returns what to add to it."""
+        return {}
 
     def finished(self, run: Trainer) -> None:
         """The run came to its end."""
