@@ -28,6 +28,7 @@ from symsteer.leaderboard.records import (
 )
 from symsteer.leaderboard.records.provenance import checkout, git
 from symsteer.leaderboard.summary import MIN_SEEDS, Key, recipe_of, row_place, seeds_of
+from symsteer.variant import file_name
 
 MIN_EPISODES = 100
 """Held-out episodes of an admissible record's final evaluation."""
@@ -154,8 +155,8 @@ def consistent(file: Path, record: RunRecord) -> Iterator[str]:
     """Name and seeds of the run are those of its configuration."""
     settings, seed = record.settings, record.settings.seed
     keys = (settings.task, settings.embodiment, settings.variant, settings.agent, f"s{seed}")
-    named = "-".join(keys).replace(":", "=")
-    if not record.run_id.replace(":", "=").startswith(f"{named}-"):
+    named = file_name("-".join(keys))
+    if not file_name(record.run_id).startswith(f"{named}-"):
         yield (
             f"the run is named {record.run_id}, but its configuration is that of {named}: take the "
             "record as `symsteer run` wrote it."

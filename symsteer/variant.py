@@ -119,8 +119,16 @@ def lacks_strength(text: str) -> bool:
     return text != UNBROKEN and "+" not in text and not _divide(text)[1]
 
 
+def with_strength(text: str, strength: float) -> str:
+    """The text of names without strengths, each with this one; other texts stay as they are."""
+    parts = text.split("+")
+    if text == UNBROKEN or any(_divide(part)[1] for part in parts):
+        return text
+    return "+".join(f"{part}:{strength:g}" for part in parts) if strength else UNBROKEN
+
+
 def file_name(text: str) -> str:
-    """The text of a variant as a part of file names, which may not hold a colon."""
+    """The text of a variant, or ``module:Class``, as a part of file names: without a colon."""
     return text.replace(":", "=")
 
 

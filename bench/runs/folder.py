@@ -19,6 +19,7 @@ from symsteer.bench.runs.config import RunConfig, content_key
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
 from symsteer.leaderboard.records import read_record
+from symsteer.variant import file_name
 
 State = Literal["missing", "running", "interrupted", "failed", "finished"]
 
@@ -37,10 +38,9 @@ def run_id(config: RunConfig, origin: dict[str, Any]) -> str:
         config: the run's configuration.
         origin: content hashes of demonstrations or a policy that came from files.
     """
-    variant = config.variant.replace(":", "=")
-    agent = config.agent.replace(":", ".")
+    variant, agent, task = map(file_name, (config.variant, config.agent, config.task))
     key = content_key(config.to_json(), origin)
-    return f"{config.task}-{config.embodiment}-{variant}-{agent}-s{config.seed}-{key}"
+    return f"{task}-{config.embodiment}-{variant}-{agent}-s{config.seed}-{key}"
 
 
 def is_finished(folder: Path) -> bool:

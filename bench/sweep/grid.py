@@ -20,6 +20,7 @@ from typing import Any
 
 from symsteer.errors import UserError
 from symsteer.names import nearest, unknown
+from symsteer.variant import with_strength
 
 SUITES = Path(__file__).parent.parent / "suites"
 
@@ -161,11 +162,7 @@ def _with_strength(variant: Any, strength: Any, source: str) -> str:
         raise UserError(f"{source}: grid.strength needs grid.variant, a list of names")
     if isinstance(strength, bool) or not isinstance(strength, int | float):
         raise UserError(f"{source}: grid.strength must list numbers in [0, 1], not {strength!r}")
-    if variant == "none" or ":" in variant:
-        return variant
-    if strength == 0:
-        return "none"
-    return "+".join(f"{name}:{strength:g}" for name in variant.split("+"))
+    return with_strength(variant, strength)
 
 
 def _with_tables(shared: dict[str, Any], source: str) -> dict[str, Any]:
