@@ -1,4 +1,4 @@
-"""The checkpoint of a run: one file of tensors and plain data beside its checksum."""
+"""The checkpoint of a run: one file with tensors, plain data and their checksum."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FORMAT = 3
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint of tensors and plain data atomically: the old one stays until then.
+    """Write a checkpoint of tensors and plain data atomically.
 
     The state is stored as bytes with their SHA-256, because ``torch.load`` does not verify the
     checksums of the archive that it reads.
@@ -43,13 +43,13 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
     """The last checkpoint of a run (``weights_only``), or None before the first one.
 
     Raises:
-        UserError: if the file is damaged or of another run.
+        UserError: if the file is damaged or belongs to another run.
     """
     path = folder / CHECKPOINT
     cure = "delete it to start the run from the beginning"
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what torch thinks of a foreign pickle
+            warnings.simplefilter("ignore")  # torch's warnings about other pickle files
             file = torch.load(io.BytesIO(path.read_bytes()), weights_only=True)
     except FileNotFoundError:
         return None

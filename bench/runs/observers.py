@@ -1,7 +1,7 @@
-"""Who writes down a run: the record, TensorBoard, progress, pictures.
+"""Observers that write the results of a run: record, TensorBoard, progress, pictures.
 
-Each is an :class:`symsteer.bench.runs.trainer.Observer`. The record comes first: all others are
-views of what it holds.
+Each is an :class:`symsteer.bench.runs.trainer.Observer`. The record comes first; all others
+show its contents.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
     from symsteer.bench.runs.trainer import Trainer
 
 LOG_EVERY = 10
-"""Vectorised decisions between two writes of training scalars."""
+"""Decisions (of all environments together) between two writes of training scalars."""
 
 PROGRESS_SECONDS = 2.0
-"""Least time between two writes of progress.json within a phase."""
+"""Shortest time between two writes of progress.json within a phase."""
 
 
 class Observe:
-    """An observer to which nothing matters; the others override what they need."""
+    """An observer that does nothing. Subclasses override what they need."""
 
     def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None: ...
     def entered(self, run: Trainer, phase: str) -> None: ...
@@ -66,10 +66,10 @@ class Observe:
 
 
 class RecordWriter(Observe):
-    """Keeps record.json: written at the start, after every evaluation, and at the end.
+    """Writes record.json at the start, after every evaluation, and at the end.
 
     Args:
-        resolved: the configuration as the record holds it.
+        resolved: the configuration as in the record.
     """
 
     record: RunRecord
@@ -116,7 +116,7 @@ class RecordWriter(Observe):
     def _continue(
         self, run: Trainer, checkpoint: Mapping[str, Any], provenance: Provenance
     ) -> None:
-        """Take the record as it was at the checkpoint."""
+        """Restore the record of the checkpoint."""
         self.record = record = read_record(run.folder / RECORD)
         del record.evaluations[checkpoint["evaluations"] :]
         mine = (run.folder.name, config_hash(self.resolved), checkpoint["history"])
@@ -149,7 +149,7 @@ class RecordWriter(Observe):
         self.record.failure = (
             "interrupted by the user" if interrupted else f"{type(error).__name__}: {error}"
         )
-        # A folder that cannot be written is most likely what stopped the run.
+        # Often the run failed because this folder cannot be written.
         with contextlib.suppress(UserError):
             self._close(run, "interrupted" if interrupted else "failed")
 
@@ -164,10 +164,10 @@ class RecordWriter(Observe):
 
 
 class TensorBoard(Observe):
-    """Writes the events of a run: what the record holds, and scalars of training between.
+    """Writes the events of a run: the numbers of the record, and training scalars.
 
     Args:
-        records: the observer that keeps the record.
+        records: the observer that writes the record.
     """
 
     log: RunLog
@@ -177,7 +177,7 @@ class TensorBoard(Observe):
         self.means = _Means()
 
     def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
-        # Without a checkpoint an earlier process may still have left events.
+        # Even without a checkpoint, an earlier process may have written events.
         purge = run.env_steps + 1 if checkpoint else 0
         self.log = RunLog(run.folder, self.records.record, purge)
         self.rounds = 0
@@ -205,7 +205,7 @@ class TensorBoard(Observe):
         self.log.scalars({f"diag/{k}": v for k, v in evaluation.diagnostics.items()}, run.env_steps)
 
     def saving(self, run: Trainer) -> Mapping[str, Any]:
-        # A continued run does not write again what lies before its checkpoint.
+        # A continued run does not repeat the events before its checkpoint.
         self.log.flush()
         return {}
 
@@ -224,11 +224,11 @@ class TensorBoard(Observe):
 
 
 class Pictures(Observe):
-    """Pictures of the last evaluation in TensorBoard; the record is closed by then.
+    """Pictures of the last evaluation in TensorBoard, drawn after the record is closed.
 
     Args:
-        tensorboard: where they are written.
-        quiet: do not say why a picture is missing.
+        tensorboard: writes them.
+        quiet: do not print why a picture is missing.
     """
 
     def __init__(self, tensorboard: TensorBoard, quiet: bool):
@@ -304,12 +304,12 @@ class Progress(Observe):
 
 
 class ProgressFile:
-    """progress.json: how far a running run is.
+    """progress.json: the progress of a running run.
 
     Args:
         folder: of the run.
         budget: control steps that the run may use.
-        env_steps: control steps that it has used already, if it continues.
+        env_steps: control steps that a continued run has already used.
     """
 
     def __init__(self, folder: Path, budget: int, env_steps: int = 0):
@@ -319,7 +319,7 @@ class ProgressFile:
         self._phase = ""
 
     def write(self, phase: str, env_steps: int, success: float | None = None) -> None:
-        """Write at most every two seconds; a change of phase is written at once."""
+        """Write if the phase has changed, or two seconds after the last time."""
         now = time.monotonic()
         if phase == self._phase and now - self._last < PROGRESS_SECONDS:
             return
@@ -334,13 +334,13 @@ class ProgressFile:
             "seconds_left": max(0, self._budget - env_steps) / rate if rate > 0 else None,
             "updated": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-        # A full disk is reported where results are written; progress is not worth a run.
+        # Do not stop a run for this file. A full disk is reported when results are written.
         with contextlib.suppress(UserError):
             write_atomically(self._path, json.dumps(data).encode(), durable=False)
 
 
 class _Means:
-    """Means of named tensors since they were last taken; reads the device only then."""
+    """Means of named tensors since the last call of ``take``. Only ``take`` reads the device."""
 
     def __init__(self) -> None:
         self._sums: dict[str, torch.Tensor] = {}
@@ -361,22 +361,22 @@ class _Means:
 
 
 def observers_of(config: RunConfig, resolved: dict[str, Any], progress: bool) -> list[Observe]:
-    """The observers of a run, in the order in which they are told.
+    """The observers of a run, in the order in which they are called.
 
     Args:
         config: of the run.
-        resolved: the configuration as the record holds it.
+        resolved: the configuration as in the record.
         progress: whether to show progress.
     """
     records = RecordWriter(resolved)
     tensorboard = TensorBoard(records)
     pictures = Pictures(tensorboard, quiet=not progress)
-    # The record is closed before pictures are drawn, and TensorBoard after.
+    # The record is closed before the pictures are drawn, TensorBoard after them.
     return [records, Progress(quiet=not progress), pictures, tensorboard]
 
 
 def _history(record: RunRecord) -> str:
-    """A key of all that the record says about the evaluations so far."""
+    """A hash of all evaluations in the record."""
     return content_key(
         [evaluation.model_dump(mode="json", by_alias=True) for evaluation in record.evaluations]
     )
