@@ -39,7 +39,8 @@ class MatchedStandardAgent(StandardAgent):
     """The standard agent with as many parameters as the equivariant one.
 
     At equal width, plain hidden layers have |G| times the parameters of equivariant ones. This
-    agent separates the effect of symmetry from that of size. Actor and critics are matched separately.
+    agent separates the effect of symmetry from that of size. Actor and critics are matched
+    separately.
     """
 
     name = "standard-matched"
@@ -62,7 +63,7 @@ def plain_layers(inputs: int, width: int, depth: int, outputs: int) -> list[nn.M
 
 
 def matched_width(parameters: int, inputs: int, depth: int, outputs: int) -> int:
-    """The width with which the number of parameters of ``plain_layers`` is closest to a given one."""
+    """The width with which ``plain_layers`` has about the given number of parameters."""
 
     def size(width: int) -> int:
         hidden = (depth - 1) * (width + 1) * width
