@@ -1,7 +1,7 @@
 """Steering agents: SAC in the latent noise of a frozen policy, and the references it must beat.
 
-``AGENTS`` names them; a new agent of SymSteer takes one file and one line here, one of another
-package an entry point (docs/submit.md).
+``AGENTS`` maps names to classes. To add an agent to SymSteer, write one file and add one line here.
+Another package adds its agent with an entry point (docs/submit.md).
 """
 
 from __future__ import annotations

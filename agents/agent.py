@@ -1,4 +1,4 @@
-"""The contract of a steering agent: what it is built from, and what the trainer calls.
+"""The interface of a steering agent: its inputs, and the methods that the trainer calls.
 
 The trainer's loop is the same for every agent::
 
@@ -26,7 +26,7 @@ from symsteer.errors import UserError
 from symsteer.policies.geometry import Layout
 
 Role = Literal["reference", "learner", "control"]
-"""``reference``: what every learner must beat; ``control``: a learner that must not win."""
+"""``reference``: every learner must beat it. ``control``: trained, but must not win."""
 
 Decode = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 Normalize = Callable[[torch.Tensor], torch.Tensor]
@@ -34,7 +34,7 @@ Normalize = Callable[[torch.Tensor], torch.Tensor]
 
 @dataclass(frozen=True)
 class AgentContext:
-    """Everything that an agent is told about its problem.
+    """The problem, as an agent sees it.
 
     Attributes:
         obs_layout: geometry of an observation.
@@ -43,10 +43,10 @@ class AgentContext:
         execute: Ta, actions executed per decision.
         decode: the frozen policy, ``(obs [B, obs_dim], noise [B, Tp, Da]) -> actions [B, Tp, Da]``.
             Differentiable with respect to the noise.
-        normalize_obs: brings observations ``[B, obs_dim]`` to the networks' scale; commutes with
-            the group, as the base policy's normaliser does.
+        normalize_obs: scales observations ``[B, obs_dim]`` for the networks. It commutes with the
+            group, as the base policy's normaliser does.
         device, dtype: of all tensors.
-        seed: of initialisation and of the agent's own noise.
+        seed: for the initialisation and for the agent's noise.
     """
 
     obs_layout: Layout
@@ -67,7 +67,7 @@ class AgentContext:
 
 @dataclass(frozen=True)
 class Budget:
-    """What a run offers to an agent.
+    """What an agent may use in a run.
 
     Attributes:
         env_steps: control steps, summed over the parallel environments.
@@ -109,7 +109,7 @@ MakeEnv = Callable[[bool], NoiseEnv]
 
 @dataclass(frozen=True)
 class AgentOptions:
-    """Options of an agent without any."""
+    """For agents without options."""
 
 
 class Agent:
@@ -118,9 +118,9 @@ class Agent:
     Attributes:
         name: in configurations and records.
         role: see :data:`Role`; the record holds it.
-        Options: a frozen dataclass, whose fields become ``--agent.X`` on the command line.
-        generator: of the agent's noise. An evaluation restores its state.
-        replay: kept transitions, saved with each checkpoint; None for agents that keep none.
+        Options: a frozen dataclass. Its fields become ``--agent.X`` on the command line.
+        generator: draws the agent's noise. An evaluation restores its state afterwards.
+        replay: transitions, saved with each checkpoint; None for agents without a replay.
     """
 
     name: ClassVar[str]
@@ -138,18 +138,18 @@ class Agent:
 
     @classmethod
     def check(cls, options: Any, budget: Budget) -> None:
-        """Refuse options that cannot work with a budget, before anything is built.
+        """Check the options against the budget, before anything is built.
 
         Raises:
-            UserError: one sentence on what to change.
+            UserError: if they cannot work together; the message says what to change.
         """
 
     def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
-        """Use a part of the budget before training: a search, or pre-training.
+        """Search or pre-train, with a part of the budget.
 
         Returns:
-            Control steps to train for, counted from the start of the run; 0 for agents that do
-            not train.
+            The control step at which training ends, counted from the start of the run; 0 for
+            agents that do not train.
         """
         return 0
 
@@ -157,13 +157,13 @@ class Agent:
         """Noise ``[B, Tp, Da]`` for observations ``[B, obs_dim]``.
 
         Args:
-            obs: environment units.
-            deterministic: as in evaluations; without it as in training, exploration included.
+            obs: in environment units.
+            deterministic: True in evaluations. False in training, with exploration.
         """
         raise NotImplementedError(f"{type(self).__name__} must say how it acts")
 
     def observe(self, transition: Transition) -> None:
-        """Take note of one decision of all training environments."""
+        """Receive one decision of all training environments, e.g. to store it."""
 
     def batches(self) -> Iterable[Batch]:
         """Batches for the updates that are due now."""
@@ -174,15 +174,15 @@ class Agent:
         return {}
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
-        """What an evaluation reports beside success (docs/metrics.md)."""
+        """Scalars that an evaluation reports in addition to success (docs/metrics.md)."""
         return {}
 
     def parameter_counts(self) -> dict[str, int]:
-        """Trainable numbers: ``actor``, ``critic`` (all together), ``total``, ``width``."""
+        """Trainable parameters (``actor``, ``critic``: all critics, ``total``) and ``width``."""
         return dict.fromkeys(("actor", "critic", "total", "width"), 0)
 
     def description(self) -> dict[str, Any]:
-        """What a checkpoint must agree with."""
+        """Properties that a checkpoint must have in common with the agent."""
         return {
             "agent": self.name,
             "obs_layout": self.obs_layout.to_json(),
@@ -210,7 +210,7 @@ class Agent:
         self.generator.set_state(state["generator"].cpu())
 
     def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
-        """``count`` chunks of N(0, I), ``[count, Tp, Da]``: what the base policy plays."""
+        """``count`` chunks from N(0, I), ``[count, Tp, Da]``: the noise of the base policy."""
         return torch.randn(
             count,
             self.horizon,
@@ -226,7 +226,7 @@ class Agent:
 
 @runtime_checkable
 class HasCritic(Protocol):
-    """An agent whose Q-values an evaluation holds against on-policy returns."""
+    """An agent with Q-values, which an evaluation compares with on-policy returns."""
 
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """A draw from the stochastic policy ``[B, Tp, Da]`` and its log-probability ``[B]``."""

@@ -1,8 +1,8 @@
 """The approximately equivariant agent: a residual pathway prior (RPP, arXiv 2112.01388).
 
-Every layer is an equivariant map plus a plain map. The plain (free) path starts near zero and is
-penalised: loss + w_b |W_free|^2 + w_e |W_eq|^2 with w_b > w_e. At zero the agent is exactly the
-equivariant one; where the world breaks the symmetry, the data can pay for leaving it.
+Every layer is the sum of an equivariant map and a plain map. The plain (free) path starts near zero
+and is penalised: loss + w_b |W_free|^2 + w_e |W_eq|^2 with w_b > w_e. If the free path is zero, the
+agent is exactly equivariant. If the world breaks the symmetry, the free path can grow.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class ApproximateOptions(SacOptions):
 
 
 class ResidualPathway(nn.Module):
-    """Sum of an equivariant layer and a plain one of the same shape."""
+    """The sum of an equivariant layer and a plain layer of the same shape."""
 
     def __init__(self, equivariant: nn.Module, free_init: float):
         super().__init__()
@@ -72,7 +72,7 @@ class ApproximateAgent(EquivariantAgent):
         return [ResidualPathway(layer, self.options.free_init) for layer in super().critic_layers()]
 
     def parameter_groups(self, network: nn.Module) -> list[dict[str, Any]]:
-        # Adam adds weight_decay * W to the gradient: that of w |W|^2 for weight_decay = 2 w.
+        # Adam adds weight_decay * W to the gradient. With weight_decay = 2 w it is that of w |W|^2.
         free, equivariant = paths(network)
         return [
             {"params": free, "weight_decay": 2 * self.options.free_penalty},
@@ -80,7 +80,7 @@ class ApproximateAgent(EquivariantAgent):
         ]
 
     def after_update(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Norm of the free path over that of the equivariant one, by network."""
+        """For each network: norm of the free path / norm of the equivariant path."""
         scalars = {}
         for name, network in (("actor", self.actor), ("critic", self.critic)):
             free, equivariant = (

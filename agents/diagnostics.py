@@ -1,4 +1,4 @@
-"""Is the critic right, and does the agent keep its symmetry? Every scalar with its formula.
+"""Diagnostics of a learner: errors of its critics, and errors of its symmetry.
 
 All values are in the environment's reward units, per decision. ``q`` arrays hold all critics,
 ``[critics, B]``, as :meth:`symsteer.agents.sac.SacAgent.q_values` returns them.
@@ -25,9 +25,9 @@ SYMMETRY_STATES = 64
 
 
 def critic_diagnostics(agent: SacAgent, played: Played) -> Scalars:
-    """All diagnostics of a learner at one evaluation, by their names in the record.
+    """All diagnostics of a learner at one evaluation, by the names that the record uses.
 
-    docs/metrics.md defines each.
+    docs/metrics.md defines them.
     """
     assert played.on_policy is not None
     options, greedy = agent.options, played.greedy
@@ -94,9 +94,9 @@ def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -
 
 
 def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float:
-    """Room that soft Q may need: ``alpha * gamma / (1 - gamma) * |log pi|``.
+    """How far soft Q may exceed the hard bounds: ``alpha * gamma / (1 - gamma) * |log pi|``.
 
-    The bonus of a decision's own noise is not part of its Q value, hence the leading gamma.
+    The first factor is gamma because Q(s, w) does not contain the entropy bonus of w itself.
 
     Args:
         gamma: discount per decision.
@@ -107,11 +107,11 @@ def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float
 
 
 def _bias_on_policy(agent: SacAgent, played: Played, alpha: float) -> Scalars:
-    """Bias of Q on the stochastic episodes, up to the first success of each."""
+    """Bias of Q on the stochastic episodes, each up to its first success."""
     run, log_prob = played.on_policy, played.log_prob
     assert run is not None
     assert log_prob is not None
-    # One column: the decisions of each episode up to its first success, episode after episode.
+    # All episodes in one column, each with its decisions up to the first success.
     rows = run.running.T
     truncated = torch.zeros_like(run.running)
     truncated[-1] = run.running[-1] & ~run.terminal[-1]
@@ -130,7 +130,7 @@ def _bias_on_policy(agent: SacAgent, played: Played, alpha: float) -> Scalars:
         column(log_prob)[:, None],
         alpha,
     )
-    # The return that the critics are trained towards: soft only with the soft backup.
+    # The critics estimate the soft return only with the soft backup.
     kind = "soft_bias" if agent.options.soft_backup else "bias"
     return {
         "q_bias": result[f"{kind}_mean"],
@@ -144,10 +144,9 @@ def _bias_on_policy(agent: SacAgent, played: Played, alpha: float) -> Scalars:
 
 
 def bound_violation(q: torch.Tensor, low: float, high: float) -> Scalars:
-    """How many values no return can explain.
+    """Q-values outside the interval of returns that the task allows.
 
-    - ``violation_share`` = mean over critics and states of [Q < low or Q > high or Q not finite],
-      with the interval of returns that the task allows;
+    - ``violation_share`` = mean over critics and states of [Q < low or Q > high or Q not finite];
     - ``max_abs_q`` = max |Q|; ``q_min``, ``q_mean``, ``q_max``;
     - ``finite`` = 1 if every value is finite, else 0.
 
@@ -184,25 +183,25 @@ def q_bias(
         hard:  G(t) = r(t) + gamma (1 - d(t)) G(t+1)
         soft:  G(t) = r(t) + gamma (1 - d(t)) (G(t+1) - alpha log pi(t+1)).
 
-    The critics bootstrap through time-outs, so the return of an episode that was cut k decisions
-    after state t lacks ``gamma^k`` times an unknown tail. Nothing is guessed in its place:
+    The critics bootstrap through time-outs. If an episode was cut k decisions after state t, its
+    return lacks ``gamma^k`` times an unknown tail. The tail is handled in two ways:
 
-    - states with ``gamma^k <= tail_tolerance`` (terminated episodes: 0) are *covered*; their tail
-      is taken at the middle of ``tail``. ``bias_mean``, ``bias_std`` = mean and standard deviation
-      of Q - G over covered states, ``bias_normalized``, ``bias_std_normalized`` = both divided by
-      |mean G|; ``covered_share`` = their share. Covered states lean towards successful episodes:
-      read the share beside the bias.
-    - over *all* states ``bias_low`` = mean(Q - G with the highest tail) and ``bias_high`` = mean(Q
-      - G with the lowest tail) enclose the mean hard bias, whatever the tail is.
+    - A state is *covered* if ``gamma^k <= tail_tolerance`` (in terminated episodes the weight is
+      0). Its tail is set to the middle of ``tail``. ``bias_mean``, ``bias_std`` = mean and standard
+      deviation of Q - G over covered states. ``bias_normalized``, ``bias_std_normalized`` = both
+      divided by |mean G|. ``covered_share`` = share of covered states. Successful episodes are
+      over-represented in them, so read this share together with the bias.
+    - Over *all* states, ``bias_low`` = mean(Q - G with the highest tail) and ``bias_high`` = mean(Q
+      - G with the lowest tail). The mean hard bias lies between them for every possible tail.
 
-    ``soft_bias_mean`` and ``soft_bias_std`` repeat the first two with the soft return, if
-    ``log_prob`` is given. Missing figures (nothing covered) are NaN.
+    If ``log_prob`` is given, ``soft_bias_mean`` and ``soft_bias_std`` are the first two with the
+    soft return. If no state is covered, the values are NaN.
 
     Args:
         q: mean or any one critic's value of the played noise, ``[T, N]``.
         reward, terminal, truncated, log_prob: per decision, ``[T, N]``; ``terminal`` by success,
-            ``truncated`` by time-out. What follows an episode's end in a column is the next
-            episode; the last row cuts whatever still runs there.
+            ``truncated`` by time-out. After the end of an episode, a column continues with the
+            next episode. The last row cuts all episodes that have not ended.
         gamma, alpha: discount and entropy weight.
         tail: smallest and largest value that a state can have, the feasible returns.
         tail_tolerance: largest weight of the unknown tail in a covered state.
@@ -226,7 +225,7 @@ def q_bias(
         goes_on = (~ends[t] & ~cut[t]).double()
         hard[t] = reward[t] + gamma * goes_on * next_hard
         soft[t] = reward[t] + gamma * goes_on * (next_soft + next_bonus)
-        # Discount with which the unknown value after the cut enters G(t).
+        # Weight of the unknown value after the cut in G(t).
         weight[t] = gamma * torch.where(cut[t], 1.0, goes_on * next_weight)
         next_hard, next_soft, next_weight, next_bonus = hard[t], soft[t], weight[t], bonus[t]
 
@@ -258,10 +257,11 @@ def q_bias(
 
 
 def critic_preference(agent: SacAgent, obs: torch.Tensor, generator: torch.Generator) -> Scalars:
-    """How much better than the base the critic believes the actor to be.
+    """By how much the critics prefer the actor to the base policy.
 
     ``critic_preference`` = mean over states and critics of Q(s, deterministic actor) - Q(s, w),
-    w ~ N(0, I). Set it beside the true gap in return; a belief without a gap is exploitation.
+    w ~ N(0, I). Compare it with the true difference in return. If there is no true difference, the
+    actor exploits errors of the critics.
 
     Args:
         obs: ``[B, obs_dim]``.
@@ -274,7 +274,7 @@ def critic_preference(agent: SacAgent, obs: torch.Tensor, generator: torch.Gener
 
 
 def policy_statistics(agent: SacAgent, obs: torch.Tensor) -> Scalars:
-    """Where the stochastic policy stands.
+    """Temperature, entropy and noise norms of the stochastic policy.
 
     - ``alpha`` = exp(log alpha); ``entropy`` = mean of -log pi(w|s) over one draw per state;
     - ``noise_norm`` = mean ||w||; ``mode_norm`` = mean ||deterministic w||;
@@ -295,10 +295,10 @@ def policy_statistics(agent: SacAgent, obs: torch.Tensor) -> Scalars:
 def orbit_variance(
     agent: SacAgent, obs: torch.Tensor, noise: torch.Tensor, group: Group
 ) -> Scalars:
-    """Zero for invariant critics, a dial for approximate ones.
+    """Variance of Q over group orbits: 0 for invariant critics.
 
     - ``orbit_variance`` = mean over states and critics of Var_g Q(gs, gw), g over the group;
-    - ``orbit_share`` = that divided by the variance of Q over the whole orbit-extended batch.
+    - ``orbit_share`` = ``orbit_variance`` / variance of Q over the batch with all its group images.
 
     Args:
         obs, noise: ``[B, obs_dim]``, ``[B, Tp, Da]``.

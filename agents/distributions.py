@@ -1,13 +1,13 @@
-"""A Gaussian squashed into balls, one per irrep block, that commutes with the group.
+"""A squashed Gaussian that commutes with the group: each irrep block is squashed into a ball.
 
 Noise ``w`` splits into irrep blocks (scalars and planar vectors). Each block is
 
     u = mean + scale * eps,   eps ~ N(0, I),   one scale per block,
     w = bound * tanh(|u|) * u / |u|,
 
-so a rotation of ``mean`` and ``eps`` rotates ``w``, and the density is invariant. A tanh for each
-number by itself would pin the axes: it commutes with quarter turns only. On scalars the two
-agree. The change of volume of one block is
+so a rotation of ``mean`` and ``eps`` rotates ``w``, and the density is invariant. The usual tanh of
+each number commutes with quarter turns only. For scalars both are the same. The log-determinant of
+one block is
 
     log |dw/du| = size * log(bound) + log sech^2(|u|) + (size - 1) * log(tanh(|u|) / |u|).
 
@@ -26,13 +26,13 @@ from torch import nn
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Layout
 
-# Below this |u|^2, functions of |u| are evaluated by their power series in |u|^2, whose first
-# dropped terms are below 1e-14 there.
+# Below this |u|^2, functions of |u| are evaluated by their power series in |u|^2. The first dropped
+# terms are below 1e-14 there.
 SMALL = 1e-4
 
 
 class SquashedGaussian(nn.Module):
-    """The distribution family of one noise layout; parameters come with every call.
+    """The distribution family of one noise layout; its methods take the parameters.
 
     Args:
         layout: geometry of the flattened noise, ``dim`` numbers in ``blocks`` irrep blocks.
@@ -75,11 +75,11 @@ class SquashedGaussian(nn.Module):
         return noise, self._gaussian(eps, log_scale) - log_volume
 
     def mode(self, mean: torch.Tensor) -> torch.Tensor:
-        """The squashed mean, ``[..., dim]``: what a deterministic policy plays."""
+        """The squashed mean, ``[..., dim]``: the noise of the deterministic policy."""
         return self._squash(mean)[0]
 
     def saturated(self, noise: torch.Tensor, share: float = 0.95) -> torch.Tensor:
-        """Which blocks' norms exceed ``share`` of the bound, ``[..., blocks]`` bool."""
+        """Blocks with a norm above ``share`` of the bound, ``[..., blocks]`` bool."""
         return noise.square() @ self.membership > (share * self.bound) ** 2
 
     def _spread(self, per_block: torch.Tensor) -> torch.Tensor:
@@ -105,8 +105,8 @@ class RadialTanh(torch.autograd.Function):
         w = p u,   log det = log sech^2 |u| + (n - 1) log p,
         dp/ds = (sech^2 |u| - p) / (2 s),   d log det / ds = -p + (n - 1) (dp/ds) / p.
 
-    A function of s, not of |u|, is smooth at zero. Written out because automatic differentiation
-    of the same formulas took a sixth of an update's time.
+    As functions of s (not of |u|) they are smooth at zero. The derivative is written out because
+    automatic differentiation of the same formulas took a sixth of an update's time.
     """
 
     @staticmethod
@@ -123,7 +123,7 @@ class RadialTanh(torch.autograd.Function):
         r = s.sqrt()
         tanh = r.tanh()
         ratio = torch.where(small, 1 - s * (1 / 3 - s * (2 / 15 - s * 17 / 315)), tanh / r)
-        # sech^2 = 4 / (e^r + e^-r)^2, written so that large radii neither overflow nor give log 0.
+        # sech^2 = 4 / (e^r + e^-r)^2, in a form without overflow or log 0 at large radii.
         far = 2 * (math.log(2) - r - torch.log1p((-2 * r).exp()))
         log_sech2 = torch.where(small, -s * (1 - s * (1 / 6 - s * 2 / 45)), far)
         log_volume = (log_sech2 + (sizes - 1) * ratio.log()).sum(-1)
@@ -135,7 +135,7 @@ class RadialTanh(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
-        """Chain rule through s: du gathers ``p dw`` and ``2 u`` times what reaches s."""
+        """Chain rule through s: du = ``p dw`` + ``2 u`` times the gradient of s."""
         grad_w, grad_volume = gradients
         u, membership, index, ratio, slope, sizes = ctx.saved_tensors
         to_s = slope * ((grad_w * u) @ membership)

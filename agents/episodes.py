@@ -1,4 +1,4 @@
-"""Whole episodes as tensors: what evaluations play and diagnostics look at."""
+"""Whole episodes as tensors. Evaluations play them, diagnostics are computed from them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class Rollout:
         episodes: columns ``seed, success_once, success_at_end, return, episode_len`` of
             ManiSkill's metrics, each ``[N]``.
         obs: observation of every decision, ``[T, N, obs_dim]``.
-        noise: what the agent chose, ``[T, N, Tp, Da]``.
+        noise: chosen by the agent, ``[T, N, Tp, Da]``.
         reward: summed over the executed steps, ``[T, N]``.
         next_obs: ``[T, N, obs_dim]``.
-        running: whether the episode had not yet succeeded before the decision, ``[T, N]`` bool.
-        terminal: whether the decision led to the first success, ``[T, N]`` bool.
+        running: no success before this decision, ``[T, N]`` bool.
+        terminal: the first success happened in this decision, ``[T, N]`` bool.
     """
 
     episodes: dict[str, torch.Tensor]
@@ -33,7 +33,7 @@ class Rollout:
     terminal: torch.Tensor
 
     def episodes_of(self, rows: slice) -> Rollout:
-        """The same for some of the episodes."""
+        """The same data for some of the episodes."""
         return Rollout(
             episodes={name: value[rows] for name, value in self.episodes.items()},
             **{name: getattr(self, name)[:, rows] for name in DECISION_FIELDS},
@@ -47,7 +47,7 @@ class Played:
     Attributes:
         greedy: of the deterministic actor.
         on_policy: of the stochastic actor; None for agents without a critic.
-        log_prob: of the noise in ``on_policy``, ``[T, N]``; None with it.
+        log_prob: of the noise in ``on_policy``, ``[T, N]``; None if ``on_policy`` is None.
         feasible: lowest and highest discounted return that the reward allows, per decision.
         generator: for random noise that diagnostics need, on the agent's device.
     """

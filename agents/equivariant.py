@@ -1,9 +1,9 @@
-"""The equivariant agent: every linear map commutes with the group. If the scene turns, the policy's
-noise turns with it, and the critics' values stay the same.
+"""The equivariant agent: every linear map commutes with the group. If the scene is rotated, the
+actor's noise rotates with it and the critics' values do not change.
 
 Actor: lift, group convolutions, projection to the chunk's irreps (means) and to one scalar per
-irrep block (scales). Critics: the same trunk over observation and noise, pooled over the group
-axis. Both ends are one :class:`Pool`: onto a scalar it is exactly that pooling.
+irrep block (scales). Critics: the same trunk for observation and noise, pooled over the group axis.
+The last layer of both is a :class:`Pool`; with a scalar output it is this pooling.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ VALUE = Layout([Field("value", 0)])
 class Pool(Project):
     """``Project`` as a sum over the group instead of a mean: y = sum_g rho(g) W f(g) + b.
 
-    Adam moves every parameter by about ``lr``, whatever its gradient's size. The mean divides
-    that by |G| in the dense matrix, and the output would learn |G| times slower than a plain
-    layer's. With the sum, and the plain layer's bound for |G| * channels inputs at the start,
-    equivariant and plain layers move alike.
+    Adam changes every parameter by about ``lr`` per step, for any size of the gradient. A mean
+    would divide this step by |G| in the dense matrix: the output layer would learn |G| times slower
+    than a plain layer. With a sum, both change equally fast. The initial weights have the bound of
+    a plain layer with |G| * channels inputs.
     """
 
     def __init__(self, group: Group, channels: int, layout: Layout):
@@ -42,7 +42,7 @@ class Pool(Project):
 
 
 class EquivariantAgent(SacAgent):
-    """Equivariant actor, invariant critics, exact for every element of ``group``."""
+    """Equivariant actor and invariant critics, exact for every element of ``group``."""
 
     name = "equivariant"
 
@@ -54,19 +54,19 @@ class EquivariantAgent(SacAgent):
 
 
 def equivariant_actor_layers(agent: SacAgent) -> list[nn.Module]:
-    """From observation to means and scales; the output layer starts small."""
+    """Layers from observation to means and scales; small initial output."""
     layers = equivariant_layers(agent.obs_layout, agent.actor_layout, agent.options)
     shrink_(layers[-1], agent.options.initial_output)
     return layers
 
 
 def equivariant_critic_layers(agent: SacAgent) -> list[nn.Module]:
-    """From observation and noise to an invariant value."""
+    """Layers from observation and noise to an invariant value."""
     return equivariant_layers(agent.critic_layout, VALUE, agent.options)
 
 
 def equivariant_layers(inputs: Layout, outputs: Layout, options: SacOptions) -> list[nn.Module]:
-    """``depth`` hidden layers of width/|G| regular fields and an output layer."""
+    """``depth`` hidden layers with width/|G| regular fields each, and an output layer."""
     group = Group.parse(options.group)
     fields = max(1, round(options.width / group.order))
     return [

@@ -1,7 +1,7 @@
 """The golden ticket: the best constant noise, found by search on training episodes.
 
-One noise chunk for all states, as in arXiv 2603.15757. The search is sequential halving (Karnin,
-Koren and Somekh, ICML 2013): every round plays the remaining candidates on the same initial
+It plays one noise chunk in all states, as in arXiv 2603.15757. The search is sequential halving
+(Karnin, Koren and Somekh, ICML 2013): each round plays the remaining candidates on the same initial
 states and keeps the better half.
 """
 
@@ -24,7 +24,7 @@ class GoldenTicketOptions(AgentOptions):
     """Options of the golden ticket."""
 
     candidates: int = 64
-    """Constant noises in the first round, at most; halved until the budget suffices."""
+    """Candidates of the first round; fewer if the budget is too small for them."""
 
     def __post_init__(self) -> None:
         if self.candidates < 2:
@@ -32,7 +32,7 @@ class GoldenTicketOptions(AgentOptions):
 
 
 class GoldenTicketAgent(Agent):
-    """One constant noise for all states, the best of a search on training episodes."""
+    """Plays the best constant noise of a search on training episodes."""
 
     name = "golden-ticket"
     role = "reference"
@@ -48,7 +48,7 @@ class GoldenTicketAgent(Agent):
 
     @classmethod
     def check(cls, options: GoldenTicketOptions, budget: Budget) -> None:
-        """Refuse a budget that does not suffice for two candidates."""
+        """Check that the budget is enough for two candidates."""
         rounds(budget, options.candidates)
 
     def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
@@ -82,11 +82,11 @@ class GoldenTicketAgent(Agent):
         return self.ticket.expand(len(obs), *self.ticket.shape).clone()
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
-        """The ticket's root mean square (of N(0, I): about 1), and the search's numbers."""
+        """Root mean square of the ticket (about 1 for N(0, I)), and numbers of the search."""
         return {"ticket_rms": self.ticket.square().mean().sqrt().item(), **self.searched}
 
     def state_dict(self) -> dict[str, Any]:
-        """The generator, the ticket and the search's numbers."""
+        """The generator, the ticket and the numbers of the search."""
         return {**super().state_dict(), "ticket": self.ticket.clone(), "searched": self.searched}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -104,7 +104,7 @@ def play_constant(env: NoiseEnv, noise: torch.Tensor, seeds: list[int]) -> dict[
     """
     parts = []
     for start in range(0, len(seeds), env.num_envs):
-        # The last batch may be short: its spare environments repeat a row and are dropped.
+        # If the last batch is not full, the other environments repeat a row and are dropped.
         rows = torch.arange(start, start + env.num_envs).clamp(max=len(seeds) - 1)
         env.reset([seeds[int(row)] for row in rows])
         for _ in range(math.ceil(env.max_episode_steps / env.execute)):
@@ -116,10 +116,10 @@ def play_constant(env: NoiseEnv, noise: torch.Tensor, seeds: list[int]) -> dict[
 
 
 def rounds(budget: Budget, candidates: int) -> list[int]:
-    """Candidates of every round: as many as the budget can play once in each round.
+    """Number of candidates in every round, limited by the budget.
 
     Raises:
-        UserError: if the budget does not suffice for two candidates.
+        UserError: if the budget is not enough for two candidates.
     """
     batch = budget.num_envs * budget.max_episode_steps
     while candidates >= 2:

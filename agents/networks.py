@@ -1,12 +1,12 @@
-"""The one network shape of every agent: a stack of multilayer perceptrons.
+"""The network of every agent: an ensemble of multilayer perceptrons.
 
-What distinguishes the agents is where the matrices come from. A layer is any module with
-``dense() -> (weight [out, in], bias [out])``: an ordinary linear layer, an equivariant layer
-expanded to its dense matrix, or the sum of both. The product is then the same for all, and the
-members of an ensemble share it (one batched product instead of one per critic).
+The agents differ only in their layers. A layer is any module with
+``dense() -> (weight [out, in], bias [out])``: a plain linear layer, an equivariant layer expanded
+to its dense matrix, or the sum of both. All agents then compute the same matrix products. The
+members of an ensemble share one batched product (instead of one per critic).
 
-The nonlinearity is LayerNorm (optional, without parameters of its own) followed by ReLU. Both
-commute with permutations of the features, so regular fields stay regular fields.
+The nonlinearity is LayerNorm (optional, without parameters) followed by ReLU. Both commute with
+permutations of the features, so regular fields stay regular fields.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Weights = list[tuple[torch.Tensor, torch.Tensor]]
 
 
 class DenseLayer(Protocol):
-    """A linear layer that can give itself as one matrix."""
+    """A linear layer that returns its weight as one dense matrix."""
 
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Weight ``[out, in]`` and bias ``[out]``."""
@@ -31,7 +31,7 @@ class DenseLayer(Protocol):
 
 
 class Dense(nn.Linear):
-    """An ordinary linear layer."""
+    """A plain linear layer."""
 
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self.weight, self.bias
@@ -41,7 +41,7 @@ class Ensemble(nn.Module):
     """``members`` perceptrons of equal shape, evaluated together.
 
     Args:
-        members: for each member its layers, first to last.
+        members: the layers of each member, first to last.
         layer_norm: whether hidden features are normalised.
 
     ``width`` is the number of features of the first hidden layer.
@@ -57,8 +57,8 @@ class Ensemble(nn.Module):
     def weights(self) -> Weights:
         """The dense matrices of every layer; differentiable with respect to the parameters.
 
-        Kept until :meth:`changed`: acting, judging and the next update share one expansion. One
-        backward pass per expansion, as that frees its graph.
+        The result is cached until :meth:`changed` is called, so acting, critic values and the next
+        update use the same one. Only one backward pass per expansion: it frees the graph.
         """
         if self._expanded is None:
             with torch.enable_grad():
@@ -66,7 +66,7 @@ class Ensemble(nn.Module):
         return self._expanded
 
     def changed(self) -> None:
-        """To be called whenever parameters changed (optimiser step, loading)."""
+        """Drop the cache. Call this after every change of parameters (optimiser step, loading)."""
         self._expanded = None
 
     def _expand(self) -> Weights:
@@ -77,7 +77,7 @@ class Ensemble(nn.Module):
         return stacked
 
     def apply_weights(self, weights: Weights, x: torch.Tensor) -> torch.Tensor:
-        """Evaluate given matrices: ``[B, in] -> [members, B, out]``."""
+        """Evaluate with the given matrices: ``[B, in] -> [members, B, out]``."""
         out = x.expand(len(weights[0][0]), *x.shape)
         for index, (matrix, bias) in enumerate(weights):
             if index > 0:
@@ -98,17 +98,17 @@ def dense(layer: nn.Module) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def detached(weights: Weights) -> Weights:
-    """The same matrices without gradient."""
+    """The same matrices without gradients."""
     return [(matrix.detach(), bias.detach()) for matrix, bias in weights]
 
 
 def shrink_(layer: nn.Module, factor: float) -> None:
-    """Scale all parameters of a layer, in place: a small output at initialisation."""
+    """Multiply all parameters of a layer by a factor, in place, for a small initial output."""
     with torch.no_grad():
         for parameter in layer.parameters():
             parameter.mul_(factor)
 
 
 def count(module: nn.Module) -> int:
-    """Number of trainable numbers."""
+    """Number of trainable parameters."""
     return sum(parameter.numel() for parameter in module.parameters())

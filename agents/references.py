@@ -1,4 +1,4 @@
-"""What every learner has to beat, at no cost: the base policy's own noise, and none."""
+"""References without training: random noise (the base policy as it is) and zero noise."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from symsteer.agents.agent import Agent
 
 
 class BaseAgent(Agent):
-    """w ~ N(0, I), seeded: the frozen policy as it is."""
+    """w ~ N(0, I), seeded: the frozen policy without steering."""
 
     name = "base"
     role = "reference"
 
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
-        """Noise ``[B, Tp, Da]``; also random when ``deterministic``, for that is the base."""
+        """Noise ``[B, Tp, Da]``; random even if ``deterministic``, as the base policy is."""
         return self.gaussian_noise(len(obs))
 
 
 class ZeroAgent(Agent):
-    """w = 0: fixed by every group element, hence free of cost and exactly equivariant."""
+    """w = 0: invariant under the group, so exactly equivariant, and free of cost."""
 
     name = "zero"
     role = "reference"

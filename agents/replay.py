@@ -1,4 +1,4 @@
-"""Transitions in tensors on the learner's device, with the fields that an agent asks for."""
+"""Replay buffer on the learner's device, with the fields that an agent needs."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ import torch
 from symsteer.errors import UserError
 
 FIRST_ROWS = 4096
-"""Rows allocated at first; the buffer doubles up to its capacity as it fills."""
+"""Rows allocated at the start. When they are full, the buffer doubles, up to its capacity."""
 
 
 @dataclass
 class Transition:
     """One decision of N environments.
 
-    ``terminal`` is true only where the episode ended by success. A time-out is not terminal: its
-    target bootstraps from ``next_obs``, which is the last observation of the episode, not the
-    first one after the reset.
+    ``terminal`` is true only if the episode ended with success. A time-out is not terminal: its
+    target bootstraps from ``next_obs``. This is the last observation of the episode, not the first
+    one after the reset.
 
     Attributes:
-        obs: observation that was acted on, ``[N, obs_dim]``.
-        noise: what the agent chose, ``[N, Tp, Da]``.
+        obs: observation before the decision, ``[N, obs_dim]``.
+        noise: chosen by the agent, ``[N, Tp, Da]``.
         actions: the executed action chunk, ``[N, Ta, Da]``.
         reward: summed over the executed steps, ``[N]``.
-        next_obs: observation that the decision led to, ``[N, obs_dim]``.
+        next_obs: observation after the decision, ``[N, obs_dim]``.
         terminal: success, ``[N]`` bool.
         truncated: the time limit was reached without success, ``[N]`` bool.
     """
@@ -42,7 +42,7 @@ class Transition:
 
 
 class Batch(dict[str, torch.Tensor]):
-    """Transitions by field, one per row: ``batch.obs`` is ``batch["obs"]``.
+    """Transitions, one per row of each field; ``batch.obs`` is ``batch["obs"]``.
 
     Flags are 0 or 1 in the buffer's dtype.
     """
@@ -56,18 +56,18 @@ class Batch(dict[str, torch.Tensor]):
             ) from error
 
     def replace(self, **changes: torch.Tensor) -> Batch:
-        """A copy with some fields exchanged."""
+        """A copy with some fields replaced."""
         return Batch({**self, **changes})
 
 
 class ReplayBuffer:
-    """A ring of transitions with seeded uniform sampling.
+    """A ring buffer of transitions with seeded uniform sampling.
 
     Args:
         capacity: number of transitions kept; the oldest is overwritten first.
         shapes: shape of each field in one transition, by field name of :class:`Transition`.
-        device, dtype: where and how the numbers are kept.
-        seed: of the generator that draws batches.
+        device, dtype: of the stored tensors.
+        seed: for drawing batches.
 
     Raises:
         UserError: if the capacity is not positive.
@@ -94,7 +94,7 @@ class ReplayBuffer:
         return self.size
 
     def add(self, transition: Transition | Mapping[str, torch.Tensor]) -> None:
-        """Append N transitions; fields that the buffer does not hold are ignored.
+        """Append N transitions; other fields than those of the buffer are ignored.
 
         Raises:
             UserError: if N exceeds the capacity.

@@ -1,25 +1,25 @@
 """Soft actor-critic in the latent noise of a frozen diffusion policy: the core of every learner.
 
-After Haarnoja et al., arXiv 1812.05905, as used for steering by DSRL, arXiv 2506.15799. An action
-is the whole noise chunk ``w [Tp, Da]``; a step is one decision of the latent-noise environment.
-An agent overrides only what it does differently:
+After Haarnoja et al., arXiv 1812.05905, used for steering as in DSRL, arXiv 2506.15799. An action
+is the whole noise chunk ``w [Tp, Da]``. A step is one decision of the latent-noise environment.
+Subclasses override only what they change:
 
 ====================  ===============================================================
 ``actor_layers``    layers of the actor
 ``critic_layers``   layers of one critic
 ``parameter_groups``  Adam's parameter groups of a network
-``critic_target``   what the critics are trained towards
-``critic_loss``     distance of the critics from their target
-``actor_loss``      what the actor minimises
+``critic_target``   target of the critics
+``critic_loss``     loss of the critics
+``actor_loss``      loss of the actor
 ``critic_penalty``, ``actor_penalty``  regularisers, added to the losses
-``constraints``     gaps that trained multipliers close; the temperature is one
-``after_update``    what follows an update; more scalars
+``constraints``     gaps of the trained multipliers; the temperature is one of them
+``after_update``    called after each update; returns more scalars
 ====================  ===============================================================
 
 Deviations from the paper, numbered as in ``docs/agents.md``:
 
 1. the squash is radial, one scale per irrep block (``distributions.py``);
-2. the target carries no entropy bonus unless ``soft_backup`` (hard backup);
+2. the target has no entropy bonus (hard backup), except with ``soft_backup``;
 3. time-outs bootstrap; only success is terminal;
 4. LayerNorm in actor and critics; the actor's output layer starts small.
 """
@@ -49,11 +49,11 @@ LOG_SCALE_MIN, LOG_SCALE_MAX = -5.0, 1.0
 
 @dataclass(frozen=True)
 class SacOptions(AgentOptions):
-    """What all SAC agents share.
+    """Options of all SAC agents.
 
-    The defaults suit many environments and few updates: data are cheap here, and a critic trained
-    hard on few decisions is exploited by the actor. They were chosen on PickCube, floating,
-    unbroken, with the equivariant and the standard agent, seeds 0 and 1.
+    The defaults are for many environments and few updates. Data are cheap here, and the actor
+    exploits a critic that is trained with many updates on few decisions. They were chosen on
+    PickCube, floating, unbroken, with the equivariant and the standard agent, seeds 0 and 1.
     """
 
     gamma: float = 0.95
@@ -65,38 +65,38 @@ class SacOptions(AgentOptions):
     batch_size: int = 192
     """Transitions per update."""
     tau: float = 0.015
-    """Share of the online critics that enters the target critics at each update."""
+    """Weight of the online critics when the target critics are updated."""
     critics: int = 2
-    """Number of critics; the smallest value counts."""
+    """Number of critics; the smallest of their values is used."""
     layer_norm: bool = True
-    """Normalise hidden features; without it Q diverges easily."""
+    """Normalise hidden features; without it Q often diverges."""
     width: int = 128
-    """Hidden features per layer; a group of order n shares them out over width/n fields."""
+    """Hidden features per layer; with a group of order n they are width/n regular fields."""
     depth: int = 2
     """Hidden layers."""
     group: str = "C8"
-    """Symmetry group, C_n or D_n: of equivariant layers, and for measuring equivariance."""
+    """Symmetry group, C_n or D_n, of equivariant layers and of the measured equivariance errors."""
     noise_bound: float = 1.5
     """Largest norm of an irrep block of the noise."""
     target_entropy: float | None = None
-    """Entropy that alpha aims at, nats per decision; default: minus half the noise's numbers."""
+    """Target of the entropy, nats per decision; default: minus half the noise dimension."""
     initial_alpha: float = 0.01
     """Entropy weight at the start."""
     initial_scale: float = 0.5
-    """Standard deviation, before the squash, of the untrained policy."""
+    """Standard deviation of the untrained policy before the squash."""
     initial_output: float = 0.01
     """Factor on the actor's output layer at initialisation; small means w starts around 0."""
     soft_backup: bool = False
-    """Put the entropy bonus into the critics' target, as in the paper."""
+    """Add the entropy bonus to the critics' target, as in the paper."""
     reward_scale: float = 0.25
-    """Factor on rewards before learning (0.25: one decision of four steps costs 1); reported Q
-    values are divided by it again."""
+    """Factor on rewards in training (0.25: one decision of four steps costs 1). Reported Q-values
+    are in unscaled reward units."""
     utd: float = 0.3
     """Updates per collected decision."""
     warmup: int = 1280
-    """Decisions played with noise from N(0, I), the base policy, before the first update."""
+    """Decisions with noise from N(0, I) (the base policy) before the first update."""
     replay_capacity: int = 200_000
-    """Decisions kept for replay."""
+    """Capacity of the replay buffer, in decisions."""
 
     def __post_init__(self) -> None:
         positive = (
@@ -125,10 +125,10 @@ class SacOptions(AgentOptions):
 
 
 class Multiplier:
-    """A positive number ``exp(log)`` that grows while its constraint's gap is negative.
+    """A positive number ``exp(log)`` that grows while the gap of its constraint is negative.
 
-    Its loss is ``log * gap``, minimised by Adam: for the temperature the gap is the entropy minus
-    its target (Haarnoja et al., arXiv 1812.05905, section 5).
+    Adam minimises its loss ``log * gap``. The gap of the temperature is the entropy minus its
+    target (Haarnoja et al., arXiv 1812.05905, section 5).
     """
 
     def __init__(self, initial: float, lr: float, device: torch.device, dtype: torch.dtype):
@@ -137,7 +137,7 @@ class Multiplier:
 
     @property
     def value(self) -> torch.Tensor:
-        """The present number, without gradient."""
+        """The current value, without gradient."""
         return self.log.detach().exp()
 
     def step(self, gap: torch.Tensor) -> torch.Tensor:
@@ -147,7 +147,7 @@ class Multiplier:
         return loss.detach()
 
     def state_dict(self) -> dict[str, Any]:
-        """Number and optimiser."""
+        """Value and optimiser."""
         return {"log": self.log.detach(), "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -158,14 +158,14 @@ class Multiplier:
 
 
 class SacAgent(Agent):
-    """Actor, critics, temperature and their updates; subclasses supply the layers."""
+    """Actor, critics, temperature and their updates; subclasses define the layers."""
 
     role = "learner"
     Options = SacOptions
     options: SacOptions
 
     replay_fields: ClassVar[tuple[str, ...]] = ("obs", "noise", "reward", "next_obs", "terminal")
-    """Fields of :class:`Transition` that the replay keeps, e.g. also ``actions``."""
+    """Fields of :class:`Transition` that the replay stores; a subclass may add ``actions``."""
 
     replay: ReplayBuffer
 
@@ -175,7 +175,7 @@ class SacAgent(Agent):
         self.noise_layout = context.noise_layout
         self.distribution = SquashedGaussian(self.noise_layout, options.noise_bound)
         blocks = Field("log_scales", 0, self.distribution.blocks)
-        # The actor's output: means, then one invariant number per irrep block.
+        # Output of the actor: the means, then one invariant number per irrep block.
         self.actor_layout = Layout([*self.noise_layout.fields, blocks])
         self.critic_layout = _side_by_side(obs=self.obs_layout, noise=self.noise_layout)
         self.target_entropy = (
@@ -183,7 +183,7 @@ class SacAgent(Agent):
             if options.target_entropy is None
             else options.target_entropy
         )
-        with torch.random.fork_rng(devices=[]):  # the caller's generator stays as it is
+        with torch.random.fork_rng(devices=[]):  # does not change the global generator
             torch.manual_seed(context.seed)
             actor = Ensemble([self.actor_layers()], options.layer_norm)
             critics = [self.critic_layers() for _ in range(options.critics)]
@@ -191,8 +191,8 @@ class SacAgent(Agent):
         self.distribution.to(self.device, self.dtype)
         self.actor = actor.to(self.device, self.dtype)
         self.critic = critic.to(self.device, self.dtype)
-        # The targets are kept as dense matrices: expansion is linear, so following the matrices is
-        # following the parameters, without an expansion of their own.
+        # The targets are stored as dense matrices. Expansion is linear, so averaging the matrices
+        # equals averaging the parameters, and the targets need no expansion.
         self.target = [(w.clone(), b.clone()) for w, b in detached(self.critic.weights())]
         self.actor_optimizer = adam(self.parameter_groups(self.actor), options.lr)
         self.critic_optimizer = adam(self.parameter_groups(self.critic), options.lr)
@@ -209,7 +209,7 @@ class SacAgent(Agent):
 
     @classmethod
     def check(cls, options: SacOptions, budget: Budget) -> None:
-        """Refuse a budget in which nothing would be learned, or a replay that is too small."""
+        """Check that training begins within the budget, and that the replay is large enough."""
         warm_up = options.warmup * budget.execute
         if budget.env_steps <= warm_up:
             raise UserError(
@@ -248,7 +248,7 @@ class SacAgent(Agent):
         next_q = self._q(self.target, next_obs, noise).amin(0)
         if self.options.soft_backup:
             next_q = next_q - self.alpha * log_prob
-        # Only success ends the future; a time-out has terminal 0 and bootstraps.
+        # Only success is terminal; a time-out has terminal 0 and bootstraps.
         reward = self.options.reward_scale * batch.reward
         return reward + self.options.gamma * (1 - batch.terminal) * next_q
 
@@ -262,7 +262,7 @@ class SacAgent(Agent):
         """Mean of alpha log pi - min Q.
 
         Args:
-            q: values of ``noise``, ``[critics, B]``; differentiable with respect to it only.
+            q: values of ``noise``, ``[critics, B]``; differentiable with respect to ``noise``.
             noise: drawn from the actor, flat, ``[B, Tp * Da]``; see :meth:`chunk`.
             log_prob: ``[B]``.
             batch: transitions.
@@ -270,28 +270,28 @@ class SacAgent(Agent):
         return (self.alpha * log_prob - q.amin(0)).mean()
 
     def critic_penalty(self, batch: Batch) -> torch.Tensor | None:
-        """A regulariser of the critics, added to their loss; None for none."""
+        """A regulariser, added to the critics' loss; None: no regulariser."""
         return None
 
     def actor_penalty(self, batch: Batch) -> torch.Tensor | None:
-        """A regulariser of the actor, added to its loss; None for none."""
+        """A regulariser, added to the actor's loss; None: no regulariser."""
         return None
 
     def constraints(
         self, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
     ) -> dict[str, torch.Tensor]:
-        """Gap of each constraint in ``multipliers``, a scalar: below 0 its multiplier grows."""
+        """Gap of each constraint in ``multipliers``, a scalar; negative: the multiplier grows."""
         return {"alpha": -log_prob.mean() - self.target_entropy}
 
     def after_update(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """What follows an update; returns further scalars."""
+        """Called after each update; returns more scalars."""
         return {}
 
     # Acting.
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
-        """Noise ``[B, Tp, Da]``; without ``deterministic`` N(0, I) during the warm-up."""
+        """Noise ``[B, Tp, Da]``; N(0, I) during the warm-up, if not ``deterministic``."""
         if deterministic:
             return self.chunk(self.distribution.mode(self.moments(obs)[0]))
         if self.decisions < self.options.warmup:
@@ -331,14 +331,14 @@ class SacAgent(Agent):
         return budget.env_steps
 
     def observe(self, transition: Transition) -> None:
-        """Keep the decisions; each one behind the warm-up pays for ``utd`` updates."""
+        """Store the decisions; after the warm-up, each one adds ``utd`` updates that are due."""
         self.replay.add(transition)
         if self.decisions >= self.options.warmup:
             self.owed += len(transition.reward) * self.options.utd
         self.decisions += len(transition.reward)
 
     def batches(self) -> Iterator[Batch]:
-        """One batch for each update that is paid for."""
+        """One batch for each update that is due."""
         while self.owed >= 1:
             self.owed -= 1
             yield self.replay.sample(self.options.batch_size)
@@ -347,7 +347,7 @@ class SacAgent(Agent):
         """One step of critics, actor, multipliers and target critics.
 
         Returns:
-            Scalars as tensors on the device (reading them waits for the device).
+            Scalars as tensors on the device; reading them waits for the device.
         """
         obs, next_obs = self._features(batch.obs), self._features(batch.next_obs)
         alpha = self.alpha
@@ -360,7 +360,7 @@ class SacAgent(Agent):
         self.critic.changed()
 
         noise, log_prob = self._sample(*self._heads(self.actor.weights(), obs))
-        judge = detached(self.critic.weights())  # the actor's loss must not reach the critics
+        judge = detached(self.critic.weights())  # no gradient of the actor's loss in the critics
         actor_loss = self.actor_loss(self._q(judge, obs, noise), noise, log_prob, batch)
         descend(actor_loss, self.actor_optimizer, self.actor_penalty(batch))
         self.actor.changed()
@@ -386,13 +386,13 @@ class SacAgent(Agent):
         }
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
-        """Q against its bounds and fresh returns, symmetry, temperature (docs/metrics.md)."""
+        """Errors of Q, equivariance errors, temperature (docs/metrics.md)."""
         return critic_diagnostics(self, played)
 
     # Saving.
 
     def description(self) -> dict[str, Any]:
-        """What a checkpoint must agree with: agent, geometry, sizes."""
+        """Agent, geometry and sizes; a checkpoint must have the same."""
         keys = ("group", "width", "depth", "critics", "layer_norm", "noise_bound")
         return {**super().description(), **{key: getattr(self.options, key) for key in keys}}
 
@@ -432,7 +432,7 @@ class SacAgent(Agent):
         self.updates = int(state["updates"])
 
     def parameter_counts(self) -> dict[str, int]:
-        """Trainable numbers (all critics together, without targets) and the actor's width."""
+        """Numbers of trainable parameters (without target critics), and the actor's width."""
         actor, critic = count(self.actor), count(self.critic)
         return {
             "actor": actor,
@@ -487,14 +487,14 @@ class SacAgent(Agent):
 
 
 def adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
-    """Adam as all parts of the learner use it."""
+    """The Adam of all parts of the learner."""
     return torch.optim.Adam(groups, lr=lr, fused=True)
 
 
 def descend(
     loss: torch.Tensor, optimizer: torch.optim.Optimizer, penalty: torch.Tensor | None = None
 ) -> None:
-    """One gradient step on a loss and its regulariser."""
+    """One gradient step on a loss plus its regulariser."""
     optimizer.zero_grad()
     (loss if penalty is None else loss + penalty).backward()
     optimizer.step()
@@ -505,7 +505,7 @@ def _flat(weights: Weights) -> list[torch.Tensor]:
 
 
 def _side_by_side(**layouts: Layout) -> Layout:
-    """One layout of several vectors written one after the other."""
+    """The layout of several concatenated vectors."""
     return Layout(
         [
             Field(f"{prefix}.{f.name}", f.frequency, f.multiplicity, f.odd)

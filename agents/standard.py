@@ -1,4 +1,4 @@
-"""The plain agent: ordinary perceptrons, which know nothing of the symmetry (DSRL's choice)."""
+"""The standard agent: plain perceptrons without symmetry, as in DSRL."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from symsteer.agents.sac import SacAgent
 
 
 class StandardAgent(SacAgent):
-    """Plain actor, plain critics."""
+    """SAC with a plain actor and plain critics."""
 
     name = "standard"
 
@@ -36,10 +36,11 @@ class StandardAgent(SacAgent):
 
 
 class MatchedStandardAgent(StandardAgent):
-    """The plain agent with as many parameters as the equivariant one of the same configuration.
+    """The standard agent with as many parameters as the equivariant one.
 
-    At equal width plain hidden layers have |G| times the parameters of equivariant ones, so this
-    rival separates symmetry from size. Actor and critics are matched each by itself.
+    At equal width, plain hidden layers have |G| times the parameters of equivariant ones. This
+    agent separates the effect of symmetry from that of size. Actor and critics are matched
+    separately.
     """
 
     name = "standard-matched"
@@ -62,7 +63,7 @@ def plain_layers(inputs: int, width: int, depth: int, outputs: int) -> list[nn.M
 
 
 def matched_width(parameters: int, inputs: int, depth: int, outputs: int) -> int:
-    """The width at which ``plain_layers`` comes closest to a number of parameters."""
+    """The width with which ``plain_layers`` has about the given number of parameters."""
 
     def size(width: int) -> int:
         hidden = (depth - 1) * (width + 1) * width

@@ -1,13 +1,13 @@
 """How vectors split into geometric parts, and how planar symmetries act on them.
 
-A :class:`Layout` is the only place that knows which numbers of an observation, an action or a
-noise vector are horizontal vectors, scalars or higher frequencies. All other code asks it for
-slices and matrices and never indexes such a vector by number.
+A :class:`Layout` defines which numbers of an observation, an action or a noise vector are
+horizontal vectors, scalars or higher frequencies. All other code gets slices and matrices from
+the layout. It never uses fixed indices into such a vector.
 
 A planar symmetry is a pair ``(angle, reflect)``: first the reflection (x, y) -> (x, -y) if
 ``reflect``, then the rotation by ``angle`` about the vertical axis. An irrep block of frequency
-``k >= 1`` turns ``k`` times as fast as the plane; frequency 0 is a scalar. ``odd`` blocks change
-sign under reflections in addition (yaw, axial vectors, mirrored rotation columns).
+``k >= 1`` rotates by ``k * angle``; frequency 0 is a scalar. ``odd`` blocks also change sign under
+reflections (yaw, axial vectors, mirrored rotation columns).
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ Slice: TypeAlias = slice
 
 @dataclass(frozen=True)
 class Field:
-    """A named part of a vector: equal irrep blocks side by side.
+    """A named part of a vector: consecutive irrep blocks of the same kind.
 
     Args:
         name: unique within its layout.
-        frequency: 0 for scalars (one number each), k >= 1 for pairs that turn by ``k * angle``.
+        frequency: 0 for scalars (one number each), k >= 1 for pairs that rotate by ``k * angle``.
         multiplicity: number of blocks.
-        odd: whether the blocks change sign under reflections in addition.
+        odd: whether the blocks also change sign under reflections.
     """
 
     name: str
@@ -119,7 +119,7 @@ class Layout:
 
     @functools.cached_property
     def block_index(self) -> torch.Tensor:
-        """For each number the index of its irrep block, ``[dim]`` int64."""
+        """The index of each number's irrep block, ``[dim]`` int64."""
         sizes = torch.tensor([block.stop - block.start for block in self.blocks])
         return torch.repeat_interleave(torch.arange(len(self.blocks)), sizes)
 
@@ -133,7 +133,7 @@ class Layout:
         )
 
     def repeat(self, count: int) -> Layout:
-        """The layout of ``count`` such vectors flattened one after the other."""
+        """The layout of ``count`` concatenated vectors."""
         return Layout(
             [
                 Field(f"{f.name}[{i}]", f.frequency, f.multiplicity, f.odd)
@@ -163,10 +163,10 @@ class Layout:
         return x @ self.matrix(angle, reflect, x.dtype).to(x.device).T
 
     def rotate(self, x: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-        """Turn every row of ``x [N, ..., dim]`` by its own ``angle [N]`` (radians)."""
+        """Rotate every row of ``x [N, ..., dim]`` by its own ``angle [N]`` (radians)."""
         frequency, partner, sign = self._quarter_turn
         turn = angle.to(x).view(-1, *(1,) * (x.dim() - 1)) * frequency.to(x)
-        # x cos(k a) + J x sin(k a), where J turns each vector by 90 degrees.
+        # x cos(k a) + J x sin(k a), where J rotates each vector by 90 degrees.
         return turn.cos() * x + turn.sin() * sign.to(x) * x[..., partner.to(x.device)]
 
     @functools.cached_property
@@ -198,7 +198,7 @@ class Layout:
         return escnn.nn.FieldType(space, representations)
 
     def to_json(self) -> list[dict[str, Any]]:
-        """A JSON-ready description; :meth:`from_json` reads it."""
+        """Plain data for JSON; :meth:`from_json` reads it."""
         return [
             {
                 "name": f.name,
@@ -214,7 +214,7 @@ class Layout:
         """Rebuild a layout.
 
         Raises:
-            UserError: if the description is not one that :meth:`to_json` writes.
+            UserError: if the data are not in the form of :meth:`to_json`.
         """
         try:
             fields = [
@@ -344,13 +344,13 @@ def equivariance_error(
 ) -> float:
     """max over g of rms ||f(g x) - g f(x)|| / rms ||f(x)||.
 
-    The outputs are compared in float64; the inputs are transformed in their own type.
+    The outputs are compared in float64. The inputs are transformed in their own dtype.
 
     Args:
         function: f, called with the inputs as positional arguments.
         inputs: x, each ``[..., dim]`` of its layout; the group acts on the last axis.
         layouts: one for each input.
-        output_layout: of the last axis of what f returns.
+        output_layout: of the last axis of f's output.
         group: a finite group.
     """
     own = function(*inputs).double()
@@ -378,7 +378,7 @@ def _escnn() -> Any:
 
 
 def _cos_sin(angle: float) -> tuple[float, float]:
-    """Cosine and sine, exact at multiples of 90 degrees so that C4 permutes axes exactly."""
+    """Cosine and sine, exact at multiples of 90 degrees, so that C4 permutes the axes exactly."""
     quarter = angle / (math.pi / 2)
     if abs(quarter - round(quarter)) < 1e-12:
         return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarter) % 4]

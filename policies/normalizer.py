@@ -1,8 +1,8 @@
 """Normalisation to unit size and bounds; both commute with planar symmetries.
 
-Per-dimension min-max statistics break rotation equivariance: the two components of a horizontal
-vector get different scales and offsets. Here each scalar is scaled to [-1, 1], each irrep
-block of frequency >= 1 has one scale and no offset, and bounds act on the norm of each block.
+Min-max statistics per dimension break rotation equivariance: the two components of a horizontal
+vector get different scales and offsets. Here each scalar is scaled to [-1, 1]. Each irrep block of
+frequency >= 1 has one scale and no offset. Bounds limit the norm of each block.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from symsteer.errors import UserError
 from symsteer.policies.geometry import Layout
 
 MINIMUM_RANGE = 1e-2
-"""Half-ranges below this count as constant (1 cm, or 0.6 degrees in a rotation column): dividing
-by them would scale simulation noise up to unit size."""
+"""A smaller half-range counts as constant (1 cm, or 0.6 degrees in a rotation column). Division
+by it would scale simulation noise to unit size."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -29,12 +29,12 @@ def _same_block(layout: Layout, dtype: torch.dtype, device: torch.device) -> tor
 def clip_blocks(x: torch.Tensor, layout: Layout, radius: float) -> torch.Tensor:
     """Shorten every irrep block of ``x [..., dim]`` to at most ``radius``.
 
-    Scalars are clamped to [-radius, radius], vectors keep their direction. Blocks within the
-    bound come back bit-equal.
+    Scalars are clamped to [-radius, radius]. Vectors keep their direction. Blocks within the bound
+    are returned unchanged, bit for bit.
     """
     norm = ((x * x) @ _same_block(layout, x.dtype, x.device)).sqrt()
     shortened = x * (radius / norm.clamp_min(radius))
-    # Only for components that rounding left a few ulps outside.
+    # Only for components that are a few ulps outside after rounding.
     return shortened.clamp(-radius, radius)
 
 
@@ -45,7 +45,7 @@ class Normalizer(nn.Module):
         layout: geometry of the vectors.
         scale: ``[dim]``, positive, equal within each block of frequency >= 1.
         offset: ``[dim]``, zero except for scalars that are invariant under reflections.
-        deviation: ``[dim]``, how much the data vary, data units; see :meth:`fit`.
+        deviation: ``[dim]``, spread of the data in data units; see :meth:`fit`.
 
     The state dict holds ``scale``, ``offset`` and ``deviation``.
     """
@@ -73,12 +73,12 @@ class Normalizer(nn.Module):
     def fit(cls, layout: Layout, data: torch.Tensor) -> Normalizer:
         """Statistics of ``data [..., dim]``.
 
-        Scalars: the middle and half the range between minimum and maximum. Odd scalars (they
-        change sign under reflections): the largest magnitude, no offset. Vectors: the largest
-        norm, no offset. A range below ``MINIMUM_RANGE`` gives scale 1.
+        Scalars: offset = middle, scale = half the range between minimum and maximum. Odd scalars
+        (they change sign under reflections): scale = largest magnitude, no offset. Vectors: scale =
+        largest norm, no offset. A range below ``MINIMUM_RANGE`` gives scale 1.
 
-        ``deviation`` is the standard deviation of a scalar, and of a vector the root mean square
-        of its components about zero: the standard deviation over all rotations of the data.
+        ``deviation`` of a scalar is its standard deviation. ``deviation`` of a vector is the root
+        mean square of its components: the standard deviation over all rotations of the data.
 
         Raises:
             UserError: if the data are empty, not finite or of another width.
@@ -94,7 +94,7 @@ class Normalizer(nn.Module):
         low, high = data.min(dim=0).values, data.max(dim=0).values
         squares = (data * data) @ _same_block(layout, data.dtype, data.device)
         radius = squares.max(dim=0).values.sqrt()
-        # An offset would break the symmetry of everything that is not invariant.
+        # An offset would break the symmetry of blocks that are not invariant.
         shiftable = layout.invariant_mask(reflections=True).to(data.device)
         offset = torch.where(shiftable, (low + high) / 2, 0.0)
         scale = torch.where(shiftable, (high - low) / 2, radius)

@@ -1,7 +1,7 @@
 """SymSteer: how much symmetry should RL keep when it steers an equivariant diffusion policy?
 
-The public names are those of ``__all__``; everything else may change between versions
-(docs/api.md). They are imported on first use, so that ``import symsteer`` is cheap.
+The public names are those in ``__all__``. Everything else may change between versions
+(docs/api.md). They are imported on first use, so ``import symsteer`` is fast.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The command ``symsteer``: finds a verb, reads its arguments, turns errors into exit codes.
 
-Only the module of the named verb is imported, so that ``symsteer --help`` costs no import of torch
-or ManiSkill, and ``symsteer doctor`` works where they cannot be imported.
+Only the module of the given verb is imported. So ``symsteer --help`` does not import torch or
+ManiSkill, and ``symsteer doctor`` works even if they cannot be imported.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Verb:
     Attributes:
         target: ``module:function``; the function returns the exit code.
         summary: one line for the list of verbs.
-        computes: whether it uses torch, so that the number of threads must be set.
-        parses: whether the function takes the list of arguments and parses it itself. The
-            arguments of all others are parsed by tyro from the function's signature.
+        computes: whether it uses torch; then the number of threads is set.
+        parses: whether the function parses the list of arguments itself. For all others, tyro
+            parses them from the function's signature.
     """
 
     target: str
@@ -82,7 +82,7 @@ def main() -> int:
     Returns:
         The exit code: 0 done, 1 something failed, 2 the input is wrong, 130 interrupted.
     """
-    # Notes of third-party packages about optional parts that SymSteer does not use.
+    # Warnings of other packages about optional parts that SymSteer does not use.
     warnings.filterwarnings("ignore", message=".*py3nj.*")
     warnings.filterwarnings("ignore", message="Failed to find system libvulkan.*")
     try:
@@ -92,7 +92,7 @@ def main() -> int:
     except WorkerLostError as error:
         return complain(error, f"error: {error}", 1)
     except BrokenPipeError:
-        # The reader closed the pipe; without this Python would complain again at its exit.
+        # The reader closed the pipe. Without this, Python would print an error at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except OSError as error:
@@ -136,7 +136,7 @@ def demo(out: Path = Path("runs/demo")) -> int:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    """Run a verb; without one, or with --help, print the list of verbs."""
+    """Run a verb; without a verb or with --help, print the list of verbs."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return 0
@@ -180,9 +180,10 @@ def _overview() -> str:
 
 
 def _limit_threads() -> None:
-    """Let torch use one thread, or as many as OMP_NUM_THREADS says.
+    """Let torch use one thread, or the number in OMP_NUM_THREADS.
 
-    The networks are small: more threads slow them down, above all beside other runs.
+    The networks are small: more threads make them slower, especially when several runs share a
+    machine.
     """
     import torch
 
@@ -190,7 +191,7 @@ def _limit_threads() -> None:
 
 
 def _threads(wanted: str) -> int:
-    """The first number of OMP_NUM_THREADS, which may list one for each level; 1 without one."""
+    """The first number in OMP_NUM_THREADS (it may be a list); 1 if there is none."""
     number = re.match(r"\s*0*([1-9]\d{0,3})\b", wanted)
     return int(number[1]) if number else 1
 
@@ -203,7 +204,7 @@ def _is_out_of_memory(error: Exception) -> bool:
 
 
 def _script(name: str) -> str:
-    """How to call a console script of this environment from the present folder."""
+    """How to call a console script of this environment from the current folder."""
     path = Path(sys.executable).with_name(name)
     try:
         return str(path.relative_to(Path.cwd()))

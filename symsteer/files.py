@@ -1,4 +1,4 @@
-"""Atomic writing: a file holds its old content or all of the new one, never a part."""
+"""Atomic writing: a file has its complete old or its complete new content, never a part."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:
 def write_together(
     files: Mapping[Path, bytes], stale: Iterable[Path] = (), durable: bool = True
 ) -> None:
-    """Write all files under temporary names, then rename them, then remove ``stale`` ones.
+    """Write all files under temporary names, rename them, then remove the files in ``stale``.
 
     Args:
         files: contents by path; missing folders are made.
-        stale: files to remove once all others are in place.
-        durable: wait until the data have reached the disk.
+        stale: files to remove after all others are written.
+        durable: wait until the data are on the disk.
 
     Raises:
         UserError: if a folder cannot be written, a path is a folder, or the disk is full. The
-            files are then as they were; only a rename that fails, after all data have reached
-            the disk, can leave a mixture.
+            files then keep their old content. One exception: if a rename fails, some files are
+            old and some are new.
     """
     staged: list[tuple[Path, Path]] = []
     path = Path()
@@ -62,7 +62,7 @@ def write_together(
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring a folder's list of files to disk."""
+    """Write a folder's list of files to disk."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""What to say about a name that does not exist: one "did you mean" for everything."""
+"""The error message about an unknown name, with the nearest valid name."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from symsteer.errors import UserError
 
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:
-    """The valid name that looks most like ``name``, if any is close."""
+    """The valid name that is most similar to ``name``; None if none is similar."""
     return next(iter(difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)), None)
 
 
 def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> UserError:
-    """The error for a name that is none of the valid ones.
+    """The error for a name that does not exist.
 
     Args:
         kind: what the name should be, such as ``task``.
-        name: what was given.
-        valid: all names, in the order in which they are listed.
-        where: the file or command that holds the name, to begin the sentence with.
+        name: the unknown name.
+        valid: all valid names, in the order of the list in the message.
+        where: the file or command with the name; the message begins with it.
     """
     valid = list(valid)
     close = nearest(name, valid)

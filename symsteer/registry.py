@@ -2,10 +2,11 @@
 
 A name stands for a class. It comes from one of three places:
 
-- SymSteer's own table in the package that holds the kind (``symsteer.agents.BUILTIN``, ...);
+- SymSteer's own table: ``symsteer.agents.AGENTS``, ``symsteer.policies.POLICIES``,
+  ``symsteer.bench.variants.VARIANTS``, ``symsteer.bench.tasks.TASKS``;
 - an entry point of an installed distribution, in the group ``symsteer.agents``,
   ``symsteer.policies``, ``symsteer.variants`` or ``symsteer.tasks``;
-- ``package.module:Class``, for trying a class that is not installed.
+- ``package.module:Class``, to try a class that is not installed.
 
 Names and summaries are read without importing any of the classes: ``symsteer --help`` and
 ``symsteer list`` must not wait for torch or ManiSkill.
@@ -33,14 +34,14 @@ from symsteer.names import unknown
 T = TypeVar("T")
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,59}")
-"""Names become part of run folders and records."""
+"""Names become parts of file names and records."""
 
 TARGET = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 @dataclass(frozen=True)
 class Extension:
-    """Code from outside SymSteer that a run used, so that others can look it up.
+    """Code from outside SymSteer that a run used.
 
     Attributes:
         kind: agent, policy, variant or task.
@@ -76,7 +77,7 @@ class Registry(Generic[T]):
         self.kind, self.group, self.builtin, self.base = kind, group, dict(builtin), base
 
     def names(self) -> list[str]:
-        """SymSteer's own names in their order, then those of other distributions, sorted."""
+        """SymSteer's own names in table order, then the sorted names of other distributions."""
         return [*self.builtin, *sorted(set(self._entry_points()) - set(self.builtin))]
 
     def __contains__(self, name: str) -> bool:
@@ -102,11 +103,11 @@ class Registry(Generic[T]):
         raise unknown(self.kind, name, self.names())
 
     def get(self, name: str) -> T:
-        """The class of a name, imported.
+        """Import and return the class of a name.
 
         Raises:
-            UserError: if there is no such name, its module cannot be imported, or what it names
-                is not a class of this kind.
+            UserError: if there is no such name, its module cannot be imported, or it is not a
+                class of this kind.
         """
         target = self.target(name)
         if ":" not in name and not NAME.fullmatch(name):
@@ -125,10 +126,10 @@ class Registry(Generic[T]):
         return found  # type: ignore[return-value]
 
     def name_of(self, found: type) -> str:
-        """The name under which :meth:`get` finds a class; ``module:Class`` if it has no other.
+        """The name with which :meth:`get` finds a class; ``module:Class`` if it has no other.
 
         Raises:
-            UserError: if the class cannot be imported by a name.
+            UserError: if the class cannot be imported by name.
         """
         target = f"{found.__module__}:{found.__qualname__}"
         targets = {name: points[0].value for name, points in self._entry_points().items()}
@@ -145,7 +146,7 @@ class Registry(Generic[T]):
         return _first_line(self.target(name))
 
     def extension(self, name: str) -> Extension | None:
-        """What a record says of a name from outside SymSteer; None for SymSteer's own.
+        """The entry of a record for a name from outside SymSteer; None for SymSteer's own names.
 
         Raises:
             UserError: as :meth:`get`.
@@ -226,7 +227,7 @@ def _load(target: str, what: str) -> Any:
         module = importlib.import_module(module_name)
     except UserError:
         raise
-    # Whatever a file may raise while it is imported.
+    # Importing a file can raise any exception.
     except Exception as error:
         raise UserError(
             f"{what} cannot be imported from {module_name} ({type(error).__name__}: "
@@ -238,7 +239,7 @@ def _load(target: str, what: str) -> Any:
 
 
 def _line(error: Exception, module: str) -> str:
-    """Where in the named module an import failed."""
+    """The line of the module at which the import failed."""
     if isinstance(error, SyntaxError):  # its message names the line already
         return ""
     path = getattr(sys.modules.get(module), "__file__", None) or _file_of(module)

@@ -1,4 +1,4 @@
-"""What is printed: plain lines without control characters."""
+"""Printing plain lines without control characters."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ LONGEST_LINE = 900
 
 
 def printable(text: str) -> str:
-    """Text whose control characters, line breaks excepted, are replaced by ``?``.
+    """The text with control characters replaced by ``?``, except line breaks.
 
     Files and arguments can bring such characters into a message.
     """

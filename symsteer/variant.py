@@ -1,7 +1,7 @@
-"""How a broken world is written: ``none``, ``name:strength``, or several joined by ``+``.
+"""The text of a variant: ``none``, ``name:strength``, or several joined by ``+``.
 
-This is the only module that knows the spelling. Whether a name exists is for the registry of
-variants to say (``symsteer.bench.variants``).
+Only this module reads and writes this text. The registry of variants (``symsteer.bench.variants``)
+knows which names exist.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ UNBROKEN = "none"
 
 @dataclass(frozen=True)
 class VariantSpec:
-    """One way to break the symmetry and how strongly.
+    """A way to break the symmetry, and its strength.
 
     Attributes:
         name: of the variant.
@@ -45,7 +45,7 @@ class VariantSpec:
 
     @property
     def changes_nothing(self) -> bool:
-        """Whether it has one strength, and that is 0."""
+        """Whether its only strength is 0."""
         return self.strength == 0
 
     @property
@@ -64,12 +64,12 @@ def parse_variant(
 
     Args:
         text: ``none``, ``name:strength``, or several of these joined by ``+``.
-        strength: of a single name that is written without one; a number, or one per environment
-            as a sequence, array or tensor.
+        strength: for a single name without a strength in the text; a number, or one per
+            environment as a sequence, array or tensor.
         check: called with each name before its strength is read; raises for an unknown one.
 
     Returns:
-        Every part in the given order, those of strength 0 included.
+        All parts in the given order, including those of strength 0.
 
     Raises:
         UserError: for a repeated name, a missing, repeated or malformed strength, one outside of

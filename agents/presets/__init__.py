@@ -1,7 +1,7 @@
 """Presets: named settings of agents as data, one TOML file each.
 
-The table ``[all]`` holds options of every agent that has them; a table with an agent's name holds
-that agent's own and wins.
+The table ``[all]`` has options for every agent that knows them. A table with an agent's name has
+options for this agent only and has priority.
 """
 
 from __future__ import annotations

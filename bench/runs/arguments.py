@@ -1,8 +1,7 @@
 """The command line of ``symsteer run``.
 
-Which options there are depends on ``--agent NAME`` and ``--policy.name NAME``: each agent and each
-policy brings its own dataclass of options. So these names are read first; then tyro parses the
-whole line.
+The options depend on ``--agent NAME`` and ``--policy.name NAME``: each agent and each policy has
+its own dataclass of options. So these two names are read first. Then tyro parses the whole line.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ the policy that --policy.name names.
 
 @dataclass(frozen=True)
 class Execution:
-    """How a run is executed; none of it changes the results."""
+    """How a run is executed. These options do not change the results."""
 
     out: Path = Path("runs")
     """Folder of the runs; demonstrations and base policies are kept in OUT/base."""
@@ -36,10 +35,10 @@ class Execution:
     """Trajectory file (.h5 with .json) to train the base policy on, instead of demonstrations of
     the scripted expert."""
     base_policy: Path | None = None
-    """Saved base policy (policy.safetensors) to steer, instead of training one; the run takes over
-    its settings and those of its demonstrations."""
+    """Saved base policy (policy.safetensors) to steer, instead of training one. The run uses its
+    settings and those of its demonstrations."""
     workers: int = 1
-    """Processes that share the simulation; they change nothing in the record but times."""
+    """Processes that share the simulation; they only change the times in the record."""
     quiet: bool = False
     """No progress bars."""
 
@@ -49,8 +48,8 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunConfig, Execution]:
 
     Raises:
         UserError: if there is no such agent, policy or preset, or a value is out of range.
-        SystemExit: with code 0 after ``--help``, with 2 for an unknown option or a value that
-            cannot be read; tyro has printed the help or the mistake.
+        SystemExit: with code 0 after ``--help``; with code 2 for an unknown option or a value that
+            cannot be read. tyro has printed the help or the error.
     """
     agent = last_value(arguments, "--agent") or RunConfig.agent
     policy = last_value(arguments, "--policy.name") or RunConfig.policy_name
@@ -95,10 +94,10 @@ def last_value(arguments: Sequence[str], option: str) -> str | None:
 
 
 def _interface(defaults: RunConfig) -> type:
-    """A dataclass from whose fields tyro makes the options.
+    """A dataclass; tyro makes the options from its fields.
 
-    It inherits from RunConfig, where tyro finds the help of the fields. A field whose name tyro
-    sees as "" adds nothing to the names of the options below it: so there are ``--agent`` and
+    It inherits from RunConfig, because tyro reads the help of the fields there. A field with the
+    name "" adds no prefix to the options below it. This gives both ``--agent`` and
     ``--agent.gamma``.
     """
     agent_part = _dataclass(
@@ -139,10 +138,10 @@ def _dataclass(name: str, *members: tuple[str, Any, Any]) -> type:
 
 
 def _help(kind: Any, text: str, metavar: str | None = None, name: str | None = None) -> Any:
-    """A type whose option has a help text; dataclasses made here have no source to hold it."""
+    """A type with a help text for its option. Dataclasses made here have no docstrings for it."""
     return Annotated[kind, tyro.conf.arg(help=text, metavar=metavar, name=name)]
 
 
 def _without_name(name: str, default: Any) -> tuple[str, Any, Any]:
-    """A field that is a dataclass whose options do not begin with the field's name."""
+    """A field with a dataclass; its options do not have the field's name as prefix."""
     return name, Annotated[type(default), tyro.conf.arg(name="")], default

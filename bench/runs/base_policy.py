@@ -35,13 +35,13 @@ def prepare_base(
 ) -> ChunkPolicy:
     """The frozen base policy of a run, with its steerability report.
 
-    It is trained on demonstrations of the unbroken task in the run's embodiment, whatever the
-    run's variant is: the agent has to cope with the broken symmetry, not the base policy.
+    It is trained on demonstrations of the unbroken task in the run's embodiment, for every variant:
+    the agent has to handle the broken symmetry, not the base policy.
 
     Args:
         config: the run.
         out: folder of the runs; ``out/base`` keeps demonstrations and policies.
-        demonstrations: a trajectory file to train on instead of the scripted expert's.
+        demonstrations: a trajectory file to train on, instead of demonstrations of the expert.
         policy: a saved policy to use instead of training one.
         progress: whether to show progress bars.
         workers: processes that share the environments of the steerability report.
@@ -70,8 +70,8 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
     """The configuration of a run that uses a saved base policy instead of training one.
 
     Args:
-        config: with the default settings of the base policy and its demonstrations, or those of
-            the file.
+        config: its settings of the base policy and the demonstrations must be the defaults or
+            those of the file.
         path: of the policy.
 
     Raises:
@@ -95,7 +95,7 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
         own["demonstrations"] = world["demonstrations"]
         own["policy_seed"] = world["policy_seed"]
     told = build_config(config.to_json() | own, str(path))
-    # What has its default value was not asked for: the file decides.
+    # A setting with its default value was not asked for: the value of the file is used.
     plain = RunConfig(agent=config.agent, policy_name=config.policy_name)
     default, asked, found = (flat(c.to_json()) for c in (plain, config, told))
     default["policy.name"] = RunConfig.policy_name
@@ -135,14 +135,14 @@ def find_base(config: RunConfig, out: Path) -> Path | None:
 def demonstration_path(config: RunConfig, out: Path) -> Path:
     """Path of the scripted expert's demonstrations for a run, whether they exist or not."""
     wanted = config.demonstrations
-    # The mode's settings are part of the name: after a change of them old files are not found.
+    # The settings of the mode are part of the name: if they change, old files are not found.
     key = content_key(dataclasses.asdict(MODES[wanted.mode]), FORMAT)
     name = f"{config.task}-{config.embodiment}-{wanted.mode}-{wanted.count}-s{wanted.seed}-{key}.h5"
     return out / "base" / name
 
 
 def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> Path:
-    """The scripted expert's demonstrations of the unbroken task, collected if need be."""
+    """The scripted expert's demonstrations of the unbroken task; collected if they do not exist."""
     wanted = config.demonstrations
     path = demonstration_path(config, out)
     if path.is_file():
@@ -183,7 +183,7 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
 
 def _policy_folder(config: RunConfig, out: Path, demos: Demonstrations) -> Path:
     name, options = config.policy_name, config.policy.to_json()
-    # Code from outside of SymSteer may change while its name stays.
+    # Code from outside SymSteer can change under the same name.
     extension = POLICIES.extension(name)
     key = content_key(
         demos.content_hash, name, options, extension and extension.sha256, config.policy_seed

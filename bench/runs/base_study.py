@@ -52,14 +52,14 @@ def study(
     demonstrations; n demonstrations are the first n of the largest number.
 
     Args:
-        config: task, embodiment, kind of demonstrations and options of one policy, which the
-            others share as far as they have them.
+        config: task, embodiment, kind of demonstrations, and options of one policy. The other
+            policies use the same values of the options that they have, too.
         out: folder that keeps demonstrations in ``out/base``.
         names: of the policies.
         counts: numbers of demonstrations.
         seeds: number of seeds, from 0.
         episodes: held-out episodes of each policy, with noise from N(0, I).
-        workers: processes side by side.
+        workers: number of processes.
 
     Returns:
         A plain dictionary for each policy: its cell, ``success``, ``successes``, ``episodes``,
@@ -87,7 +87,7 @@ def study(
 
 
 def write_study(path: Path, config: RunConfig, rows: Sequence[dict[str, Any]]) -> None:
-    """Write the rows and what made them as JSON."""
+    """Write the rows and their configuration as JSON."""
     write_json(
         path,
         {
@@ -101,7 +101,7 @@ def write_study(path: Path, config: RunConfig, rows: Sequence[dict[str, Any]]) -
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """A markdown table: success, mean over seeds and the seeds' range."""
+    """A markdown table of success: mean over seeds [lowest, highest seed]."""
     names = list(dict.fromkeys(row["name"] for row in rows))
     counts = list(dict.fromkeys(row["count"] for row in rows))
     lines = [

@@ -28,7 +28,7 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
     """The last checkpoint of a run (``weights_only``), or None before the first one.
 
     Raises:
-        UserError: if the file is damaged or of another run.
+        UserError: if the file is damaged or belongs to another run.
     """
     path = folder / CHECKPOINT
     cure = "delete it to start the run from the beginning"

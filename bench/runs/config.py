@@ -1,4 +1,4 @@
-"""Everything that determines a run; the same configuration gives the same record on the CPU."""
+"""The configuration of a run. On the CPU, the same configuration gives the same record."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LARGEST_COUNT = 10**12
 LARGEST_BATCH = 100_000
 
 LONGEST_VARIANT = 120
-"""Characters; the variant is a part of the run's name."""
+"""In characters; the variant is part of the run's name."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class DemonstrationConfig:
     """Demonstrations of the unbroken task by the scripted expert."""
 
     mode: Literal["clean", "diverse"] = "diverse"
-    """`diverse` perturbs the expert and keeps successes; a policy trained on `clean` ones leaves
+    """`diverse` perturbs the expert and keeps successes. A policy trained on `clean` ones leaves
     little to steer."""
     count: int = 50
     """Number of demonstrations."""
@@ -43,14 +43,14 @@ class DemonstrationConfig:
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """Held-out episodes, the same initial states for every agent, variant and seed."""
+    """Held-out episodes. Their initial states are the same for every agent, variant and seed."""
 
     every: int = 5_000
     """Control steps of training between two evaluations."""
     episodes: int = 50
     """Episodes of an evaluation during training."""
     final_episodes: int = 100
-    """Episodes of the last evaluation, the one that tables report."""
+    """Episodes of the last evaluation, which tables report."""
     diagnostic_episodes: int = 32
     """Stochastic on-policy episodes; Q is compared with their returns at every evaluation."""
     steerability_states: int = 24
@@ -61,7 +61,7 @@ class EvaluationConfig:
 class RunConfig:
     """One steering run.
 
-    Options of the agent and of the policy that are left out take their defaults.
+    Options of the agent and of the policy that are not given have their defaults.
     """
 
     task: str = "PickCube-v1"
@@ -71,7 +71,7 @@ class RunConfig:
     variant: str = "none"
     """How the symmetry is broken: `none`, `action_gain:0.5`, or several joined with `+`."""
     agent: str = "equivariant"
-    """Agent; `symsteer list` names them. One of your own: `package.module:Class`."""
+    """Agent; `symsteer list` names them. Your own class: `package.module:Class`."""
     seed: int = 0
     """Seed of the run: networks, exploration, training episodes."""
     env_steps: int = 50_000
@@ -79,15 +79,16 @@ class RunConfig:
     num_envs: int = 64
     """Parallel training environments."""
     checkpoint_every: int = 250
-    """Control steps of each environment between two checkpoints. There all environments begin new
-    episodes in fresh scenes, for PhysX remembers contacts that no checkpoint can hold."""
+    """Control steps of each environment between two checkpoints. After each checkpoint, all
+    environments begin new episodes in fresh scenes, because a checkpoint cannot contain the
+    contacts that PhysX remembers."""
     sim: Literal["cpu", "cuda"] = "cpu"
-    """Where physics runs."""
+    """Device of the simulation."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where networks run."""
+    """Device of the networks."""
     demonstrations: DemonstrationConfig = field(default_factory=DemonstrationConfig)
     policy_name: str = "edp"
-    """Base policy; `symsteer list` names them. One of your own: `package.module:Class`."""
+    """Base policy; `symsteer list` names them. Your own class: `package.module:Class`."""
     policy: PolicyOptions = None  # type: ignore[assignment]
     policy_seed: int = 0
     """Seed of the base policy's training; runs that share it share the base policy."""
@@ -146,14 +147,14 @@ class RunConfig:
 
 
 def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
-    """A run's configuration from nested plain data; what is left out keeps its default.
+    """A run's configuration from nested plain data; missing keys have their defaults.
 
     Args:
-        data: as :meth:`RunConfig.to_json` returns it, or a part of that.
-        source: where the data come from, for messages.
+        data: as from :meth:`RunConfig.to_json`, or a part of it.
+        source: the origin of the data, for messages.
 
     Raises:
-        UserError: on an unknown key (with the nearest valid one) or a value of a wrong type.
+        UserError: for an unknown key (the message has the nearest valid one) or a wrong type.
     """
     data = dict(data)
     _check_plain(data, f"{source}: ", "")
@@ -180,7 +181,7 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
 
 
 def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one, keys joined by dots, e.g. ``policy.width``."""
+    """Nested tables as one table, keys joined by dots, e.g. ``policy.width``."""
     found: dict[str, Any] = {}
     for key, value in data.items():
         if isinstance(value, Mapping):
@@ -191,10 +192,10 @@ def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def check_keys(data: Iterable[str], valid: Iterable[str], source: str, prefix: str = "") -> None:
-    """Refuse keys that are not valid.
+    """Check that all keys are valid.
 
     Raises:
-        UserError: naming the nearest valid key.
+        UserError: if one is not; the message has the nearest valid key.
     """
     valid = sorted(valid)
     for key in data:
@@ -212,7 +213,7 @@ def content_key(*parts: Any) -> str:
 def _defaults(agent: str, policy_name: str) -> tuple[RunConfig, dict[str, Any]]:
     """The default configuration of an agent and a policy, and its plain data without their names.
 
-    Made once per pair: a suite has thousands of configurations.
+    Cached per pair, because a suite can have thousands of configurations.
     """
     defaults = RunConfig(agent=agent, policy_name=policy_name)
     plain = defaults.to_json()
@@ -228,7 +229,7 @@ def _adapter(of: type) -> TypeAdapter[Any]:
 def _validated(of: type, data: Mapping[str, Any], prefix: str) -> Any:
     """An instance of a dataclass from plain data."""
     try:
-        # As JSON, in which strictness still takes 1 for 1.0, but "1" or true for no number.
+        # As JSON: strict mode then accepts 1 for 1.0, but neither "1" nor true for a number.
         return _adapter(of).validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         first = error.errors()[0]
@@ -266,7 +267,7 @@ def _check_nested_keys(
 
 
 def _check_plain(data: Any, head: str, key: str) -> None:
-    """Refuse what JSON cannot hold: NaN, infinities, and TOML's dates and times."""
+    """Refuse values that JSON does not have: NaN, infinities, and TOML's dates and times."""
     if isinstance(data, Mapping):
         for name, value in data.items():
             _check_plain(value, head, f"{key}.{name}" if key else name)

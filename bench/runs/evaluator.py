@@ -1,4 +1,4 @@
-"""Held-out episodes of an agent, and on-policy ones against which its Q-values are held."""
+"""Held-out episodes of an agent, and on-policy episodes to compare its Q-values with."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ def make_env(
 
 
 class Evaluator:
-    """Plays the held-out episodes and measures the diagnostics; leaves the agent as it was.
+    """Plays the held-out episodes and measures the diagnostics; does not change the agent.
 
     Args:
         config: the run.
         base: the frozen policy.
-        agent: plays.
+        agent: the agent that plays.
         feasible: lowest and highest return that the reward allows, per decision.
-        variant: how the world is broken in these episodes.
+        variant: of these episodes.
         workers: processes that share the environments.
 
     Attributes:
-        played: the episodes of the deterministic actor in the last measurement, if there was one.
+        played: the deterministic episodes of the last measurement; None before the first one.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Evaluator:
         """Episodes of the deterministic actor on the first ``count`` held-out seeds.
 
         Returns:
-            ManiSkill's metrics, a column of ``count`` values each, and the diagnostics.
+            ManiSkill's metrics (columns of ``count`` values) and the diagnostics.
         """
         agent, seeds = self.agent, held_out_seeds(count)
         state = agent.generator.get_state()
@@ -87,7 +87,7 @@ class Evaluator:
             self.played = greedy
             return greedy.episodes, agent.diagnostics(played)
         finally:
-            # An evaluation draws noise of its own, so that training goes on as if without it.
+            # An evaluation must not change the random numbers of the training after it.
             agent.generator.set_state(state)
 
     def close(self) -> None:
@@ -97,7 +97,7 @@ class Evaluator:
     def _with_on_policy(
         self, agent: Agent, seeds: Sequence[int]
     ) -> tuple[Rollout, Rollout, torch.Tensor]:
-        """Deterministic episodes from ``seeds`` and stochastic ones, side by side."""
+        """Deterministic episodes from ``seeds``, and stochastic ones in the same batches."""
         assert isinstance(agent, HasCritic)
         greedy_count = len(seeds)
         extra = diagnostic_seeds(self.extra)

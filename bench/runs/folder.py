@@ -1,8 +1,8 @@
-"""The folder of a run: what lies in it, which process works on it, how far it is.
+"""The folder of a run: its files, its lock and its state.
 
-It holds config.json, record.json, policy.safetensors (the base policy that is steered),
-checkpoint.pt, progress.json, the TensorBoard events, and .lock, which the process that works on
-the run holds.
+The files: config.json, record.json, policy.safetensors (the base policy that is steered),
+checkpoint.pt, progress.json, the TensorBoard events, and .lock, which is locked by the process that
+works on the run.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class RunBusyError(UserError):
 
 
 def run_id(config: RunConfig, origin: dict[str, Any]) -> str:
-    """A readable name that is unique to the configuration.
+    """A readable name that is unique for the configuration.
 
     Args:
         config: the run's configuration.
@@ -54,8 +54,8 @@ def is_finished(folder: Path) -> bool:
 def state_of(folder: Path) -> State:
     """The state of a run.
 
-    ``running`` means that a process holds the run now. A run whose process was killed is
-    ``interrupted``, whatever its record says, and can be continued.
+    ``running`` means that a process holds the lock of the run. If the process was killed, the state
+    is ``interrupted`` for every status in the record, and the run can be continued.
     """
     if is_finished(folder):
         return "finished"
@@ -73,7 +73,7 @@ def state_of(folder: Path) -> State:
 def claimed(folder: Path) -> Iterator[None]:
     """Create the folder of a run if it is missing, and lock it against other processes.
 
-    The system releases the lock when the process ends.
+    The operating system releases the lock when the process ends.
 
     Raises:
         UserError: if the run is finished already, or the folder cannot be written.
@@ -81,7 +81,7 @@ def claimed(folder: Path) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Not at once: a process that reads the state of a run holds its lock for a moment.
+        # Try for a while: a process that reads the state of a run holds its lock for a moment.
         lock = FileLock(folder / LOCK, timeout=1)
         lock.acquire()
     except Timeout as error:
@@ -105,7 +105,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def discard_empty(folder: Path) -> None:
-    """Remove the folder of a run that has produced nothing yet."""
+    """Remove the folder of a run that has no results yet."""
     if not {path.name for path in folder.iterdir()} - {CONFIG, PROGRESS, LOCK}:
         for path in folder.iterdir():
             path.unlink()
@@ -121,7 +121,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """The resolved configuration of a run.
 
     Raises:
-        UserError: if the folder is no run's, or its configuration is damaged.
+        UserError: if the folder is not the folder of a run, or its configuration is damaged.
     """
     path = folder / CONFIG
     try:
@@ -141,7 +141,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_progress(folder: Path) -> dict[str, Any] | None:
-    """What ``progress.json`` holds; None if it is missing or damaged."""
+    """The contents of ``progress.json``; None if it is missing or damaged."""
     try:
         data = json.loads((folder / PROGRESS).read_text())
     except (OSError, ValueError, RecursionError):
@@ -156,5 +156,5 @@ def _is_held(folder: Path) -> bool:
             return False
     except Timeout:
         return True
-    except OSError:  # a folder that cannot be written is nobody's
+    except OSError:  # no process can work in a folder that cannot be written
         return False

@@ -1,4 +1,4 @@
-"""Who writes down a run: the record, TensorBoard, progress, pictures.
+"""Observers that write the results of a run: record, TensorBoard, progress, pictures.
 
 The record comes first; the others show what it holds.
 """
@@ -41,17 +41,17 @@ from symsteer.leaderboard.records import (
 )
 
 LOG_EVERY = 10
-"""Vectorised decisions between two writes of training scalars."""
+"""Decisions (of all environments together) between two writes of training scalars."""
 
 PROGRESS_SECONDS = 2.0
-"""Least time between two writes of progress.json within a phase."""
+"""Shortest time between two writes of progress.json within a phase."""
 
 
 class RecordWriter(Observer):
     """Keeps record.json: written at the start, after every evaluation, and at the end.
 
     Args:
-        resolved: the configuration as the record holds it.
+        resolved: the configuration as in the record.
     """
 
     record: RunRecord
@@ -98,7 +98,7 @@ class RecordWriter(Observer):
     def _continue(
         self, run: Trainer, checkpoint: Mapping[str, Any], provenance: Provenance
     ) -> None:
-        """Take the record as it was at the checkpoint."""
+        """Restore the record of the checkpoint."""
         self.record = record = read_record(run.folder / RECORD)
         del record.evaluations[checkpoint["evaluations"] :]
         mine = (run.folder.name, config_hash(self.resolved), checkpoint["history"])
@@ -131,7 +131,7 @@ class RecordWriter(Observer):
         self.record.failure = (
             "interrupted by the user" if interrupted else f"{type(error).__name__}: {error}"
         )
-        # A folder that cannot be written is most likely what stopped the run.
+        # Often the run failed because this folder cannot be written.
         with contextlib.suppress(UserError):
             self._close(run, "interrupted" if interrupted else "failed")
 
@@ -149,7 +149,7 @@ class TensorBoard(Observer):
     """Writes the events of a run: what the record holds, and scalars of training between.
 
     Args:
-        records: the observer that keeps the record.
+        records: the observer that writes the record.
     """
 
     log: RunLog
@@ -159,7 +159,7 @@ class TensorBoard(Observer):
         self.means = _Means()
 
     def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
-        # Without a checkpoint an earlier process may still have left events.
+        # Even without a checkpoint, an earlier process may have written events.
         purge = run.env_steps + 1 if checkpoint else 0
         self.log = RunLog(run.folder, self.records.record, purge)
         self.rounds = 0
@@ -189,7 +189,7 @@ class TensorBoard(Observer):
         self.log.scalars(values, run.env_steps)
 
     def saving(self, run: Trainer) -> Mapping[str, Any]:
-        # A continued run does not write again what lies before its checkpoint.
+        # A continued run does not repeat the events before its checkpoint.
         self.log.flush()
         return {}
 
@@ -211,8 +211,8 @@ class Pictures(Observer):
     """Pictures of the last evaluation in TensorBoard; the record is closed by then.
 
     Args:
-        tensorboard: where they are written.
-        quiet: do not say why a picture is missing.
+        tensorboard: writes them.
+        quiet: do not print why a picture is missing.
     """
 
     def __init__(self, tensorboard: TensorBoard, quiet: bool):
@@ -288,12 +288,12 @@ class Progress(Observer):
 
 
 class ProgressFile:
-    """progress.json: how far a running run is.
+    """progress.json: the progress of a running run.
 
     Args:
         folder: of the run.
         budget: control steps that the run may use.
-        env_steps: control steps that it has used already, if it continues.
+        env_steps: control steps that a continued run has already used.
     """
 
     def __init__(self, folder: Path, budget: int, env_steps: int = 0):
@@ -303,7 +303,7 @@ class ProgressFile:
         self._phase = ""
 
     def write(self, phase: str, env_steps: int, success: float | None = None) -> None:
-        """Write at most every two seconds; a change of phase is written at once."""
+        """Write if the phase has changed, or two seconds after the last time."""
         now = time.monotonic()
         if phase == self._phase and now - self._last < PROGRESS_SECONDS:
             return
@@ -318,13 +318,13 @@ class ProgressFile:
             "seconds_left": max(0, self._budget - env_steps) / rate if rate > 0 else None,
             "updated": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-        # A full disk is reported where results are written; progress is not worth a run.
+        # Do not stop a run for this file. A full disk is reported when results are written.
         with contextlib.suppress(UserError):
             write_atomically(self._path, json.dumps(data).encode(), durable=False)
 
 
 class _Means:
-    """Means of named tensors since they were last taken; reads the device only then."""
+    """Means of named tensors since the last call of ``take``. Only ``take`` reads the device."""
 
     def __init__(self) -> None:
         self._sums: dict[str, torch.Tensor] = {}
@@ -349,18 +349,18 @@ def observers_of(config: RunConfig, resolved: dict[str, Any], progress: bool) ->
 
     Args:
         config: of the run.
-        resolved: the configuration as the record holds it.
+        resolved: the configuration as in the record.
         progress: whether to show progress.
     """
     records = RecordWriter(resolved)
     tensorboard = TensorBoard(records)
     pictures = Pictures(tensorboard, quiet=not progress)
-    # The record is closed before pictures are drawn, and TensorBoard after.
+    # The record is closed before the pictures are drawn, TensorBoard after them.
     return [records, Progress(quiet=not progress), pictures, tensorboard]
 
 
 def _history(record: RunRecord) -> str:
-    """A key of all that the record says about the evaluations so far."""
+    """A hash of all evaluations in the record."""
     return content_key(
         [evaluation.model_dump(mode="json", by_alias=True) for evaluation in record.evaluations]
     )

@@ -1,7 +1,7 @@
-"""What the last evaluation looked like: paths from above, and frames of one episode.
+"""Pictures of the last evaluation: paths from above, and frames of one episode.
 
-The paths are drawn from the observations that the evaluation went through anyway. The frames need
-a Vulkan driver and simulate one episode anew, in a scene of its own.
+The paths are drawn from the observations of the evaluation. The frames need a Vulkan driver.
+One episode is simulated again for them.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Layout
 
 EPISODES = 32
-"""Episodes whose paths are drawn; more would hide one another."""
+"""Number of episodes with drawn paths; more paths would cover each other."""
 
 SECTORS = 12
-"""Directions that successes are counted in."""
+"""Number of sectors in which successes are counted."""
 
 FRAMES = 6
 """Frames of an episode, in two rows."""
 
-# Told apart with colour blindness, after Okabe and Ito.
+# Colours that colour-blind readers can distinguish, from Okabe and Ito.
 SUCCESS, FAILURE, TOOL = "#0072B2", "#D55E00", "#999999"
 
 
 def positions(layout: Layout) -> list[str]:
-    """Fields that are horizontal positions in the workspace: the tool's first, the goal's last."""
+    """Fields with horizontal positions in the workspace: first the tool, last the goal."""
     return [
         field.name
         for field in layout.fields
@@ -51,18 +51,19 @@ def positions(layout: Layout) -> list[str]:
 
 
 def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
-    """Where tool and objects went, seen from above, and in which directions there was success.
+    """Paths of tool and objects from above, and successes by direction.
 
-    The paths are those of the first 32 episodes up to their first success. Beside them the same,
-    each turned about the workspace centre so that the way from the last but one named position to
-    the last (object to goal, or tool to object where there is no goal) points to the right: what a
-    symmetric agent does in a symmetric world does not depend on that turn. Below, episodes and
-    successes by the direction of that way.
+    Left: the first 32 episodes, each up to its first success. Right: the same paths, each turned
+    about the workspace centre so that the vector between the last two positions of the layout
+    (object to goal; tool to object in tasks without a goal) points to the right. In a symmetric
+    world, the turned paths of a symmetric agent do not depend on the turn. Below: episodes and
+    successes by the direction of this vector.
 
     Args:
         rollout: episodes of the deterministic actor.
-        layout: of the observation; what it says is drawn, also where a variant distorts it.
-        title: what the run is called.
+        layout: of the observation. The observed positions are drawn, with the errors that a
+            variant adds.
+        title: name of the run.
 
     Returns:
         A picture ``[height, width, 3]`` uint8.
@@ -85,7 +86,7 @@ def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
         "Seen from above, about the workspace centre."
     )
     with mpl.rc_context({"font.family": "DejaVu Sans", "font.size": 9}):
-        # Nearly square: TensorBoard fits pictures to the width of a card.
+        # Almost square, because TensorBoard scales pictures to the width of a card.
         figure = Figure(figsize=(8.4, 8.4), dpi=110, layout="constrained")
         figure.suptitle(title, fontsize=11)
         above, turned = figure.add_subplot(2, 2, 1), figure.add_subplot(2, 2, 2)
@@ -93,7 +94,7 @@ def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
         _draw_paths(above, paths[:, :, :drawn], lengths, success)
         above.set_title("paths")
         _draw_paths(turned, _turn(paths, -direction)[:, :, :drawn], lengths, success)
-        # One scale, about the workspace centre: turning is then seen as turning.
+        # The same scale and centre in both panels, so that they differ by turns only.
         reach = 1.05 * max(np.abs(a.dataLim.get_points()).max() for a in (above, turned))
         for axes in (above, turned):
             axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
@@ -128,7 +129,7 @@ def _turn(paths: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _draw_paths(axes: Axes, paths: np.ndarray, lengths: np.ndarray, success: np.ndarray) -> None:
-    """Draw the episodes ``paths [names, T + 1, N, 2]``, as long as they are."""
+    """Draw the episodes ``paths [names, T + 1, N, 2]``, each up to its length."""
     for i in range(paths.shape[2]):
         color = SUCCESS if success[i] else FAILURE
         tool, *objects = paths[:, : lengths[i], i]
@@ -158,9 +159,9 @@ def frames_of(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> np.ndarra
     """Frames of the first held-out episode, from its start to its first success or time limit.
 
     Args:
-        config: says which world, as it is in evaluations.
+        config: of the run; the episode is in the world of its evaluations.
         policy: decodes the noise.
-        agent: its deterministic actor plays.
+        agent: plays deterministically.
 
     Returns:
         Six frames in two rows, evenly spaced in time, ``[height, width, 3]`` uint8.
@@ -225,5 +226,5 @@ def episode_frames(
 
 
 def _frame(env: Any) -> np.ndarray:
-    # The upper fifth shows no more than the horizon.
+    # The upper fifth shows only the horizon.
     return env.render()[0].cpu().numpy()[SIZE // 5 :, :, :3]

@@ -1,4 +1,4 @@
-"""One steering run, from demonstrations to the record: start it, continue it, evaluate it again."""
+"""One steering run, from demonstrations to the record: start, continue, evaluate again."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ from symsteer.variant import variant_text
 
 
 def check(config: RunConfig) -> None:
-    """Refuse what cannot be run before anything is built.
+    """Check that a configuration can be run, before anything is built.
 
     Raises:
         UserError: for an unknown task, embodiment or variant, a strength out of range, a budget
-            in which nothing is learned, or a device that this machine lacks.
+            in which nothing is learned, or a device that this machine does not have.
     """
     task_class(config.task)
     check_embodiment(config.embodiment)
@@ -75,12 +75,11 @@ def execute(
     Args:
         config: what to run.
         out: folder of the runs.
-        demonstrations: a trajectory file instead of the scripted expert's.
-        policy: a saved base policy instead of a trained one; the configuration takes over its
-            settings.
+        demonstrations: a trajectory file, instead of demonstrations of the scripted expert.
+        policy: a saved base policy, instead of training one; the run uses its settings.
         progress: whether to show progress bars.
-        workers: processes that share the environments. They are no part of the configuration:
-            the record is the same but for the clock.
+        workers: processes that share the environments. They are not part of the configuration:
+            the record is the same except for times.
 
     Returns:
         The run's folder.
@@ -110,7 +109,7 @@ def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
         progress, workers: as for :func:`execute`.
 
     Raises:
-        UserError: if the folder is no run's, the run is finished, its checkpoint is damaged, or
+        UserError: if the folder is not a run's, the run is finished, its checkpoint is damaged, or
             another process is working on it.
     """
     folder = named(folder)
@@ -134,10 +133,10 @@ class EvaluationResult:
 
     Attributes:
         run_id: of the run.
-        variant: how the world was broken in these episodes.
+        variant: of these episodes.
         evaluation: as in a record.
-        recorded: whether the record's final evaluation has the same episodes; None where it is of
-            another variant or number of episodes.
+        recorded: whether the final evaluation in the record is equal; None if it has another
+            variant or number of episodes.
     """
 
     run_id: str
@@ -158,16 +157,16 @@ class EvaluationResult:
 def evaluate(
     folder: Path, variant: str | None = None, episodes: int | None = None, workers: int = 1
 ) -> EvaluationResult:
-    """Evaluate a run's last checkpoint again, in its own world or in one broken otherwise.
+    """Evaluate a run's last checkpoint again, with its own variant or another one.
 
     Args:
-        folder: of the run; nothing in it changes.
-        variant: how the world is broken; default: as in the run.
-        episodes: number of held-out episodes; default: the run's final ones.
+        folder: of the run; it is not changed.
+        variant: default: the variant of the run.
+        episodes: number of held-out episodes; default: as in the final evaluation.
         workers: processes that share the environments.
 
     Raises:
-        UserError: if the folder is no run's, or it has no checkpoint yet.
+        UserError: if the folder is not a run's, or it has no checkpoint yet.
     """
     run = restored(folder)
     config, folder = run.config, run.folder

@@ -1,4 +1,4 @@
-"""What a run's folder holds, read back: configuration, base policy, trained agent."""
+"""Reading a run's folder: configuration, base policy, trained agent."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ def restored(folder: Path) -> Restored:
 
 
 def named(folder: Path) -> Path:
-    """The folder by its own name, which is the run's, also for ``.`` or a link."""
+    """The folder's full path, also for ``.`` or a link: its name is the run's name."""
     return Path(os.path.realpath(folder))
 
 
 def stored_config(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
-    """Configuration of a run's folder, and the content hashes of the files it began from.
+    """Configuration of a run's folder, and the content hashes of the files it started from.
 
     Raises:
         UserError: if the folder is not a run's, or its configuration is damaged or edited.

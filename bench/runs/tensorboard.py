@@ -1,4 +1,4 @@
-"""TensorBoard as a view of the record: the same numbers, nothing that the record contradicts."""
+"""TensorBoard events: the numbers of the record, and training scalars."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LAYOUT = {
 }
 
 IDENTITY = frozenset({"task", "embodiment", "variant", "agent", "seed"})
-"""Settings that the HParams tab shows first; the others are there to be ticked."""
+"""Settings that the HParams tab shows first; the others can be selected."""
 
 FINAL_METRICS = (
     "eval/success_once",
@@ -59,20 +59,20 @@ FINAL_METRICS = (
 
 
 class RunLog:
-    """What TensorBoard shows of one run: scalars against control steps, settings, pictures.
+    """TensorBoard's view of one run: scalars against control steps, settings, pictures.
 
     Namespaces: ``eval/`` held-out episodes, ``train/`` training episodes and batches, ``losses/``,
     ``time/`` seconds and rates, ``diag/`` Q and equivariance diagnostics. docs/metrics.md has the
     formulas.
 
     Args:
-        folder: the run's folder; the events stand beside its record.
-        record: the run's record, with everything that is known before the first step.
-        purge_step: TensorBoard drops what earlier processes wrote at this step and
-            later, since the run writes it again.
+        folder: the run's folder.
+        record: the run's record at its start.
+        purge_step: TensorBoard drops events of earlier processes at this step and later, because
+            the run writes them again.
 
     Raises:
-        UserError: here and in all methods that write, if the disk is full or not writable.
+        UserError: here and in all methods that write, if the disk is full or read-only.
     """
 
     def __init__(self, folder: Path, record: RunRecord, purge_step: int = 0):
@@ -81,7 +81,7 @@ class RunLog:
         with self._reported():
             self.writer = SummaryWriter(str(folder), purge_step=purge_step)
             self.writer.add_custom_scalars(LAYOUT)
-            # A continued run may stand on another commit: its text is added to the first one's.
+            # A continued run may use another commit: its text is added to the first one.
             self.writer.add_text("config", config_text(record), purge_step)
             settings = _settings(record.config)
             known = {**_known_settings(), **settings}
@@ -92,7 +92,7 @@ class RunLog:
             self.writer.flush()
 
     def scalars(self, values: Mapping[str, float | None], step: int) -> None:
-        """Write every value that was measured, by tag (``eval/success_once``)."""
+        """Write all values that are not None, by tag (``eval/success_once``)."""
         with self._reported():
             for tag, value in values.items():
                 if value is not None:
@@ -113,14 +113,14 @@ class RunLog:
         self.close()
 
     def flush(self) -> None:
-        """Bring to disk what was written so far."""
+        """Write all events to disk."""
         with self._reported():
             self.writer.flush()
 
     def close(self) -> None:
-        """Flush to disk; nothing can be written any more.
+        """Write all events to disk and close.
 
-        The record is closed by then: what cannot be written is left out.
+        The record is already closed, so errors are ignored.
         """
         with contextlib.suppress(OSError):
             self.writer.close()
@@ -148,7 +148,7 @@ class RunLog:
 
 @functools.cache
 def _silence_writing_thread() -> None:
-    """Keep TensorBoard's thread from printing a traceback; its errors come back in later calls."""
+    """Stop TensorBoard's thread from printing tracebacks; later calls raise its errors."""
     others = threading.excepthook
 
     def hook(args: threading.ExceptHookArgs) -> None:
@@ -160,7 +160,7 @@ def _silence_writing_thread() -> None:
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
-    """A configuration with dotted names, in values that TensorBoard knows; None reads "none"."""
+    """A configuration with dotted names and values of TensorBoard's types; "none" for None."""
 
     def known(value: Any) -> bool | int | float | str:
         if value is None:
@@ -182,7 +182,7 @@ def _known_settings() -> dict[str, bool | int | float | str]:
 
 
 def config_text(record: RunRecord) -> str:
-    """Two markdown tables: where a run stands, and its whole configuration."""
+    """Two markdown tables: facts about a run, and its whole configuration."""
     base = record.base_policy
     facts = {
         "run": record.run_id,
@@ -232,7 +232,7 @@ def _share(value: float | None) -> str:
 
 
 def _experiment(settings: Mapping[str, Any]) -> api_pb2.Experiment:
-    """Columns of the HParams tab. All runs have the same: TensorBoard reads any one run's."""
+    """Columns of the HParams tab, equal for all runs: TensorBoard reads those of any one run."""
     types = {
         bool: api_pb2.DATA_TYPE_BOOL,
         int: api_pb2.DATA_TYPE_FLOAT64,
@@ -251,7 +251,7 @@ def _experiment(settings: Mapping[str, Any]) -> api_pb2.Experiment:
 
 
 def _session(record: RunRecord, settings: Mapping[str, Any]) -> plugin_data_pb2.SessionStartInfo:
-    # The table's first column, where a whole run's name would be cut to what all have in common.
+    # The first column of the table. A full run name would be cut to the part that all runs share.
     session = plugin_data_pb2.SessionStartInfo(
         group_name=record.run_id.rpartition("-")[2], start_time_secs=record.started.timestamp()
     )

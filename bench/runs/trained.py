@@ -1,4 +1,4 @@
-"""Using what was trained: a finished run, or a saved base policy, as an object that acts."""
+"""A trained run or a saved base policy as an object that acts."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Trained:
 
     Attributes:
         policy: the base policy.
-        agent: chooses its noise; for a policy file N(0, I).
+        agent: chooses its noise; N(0, I) for a policy file.
         config: of the run; None for a policy file.
-        world: ``task``, ``embodiment`` and ``variant`` that it was trained in; empty where a
-            policy file does not say.
+        world: ``task``, ``embodiment`` and ``variant`` of the training; empty if a policy file does
+            not contain them.
     """
 
     policy: ChunkPolicy
@@ -38,16 +38,14 @@ class Trained:
 
     @torch.no_grad()
     def act(self, obs: Any, deterministic: bool = True) -> torch.Tensor:
-        """The actions to execute next, steered.
+        """The next actions, with the noise that the agent chooses.
 
         Args:
-            obs: ``[N, obs_dim]``, tensor or array; what environments with ``obs_mode="state"``
-                return.
-            deterministic: as in evaluations; else drawn from the agent's distribution.
+            obs: ``[N, obs_dim]``, tensor or array, from environments with ``obs_mode="state"``.
+            deterministic: True as in evaluations; False draws from the agent's distribution.
 
         Returns:
-            ``[N, Ta, act_dim]`` on the device of ``obs``: execute them one after the other, then
-            ask again.
+            ``[N, Ta, act_dim]`` on the device of ``obs``. Execute them in order, then call again.
 
         Raises:
             UserError: if the observations have another width.
@@ -63,13 +61,12 @@ class Trained:
         return chunk[:, : self.policy.execute].to(given.device)
 
     def make_env(self, num_envs: int = 1, variant: str | None = None, **options: Any) -> Any:
-        """Environments in which it can act.
+        """Environments of the task that it was trained for.
 
         Args:
             num_envs: how many in parallel.
-            variant: how the world is broken, e.g. ``action_gain:0.5`` or ``none``; default: as in
-                training.
-            options: further ones of :func:`symsteer.make`.
+            variant: e.g. ``action_gain:0.5`` or ``none``; default: the variant of the training.
+            options: other options of :func:`symsteer.make`.
 
         Raises:
             UserError: for an unknown variant, or if a policy file does not name its task.
@@ -95,7 +92,7 @@ def load(path: str | Path, device: str = "cpu") -> Trained:
         device: for a policy file; a run comes back on its own device.
 
     Raises:
-        UserError: if the path is neither, or a file is damaged.
+        UserError: if the path is neither of them, or a file is damaged.
     """
     path = Path(path)
     if (path / CONFIG).is_file() or (path.is_dir() and not (path / "policy.safetensors").is_file()):

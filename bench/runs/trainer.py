@@ -1,11 +1,10 @@
 """The loop of one run: the same for every agent.
 
-A checkpoint falls where all environments begin new episodes in fresh scenes. It holds everything
-that the rest of the run depends on, so that a run that was killed and continued ends with the
-record of an undisturbed one but for the clock (on the CPU; CUDA's sums are not repeatable).
+A checkpoint is written when all environments begin new episodes in fresh scenes. It contains
+everything that the rest of the run depends on. So a run that was killed and continued has the same
+record as one that was not, except for times (on the CPU; CUDA's sums are not repeatable).
 
-Observers write down what happens (:mod:`symsteer.bench.runs.observers`); the loop does not know
-which there are.
+Observers (:mod:`symsteer.bench.runs.observers`) write the results.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from symsteer.policies.contract import ChunkPolicy
 
 
 def budget_of(config: RunConfig) -> Budget:
-    """What a run offers to its agent."""
+    """What the agent of a run may use."""
     return Budget(
         config.env_steps,
         config.num_envs,
@@ -69,20 +68,16 @@ def feasible_return(config: RunConfig, agent: Agent, base: ChunkPolicy) -> tuple
 
 
 class Observer:
-    """Is told what happens in a run. Subclasses override what they need."""
+    """Is called at the events of a run; a method may do nothing."""
 
     def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
-        """The run was built; nothing has been simulated in this process."""
+        """The run was built; this process has not simulated anything yet."""
 
     def entered(self, run: Trainer, phase: str) -> None:
         """A phase begins: ``preparing``, ``evaluation``."""
 
     def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None:
-        """All training environments took one decision.
-
-        Args:
-            scalars: metrics of the episodes that ended, then those of each update.
-        """
+        """All training environments took one decision."""
 
     def paused(self, run: Trainer) -> None:
         """All environments are about to begin new episodes in fresh scenes."""
@@ -95,14 +90,14 @@ class Observer:
         return {}
 
     def finished(self, run: Trainer) -> None:
-        """The run came to its end."""
+        """The run has finished."""
 
     def failed(self, run: Trainer, error: BaseException) -> None:
-        """The run did not finish; its last checkpoint stays."""
+        """The run did not finish; its last checkpoint is kept."""
 
 
 class Trainer:
-    """State of a run; :meth:`play` brings it to its end.
+    """State of a run; :meth:`play` executes the rest of it.
 
     Args:
         config: what to run.
@@ -150,7 +145,7 @@ class Trainer:
 
     @property
     def title(self) -> str:
-        """The run in words."""
+        """The run as a short text."""
         config = self.config
         return f"{config.agent} on {config.task} ({config.variant}), seed {config.seed}"
 
@@ -184,7 +179,7 @@ class Trainer:
             observer.finished(self)
 
     def stop(self, error: BaseException) -> None:
-        """Tell that the run did not finish."""
+        """Tell the observers that the run did not finish."""
         for observer in self.observers:
             observer.failed(self, error)
 
@@ -210,7 +205,7 @@ class Trainer:
             observer.evaluated(self, evaluation)
 
     def _prepare(self) -> None:
-        """Let the agent search or train beforehand, with environments that it asks for."""
+        """Let the agent search or pre-train, in environments that it makes."""
         for observer in self.observers:
             observer.entered(self, "preparing")
         made: list[LatentNoiseEnv] = []
@@ -237,7 +232,7 @@ class Trainer:
         env.close()
 
     def _train_until_checkpoint(self, env: LatentNoiseEnv, end: int) -> None:
-        """From a fresh start of all environments to the next one, or to the end of training."""
+        """Train from one fresh start of all environments to the next, or to the end."""
         config, agent = self.config, self.agent
         if self.next_evaluation == 0:
             self.evaluate()
@@ -277,7 +272,7 @@ class Trainer:
         return env
 
     def _checkpoint(self) -> None:
-        """Everything that the rest of the run depends on; the replay only while it is needed."""
+        """Save everything that the rest of the run depends on; the replay only until the end."""
         replay = None if self.final else self.agent.replay
         state: dict[str, Any] = {
             "base_policy": self.base.content_hash(),
@@ -296,7 +291,7 @@ class Trainer:
         save_checkpoint(self.folder, {**state, "seconds": self.seconds})
 
     def _restore(self, state: Mapping[str, Any]) -> float:
-        """Take a checkpoint's state; returns the seconds that the run had taken then."""
+        """Load a checkpoint's state; returns the seconds that the run had taken until then."""
         if state["base_policy"] != self.base.content_hash():
             raise UserError(
                 f"{self.folder / CHECKPOINT} steers another base policy than "

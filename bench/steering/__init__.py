@@ -1,1 +1,1 @@
-"""The latent-noise environment, evaluation in it and the collect/update loop."""
+"""The latent-noise environment, evaluation in it, and the seeds of episodes."""

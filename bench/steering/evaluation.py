@@ -24,8 +24,8 @@ def rollout(env: LatentNoiseEnv, act: Act, seeds: Sequence[int]) -> Rollout:
 
     Args:
         env: with ``ignore_terminations``, so that success at the end is measured.
-        act: called once a decision for the N parallel environments.
-        seeds: any number; they are worked off in batches of N.
+        act: called once per decision for the N parallel environments.
+        seeds: any number; they are played in batches of N.
 
     Raises:
         UserError: if the environment ends episodes at success.
@@ -34,7 +34,7 @@ def rollout(env: LatentNoiseEnv, act: Act, seeds: Sequence[int]) -> Rollout:
         raise UserError("evaluation needs an environment with ignore_terminations=True")
     parts = []
     for start in range(0, len(seeds), env.num_envs):
-        # The last batch may be short: its spare environments repeat a seed and are dropped.
+        # If the last batch is not full, the other environments repeat a seed and are dropped.
         rows = torch.arange(start, start + env.num_envs).clamp(max=len(seeds) - 1)
         keep = min(env.num_envs, len(seeds) - start)
         parts.append(_rollout_batch(env, act, [seeds[int(row)] for row in rows], rows, keep))
@@ -68,17 +68,17 @@ def _rollout_batch(
 
 @dataclass
 class Steerability:
-    """Whether there is anything to steer in a base policy.
+    """How much the noise of a base policy changes its behaviour.
 
     Attributes:
         success: share of successful episodes over all states and draws (noise from N(0, I)).
-        episodes: how many episodes that is.
+        episodes: number of episodes.
         solvable: share of initial states that at least one of the draws solves.
-        states: how many initial states.
-        draws: noise draws a state.
+        states: number of initial states.
+        draws: noise draws per state.
         action_std: spread of the normalised actions over the noise on visited states; see
             :func:`symsteer.policies.steerability.action_spread`.
-        warning: why steering cannot work, or None.
+        warning: why steering is unlikely to work, or None.
     """
 
     success: float
@@ -102,7 +102,7 @@ def steerability(
 ) -> Steerability:
     """Draw noise ``draws`` times for each of ``states`` initial states.
 
-    The thresholds of the warning come from pilot runs: bases under them gained nothing from SAC.
+    The thresholds of the warning come from pilot runs: below them, SAC did not improve the base.
     """
     generator = torch.Generator().manual_seed(seed)
     seeds = [start for start in steerability_seeds(seed, states) for _ in range(draws)]
@@ -113,7 +113,7 @@ def steerability(
 
     result = rollout(env, act, seeds)
     success = result.episodes["success_once"].float().view(states, draws)
-    # The first draw's states on the way of every initial state, as far as it was not yet solved.
+    # The states that the first draw of every initial state visits before its first success.
     visited = result.obs[:, ::draws][result.running[:, ::draws]]
     action_std = action_spread(policy, visited, draws, seed)["action_std"]
     solvable = (success.amax(dim=1) > 0).float().mean().item()

@@ -1,7 +1,7 @@
 """The MDP that a steering agent sees: its action is the noise that the base policy decodes.
 
-State s, action w in R^(Tp x Da); the frozen policy decodes a = pi_dp(s, w), the first Ta actions
-are executed, rewards are summed over them (DSRL, arXiv 2506.15799; Equi-DSRL, arXiv 2512.11345).
+State s, action w in R^(Tp x Da). The frozen policy decodes a = pi_dp(s, w). The first Ta actions
+are executed, and their rewards are summed (DSRL, arXiv 2506.15799; Equi-DSRL, arXiv 2512.11345).
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from symsteer.policies.contract import ChunkPolicy
 
 @dataclass
 class Step(Transition):
-    """What one decision led to; every tensor has N rows.
+    """The result of one decision; every tensor has N rows.
 
-    ``reward`` is -1 for every executed step before success, and what a variant makes it cost in
-    addition (``info["extra_cost"]``), summed over the chunk.
+    ``reward`` is -1 for every executed step before success, minus the extra cost of a variant
+    (``info["extra_cost"]``), summed over the chunk.
 
     Attributes:
-        obs_after: observation to act on next, ``[N, obs_dim]``: the first one of a new episode
-            where the last one ended.
-        success_once: the episode of this decision has had a success so far, ``[N]`` bool.
+        obs_after: observation for the next decision, ``[N, obs_dim]``. If the episode ended, it is
+            the first one of the new episode.
+        success_once: success in this episode so far, ``[N]`` bool.
         episodes: ManiSkill's metrics of the episodes that ended, each ``[number ended]``.
     """
 
@@ -51,10 +51,10 @@ class LatentNoiseEnv:
 
     Args:
         env: parallel ManiSkill environments from :func:`symsteer.bench.tasks.make`.
-        policy: frozen decoder with the same layouts; its device is the device of everything that
-            goes in and comes out, wherever physics runs.
-        ignore_terminations: let episodes run to the time limit after a success, as ManiSkill's
-            evaluation does; without it a success ends the episode.
+        policy: frozen decoder with the same layouts. All inputs and outputs are on its device,
+            also if physics runs on another one.
+        ignore_terminations: episodes go on to the time limit after a success, as in ManiSkill's
+            evaluation. If False, a success ends the episode.
         seed: of the run, for :meth:`training_seeds`.
 
     Attributes:
@@ -81,10 +81,10 @@ class LatentNoiseEnv:
         return training_seeds(self.seed, start, count)
 
     def reset(self, seeds: list[int]) -> torch.Tensor:
-        """Start an episode everywhere, environment i from ``seeds[i]``; ``[N, obs_dim]``."""
+        """Start new episodes, environment i from ``seeds[i]``; observations ``[N, obs_dim]``."""
         start = time.perf_counter()
-        # PhysX orders contacts by a scene's history: only fresh scenes give the same episodes
-        # whatever was played before.
+        # In PhysX the order of contacts depends on the history of a scene. Only in fresh scenes
+        # are episodes independent of those before.
         obs, _ = self.env.reset(seed=seeds, options={"reconfigure": True})
         self._obs = obs.to(self.device)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
@@ -95,9 +95,9 @@ class LatentNoiseEnv:
 
     @torch.no_grad()
     def step(self, noise: torch.Tensor) -> Step:
-        """Decode ``noise [N, Tp, Da]``, execute the first Ta actions, reset what ended.
+        """Decode ``noise [N, Tp, Da]``, execute the first Ta actions, reset ended episodes.
 
-        What a chunk still does after its episode has ended counts for nothing.
+        Steps of a chunk after the end of its episode are not counted.
         """
         start = time.perf_counter()
         obs = next_obs = self._obs
@@ -108,7 +108,7 @@ class LatentNoiseEnv:
         reward = torch.zeros(self.num_envs, device=self.device)
         terminal, truncated = torch.zeros_like(alive), torch.zeros_like(alive)
         success_at_end = torch.zeros_like(alive)
-        # Where every episode reaches its limit within the chunk, nobody needs the rest of it.
+        # If all episodes reach their time limit within the chunk, its rest is not needed.
         steps = min(self.execute, self.max_episode_steps - int(self._elapsed.min()))
         for seen, info in self._play(actions[:, :steps]):
             if not alive.any():
@@ -162,9 +162,9 @@ class LatentNoiseEnv:
     def _play(self, actions: torch.Tensor) -> Iterator[tuple[torch.Tensor, dict[str, Any]]]:
         """Observation and info after each step of ``actions [N, T, Da]``.
 
-        Environments in several processes take the whole chunk in one exchange. They therefore
-        play on after all episodes have ended, and one process does too: its scenes then have the
-        same history, and all that follows is the same to the bit.
+        With several processes, the environments get the whole chunk in one exchange. So they also
+        simulate the steps after all episodes have ended. One process does the same: its scenes
+        then have the same history, and the results are equal bit for bit.
         """
         if not hasattr(self.env, "step_chunk"):
             for t in range(actions.shape[1]):

@@ -1,7 +1,7 @@
-"""Which episodes are played when: seeds of training, evaluation, diagnostics, steerability.
+"""Seeds of episodes in training, evaluation, diagnostics and steerability reports.
 
-The ranges do not overlap: steerability below ``HELD_OUT_SEED``, evaluation from it on, diagnostics
-half a million above it, training from 2^22 to 2^31.
+The ranges do not overlap: steerability is below ``HELD_OUT_SEED``, evaluation begins at it,
+diagnostics begin half a million above it, training is from 2^22 to 2^31.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def held_out_seeds(count: int) -> list[int]:
 
 
 def diagnostic_seeds(count: int) -> list[int]:
-    """The first ``count`` on-policy episodes against whose returns Q is held."""
+    """The first ``count`` on-policy episodes; Q is compared with their returns."""
     return [DIAGNOSTIC_SEED + i for i in range(count)]
 
 

@@ -1,1 +1,1 @@
-"""Suites of runs: grids as data, worked off by a pool of processes."""
+"""Suites of runs: grids as data, executed by a pool of processes or a cluster."""

@@ -24,19 +24,19 @@ ADDRESS = re.compile(r"auto|(\[[0-9a-fA-F:]+\]|[^:/\s]+):[0-9]{1,5}")
 
 
 class RayCluster:
-    """Tasks on a cluster: one processor and one thread each, and a GPU if the run wants CUDA.
+    """Tasks on a cluster: one processor and one thread each, and a GPU if the run uses CUDA.
 
     Args:
         address: ``auto`` for the cluster that this machine belongs to, or ``host:port`` of its
             head.
         out: folder of the runs; every machine must see it under the same path.
-        capacity: most tasks at the same time; None: as many as fit on the cluster.
+        capacity: largest number of tasks at the same time; None: as many as fit on the cluster.
 
     Raises:
         UserError: if Ray is not installed, no cluster answers, or a machine does not see ``out``.
     """
 
-    # A file server may take this long to release the lock of a machine that was lost.
+    # A file server can need this long to release the lock of a lost machine.
     patience = 120.0
 
     def __init__(self, address: str, out: Path, capacity: int | None):
@@ -54,7 +54,7 @@ class RayCluster:
     def submit(self, function: Callable[..., Result], *args: Any) -> Future:
         """Start a task."""
         cuda = any(isinstance(a, RunConfig) and "cuda" in (a.sim, a.device) for a in args)
-        # The other machines need the full path of the folder.
+        # Other machines need the full path of the folder.
         args = tuple(self._out if isinstance(a, Path) else a for a in args)
         if (function, cuda) not in self._functions:
             options = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)
@@ -65,7 +65,7 @@ class RayCluster:
         return future
 
     def result(self, future: Future) -> Result:
-        """The result of a task that has ended, also if its machine was lost."""
+        """The result of a task that has ended; also if its machine was lost."""
         del self._references[future]
         errors = self._ray.exceptions
         try:
@@ -88,7 +88,7 @@ class RayCluster:
 
 
 def check_address(address: str) -> None:
-    """Refuse what cannot be the address of a cluster, without connecting to it.
+    """Check the form of a cluster's address, without connecting to it.
 
     Raises:
         UserError: if it is neither ``auto`` nor ``host:port``.
@@ -121,7 +121,7 @@ def _connect(address: str) -> Any:
 
 
 def _wait_for_answer(address: str) -> None:
-    """Fail after seconds if no Ray head answers; Ray itself would wait for minutes."""
+    """Fail after a few seconds if no Ray head answers; Ray itself would wait for minutes."""
     channel = grpc.insecure_channel(address)
     try:
         grpc.channel_ready_future(channel).result(timeout=CONNECT_SECONDS)
@@ -135,7 +135,7 @@ def _wait_for_answer(address: str) -> None:
 
 
 def _check_shared(ray: Any, out: Path) -> None:
-    """Refuse a folder in which a machine of the cluster does not see the files of this one."""
+    """Check that every machine of the cluster sees the files of this machine in a folder."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     token = out / f".token-{uuid.uuid4().hex}"
@@ -175,7 +175,7 @@ def _check_shared(ray: Any, out: Path) -> None:
 
 
 def _answer(token: Path, node: str) -> bool:
-    """On another machine: whether the token is there and a file can be written beside it."""
+    """On another machine: whether the token exists and a file can be written next to it."""
     try:
         if token.read_text() != token.name:
             return False

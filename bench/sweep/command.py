@@ -1,4 +1,4 @@
-"""``symsteer sweep``: run what is not finished, or show what would be run."""
+"""``symsteer sweep``: run the runs that are not finished, or show them."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def number_of_workers(asked: int, configs: list[RunConfig]) -> int:
     """How many runs to execute at the same time on this machine.
 
     Args:
-        asked: the number that the user gave; 0: one per core, or one in all on CUDA, where the
-            runs would share a device.
+        asked: the number that the user gave. 0 means one per core, or only one on CUDA, because
+            the runs would share a device.
         configs: of the runs.
 
     Raises:
@@ -112,7 +112,7 @@ def look_at(plan: Plan) -> dict[PlannedRun, Sighting]:
 
 
 def preview(plan: Plan, workers: int = 0, ray: str | None = None) -> str:
-    """A text that shows what a sweep would do; nothing is run, written or connected to.
+    """A text that shows what a sweep would do. It runs and writes nothing, and does not connect.
 
     Raises:
         UserError: if ``workers`` is negative, or ``ray`` is not an address.
@@ -152,7 +152,7 @@ def _time(estimate: Estimate, todo: list[PlannedRun], workers: int | None, bases
 
 
 def _counts(seen: dict[PlannedRun, Sighting]) -> list[str]:
-    """A table: for each setting in which the runs differ and each of its values, runs by state."""
+    """A table: the number of runs by state, for each value of the settings in which runs differ."""
     rows = []
     names = {"interrupted": "unfinished", "failed": "unfinished"}
     states = {run: names.get(s.state, s.state) for run, s in seen.items()}

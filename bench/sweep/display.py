@@ -1,4 +1,4 @@
-"""The output of a sweep: live lines on a terminal, else one plain line for each run that ends."""
+"""The output of a sweep: live lines on a terminal, otherwise one plain line per finished run."""
 
 from __future__ import annotations
 
@@ -85,13 +85,13 @@ class Display(contextlib.AbstractContextManager):
 
     def write(self, status: str, text: str) -> None:
         """Print one line."""
-        # Not with the console, which folds lines. A closed pipe does not stop the sweep.
+        # Not with the console, because it wraps lines. A closed pipe does not stop the sweep.
         with contextlib.suppress(BrokenPipeError):
             print(f"{status:9s} {text}", file=self.console.file, flush=True)
 
 
 class LiveDisplay(Display):
-    """On a terminal: also a live line for each run, and one for the whole sweep."""
+    """For terminals: in addition a live line for each run, and one for the whole sweep."""
 
     STYLES: Mapping[str, str] = {"finished": "green", "failed": "red"}
 

@@ -17,7 +17,7 @@ Progress = Mapping[str, Any]
 
 
 class Estimate:
-    """Seconds of a run: the median of the most similar finished ones, scaled with the budget."""
+    """Seconds of a run: the median of the most similar finished runs, scaled with the budget."""
 
     def __init__(self) -> None:
         self.runs = 0
@@ -43,7 +43,7 @@ class Estimate:
             running: running ones, with their progress.
             workers: number of runs at the same time.
         """
-        # For an agent without finished runs, running ones serve.
+        # For an agent without finished runs, use its running ones.
         going: dict[tuple, list[float]] = defaultdict(list)
         for run, progress in running.items():
             if progress and progress.get("steps_per_second"):
@@ -57,7 +57,7 @@ class Estimate:
             if not rates:
                 return None
             seconds.append(statistics.median(rates) * run.env_steps * share)
-        # The whole takes at least as long as its longest run.
+        # The sweep takes at least as long as its longest run.
         return max(sum(seconds) / max(workers, 1), max(seconds, default=0.0))
 
 

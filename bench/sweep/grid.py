@@ -1,10 +1,10 @@
 """Suites as plain data: TOML files with grids of runs. Light to import.
 
-``[grid]`` lists values of keys of a run's configuration, nested keys with a dot
-(``"demonstrations.count"``); the runs are the product of the lists, in the order written.
-``strength`` lists strengths for the variants that are named without one. Several grids are written
-``[[grid]]`` each. ``[run]`` sets what all runs share, nested as the configuration is. Options of
-agents and policies are described in ``symsteer.bench.sweep.suite``.
+``[grid]`` lists values for keys of a run's configuration; nested keys have a dot
+(``"demonstrations.count"``). The runs are the product of the lists, in the order of the file.
+``strength`` lists strengths for the variants without one. If there are several
+grids, each is a ``[[grid]]``. ``[run]`` sets values for all runs, nested like the
+configuration. ``symsteer.bench.sweep.suite`` describes the options of agents and policies.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class SuiteData:
 
     Attributes:
         name: of the file, without its ending.
-        source: file name, to begin messages with.
+        source: file name; messages begin with it.
         description: what the suite is for.
-        shared: what all runs share; ``agent`` and ``policy`` are tables.
+        shared: settings of all runs; ``agent`` and ``policy`` are tables.
         grids: in the order of the file.
     """
 
@@ -178,7 +178,7 @@ def _with_tables(shared: dict[str, Any], source: str) -> dict[str, Any]:
 
 
 def _merge(shared: dict[str, Any], cell: dict[str, Any], source: str) -> dict[str, Any]:
-    """The shared settings with a cell's values in their places."""
+    """The shared settings, replaced by a cell's values."""
     merged = copy.deepcopy(shared)
     for key, value in cell.items():
         place = merged

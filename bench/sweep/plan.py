@@ -18,15 +18,15 @@ from symsteer.bench.sweep.suite import Suite
 from symsteer.errors import UserError
 
 BASIC = ("task", "embodiment", "variant", "agent", "seed")
-"""Keys of a configuration that every table and line shows."""
+"""Keys of a configuration that all tables and lines show."""
 
 OWNERS = {"agent": "agent", "policy": "policy.name"}
-"""The key that says whose options ``agent.X`` and ``policy.X`` are."""
+"""The key with the name of the agent or policy that has the options ``agent.X`` or ``policy.X``."""
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """What identifies a run in lines and tables, and its budget."""
+    """The settings that identify a run in lines and tables, and its budget."""
 
     run_id: str
     task: str
@@ -121,7 +121,7 @@ def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
     Args:
         suite: what to run.
         out: folder of the runs.
-        elsewhere: whether other machines run it; then devices are not checked.
+        elsewhere: whether other machines run it; then the devices are not checked.
 
     Raises:
         UserError: if a run cannot be started, e.g. because its task does not exist.

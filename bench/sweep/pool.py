@@ -1,4 +1,4 @@
-"""A pool of processes on this machine, one thread each, that survives the death of any of them."""
+"""A pool of processes on this machine, one thread each. A process that dies is replaced."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 class LocalPool:
-    """Processes that are kept for many tasks, because their imports take seconds.
+    """Processes that execute many tasks each, because their imports take seconds.
 
     Each process is a pool of its own: a pool of several processes breaks as a whole when one of
     them dies during its imports.
@@ -93,13 +93,13 @@ def _begin(log: str) -> None:
     for stream in (1, 2):
         os.dup2(file, stream)
     os.close(file)
-    # tqdm's usual lock is a semaphore of the system, which a process that is killed leaves behind.
+    # tqdm's default lock is a system semaphore. A killed process would not remove it.
     tqdm.set_lock(threading.RLock())
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End when the sweep ends, also if it was killed; its runs continue from their checkpoints."""
+    """End this process when the sweep ends, also if the sweep is killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -107,7 +107,7 @@ def _end_with_parent() -> None:
 
 
 def _death(code: int | None) -> str:
-    """What the exit code of a process means."""
+    """The meaning of a process's exit code, as text."""
     if code is None:
         return "its process ended before it started to work"
     if code >= 0:

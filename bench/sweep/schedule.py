@@ -1,4 +1,4 @@
-"""Execute a plan: what runs share is built once and first; then the runs, several at a time.
+"""Execute a plan: first build what runs share, each once; then execute several runs at a time.
 
 The workers are processes of this machine (``pool``) or of a cluster (``cluster``).
 """
@@ -55,7 +55,7 @@ class Outcome:
 
 
 class Watcher(Protocol):
-    """Is told about the progress of a sweep."""
+    """Is called at the events of a sweep."""
 
     def started(self, task: Task) -> None:
         """A task began."""
@@ -91,7 +91,7 @@ class Task:
 
 
 def tasks_of(plan: Plan, todo: list[PlannedRun], patience: float = 0.0) -> list[Task]:
-    """Tasks for what the runs share and does not exist yet, each once, then for the runs.
+    """The tasks of a sweep: shared data that do not exist yet, each once, then the runs.
 
     Args:
         plan: of the sweep.
@@ -127,8 +127,8 @@ def execute_plan(
 ) -> Iterator[Outcome]:
     """Execute runs of a plan, and yield the outcome of each when it ends.
 
-    A run that fails does not stop the others. Tasks that others wait for come first, then the runs
-    in the order of the suite, and last what failed before.
+    A run that fails does not stop the others. First come tasks that others wait for, then the runs
+    in the order of the suite, then tasks that failed before.
     """
     order = itertools.count()
     ready: list[tuple[int, int, Task]] = []
@@ -165,7 +165,7 @@ def execute_plan(
 
 
 def _again(task: Task, result: Result) -> bool:
-    """Whether to try a task again that did not succeed; counts the attempt."""
+    """Whether to try a failed task again; counts the attempt."""
     if result.status == "lost":
         task.losses += 1
         return task.losses < LOST_TRIES

@@ -19,7 +19,7 @@ STATES = ("finished", "running", "interrupted", "failed", "missing")
 
 @dataclass(frozen=True)
 class Status:
-    """The state of a sweep, or of runs that belong to none."""
+    """The state of a sweep, or of runs without a sweep."""
 
     title: str
     runs: dict[PlannedRun, Sighting]
@@ -31,7 +31,7 @@ class Status:
     def state(self, run: PlannedRun) -> str:
         """One of :data:`STATES`."""
         state = self.runs[run].state
-        # A run whose process was killed could not write that it failed; its sweep did.
+        # A killed process could not write that its run failed, but its sweep did.
         if state in ("interrupted", "missing") and run.run_id in self.reasons:
             return "failed"
         return state
@@ -41,7 +41,7 @@ class Status:
         return [run for run in self.runs if self.state(run) == state]
 
     def seconds_left(self) -> float | None:
-        """Seconds until all runs are finished at the present number of workers; None: unknown."""
+        """Seconds until all runs are finished with the current number of workers; None: unknown."""
         estimate = Estimate()
         for run in self.in_state("finished"):
             estimate.add(run, self.runs[run].seconds)
@@ -61,14 +61,14 @@ class Overview:
 
 
 def read_status(folder: Path, suite: str | None = None) -> Overview:
-    """The sweeps below a folder, at any depth, and the runs that belong to none.
+    """The sweeps below a folder, at any depth, and the runs without a sweep.
 
     Args:
         folder: of runs or of folders of runs, or of one run.
         suite: read only the sweeps of this suite.
 
     Raises:
-        UserError: if there is no such folder or sweep, or a sweep that was named is damaged.
+        UserError: if there is no such folder or sweep, or the given sweep is damaged.
     """
     if not folder.is_dir():
         raise UserError(f"there is no folder {folder}; name the --out of a sweep or a run")
@@ -132,7 +132,7 @@ def to_text(found: list[Status], folder: Path) -> str:
 
 
 def _of_sweep(folder: Path, path: Path) -> Status:
-    """The sweep of a manifest; its title says where it is, if that is not ``folder`` itself."""
+    """The sweep of a manifest. If it is not in ``folder`` itself, the title contains its path."""
     manifest, out = read_manifest(path), path.parent.parent
     return Status(
         manifest.title if out == folder else f"{out.relative_to(folder)}: {manifest.title}",

@@ -24,7 +24,7 @@ from symsteer.registry import Registry
 
 @dataclass(frozen=True)
 class Suite:
-    """A name, what it is for, and its runs in order."""
+    """Name, description, and the runs in order."""
 
     name: str
     description: str
@@ -64,11 +64,11 @@ class _Options:
     Args:
         kind: ``agent`` or ``policy``, the key of the tables.
         registry: of the agents or policies.
-        default: the name where none is given.
+        default: the name if none is given.
         data: the suite.
 
     Raises:
-        UserError: if a name does not exist, or none of the agents that an option is for has it.
+        UserError: if a name does not exist, or no agent (policy) has an option that is set for it.
     """
 
     def __init__(self, kind: str, registry: Registry[Any], default: str, data: SuiteData):

@@ -1,7 +1,7 @@
 """The tasks that the processes of a sweep execute, on this machine or on a cluster.
 
-They return an error as text instead of raising it: not every exception survives the way to another
-process.
+They return errors as text instead of raising them, because not every exception can be sent to
+another process.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Result:
     """How a task ended."""
 
     status: Literal["done", "failed", "busy", "lost"]
-    """``busy``: another process works on the run. ``lost``: the machine was lost, which is not the
-    task's fault."""
+    """``busy``: another process works on the run. ``lost``: the machine was lost; this is no
+    error of the task."""
     reason: str = ""
     trace: str = ""
     """The traceback of an unexpected error."""
@@ -45,7 +45,7 @@ class Result:
 
 
 def one_thread() -> None:
-    """Limit torch to one thread: the cores are shared by processes."""
+    """Limit torch to one thread, because several processes share the cores."""
     torch.set_num_threads(1)
 
 
@@ -65,8 +65,8 @@ def play(config: RunConfig, out: Path, patience: float) -> Result:
     Args:
         config: of the run.
         out: folder of the runs.
-        patience: seconds to wait until the files of another machine show here: a base policy that
-            it has trained, or that it no longer holds the run.
+        patience: seconds to wait until files of another machine are visible here: the base policy
+            that it has trained, or the released lock of the run.
     """
     folder = out / run_id(config, {})
     deadline = time.monotonic() + patience
@@ -94,6 +94,6 @@ def _guarded(action: Callable[[], object]) -> Result:
     except Exception as error:
         return Result("failed", f"{type(error).__name__}: {error}", traceback.format_exc())
     finally:
-        # A run that failed leaves simulations behind, and a process can hold only a few.
+        # Free the simulations of a failed run: a process can hold only a few.
         gc.collect()
     return Result("done")
