@@ -153,8 +153,10 @@ def scored_on_held_out_episodes(file: Path, record: RunRecord) -> Iterator[str]:
 def consistent(file: Path, record: RunRecord) -> Iterator[str]:
     """Name and seeds of the run are those of its configuration."""
     settings, seed = record.settings, record.settings.seed
-    keys = (settings.task, settings.embodiment, settings.variant, settings.agent, f"s{seed}")
-    named = "-".join(keys).replace(":", "=")
+    # Names of classes that are not installed, package.module:Class, have a dot for the colon.
+    task, agent = (name.replace(":", ".") for name in (settings.task, settings.agent))
+    keys = (task, settings.embodiment, settings.variant.replace(":", "="), agent, f"s{seed}")
+    named = "-".join(keys)
     if not record.run_id.replace(":", "=").startswith(f"{named}-"):
         yield (
             f"the run is named {record.run_id}, but its configuration is that of {named}: take the "

@@ -38,9 +38,9 @@ def run_id(config: RunConfig, origin: dict[str, Any]) -> str:
         origin: content hashes of demonstrations or a policy that came from files.
     """
     variant = config.variant.replace(":", "=")
-    agent = config.agent.replace(":", ".")
+    task, agent = (name.replace(":", ".") for name in (config.task, config.agent))
     key = content_key(config.to_json(), origin)
-    return f"{config.task}-{config.embodiment}-{variant}-{agent}-s{config.seed}-{key}"
+    return f"{task}-{config.embodiment}-{variant}-{agent}-s{config.seed}-{key}"
 
 
 def is_finished(folder: Path) -> bool:
