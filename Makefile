@@ -1,8 +1,8 @@
-# Everything runs in .venv; `make setup` makes it once and costs nothing afterwards.
+# Everything runs in .venv. `make setup` makes it once; later it does nothing.
 PYTHON ?= python3.11
 UV_VERSION := 0.9.30
 BIN := .venv/bin
-# One thread a process: runs and tests share the cores as processes.
+# One thread per process: runs and tests use the cores by running several processes.
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
@@ -12,7 +12,7 @@ help:
 	@echo "make setup         create .venv with the pinned packages"
 	@echo "make demo          demonstrations -> policy -> steering -> leaderboard, on the CPU, in minutes"
 	@echo "make test          the test suite (make test-slow: the long tests)"
-	@echo "make lint          ruff, format check, types, import contract"
+	@echo "make lint          ruff, format check, types, import contracts"
 	@echo "make requirements  compile requirements.txt from pyproject.toml"
 
 setup: .venv/.complete

@@ -290,11 +290,12 @@ def audit(
     out: Path | None = None,
     resume: bool = False,
     json: bool = False,
+    rollouts: int = 0,
+    actions: Literal["expert", "random", "policy"] = "expert",
 ) -> int:
     """Measure how broken the symmetry of a task is, in simulation (docs/audit.md).
 
-    Several tasks, embodiments, variants or strengths give a table with one cell for each
-    combination.
+    Several tasks, embodiments, variants or strengths give a table with a row for each.
 
     Args:
         task: Tasks, or all; `symsteer list` names them.
@@ -315,31 +316,40 @@ def audit(
             there, beside table.csv, table.md and summary.json.
         resume: Do not measure again what OUT holds with the same settings.
         json: Print only JSON.
+        rollouts: If above 0: compare this many whole episodes of the floating gripper with their
+            turned copies instead.
+        actions: Who acts in these episodes.
     """
     from json import dumps
 
-    from symsteer.bench.audit.cell import Settings
     from symsteer.bench.audit.report import summary, text, to_markdown, write_table
-    from symsteer.bench.audit.study import grid, run_cells
+    from symsteer.bench.audit.result import AuditSettings
+    from symsteer.bench.audit.study import compare_rollouts, grid, run_audits
 
-    template = Settings(
+    template = AuditSettings(
         group=group, states=states, count=count, chunk=chunk, resets=resets, seed=seed, sim=sim
     )
-    cells = grid(task, embodiment, variant, strength, template)
-    several = len(cells) > 1
+    wanted = grid(task, embodiment, variant, strength, template)
+    several = len(wanted) > 1
+    if rollouts:
+        for settings in wanted:
+            error = compare_rollouts(settings, rollouts, actions, runs, base_policy, not json)
+            print(f"{settings.name}, {actions}")
+            print(error.summary())
+        return 0
 
-    def done(cell: Any) -> None:
+    def done(result: Any) -> None:
         if several:
-            print(f"{cell.settings.name}: {cell.seconds:.1f} s", file=sys.stderr, flush=True)
+            print(f"{result.settings.name}: {result.seconds:.1f} s", file=sys.stderr, flush=True)
 
-    found = run_cells(cells, runs, base_policy, out, resume, progress=not json, done=done)
+    found = run_audits(wanted, runs, base_policy, out, resume, progress=not json, done=done)
     if several and out is not None:
         write_table(found, out)
     if json:
-        plain = [cell.to_json() for cell in found]
+        plain = [result.to_json() for result in found]
         print(dumps(plain if several else plain[0]))
     elif several:
-        print(to_markdown([summary(cell) for cell in found]), end="")
+        print(to_markdown([summary(result) for result in found]), end="")
     else:
         print(text(found[0]))
     if out is not None and not json:

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import version
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -284,12 +284,15 @@ class Replay:
         return wall, cpu
 
 
-_replay = cache(Replay)
+_REPLAYS: dict[tuple[type[BaseEnv], int], Replay] = {}
 
 
 def _replay_episodes(env_cls: type[BaseEnv], num_envs: int, episodes: int) -> tuple[float, float]:
     """Wall and processor seconds of the substeps of some episodes, in this process."""
-    times = [_replay(env_cls, num_envs).play() for _ in range(episodes)]
+    key = env_cls, num_envs
+    if key not in _REPLAYS:
+        _REPLAYS[key] = Replay(*key)
+    times = [_REPLAYS[key].play() for _ in range(episodes)]
     return sum(wall for wall, _ in times), sum(cpu for _, cpu in times)
 
 
@@ -394,8 +397,10 @@ def measure(
             for contender in contenders:
                 contender.turn()
     finally:
-        for started in (*helpers, *contenders):
-            started.close()
+        for helper in helpers:
+            helper.close()
+        for contender in contenders:
+            contender.close()
     rows = [contender.row for contender in contenders]
     report("timing the parts of a step")
     size = min((n for n in num_envs if n >= 64), default=max(num_envs))

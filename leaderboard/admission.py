@@ -41,7 +41,7 @@ RowKey = tuple[Key, str, str]
 
 @dataclass
 class Verdict:
-    """What is to be said of one record file."""
+    """Problems and notes of one record file."""
 
     path: Path
     problems: list[str] = field(default_factory=list)
@@ -214,7 +214,7 @@ RULES: tuple[Callable[[Path, RunRecord], Iterator[str]], ...] = (
 
 
 class _Known:
-    """The records that one record is held against: the committed ones and those before it."""
+    """The records that one record is compared with: the committed ones and those before it."""
 
     def __init__(self) -> None:
         self._runs: dict[tuple[RowKey, str], tuple[Path, RunRecord]] = {}
@@ -314,7 +314,7 @@ def _learns(record: RunRecord) -> bool:
 
 
 def _steps_of_a_decision(record: RunRecord) -> int:
-    """Environment steps of one decision in all environments: a run ends with a whole one."""
+    """Environment steps of one decision in all environments; a run ends with a complete one."""
     policy = record.config.get("policy")
     factors = (
         record.config.get("num_envs"),

@@ -2,7 +2,7 @@
 
 A verdict follows a fixed rule: the 95 % interval of the effect lies wholly on the side that the
 claim predicts (supported), wholly on the other one (contradicted), or neither (undecided). A test
-that lacks data is undecided with the reason, never left out.
+without enough data is undecided and says why; it is never left out.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Claim:
     reason: str = ""
     """Why the test cannot decide, whatever its interval says."""
     beside: str = ""
-    """Another view of the same question, without a test."""
+    """Further numbers on the same question, without a test."""
 
     @property
     def verdict(self) -> str:
@@ -108,17 +108,24 @@ def _enough(cells: Cells[T], wanted: str) -> tuple[Cells[T], str]:
     return cells, f"at most {most} paired seeds in a cell, {MIN_SEEDS} are needed"
 
 
-def _paired(
-    name: str, test: str, tables: Sequence[Table], first: str, second: str, measure: str, where: str
+def _averaged(
+    name: str, test: str, found: Cells[Sample], wanted: str
 ) -> tuple[Claim, Cells[Sample]]:
-    """Mean over cells of a paired difference, predicted to be positive."""
-    found = [(table, advantage(table, first, second, measure)) for table in tables]
-    cells, reason = _enough(found, f"`{first}` and `{second}`{where}")
+    """Mean over cells of paired differences, predicted to be positive, and the cells used."""
+    cells, reason = _enough(found, wanted)
     if not cells:
         return Claim(name, test, 1, reason=reason), cells
     effect = stratified_bootstrap([list(samples.values()) for _, samples in cells])
     seeds = sum(len(samples) for _, samples in cells)
     return Claim(name, test, 1, effect, len(cells), seeds, reason), cells
+
+
+def _paired(
+    name: str, test: str, tables: Sequence[Table], first: str, second: str, measure: str, where: str
+) -> tuple[Claim, Cells[Sample]]:
+    """The same for the difference of two agents in a measure of the map."""
+    found = [(table, advantage(table, first, second, measure)) for table in tables]
+    return _averaged(name, test, found, f"`{first}` and `{second}`{where}")
 
 
 def _sample_efficiency(tables: Sequence[Table], rival: str) -> Claim:
@@ -158,8 +165,7 @@ def _divergence(tables: Sequence[Table], rival: str) -> Claim:
     test = f"share of runs whose Q diverged, `{rival}` minus `equivariant`, all cells"
 
     def verdicts(table: Table, agent: str) -> dict[Pair, bool]:
-        # A run that broke off because its Q was not finite counts, so rows without any finished
-        # run do too.
+        # A run that failed because its Q was not finite counts, so rows may have no finished run.
         rows = [row for row in table.rows if row.agent == agent]
         found = [{r.pair: r.diverged for r in row.runs if r.diverged is not None} for row in rows]
         return max(found, key=len, default={})
@@ -191,12 +197,8 @@ def _bias(tables: Sequence[Table], rival: str) -> Claim:
     for table in tables:
         both = _joined(biases(table, rival), biases(table, EQUIVARIANT))
         found.append((table, {pair: Sample.constant(a - b) for pair, (a, b) in both.items()}))
-    cells, reason = _enough(found, f"`{rival}` and `equivariant` with a critic")
-    if not cells:
-        return Claim(name, test, 1, reason=reason)
-    effect = stratified_bootstrap([list(samples.values()) for _, samples in cells])
-    runs = sum(len(samples) for _, samples in cells)
-    return Claim(name, test, 1, effect, len(cells), runs, reason, "in units of return")
+    claim, cells = _averaged(name, test, found, f"`{rival}` and `equivariant` with a critic")
+    return replace(claim, beside="in units of return") if cells else claim
 
 
 def _joined(first: Mapping[Pair, T], second: Mapping[Pair, T]) -> dict[Pair, tuple[T, T]]:

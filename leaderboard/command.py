@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,10 +11,8 @@ from typing import TextIO
 import tyro
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.admission import check as judge
-from symsteer.leaderboard.report import PAGE_FOLDER, RECORDS, Verification, generate
-from symsteer.leaderboard.report import verify as compare
-from symsteer.leaderboard.verification import other_versions
+from symsteer.leaderboard.paths import PAGE_FOLDER, RECORDS
+from symsteer.leaderboard.verification import Verification, other_versions
 
 FEW = 10
 """`--check` lists up to this many records; of more, only those with problems or notes."""
@@ -57,10 +56,13 @@ def report(
     paths = records or (RECORDS,)
     if check:
         return _show_verdicts(paths)
+    # Here, so that the help of all commands does not wait for matplotlib and scipy.
+    from symsteer.leaderboard import report
+
     out = out or _folder_for(records)
     if verify:
-        return _show_differences(compare(paths, out, audit))
-    files = generate(paths, out, audit)
+        return _show_differences(report.verify(paths, out, audit))
+    files = report.generate(paths, out, audit)
     page = next(file for file in files if file.name == "LEADERBOARD.md")
     _say(f"wrote {page} and {len(files) - 1} files beside it")
     return 0
@@ -71,8 +73,8 @@ def _folder_for(records: Sequence[Path]) -> Path:
     if not records:
         return PAGE_FOLDER
     first = records[0]
-    out = (first.parent if first.is_file() else first) / "leaderboard"
-    if out.resolve() == PAGE_FOLDER:
+    out = (first.parent if os.path.isfile(first) else first) / "leaderboard"
+    if Path(os.path.realpath(out)) == PAGE_FOLDER:
         raise UserError(
             f"{out} holds the committed leaderboard; name another folder, or this one, with --out"
         )
@@ -97,7 +99,9 @@ def _show_differences(result: Verification) -> int:
 
 
 def _show_verdicts(paths: Sequence[Path]) -> int:
-    verdicts = judge(paths, RECORDS)
+    from symsteer.leaderboard import admission
+
+    verdicts = admission.check(paths, RECORDS)
     for verdict in verdicts:
         if verdict.is_admissible and not verdict.notes and len(verdicts) > FEW:
             continue

@@ -44,7 +44,7 @@ AUDIT = Path(__file__).resolve().parent / "results" / "audit" / "summary.json"
 """The audit of all tasks and variants that the repository and every wheel contain."""
 
 COMPONENTS = {"tool_step": "dynamics", "cost": "reward", "observation": "observation"}
-"""Defects of the audit that the map's x is the largest of, and what each one is a defect of."""
+"""Columns of the audit, and what each is a defect of. The map's x is the largest of them."""
 
 MEASURES = ("auc", "success")
 """What the advantage is measured in: area under the curve, final-window success."""
@@ -174,8 +174,8 @@ def defect_of(key: Key, audit: Audit) -> Defect | None:
 def audit_commands(keys: Sequence[Key]) -> list[str]:
     """Commands that measure the defects of tables, one for each task, embodiment and group.
 
-    Names that no task or variant could have are left out: a record's text must not become part of
-    a command that somebody copies.
+    Names that no task or variant could have are left out: text from a record must not become part
+    of a command that a reader copies.
     """
     wanted: dict[tuple[str, str, str], list[str]] = {}
     for key in sorted(keys):
@@ -275,7 +275,7 @@ def defect_map(summary: Summary, audit: Audit) -> DefectMap:
 
 
 def advantage(table: Table, first: str, second: str, measure: str) -> dict[Pair, Sample]:
-    """Paired differences of two agents in a table; empty where one of them lacks."""
+    """Paired differences of two agents in a table; empty if one of them is missing."""
     rows = table.row_of(first), table.row_of(second)
     if rows[0] is None or rows[1] is None:
         return {}
@@ -322,11 +322,10 @@ def _scatter(
 ) -> Array:
     """Draws of the standard deviation between cells: [resamples, 1].
 
-    Cells differ by more than their seeds and audits explain, for instance because tasks do. The
-    residuals say by how much, but few residuals say it badly, so that their variance is drawn from
-    its distribution (sum of squares over a chi-square draw); what is `expected` from seeds,
-    episodes and the audit is subtracted. Without this the interval misses the crossing half of the
-    time once the cells' own scatter is nearly three times what their seeds explain.
+    Cells differ by more than seeds, episodes and audit explain (`expected`), because tasks differ.
+    With few residuals their variance is uncertain, so it is drawn from its distribution (sum of
+    squares over a chi-square draw); `expected` is subtracted. Without this the interval misses the
+    crossing half of the time when cells scatter three times as much as their seeds explain.
     """
     freedom = len(residuals) - 2
     observed = (residuals**2).sum() / generator.chisquare(freedom, size=(resamples, 1))
@@ -345,9 +344,9 @@ def crossing(
 ) -> Crossing:
     """Where the line falls through zero, with the interval of its resamples.
 
-    A resample that is positive over the whole `span` has its crossing beyond the upper end, one
-    that is negative all over beyond the lower end. One that rises through zero inside has no
-    crossing of this kind; it counts against both ends, which can only widen the interval.
+    A resample that is positive over the whole `span` counts as a crossing beyond the upper end, a
+    negative one as a crossing beyond the lower end. One that rises through zero inside has no such
+    crossing; it counts against both ends, which can only widen the interval.
     """
     low, high = span
     at_low, at_high = intercepts + slopes * low, intercepts + slopes * high
@@ -359,7 +358,7 @@ def crossing(
     lowest = np.where(rising, -np.inf, roots)
     highest = np.where(rising, np.inf, roots)
     falls = intercept + slope * low > 0 >= intercept + slope * high
-    # Quantiles by order, not by interpolation: between a root and an infinity there is no number.
+    # Quantiles without interpolation: there is no number between a root and infinity.
     return Crossing(
         -intercept / slope if falls else None,
         float(np.quantile(lowest, 0.025, method="lower")),

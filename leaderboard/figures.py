@@ -1,8 +1,8 @@
 """The figures as deterministic SVG: the map, profiles, comparisons; learning curves and Q-values.
 
-Colours are Okabe and Ito's, told apart with colour blindness; agents differ by marker as well. Text
-is drawn as outlines of matplotlib's own font, so that a figure looks the same everywhere and has
-the same bytes for the same records.
+The colours are those of Okabe and Ito, which people with colour blindness can tell apart; agents
+differ by marker as well. Text is drawn as outlines of matplotlib's own font, so that the same
+records give the same bytes on every machine.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ RC: dict[str, Any] = {
     "path.simplify": False,
 }
 SHEETS: Any = ["default", RC]
-"""Starts from matplotlib's own defaults: a matplotlibrc of the user's would change the bytes."""
+"""matplotlib's own defaults first, because a user's matplotlibrc would change the bytes."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Drawing:
 
 
 def render_figures(summary: Summary, findings: Findings) -> list[Drawing]:
-    """All figures in the order of the page; those without anything to show are left out."""
+    """All figures in the order of the page; figures without data are left out."""
     drawings = []
     places: dict[tuple[str, str], list[Table]] = {}
     for table in summary.tables:
@@ -173,7 +173,7 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
     ]
     low, high = [band.low for band in bands], [band.high for band in bands]
     if len(steps) == 1 and row.is_reference:
-        # From where the search ended; those that search nothing are there from the start.
+        # From where the search ended; a reference without a search starts at 0.
         start = min(row.search_steps or 0, budget)
         value = bands[0].value
         ax.hlines(value, start, budget, color=color, linestyle=line, linewidth=1.4, zorder=1.5)
@@ -363,7 +363,7 @@ def _draw_line(ax: Axes, line: Line, color: str, right: float) -> None:
 def performance_profiles(found: Comparisons) -> Figure:
     """Share of runs that close at least a share of the gap to certain success, with 95 % bands."""
     groups = [group for group, profiles in found.profiles.items() if profiles]
-    figure, axes = _side_by_side(groups, found.cells, 3.3, sharey=True)
+    figure, axes = _side_by_side(groups, found.cells, 3.3)
     handles: dict[str, Line2D | Patch] = {}
     for ax, group in zip(axes, groups, strict=True):
         ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
@@ -389,7 +389,7 @@ def performance_profiles(found: Comparisons) -> Figure:
 
 
 def _start(profiles: Sequence[Profile]) -> float:
-    """Left end of the axis: where the first run falls out, but at most a little left of 0."""
+    """Left end of the axis: a little left of 0, or of the largest share that all runs reach."""
     all_in = np.min([profile.share for profile in profiles], axis=0) == 1
     return float(min(THRESHOLDS[all_in].max(initial=THRESHOLDS[0]), 0.0) - 0.03)
 
@@ -402,7 +402,7 @@ def improvement_chart(found: Comparisons) -> Figure:
     """P(X > Y) of every pair of learning agents with its 95 % interval; 0.5 is no difference."""
     groups = [group for group, pairs in found.improvements.items() if pairs]
     rows = list(dict.fromkeys((p.first, p.second) for g in groups for p in found.improvements[g]))
-    figure, axes = _side_by_side(groups, found.cells, 1.1 + 0.3 * len(rows), sharey=True)
+    figure, axes = _side_by_side(groups, found.cells, 1.1 + 0.3 * len(rows))
     for ax, group in zip(axes, groups, strict=True):
         ax.axvline(0.5, color="#333333", linewidth=0.9, zorder=1)
         for pair in found.improvements[group]:
@@ -422,11 +422,11 @@ def improvement_chart(found: Comparisons) -> Figure:
 
 
 def _side_by_side(
-    groups: Sequence[str], cells: Mapping[str, int], height: float, sharey: bool
+    groups: Sequence[str], cells: Mapping[str, int], height: float
 ) -> tuple[Figure, list[Axes]]:
     """One panel for each group of cells."""
     figure = Figure(figsize=(9.0 if len(groups) > 1 else 5.6, height), layout="constrained")
-    axes = list(figure.subplots(1, len(groups), squeeze=False, sharey=sharey).flat)
+    axes = list(figure.subplots(1, len(groups), squeeze=False, sharey=True).flat)
     for ax, group in zip(axes, groups, strict=True):
         plural = "s" if cells[group] > 1 else ""
         ax.set_title(f"{group} symmetry, {cells[group]} cell{plural}")

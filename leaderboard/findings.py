@@ -22,7 +22,7 @@ class Findings:
 
 
 def analyse(summary: Summary, audit: Audit) -> Findings:
-    """Compute all findings; pure and seeded."""
+    """Compute all findings; the same summary and audit give the same numbers."""
     found = defect_map(summary, audit)
     tests = claims(summary, audit, found)
     return Findings(found, compare_agents(summary), tests, fingerprint(audit))

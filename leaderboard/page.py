@@ -40,44 +40,44 @@ Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
 """By place, (task, embodiment) or () for all of them, then by kind: description and address."""
 
 READING = f"""\
-Each agent steers a frozen diffusion policy by choosing the noise that it starts from. Three
-references do not learn: `base` draws the noise at random, `zero` sets it to 0, `golden-ticket` is
-the best constant noise that a search has found. They are never ranked, and a learner is worth its
-steps where it beats the best of them. All agents of a table share the task, the demonstrations,
-the budget and the held-out episodes that score them.
+Each agent steers a frozen diffusion policy by choosing the noise that it starts from. References
+are what learners are compared with, and are never ranked: `base` draws the noise at random, `zero`
+sets it to 0, `golden-ticket` is the best constant noise that a search found. Learning is worth its
+steps where a learner beats the best reference. All agents of a table share the task, the
+demonstrations, the budget and the held-out episodes.
 
 - **Success** is `success_once` in the final window: all held-out evaluations in the last fifth of
   the budget, their episodes pooled (a reference is evaluated once). Shown are the interquartile
   mean (IQM) over seeds and its 95 % interval, from a bootstrap over seeds and over episodes: all
   runs are scored on the same initial states, so an episode is drawn for all of them at once. With
   fewer than 4 seeds the IQM is the plain mean; with one seed the interval covers its episodes
-  only. No interval covers the training of other base policies. **Last checkpoint** is the same of
-  the final evaluation alone. No number is ever the best of several evaluations. Below each table
-  stands how much success changed *from the fourth to the last fifth of the budget*: an agent with ▲
-  there was still rising, and more steps may change its place.
+  only. No interval covers the training of other base policies. **Last checkpoint** is the same for
+  the final evaluation alone. No number is the best of several evaluations. Below each table is the
+  change of success *from the fourth to the last fifth of the budget*: an agent with ▲ there was
+  still improving, and more steps may change its place.
 - **Against base** is the mean difference (not the IQM's) to the base policy on the same episodes
-  and seeds, with its 95 % interval. ▲ or ▼ marks an interval that excludes 0; without a mark, the
+  and seeds, with its 95 % interval. ▲ or ▼ marks an interval that excludes 0; without a mark the
   data do not decide.
-- **Rank** is 1 + the number of agents that are clearly better, by the same paired differences; "="
-  marks a tie. It takes {MIN_SEEDS} finished seeds in common; agents with fewer are shown without a
-  rank.
+- **Rank** is 1 + the number of learners that are clearly better, by the same paired differences;
+  "=" marks a tie. It needs {MIN_SEEDS} finished seeds in common; agents with fewer,
+  references and controls have no rank.
 - **AUC** is the area under the success curve as a share of the budget's maximum: how good the
   agent was on average while it learned. **Steps** is the median number of environment steps after
-  which the success stays at {100 * THRESHOLD:.0f} % of the best learning agent's or above, and how
-  many seeds got there; `>` means that the median seed did not within the budget. **Dip** is the
-  deepest fall below the base policy at any evaluation of any seed.
+  which success stays at or above {100 * THRESHOLD:.0f} % of the best learner's, and how many seeds
+  reached that; `>` means that the median seed did not reach it within the budget. **Dip** is the
+  lowest value below the base policy at any evaluation of any seed.
 - **Q diverged** († at a glance) counts the seeds whose Q-values left the range of returns that the
   reward allows (more than {100 * DIVERGED_SHARE:.0f} % of the states at {DIVERGED_EVALUATIONS}
   evaluations in a row, once learning has begun) or were not finite.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
-  **Status**. Below the count of seeds and episodes stand the seeds; they lead to the records.
+  **Status**. The seeds below the number of seeds and episodes are links to the records.
 """
 
 CURVES = (
     "Thick lines are the IQM (success) or the mean (Q) over seeds, bands the 95 % interval of the "
-    "IQM, thin lines single seeds, dotted ones with a cross unfinished runs; references are "
-    "horizontal, from the step on at which their search ended. The green area holds the returns "
-    "that the reward allows; a cross there ends a run whose Q was not finite."
+    "IQM, thin lines single seeds, dotted lines with a cross unfinished runs. References are "
+    "horizontal lines that start where their search ended. The green area shows the returns that "
+    "the reward allows; a cross there ends a run whose Q was not finite."
 )
 
 CLAIMS = f"""\
@@ -85,34 +85,34 @@ The paper is arXiv 2512.11345. A claim is *supported* where the 95 % interval of
 the side of 0 that the claim predicts, *contradicted* where it lies on the other side, and
 otherwise *undecided*. Differences are paired by seed (success and its area by episode, too) and
 averaged over cells; shares of diverged runs are pooled over cells, with Newcombe's interval. Only
-cells with {MIN_SEEDS} paired seeds count, and at least one is needed. Nothing is corrected for the
-number of tests: of tests without any effect, up to one in twenty would still exclude 0. *Defect*
-is the audited one (next section): cells up to {NEARLY_SYMMETRIC:g} count as symmetric, from
-{STRONGLY_BROKEN:g} on as strongly broken.
+cells with {MIN_SEEDS} paired seeds count, and at least one is needed. There is no correction for
+the number of tests: where there is no effect, up to one interval in twenty still excludes 0.
+*Defect* is the audited defect (next section): cells up to {NEARLY_SYMMETRIC:g} count as symmetric,
+from {STRONGLY_BROKEN:g} on as strongly broken.
 """
 
 MAP = f"""\
 Each point is a cell: the advantage over `{STANDARD}`, paired by seed, against the *audited
-defect*, which is measured in simulation and not read off a dial: the largest of the defects of
-dynamics (share of a step's own displacement), reward and observation. Bars are 95 % intervals;
-hollow points have fewer than {MIN_SEEDS} paired seeds and do not enter the line, which needs
-{MIN_CELLS} cells. The line's band, slope and crossing come from drawing seeds and episodes within
-the cells, defects within their intervals, and the scatter of the cells about the line that these
-do not explain.
+defect*. The defect is measured in simulation: it is the largest of the defects of dynamics (as a
+share of a step's own displacement), reward and observation. Bars are 95 % intervals; hollow points
+have fewer than {MIN_SEEDS} paired seeds and are not used for the line, which needs {MIN_CELLS}
+cells. The intervals of line, slope and crossing come from drawing seeds and episodes within the
+cells, defects within their intervals, and the scatter of the cells about the line that these do
+not explain.
 """
 
 PROFILES = (
     "Performance profiles: the share of runs that close at least the given share of the gap "
     "between the frozen base (0, on the same episodes) and certain success (1), in the final "
-    "window. Higher is better; left of 0, steering does harm. Bands are 95 %, from drawing runs "
+    "window. Higher is better; left of 0 steering does harm. Bands are 95 %, from drawing runs "
     "within each cell."
 )
 IMPROVEMENT = (
     "Probability of improvement: how likely a run of X beats a run of Y in the same cell (ties "
     "count half), mean over cells, with 95 % intervals from drawing runs within each cell; runs on "
     "base policies that only one of the two steered are left out. "
-    "Where every run of one beats every run of the other, the interval has no width: with few runs "
-    "that claims too much."
+    "Where every run of one beats every run of the other, the interval has no width, which is too "
+    "narrow for few runs."
 )
 
 
@@ -149,15 +149,15 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
 
 
 def _seed_notice(summary: Summary) -> str:
-    learning = [row for table in summary.tables for row in table.rows if not row.is_reference]
-    few = [row for row in learning if len(row.finished) < MIN_SEEDS]
+    ranked = [row for table in summary.tables for row in table.rows if row.role == "learner"]
+    few = [row for row in ranked if len(row.finished) < MIN_SEEDS]
     if not few:
         return ""
-    which = "No agent here has" if len(few) == len(learning) else "Not every agent here has"
+    which = "No agent here has" if len(few) == len(ranked) else "Not every agent here has"
     return (
         f"> **Not ranked.** {which} the {MIN_SEEDS} finished seeds that a ranking needs. Agents "
-        "with fewer are shown in a fixed order; read the intervals, and treat differences between "
-        "agents as leads, not as results."
+        "with fewer are shown in a fixed order. Read the intervals: differences between agents are "
+        "hints, not results."
     )
 
 
@@ -207,7 +207,7 @@ def _claims(found: Sequence[Claim]) -> str:
         if claim.reason:
             verdict += f": {claim.reason}"
         elif claim.verdict == "undecided":
-            verdict += ": the interval holds 0"
+            verdict += ": the interval contains 0"
         seeds = f"{claim.cells}, {claim.seeds}" if claim.cells else NOTHING
         rows.append([claim.name, claim.test, effect, seeds, verdict])
     header = ["Claim", "Test", "Effect, 95 % interval", "Cells, paired seeds", "Verdict"]
@@ -295,7 +295,7 @@ def _excluded(crossing: Crossing) -> str:
         return f"; at 95 % it does not lie below {number(crossing.low)}"
     if np.isfinite(crossing.high):
         return f"; at 95 % it does not lie beyond {number(crossing.high)}"
-    return "; the data leave open where"
+    return "; the data do not say where"
 
 
 def _map_numbers(summary: Summary, found: DefectMap) -> str:

@@ -1,4 +1,4 @@
-"""Which record files the paths of a command line mean."""
+"""Where the committed leaderboard is, and which record files the paths of a command line mean."""
 
 from __future__ import annotations
 
@@ -9,6 +9,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from symsteer.errors import UserError
+
+PAGE_FOLDER = Path(__file__).resolve().parent
+"""The folder of the committed leaderboard, in a checkout of the repository."""
+
+RECORDS = PAGE_FOLDER / "results" / "records"
+"""The committed records; an installed package has none."""
 
 RECORD = "record.json"
 """The record's name in a run folder; committed records are called by their run_id."""

@@ -20,12 +20,6 @@ from symsteer.leaderboard.tables import render_csv
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
 
-PAGE_FOLDER = Path(__file__).resolve().parent
-"""The folder of the committed leaderboard, in a checkout of the repository."""
-
-RECORDS = PAGE_FOLDER / "results" / "records"
-"""The committed records; an installed package has none."""
-
 FIGURE_NAME = re.compile(r"(map|profiles|improvement|(success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
 
 
@@ -46,8 +40,8 @@ def generate(records: Sequence[Path], out: Path, audit: Path | None = None) -> l
         UserError: for bad records, a full disk or a folder that cannot be written; `out` is then
             as it was (`write_together`).
     """
-    out = _folder(out)
-    files = render(load_runs(records), out, read_audit(audit))
+    runs, out = load_runs(records), _folder(out)
+    files = render(runs, out, read_audit(audit))
     if (out / "figures").is_symlink():
         raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it.")
     stale = [out / name for name in _stale(out, files)]
@@ -60,8 +54,7 @@ def verify(records: Sequence[Path], out: Path, audit: Path | None = None) -> Ver
 
     Arguments and errors are those of `generate`.
     """
-    out = _folder(out)
-    runs = load_runs(records)
+    runs, out = load_runs(records), _folder(out)
     files = render(runs, out, read_audit(audit))
     found = differences(files, _stale(out, files), out)
     return Verification(len(runs), len(files), found)

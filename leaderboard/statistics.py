@@ -20,7 +20,7 @@ from scipy.integrate import trapezoid
 CONFIDENCE = 0.95
 RESAMPLES = 5000
 _EPISODES = 1
-"""Keeps the stream of episode weights apart from other generators with small seeds."""
+"""Separates the stream of episode weights from other generators with small seeds."""
 
 Array = NDArray[np.float64]
 Key = TypeVar("Key", bound=Hashable)
@@ -58,10 +58,8 @@ class Block:
 
     def draw(self, resamples: int) -> Array:
         """The value under each resample's weights of episodes: [resamples]."""
-        weights = np.stack([episode_weights(seed, resamples) for seed in self.seeds])
-        # Not `@`: matrix products would start threads for these small sums.
-        totals = (weights * self.totals[:, None]).sum(axis=0)
-        return totals / (weights * self.counts[:, None]).sum(axis=0)
+        totals = _weighted_sum(self.seeds, tuple(self.totals), resamples)
+        return totals / _weighted_counts(self.seeds, tuple(self.counts), resamples)
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ class Sample:
 
     @classmethod
     def constant(cls, value: float) -> Self:
-        """A number of the run as a whole, which no draw of episodes changes."""
+        """One number for the whole run, equal in every resample."""
         return cls.pooled([(0, value)])
 
     @cached_property
@@ -107,13 +105,28 @@ class Sample:
 def episode_weights(seed: int, resamples: int) -> Array:
     """How much the episode with this seed weighs in each resample: exponential draws of mean 1.
 
-    A function of the seed alone, so that all runs, evaluations and cells weigh an episode alike:
-    agents are scored on the same initial states, and a hard one is hard for all of them. Weights
-    in place of counts (the Bayesian bootstrap, Rubin 1981) never leave a block empty.
+    They depend on the seed only, so that an episode has the same weight in all runs, evaluations
+    and cells: agents are scored on the same initial states, and a hard one is hard for all of them.
+    With weights instead of counts (the Bayesian bootstrap, Rubin 1981) no block is ever empty.
     """
     weights = np.random.default_rng([_EPISODES, seed]).exponential(size=resamples)
     weights.flags.writeable = False
     return weights
+
+
+@lru_cache(maxsize=4)
+def _stacked_weights(seeds: tuple[int, ...], resamples: int) -> Array:
+    """`episode_weights` of several episodes: [seeds, resamples]."""
+    return np.stack([episode_weights(seed, resamples) for seed in seeds])
+
+
+def _weighted_sum(seeds: tuple[int, ...], values: tuple[float, ...], resamples: int) -> Array:
+    # Not `@`: matrix products would start threads for these small sums.
+    return (_stacked_weights(seeds, resamples) * np.array(values)[:, None]).sum(axis=0)
+
+
+_weighted_counts = lru_cache(maxsize=64)(_weighted_sum)
+"""The same, kept: most blocks of a leaderboard have equal episodes and counts."""
 
 
 def iqm(values: Sequence[float] | Array, axis: int = -1) -> Array:
@@ -335,8 +348,8 @@ def steps_to_threshold(
     """Steps of the evaluation from which on all are at or above `threshold`; None (censored) if
     the last one is below.
 
-    Not of the first one above it: an untrained actor steers with about zero noise, which often is
-    good; what counts is when the agent has got over what learning does to that.
+    The first evaluation above it does not count: an untrained actor steers with about zero noise,
+    which is often good until learning makes it worse for a while.
     """
     reached = None
     for step, value in zip(steps, values, strict=True):

@@ -38,18 +38,18 @@ from symsteer.leaderboard.statistics import (
 )
 
 SYMMETRIC_EMBODIMENT = "floating"
-"""The embodiment whose states turn with the world; any other one has an arm."""
+"""The embodiment without an arm: its states rotate with the world."""
 
 ARM = "arm kinematics"
 
 MIN_SEEDS = 5
-"""Finished runs, or pairs of them, that a rank and a verdict need."""
+"""Finished runs, or pairs of runs, that a rank and a verdict need."""
 
 FINAL_WINDOW = 5
 """The final window is the last fifth of the budget."""
 
 THRESHOLD = 0.8
-"""Steps are counted to this share of the best agent's final success."""
+"""Steps are counted until this share of the best learner's final success."""
 
 SAME_POINT = 0.01
 """Evaluations of two runs at most this share of the budget apart belong together: a run is
@@ -116,8 +116,8 @@ class Run:
     def window(self) -> dict[tuple[int, int], float]:
         """success_once in the final window by (env_steps, episode seed); empty before the end.
 
-        These are all evaluations in the last fifth of the budget; a reference has its one final
-        evaluation, wherever it stands.
+        These are all evaluations in the last fifth of the budget; of a reference it is the one
+        final evaluation, at any step.
         """
         final = self.record.final
         if final is None:
@@ -352,7 +352,7 @@ class Summary:
 
     tables: list[Table]
     set_aside: list[Run]
-    """Older or unfinished records of a cell that a better record covers."""
+    """Older or unfinished records of a configuration and seed that has a better record."""
 
     @property
     def runs(self) -> list[Run]:
@@ -422,7 +422,7 @@ def summarize(runs: Sequence[Run]) -> Summary:
 
 
 def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
-    """Keep, for each cell, the finished record, the newest of several; set the others aside."""
+    """Keep the newest finished record of each configuration and seed; set the others aside."""
     cells: dict[tuple[Key, str, str, str], list[Run]] = defaultdict(list)
     for run in runs:
         record = run.record

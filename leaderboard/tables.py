@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from symsteer.leaderboard.paper import BASE
+from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import ARM, THRESHOLD, Key, Row, Summary, Table
 from symsteer.leaderboard.text import (
     MARKS,
@@ -223,7 +224,7 @@ def _diagnostics(table: Table) -> list[str]:
 
 
 def _largest_header(table: Table) -> str:
-    """The feasible bound stands in the header, so that every row can be read against it."""
+    """The header holds the feasible bounds, so that every row can be compared with them."""
     text = "Largest \\|Q\\|, highest Q"
     if table.feasible:
         text += f" (feasible Q: {compact(table.feasible[0])} to {compact(table.feasible[1])})"
@@ -291,11 +292,10 @@ def render_csv(summary: Summary) -> str:
 
 
 def _csv_row(table: Table, row: Row) -> dict[str, object]:
-    key, success, base, best = table.key, row.success, row.difference, row.against_best
+    key, success, feasible = table.key, row.success, table.feasible
     statuses = [run.record.status for run in row.runs]
     sizes = row.runs[0].record.parameters if row.runs else None
     wall = [run.record.wall_clock.total for run in row.finished]
-    feasible = table.feasible
     return {
         "task": key.task,
         "embodiment": key.embodiment,
@@ -315,19 +315,11 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
         "success_iqm": success and success.value,
         "success_low": success and success.low,
         "success_high": success and success.high,
-        "last_checkpoint": row.last and row.last.value,
-        "last_checkpoint_low": row.last and row.last.low,
-        "last_checkpoint_high": row.last and row.last.high,
-        "against_base": base and base.value,
-        "against_base_low": base and base.low,
-        "against_base_high": base and base.high,
+        **_ends("last_checkpoint", row.last),
+        **_ends("against_base", row.difference),
         "best_reference": table.best_reference and table.best_reference.label,
-        "against_best": best and best.value,
-        "against_best_low": best and best.low,
-        "against_best_high": best and best.high,
-        "rise": row.rise and row.rise.value,
-        "rise_low": row.rise and row.rise.low,
-        "rise_high": row.rise and row.rise.high,
+        **_ends("against_best", row.against_best),
+        **_ends("rise", row.rise),
         "auc": row.area,
         "threshold": table.threshold,
         "threshold_steps": row.median_threshold_steps,
@@ -349,12 +341,18 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
     }
 
 
+def _ends(name: str, found: Interval | None) -> dict[str, object]:
+    """A column each for a value and the ends of its interval."""
+    ends = (found.value, found.low, found.high) if found else (None, None, None)
+    return dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
+
+
 def _csv_cell(value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, float):
         return f"{value:.6g}"
     text = str(value)
-    # A spreadsheet would run a text that starts like a formula, also behind blanks.
+    # A spreadsheet runs a text that starts like a formula, even after blanks.
     formula = isinstance(value, str) and text.lstrip()[:1] in ("=", "+", "-", "@")
     return f"'{text}" if formula else text

@@ -1,7 +1,7 @@
 """How the page writes texts, numbers, intervals, links and tables.
 
-Text that comes from a record is only ever shown inside code spans, stripped of what could end one
-(`code`), so that no record can inject markup, and is never used as a path or a link.
+Text from a record is shown only inside code spans, without the characters that could end one
+(`code`), so that no record can inject markup. It is never used as a path or a link.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MARKS = {1: " \u25b2", 0: "", -1: " \u25bc"}
 
 
 def code(text: str, limit: int = 300) -> str:
-    """Show text from a record as a code span that it cannot leave, on one line, in a table cell."""
+    """Text from a record as a code span on one line, safe inside a table."""
     allowed = "".join(c if c.isprintable() else " " for c in text)
     for bad, good in (("`", "'"), ("|", "¦"), ("\\", "/")):
         allowed = allowed.replace(bad, good)
@@ -89,7 +89,7 @@ def stacked(value: Interval | None, sign: bool = False, marks: str = "") -> str:
 
 
 def relative_link(path: Path, folder: Path) -> str | None:
-    """URL of `path` relative to `folder`; None where it would spell out folders of this machine."""
+    """URL of `path` relative to `folder`; None where it would name folders of this machine."""
     relative = Path(os.path.relpath(path, folder))
     if relative.is_absolute() or relative.parts[:3] == ("..", "..", ".."):
         return None

@@ -185,6 +185,11 @@ class ChunkPolicy(nn.Module, abc.ABC):
         return self.options.execute
 
     @property
+    def device(self) -> torch.device:
+        """Where the policy is."""
+        return self.act_normalizer.scale.device
+
+    @property
     def noise_layout(self) -> Layout:
         """Geometry of one flattened noise chunk, ``[Tp * act_dim]``."""
         return self.act_layout.repeat(self.horizon)

@@ -23,6 +23,17 @@ VERSION = 3
 READABLE = ("1", "2", "3")
 FILE_NAME = "policy.safetensors"
 
+DAMAGE = (
+    AttributeError,
+    KeyError,
+    RuntimeError,
+    StopIteration,
+    TypeError,
+    UserError,
+    ValueError,
+)
+"""What a description or tensors of the wrong form raise while a policy is built from them."""
+
 
 def policy_path(folder_or_path: str | Path) -> Path:
     """The policy file meant by a path: itself, or ``policy.safetensors`` in a folder."""
@@ -133,7 +144,7 @@ def load_policy(
         policy.report = description["report"]
     except NotInstalledError:
         raise
-    except (KeyError, TypeError, ValueError, RuntimeError, StopIteration, UserError) as error:
+    except DAMAGE as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"{path} is a damaged SymSteer policy ({reason}); train it again"

@@ -34,12 +34,12 @@ Slice: TypeAlias = slice
 
 @dataclass(frozen=True)
 class Field:
-    """A named run of equal irrep blocks in a vector.
+    """A named part of a vector: equal irrep blocks side by side.
 
     Args:
         name: unique within its layout.
         frequency: 0 for scalars (one number each), k >= 1 for pairs that turn by ``k * angle``.
-        multiplicity: how many blocks stand side by side.
+        multiplicity: number of blocks.
         odd: whether the blocks change sign under reflections in addition.
     """
 
@@ -124,7 +124,7 @@ class Layout:
         return torch.repeat_interleave(torch.arange(len(self.blocks)), sizes)
 
     def invariant_mask(self, reflections: bool = False) -> torch.Tensor:
-        """Which numbers no rotation (and no reflection, if asked) changes, ``[dim]`` bool."""
+        """Which numbers are invariant under rotations (and reflections), ``[dim]`` bool."""
         return torch.cat(
             [
                 torch.full((f.dim,), f.frequency == 0 and not (reflections and f.odd))

@@ -1,9 +1,8 @@
-"""Statistics that bring data to unit size, and bounds, both commuting with planar symmetries.
+"""Normalisation to unit size and bounds; both commute with planar symmetries.
 
 Per-dimension min-max statistics break rotation equivariance: the two components of a horizontal
-vector get different scales and offsets. Here scalars are brought to [-1, 1] one by one, while
-every irrep block of frequency >= 1 has one scale and no offset, and bounds act on the norm of
-each block.
+vector get different scales and offsets. Here each scalar is scaled to [-1, 1], each irrep
+block of frequency >= 1 has one scale and no offset, and bounds act on the norm of each block.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from symsteer.policies.geometry import Layout
 
 MINIMUM_RANGE = 1e-2
 """Half-ranges below this count as constant (1 cm, or 0.6 degrees in a rotation column): dividing
-by them would blow simulation noise up to unit size."""
+by them would scale simulation noise up to unit size."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -35,7 +34,7 @@ def clip_blocks(x: torch.Tensor, layout: Layout, radius: float) -> torch.Tensor:
     """
     norm = ((x * x) @ _same_block(layout, x.dtype, x.device)).sqrt()
     shortened = x * (radius / norm.clamp_min(radius))
-    # Rounding may leave a component a few ulps outside; nothing else is touched here.
+    # Only for components that rounding left a few ulps outside.
     return shortened.clamp(-radius, radius)
 
 
@@ -45,7 +44,7 @@ class Normalizer(nn.Module):
     Args:
         layout: geometry of the vectors.
         scale: ``[dim]``, positive, equal within each block of frequency >= 1.
-        offset: ``[dim]``, zero except for scalars that reflections leave alone.
+        offset: ``[dim]``, zero except for scalars that are invariant under reflections.
         deviation: ``[dim]``, how much the data vary, data units; see :meth:`fit`.
 
     The state dict holds ``scale``, ``offset`` and ``deviation``.
@@ -76,10 +75,10 @@ class Normalizer(nn.Module):
 
         Scalars: the middle and half the range between minimum and maximum. Odd scalars (they
         change sign under reflections): the largest magnitude, no offset. Vectors: the largest
-        norm, no offset. What varies by less than ``MINIMUM_RANGE`` keeps scale 1.
+        norm, no offset. A range below ``MINIMUM_RANGE`` gives scale 1.
 
         ``deviation`` is the standard deviation of a scalar, and of a vector the root mean square
-        of its components about zero: the value over all rotations of the data.
+        of its components about zero: the standard deviation over all rotations of the data.
 
         Raises:
             UserError: if the data are empty, not finite or of another width.
@@ -95,7 +94,7 @@ class Normalizer(nn.Module):
         low, high = data.min(dim=0).values, data.max(dim=0).values
         squares = (data * data) @ _same_block(layout, data.dtype, data.device)
         radius = squares.max(dim=0).values.sqrt()
-        # What reflections leave alone may have an offset; everything else is fixed at zero.
+        # An offset would break the symmetry of everything that is not invariant.
         shiftable = layout.invariant_mask(reflections=True).to(data.device)
         offset = torch.where(shiftable, (low + high) / 2, 0.0)
         scale = torch.where(shiftable, (high - low) / 2, radius)

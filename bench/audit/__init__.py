@@ -1,21 +1,21 @@
-"""How broken is the symmetry of a task, measured in simulation; docs/audit.md has the definitions.
+"""How broken the symmetry of a task is, measured in simulation; docs/audit.md has the definitions.
 
-- :func:`run_cells`: defects of dynamics, reward, observation and resets over a group, for any
-  number of :class:`Settings`; each gives a :class:`Cell`. `symsteer audit` is its command line.
+- :func:`run_audits`: defects of dynamics, reward, observation and resets, one :class:`AuditResult`
+  for each :class:`AuditSettings`. `symsteer audit` is its command line.
 - :func:`rotated_rollout_error`: whole episodes and their turned copies.
 """
 
-from symsteer.bench.audit.cell import Cell, Defect, Settings
 from symsteer.bench.audit.estimates import Estimate
+from symsteer.bench.audit.result import AuditResult, AuditSettings, Defect
 from symsteer.bench.audit.rollout import RolloutError, rotated_rollout_error
-from symsteer.bench.audit.study import run_cells
+from symsteer.bench.audit.study import run_audits
 
 __all__ = [
-    "Cell",
+    "AuditResult",
+    "AuditSettings",
     "Defect",
     "Estimate",
     "RolloutError",
-    "Settings",
     "rotated_rollout_error",
-    "run_cells",
+    "run_audits",
 ]

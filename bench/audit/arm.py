@@ -1,8 +1,8 @@
-"""Turned states of an arm whose base stands still, by inverse kinematics.
+"""Turned states of an arm with a fixed base, by inverse kinematics.
 
-The tool's pose is turned, and joint angles that reach it are searched for; the arm itself cannot
-turn, so its elbow is elsewhere than the turned elbow would be. That is the break of symmetry that
-the audit measures, apart from tool poses that no joint angles reach.
+The tool's pose is turned, and joint angles that reach it are searched. The base cannot turn, so
+the elbow is not where the turned elbow would be: this breaks the symmetry, and the audit measures
+it. Some turned poses have no solution.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from symsteer.bench.tasks.base import SymmetricTask
 ITERATIONS = 60
 DAMPING = 0.02
 LARGEST_STEP = 0.3
-"""Of a joint in one iteration, radians."""
+"""Largest step of a joint in one iteration, radians."""
 POSITION_TOLERANCE, ANGLE_TOLERANCE = 1e-5, 1e-4
-"""A pose is reached within these, metres and radians."""
+"""Tolerances of a reached pose, metres and radians."""
 SPREAD = 0.35
-"""Standard deviation of the random starts about the others, radians."""
+"""Standard deviation of the random starts around the other two, radians."""
 RANDOM_STARTS = 4
 
 
 class ArmTurner:
-    """Finds joint states of a Panda whose tool is the turned tool of given joint states.
+    """Finds joint states of a Panda that turn its tool.
 
     Damped least squares from several starts: the state's own joints and ManiSkill's rest pose,
-    both with base joint and wrist set to the turned bearing and yaw, and random ones about them.
-    Of the solutions within the joint limits, the one whose first six joints are closest to the
-    state's own is taken: a turn should change the arm as little as it can.
+    both with base joint and wrist set to the turned bearing and yaw, and random ones around them.
+    Among solutions within the joint limits, the one whose first six joints are closest to the
+    original is chosen, so that the arm changes as little as possible.
 
     Args:
         env: a task with the ``panda`` embodiment.
@@ -45,7 +45,7 @@ class ArmTurner:
 
     def __init__(self, env: SymmetricTask) -> None:
         urdf = Path(env.agent.urdf_path).read_bytes()
-        # The URDF has attributes that its parser reports one by one.
+        # The parser prints a line for each attribute of the URDF that it does not know.
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             chain = pk.build_serial_chain_from_urdf(urdf, end_link_name=env.agent.tcp.name)
             self.chain = chain.to(dtype=torch.float64)
@@ -61,20 +61,20 @@ class ArmTurner:
     def turn(
         self, state: torch.Tensor, angle: float, reflect: bool, offset: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Turn articulation states ``[S, 13 + 2 dof]`` about the world's origin, then shift them.
+        """Turn articulation states about the world's origin, then shift them.
 
-        The tool's velocity is turned as well; joint velocities are the smallest that give it.
-        Fingers are copied (a mirror image swaps them).
+        The tool's velocity is turned too; the joint velocities are the smallest that give it.
+        Finger joints are copied (a reflection swaps them).
 
         Args:
-            state: articulation states.
+            state: articulation states, ``[S, 13 + 2 dof]``.
             angle: rotation, radians.
             reflect: whether the reflection of y comes first.
             offset: shift, ``[S, 2]`` metres.
 
         Returns:
-            The states, and which of them are reachable ``[S]`` bool; rows that are not are copies
-            of the original.
+            The states, and which of them are reachable, ``[S]`` bool; unreachable rows are the
+            original ones.
         """
         n, dof = self.joints, (state.shape[1] - 13) // 2
         joints, rates = state[:, 13 : 13 + dof].double(), state[:, 13 + dof :].double()
@@ -114,7 +114,7 @@ class ArmTurner:
         angle: float,
         reflect: bool,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Joint angles that reach tool poses in the base's frame.
+        """Find joint angles that reach tool poses in the base's frame.
 
         Args:
             target: positions ``[S, 3]``.
@@ -145,7 +145,7 @@ class ArmTurner:
     def _starts(
         self, target: torch.Tensor, near: torch.Tensor, angle: float, reflect: bool
     ) -> torch.Tensor:
-        """``[starts, S, 7]``."""
+        """Initial joint angles, ``[starts, S, 7]``."""
         bearing = torch.atan2(target[:, 1], target[:, 0])
         before, _ = self._tool(near)
         swing = bearing - torch.atan2(before[:, 1], before[:, 0])
@@ -154,11 +154,11 @@ class ArmTurner:
         for origin in (near, self.rest.expand_as(near)):
             guess = origin.clone()
             if reflect:
-                # The arm's own mirror image: every joint that turns out of its plane, reversed.
+                # The mirror image of the arm: joints that turn out of its plane change sign.
                 guess[:, ::2] *= -1
             base = bearing if origin is not near else guess[:, 0] + swing
-            # Seen from above the last joint runs against the tool's yaw; with base joint and wrist
-            # at 0 the fingers stand at an eighth of a turn.
+            # The last joint turns against the tool's yaw; with base joint and wrist at 0 the yaw
+            # of the fingers is an eighth of a turn.
             yaw = near[:, 0] - near[:, 6] + math.pi / 4
             yaw = (-yaw if reflect else yaw) + angle
             guess[:, 0], guess[:, 6] = base, wrap(base + math.pi / 4 - yaw, 2 * math.pi)
@@ -170,7 +170,7 @@ class ArmTurner:
 
     def _improve(self, q: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
         jacobian = self._jacobian(q)
-        # Damping fades with the error, so that the last iterations are plain Newton steps.
+        # Damping decreases with the error, so the last iterations are Newton steps.
         damping = DAMPING * error.norm(dim=1).clamp(max=1.0)
         square = jacobian @ jacobian.transpose(1, 2)
         square = square + (damping**2 + 1e-12)[:, None, None] * torch.eye(6, dtype=q.dtype)
@@ -197,7 +197,7 @@ class ArmTurner:
         return matrix[:, :3, 3], matrix[:, :3, :3]
 
     def _jacobian(self, q: torch.Tensor) -> torch.Tensor:
-        # Single precision is enough for a direction; the error is computed in double precision.
+        # Single precision is enough for the step; the error is computed in double precision.
         return self.fast.jacobian(q.float()).double()
 
 
@@ -214,5 +214,5 @@ def _rotation_vector(matrix: torch.Tensor) -> torch.Tensor:
     sine = axis.norm(dim=1) / 2
     cosine = (matrix.diagonal(dim1=1, dim2=2).sum(dim=1) - 1) / 2
     angle = torch.atan2(sine, cosine)
-    # Half a turn has a vanishing antisymmetric part; any step away from it will do there.
+    # At half a turn the antisymmetric part is zero, and any small step leads away from it.
     return axis / (2 * sine).clamp_min(1e-12)[:, None] * angle[:, None]

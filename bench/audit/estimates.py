@@ -1,13 +1,13 @@
 """Estimators of the audit: bootstrap intervals, energy distance, distance of Gaussians.
 
-All are pure functions of numbers and a seed. Resampled are always whole states (one per episode) or
-whole resets, never single numbers of one state.
+All are pure functions of numbers and a seed. Resampling draws whole states (one per episode) or
+whole resets, never single numbers of a state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,30 +29,26 @@ class Estimate:
     low: float
     high: float
 
-    def to_json(self) -> dict[str, float]:
-        """Plain data."""
-        return asdict(self)
-
 
 def mean(values: Array, axis: int = -1) -> Array:
-    """The mean over states."""
+    """Mean over states."""
     return values.mean(axis=axis)
 
 
 def ratio(part: Array, whole: Array, axis: int = -1) -> Array:
-    """Ratio of means, nan where the denominator is zero."""
+    """Ratio of means; nan if the denominator is zero."""
     below = whole.mean(axis=axis)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(below > 0, part.mean(axis=axis) / below, np.nan)
 
 
 def root_excess(squares: Array, chance: Array, axis: int = -1) -> Array:
-    """Root of the mean of ``squares`` beyond the mean of what chance alone gives, at least 0."""
+    """Root of mean ``squares`` minus mean ``chance`` (squares due to chance alone), at least 0."""
     return np.sqrt(np.maximum(squares.mean(axis=axis) - chance.mean(axis=axis), 0.0))
 
 
 def bootstrap(statistic: Callable[..., Any], *columns: Any, seed: int) -> Estimate:
-    """``statistic`` of ``columns``, each ``[S]``, with its percentile interval over states.
+    """Compute ``statistic`` of ``columns``, each ``[S]``, with a percentile interval over states.
 
     The columns are resampled together: entry i of each belongs to state i.
 
@@ -78,12 +74,12 @@ def bootstrap(statistic: Callable[..., Any], *columns: Any, seed: int) -> Estima
 
 
 def energy_distance(x: Array, y: Array, seed: int) -> tuple[Estimate, float]:
-    """How differently two samples are distributed.
+    """Normalised energy distance of two samples.
 
-    The normalised energy distance (coefficient of inhomogeneity, Szekely and Rizzo 2013)
-    H = (2 E|X - Y| - E|X - X'| - E|Y - Y'|) / (2 E|X - Y|) lies in [0, 1] and is 0 for equal
-    distributions only. Expectations are U-statistics, so that equal distributions give 0 on average
-    and slightly negative values occur.
+    The coefficient of inhomogeneity (Szekely and Rizzo 2013)
+    H = (2 E|X - Y| - E|X - X'| - E|Y - Y'|) / (2 E|X - Y|) lies in [0, 1] and is 0 only for equal
+    distributions. Expectations are estimated by U-statistics: equal distributions give 0 on
+    average, and slightly negative values occur.
 
     Args:
         x: sample ``[n, d]``.
@@ -104,7 +100,7 @@ def energy_distance(x: Array, y: Array, seed: int) -> tuple[Estimate, float]:
         first, second = _counts(rows, n), _counts(columns, m)
         cross = ((first @ between) * second).sum(axis=-1) / (n * m)
         own = sum(
-            # Pairs of a reset with itself, also with its own repetition, say nothing.
+            # Pairs of a reset with itself do not count, also if it was drawn twice.
             ((w @ d) * w).sum(axis=-1) / (w.sum(axis=-1) ** 2 - (w**2).sum(axis=-1))
             for w, d in ((first, within_x), (second, within_y))
         )
@@ -123,7 +119,7 @@ def energy_distance(x: Array, y: Array, seed: int) -> tuple[Estimate, float]:
         method="percentile",
         rng=generator,
     ).confidence_interval
-    # Sums over a permuted first sample give all three expectations of that permutation.
+    # Sums over the permuted first sample give all three expectations of a permutation.
     labels = np.zeros((PERMUTATIONS, n + m))
     labels[:, :n] = 1
     labels = generator.permuted(labels, axis=1)
@@ -140,7 +136,7 @@ def energy_distance(x: Array, y: Array, seed: int) -> tuple[Estimate, float]:
 
 
 def _counts(index: Any, size: int) -> Array:
-    """How often each of ``size`` rows was drawn: ``[..., n]`` indices to ``[..., size]`` counts."""
+    """Number of times each row was drawn: indices ``[..., n]`` to counts ``[..., size]``."""
     index = np.asarray(index)
     flat = index.reshape(-1, index.shape[-1]).astype(np.int64)
     shifted = flat + size * np.arange(len(flat))[:, None]
@@ -149,10 +145,10 @@ def _counts(index: Any, size: int) -> Array:
 
 
 def gaussian_distance_squared(a: Array, b: Array) -> Array:
-    """Squared 2-Wasserstein distance of the Gaussians fitted to two sets of draws.
+    """Squared 2-Wasserstein distance of Gaussians fitted to two sets of draws.
 
-    |m_a - m_b|^2 + tr(C_a + C_b - 2 (C_a^(1/2) C_b C_a^(1/2))^(1/2)); for a single draw each, the
-    squared difference.
+    |m_a - m_b|^2 + tr(C_a + C_b - 2 (C_a^(1/2) C_b C_a^(1/2))^(1/2)); the squared difference for
+    a single draw each.
 
     Args:
         a: draws ``[..., K, d]``.

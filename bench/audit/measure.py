@@ -1,16 +1,16 @@
-"""Simulate every turned copy of visited states in a broken environment, and keep what came out.
+"""Simulate all turned copies of visited states in a broken environment.
 
-Copy g of state s starts in g s and executes g a. All copies of a batch start in scenes that are
-made anew, reset with the same seed and stepped equally often, so that PhysX's memory of earlier
-contacts cannot tell them apart. One more copy is the state itself, turned by one radian and back:
-it differs by rounding alone and shows what the measurement makes of nothing.
+Copy g of state s starts in g s and executes g a. All copies of a batch start in new scenes that
+were reset with the same seed and stepped equally often, so PhysX's memory of earlier contacts is
+the same for all. One more copy is the state itself, turned by one radian and back: it differs by
+rounding only and shows how small a defect can be measured.
 """
 
 from __future__ import annotations
 
 import gc
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,41 +30,43 @@ from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.variants.base import overriding
-from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 
 SCENES = 320
-"""Scenes side by side: far below ``MAX_SCENES`` of ``symsteer.bench.sim.environment``, since a
-rebuild holds the old and the new ones for a moment."""
+"""Scenes of the broken environment. Twice as many exist during a reconfiguration, and a process can
+hold at most ``symsteer.bench.sim.environment.MAX_SCENES``."""
 
 DRAWS = 24
-"""Observations of a state where the observation is random."""
+"""Observations of each state if observations are random."""
 
 Tensors = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Copies:
-    """What S states and their G copies did; the first copy is the state itself.
+    """Results of S states and their G copies; the first copy is the state itself.
 
-    Lengths in metres, angles in radians. "Turned back" means acted upon by the inverse element.
+    Lengths are in metres, angles in radians. "Turned back" means transformed by the inverse
+    element.
 
     Attributes:
-        moving, policy: of the states, ``[S]`` bool; see :class:`~bench.audit.states.Visited`.
-        reached: which copies exist, ``[S, G]`` bool (an arm cannot take every turned state).
-        place: where each copy's tool and object stand at first, seen from the policy's origin,
+        moving, policy: attributes of the states, ``[S]`` bool; see
+            :class:`~symsteer.bench.audit.states.Visited`.
+        reached: which copies exist, ``[S, G]`` bool (an arm cannot reach every turned state).
+        place: initial position of each copy's tool and object, relative to the policy's origin,
             ``[S, G, 2]`` each.
-        poses: turned-back position ``[S, G + 1, W, 3]`` and quaternion ``[S, G + 1, W, 4]`` of tool
-            and object at the start, after one step and after all (W = 3); the last of the G + 1
-            is the copy that differs by rounding.
-        cost: 1 and what the variants add, summed over the steps before success, after one step
-            and after all, ``[S, G, 2]``.
-        dense: ManiSkill's normalised dense reward less what the variants add to the cost,
-            summed over all steps, likewise.
-        function_cost, function_dense: the same of one step whose outcome is the turned outcome
-            of the unbroken task, ``[S, G]``.
-        observations: turned-back observations of the copies, ``[S, G, K, obs_dim]``, and of the
-            state itself a second time (``[S, 0]``), K draws each.
+        positions, quaternions: turned-back positions ``[S, G + 1, W, 3]`` and quaternions
+            ``[S, G + 1, W, 4]`` of tool and object at the start, after one step and after all
+            steps (W = 3); the last of the G + 1 is the copy that differs by rounding.
+        cost: 1 plus the extra cost of the variants, summed over the steps before success, after
+            one step and after all steps, ``[S, G, 2]``.
+        dense: ManiSkill's normalised dense reward minus the extra cost of the variants, summed
+            over all steps, after one step and after all steps, ``[S, G, 2]``.
+        function_cost, function_dense: cost and dense reward of one step whose outcome is set to
+            the turned outcome of the unbroken task, ``[S, G]``.
+        observations: turned-back observations of the copies, K draws each,
+            ``[S, G, K, obs_dim]``.
+        observations_again: a second set of draws for the state itself, ``[S, K, obs_dim]``.
     """
 
     moving: torch.Tensor
@@ -80,34 +82,23 @@ class Copies:
     observations: torch.Tensor
     observations_again: torch.Tensor
 
-    @staticmethod
-    def join(parts: list[Copies]) -> Copies:
-        """All states of several batches."""
-        columns = {f.name: [getattr(part, f.name) for part in parts] for f in fields(Copies)}
-        return Copies(**{name: join_trees(values) for name, values in columns.items()})
-
-    def first(self, count: int) -> Copies:
-        """The first states."""
-        rows = torch.arange(count)
-        return Copies(**{f.name: rows_of(getattr(self, f.name), rows) for f in fields(Copies)})
-
 
 @dataclass(frozen=True)
 class Resets:
-    """Features of resets, and of independent ones turned at random, ``[R, obs_dim]`` each."""
+    """Features of R resets, and of R other resets turned at random, ``[R, obs_dim]`` each."""
 
     original: torch.Tensor
     turned: torch.Tensor
 
 
-class Bench:
-    """Broken environments of one cell, and the unbroken ones that states are observed in.
+class Experiment:
+    """The broken environments of one audit, and the unbroken ones in which states are observed.
 
     Args:
         reference: the unbroken task.
-        variant: what breaks it.
+        variant: variant of the broken environments.
         group: a finite group.
-        visited: the states; it sets how many scenes are needed.
+        visited: the states; their number determines the number of scenes.
         seed: of resets and draws.
         sim: ``cpu`` or ``cuda``.
     """
@@ -123,7 +114,7 @@ class Bench:
     ) -> None:
         self.reference, self.visited, self.seed = reference, visited, seed
         self.elements: tuple[Element, ...] = group.elements
-        # Batches of equal size, so that few scenes are idle in the last one.
+        # Batches of equal size leave few scenes of the last batch unused.
         batches = math.ceil(len(visited) * (group.order + 1) / SCENES)
         self.batch = math.ceil(len(visited) / batches)
         self.turner = Turner(reference)
@@ -139,7 +130,7 @@ class Bench:
         self.centre = self.env.policy_origin[0].cpu()
 
     def close(self) -> None:
-        """Free the scenes, at once: a process can hold only so many."""
+        """Free the scenes at once: the number that a process can hold is limited."""
         self.env.close()
         del self.env
         gc.collect()
@@ -151,12 +142,11 @@ class Bench:
         random = self._observation_is_random()
         parts = []
         for start in range(0, len(self.visited), self.batch):
-            # The last batch may be short: its spare scenes repeat a state and are dropped.
+            # A short last batch is filled with copies of the last state, which are dropped.
             rows = torch.arange(start, start + self.batch).clamp(max=len(self.visited) - 1)
             keep = min(self.batch, len(self.visited) - start)
-            part = self._batch(rows, random)
-            parts.append(part.first(keep))
-        return Copies.join(parts)
+            parts.append(rows_of(self._batch(rows, random), torch.arange(keep)))
+        return join_trees(parts)
 
     def _batch(self, rows: torch.Tensor, random: bool) -> Copies:
         env, visited, elements = self.env, self.visited, self.elements
@@ -170,7 +160,7 @@ class Bench:
         layout = env.action_layout
         plan = torch.cat([layout.transform(actions, *g) for g in elements] + [actions])
 
-        # Equal scenes for all copies, as if none had been simulated before.
+        # New scenes, so that all copies have the same history.
         if not self.fresh:
             env.reset(seed=[self.seed] * env.num_envs, options={"reconfigure": True})
         else:
@@ -225,18 +215,18 @@ class Bench:
         )
 
     def _rounded(self, state: dict[str, Any]) -> dict[str, Any]:
-        """The state turned by one radian and back: the same but for rounding."""
+        """The state turned by one radian and back: equal up to rounding."""
         if self.turner.arm is None:
             there, _ = self.turner.turn(state, (1.0, False), self.centre)
             return self.turner.turn(there, (-1.0, False), self.centre)[0]
-        # Only what stands on the table: an arm comes back with other joint angles.
+        # Only the objects: inverse kinematics would return other joint angles of the arm.
         bodies = {"actors": state["actors"], "articulations": {}}
         there = self.reference.transform_state(bodies, 1.0)
         back = self.reference.transform_state(there, -1.0)
         return {**state, "actors": back["actors"]}
 
     def _put(self, state: dict[str, Any]) -> None:
-        """Set all scenes; what a variant has added to them stays where it stands."""
+        """Set the state of all scenes; objects that a variant has added stay in place."""
         whole = self.env.get_state_dict()
         for kind in ("actors", "articulations"):
             for name, value in state[kind].items():
@@ -254,7 +244,7 @@ class Bench:
         }
 
     def _split(self, values: torch.Tensor, count: int) -> torch.Tensor:
-        """``[(G + 1) * S, ...]``, copy after copy, to ``[S, G + 1, ...]``."""
+        """Reshape ``[(G + 1) * S, ...]``, ordered by copy, to ``[S, G + 1, ...]``."""
         return values.unflatten(0, (-1, count)).transpose(0, 1)
 
     def _turned_back(
@@ -280,7 +270,7 @@ class Bench:
     # ------------------------------------------------------------------ reward
 
     def _extra_cost(self, before: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
-        """What the variants add to the cost of a step whose tool came from ``before``, ``[N]``."""
+        """Extra cost of the variants for a step whose tool started at ``before``, ``[N]``."""
         moved = self.env.agent.tcp_pose.p - before
         cost = torch.zeros(self.env.num_envs, device=self.env.device)
         for variant in overriding(self.env.variants, "extra_cost"):
@@ -292,9 +282,10 @@ class Bench:
     def _reward_function(
         self, starts: list[dict[str, Any]], after: dict[str, Any], action: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Reward of turned transitions of the unbroken task; which exist, ``[S, G]``.
+        """Cost and dense reward of turned transitions of the unbroken task, and which copies exist.
 
-        Dynamics play no part: the outcome is put there, so there are no contact forces either.
+        All are ``[S, G]``. The outcome is set, not simulated: neither the broken dynamics nor
+        contact forces enter.
         """
         env, count = self.env, len(action)
         turned = [self.turner.turn(after, g, self.centre) for g in self.elements]
@@ -320,7 +311,7 @@ class Bench:
     # ------------------------------------------------------------- observation
 
     def _observation_is_random(self) -> bool:
-        """Whether two resets with different seeds see one and the same state differently."""
+        """Whether the observation of the same state depends on the seed of the reset."""
         rows = torch.zeros(self.env.num_envs, dtype=torch.long)
         state = rows_of(self.visited.state, rows)
         seen = []
@@ -335,7 +326,7 @@ class Bench:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Turned-back observations ``[S, G, K, dim]`` and of the states again ``[S, K, dim]``.
 
-        Random observations are drawn with a seed of their own for every scene and draw.
+        Every scene and every draw of random observations has its own seed.
         """
         env, layout = self.env, self.env.observation_layout
         draws = []
@@ -355,10 +346,10 @@ class Bench:
     # ------------------------------------------------------------------ resets
 
     def resets(self, count: int) -> Resets:
-        """True features of ``count`` resets and of as many other, randomly turned ones.
+        """Features of ``count`` resets, and of as many other resets turned at random.
 
-        Features are what the unbroken task would show of the state, with the policy's origin at
-        the centre.
+        Features are the unbroken task's observation of the state, relative to the policy's
+        origin.
         """
         rng = np.random.default_rng([self.seed, 6])
         features = self._features(rng, 2 * count)
@@ -382,7 +373,7 @@ class Bench:
         return torch.cat(found)[:count].double()
 
     def undistorted(self) -> torch.Tensor:
-        """What the unbroken task shows of the states, ``[S, obs_dim]``."""
+        """Observations of the states in the unbroken task, ``[S, obs_dim]``."""
         return self._observe_unbroken(self.visited.state).double()
 
     def _observe_unbroken(self, state: dict[str, Any]) -> torch.Tensor:
@@ -393,7 +384,7 @@ class Bench:
             rows = torch.arange(start, start + env.num_envs).clamp(max=total - 1)
             env.set_state_dict(rows_of(state, rows))
             seen.append(env.get_obs().cpu().clone())
-        # The base of a robot that was moved aside goes back.
+        # Move the robot's base back.
         env.reset(seed=0)
         return torch.cat(seen)[:total]
 
@@ -401,18 +392,3 @@ class Bench:
 def _inverse(element: Element) -> Element:
     angle, reflect = element
     return element if reflect else (-angle, False)
-
-
-def check_group(name: str) -> Group:
-    """A finite group with something to compare.
-
-    Raises:
-        UserError: for an unknown, infinite or trivial group.
-    """
-    group = Group.parse(name)
-    if group.order < 2:
-        raise UserError(
-            f"{name} has no element beside the identity, so there is nothing to compare; "
-            "choose C2 to C99 or D2 to D99, e.g. C8"
-        )
-    return group

@@ -1,7 +1,9 @@
-"""The tables of docs/audit.md and of the tasks' pages, from the committed summary of all cells.
+"""Writes the tables of docs/audit.md and of the tasks' pages from the committed summary.
 
-python -m symsteer.bench.audit.page                      # from docs/audit/summary.json
-python -m symsteer.bench.audit.page OUT/summary.json     # takes a new summary over first
+python -m symsteer.bench.audit.page                     # from the committed summary
+python -m symsteer.bench.audit.page OUT/summary.json    # replaces the committed summary first
+
+The committed summary is leaderboard/results/audit/summary.json.
 """
 
 from __future__ import annotations
@@ -22,21 +24,22 @@ from symsteer.bench.audit.report import (
     to_markdown,
 )
 from symsteer.errors import UserError
+from symsteer.files import write_together
 
-ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "audit.md"
-SUMMARY = ROOT / "docs" / "audit" / "summary.json"
-TASK_PAGES = ROOT / "docs" / "tasks"
+CHECKOUT = Path(__file__).resolve().parents[2]
+PAGE = CHECKOUT / "docs" / "audit.md"
+SUMMARY = CHECKOUT / "leaderboard" / "results" / "audit" / "summary.json"
+TASK_PAGES = CHECKOUT / "docs" / "tasks"
 MARK = "<!-- audit:{} -->\n"
-"""What follows this line of a task's page is generated."""
+"""Line of a task's page after which everything is generated."""
 GRADES = ((0.01, "near exact"), (0.05, "close"), (0.15, "rough"))
-"""A symmetry's grade by the larger of the tool's defect in a step and the object's in a chunk."""
+"""Limits of the larger of two defects: of the tool in a step, of the object in a chunk."""
 
 BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
 
 
 def render(rows: Sequence[dict[str, Any]]) -> str:
-    """Overview and one table for each task and embodiment, in markdown."""
+    """Overview and a table for each task and embodiment, in markdown."""
     places = list(dict.fromkeys((r["task"], r["embodiment"], r["group"]) for r in rows))
     parts = [_overview(rows)]
     for place in places:
@@ -51,7 +54,7 @@ def render(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _overview(rows: Sequence[dict[str, Any]]) -> str:
-    """Range over the tasks of each component, one row for each embodiment and variant."""
+    """Range of each component over the tasks, one row for each embodiment and variant."""
     head = ["variant", "tasks", "tool, step", "object, chunk", "cost", "observed", "resets"]
     lines = ["| " + " | ".join(head) + " |", "|---|" + "--:|" * (len(head) - 1)]
     for embodiment, group, variant in dict.fromkeys(
@@ -75,33 +78,37 @@ def _overview(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def generate(page: str, rows: Sequence[dict[str, Any]]) -> str:
-    """The page with its tables made from ``rows``.
+    """Replace the tables of docs/audit.md.
 
     Raises:
-        UserError: if the page has lost the marks between which the tables stand.
+        UserError: the page lacks the marks around the tables.
     """
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
-        raise UserError(f"docs/audit.md has lost its marks {BEGIN.strip()} and {END.strip()}")
+        raise UserError(
+            f"docs/audit.md lacks the marks {BEGIN.strip()} and {END.strip()}; restore the page"
+        )
     return f"{before}{BEGIN}\n{render(rows)}\n{END}{after}"
 
 
 def grade(row: dict[str, Any]) -> str:
-    """How well the symmetry holds in a cell, in words."""
+    """How well the symmetry of a row holds, in words."""
     defects = [row[name][0] for name in ("tool_step", "object_chunk") if row[name] is not None]
     return next((word for limit, word in GRADES if max(defects) < limit), "broken")
 
 
 def generate_task(page: str, task: str, rows: Sequence[dict[str, Any]]) -> str:
-    """A task's page with the audit of its unbroken embodiments behind the mark.
+    """Replace what follows the mark of a task's page by the audit of its unbroken embodiments.
 
     Raises:
-        UserError: if the page has lost its mark.
+        UserError: the page lacks the mark.
     """
     before, mark, _ = page.partition(MARK.format(task))
     if not mark:
-        raise UserError(f"the page of {task} has lost its mark {MARK.format(task).strip()}")
+        raise UserError(
+            f"the page of {task} lacks the mark {MARK.format(task).strip()}; restore the page"
+        )
     lines = [
         "",
         "The [audit](../audit.md) of the unbroken task in states that expert and policy visit "
@@ -119,38 +126,43 @@ def generate_task(page: str, task: str, rows: Sequence[dict[str, Any]]) -> str:
 
 
 def task_page(task: str) -> Path:
-    """Where a task's page is: ``docs/tasks/pick-cube.md`` of ``PickCube-v1``."""
+    """Path of a task's page, for instance ``docs/tasks/pick-cube.md`` for ``PickCube-v1``."""
     name = re.sub(r"(?<!^)(?=[A-Z])", "-", task.removesuffix("-v1")).lower()
     return TASK_PAGES / f"{name}.md"
 
 
 def read_summary(path: Path) -> list[dict[str, Any]]:
-    """Rows of a ``summary.json``.
+    """Read the rows of a ``summary.json``.
 
     Raises:
-        UserError: if there is none.
+        UserError: the file cannot be read.
     """
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise UserError(f"cannot read the summary {path}: {error}") from error
+        raise UserError(
+            f"cannot read the summary {path}: {error}; name the summary.json of an audit"
+        ) from error
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write docs/audit.md and the tasks' pages; the exit code."""
+    """Write docs/audit.md and the tasks' pages; returns the exit code."""
     try:
+        if not PAGE.is_file():
+            raise UserError(
+                f"there is no {PAGE}: the pages can be written in a checkout of SymSteer only"
+            )
         rows = [row for path in arguments or [str(SUMMARY)] for row in read_summary(Path(path))]
-        if arguments:
-            SUMMARY.parent.mkdir(exist_ok=True)
-            SUMMARY.write_text(summary_json(rows))
-        PAGE.write_text(generate(PAGE.read_text(), rows))
+        pages = {PAGE: generate(PAGE.read_text(), rows)}
         for task in dict.fromkeys(row["task"] for row in rows):
-            page = task_page(task)
-            page.write_text(generate_task(page.read_text(), task, rows))
+            pages[task_page(task)] = generate_task(task_page(task).read_text(), task, rows)
+        if arguments:
+            pages[SUMMARY] = summary_json(rows)
+        write_together({path: text.encode() for path, text in pages.items()})
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"wrote the tables of {len(rows)} cells to {PAGE}")
+    print(f"wrote the tables of {len(rows)} audits to {PAGE}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What the audit prints and writes: a readable page a cell, tables of many, a map."""
+"""Output of the audit: a text page of one result, tables of many, a map."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from symsteer.bench.audit.cell import BIN, Cell, Defect, Settings
 from symsteer.bench.audit.estimates import Estimate
+from symsteer.bench.audit.result import BIN, AuditResult, Defect
 from symsteer.errors import UserError
-from symsteer.files import write_atomically
+from symsteer.files import write_together
 
 EXACT = 1e-3
-"""Reward and observation defects below this are rounding."""
+"""Reward and observation defects below this are rounding errors."""
 
 SIGNIFICANT = 0.01
 """Resets differ from their turned copies below this p-value."""
@@ -27,19 +27,19 @@ MIN_COPIES = 3
 """Squares of the map with fewer copies are not drawn."""
 
 
-def text(cell: Cell) -> str:
-    """A cell as a page for the terminal."""
-    s = cell.settings
+def text(result: AuditResult) -> str:
+    """A result as a page for the terminal."""
+    s = result.settings
     visitors = " and ".join(f"{s.count} of the {v}" for v in s.visitors)
     lines = [
-        f"{s.task}, {s.embodiment}, {_variant(cell)}: group {s.group}, {cell.states} states "
-        f"({visitors}; the object moves in {cell.moving})",
+        f"{s.task}, {s.embodiment}, {_variant(result)}: group {s.group}, {result.states} states "
+        f"({visitors}; the object moves in {result.moving})",
         "",
         f"{'dynamics':26s} {'one step':>28s}   {f'chunk of {s.chunk} steps':>28s}",
     ]
     for body in ("tool", "object"):
         for subset in ("all", "moving") if body == "object" else ("all",):
-            found = [cell.defect(body, w, subset) for w in ("step", "chunk")]  # type: ignore
+            found = [result.defect(body, w, subset) for w in ("step", "chunk")]  # type: ignore
             pair = [defect for defect in found if defect is not None]
             if len(pair) < 2:
                 continue
@@ -47,58 +47,61 @@ def text(cell: Cell) -> str:
             lines.append(f"  {name:24s} " + "   ".join(f"{_relative(d):>28s}" for d in pair))
             lines.append(f"  {'':24s} " + "   ".join(f"{_millimetres(d):>28s}" for d in pair))
             lines.append(f"  {'':24s} " + "   ".join(f"{_degrees(d):>28s}" for d in pair))
-    floors = [cell.defect(b, "chunk") for b in ("tool", "object")]  # type: ignore[arg-type]
+    floors = [result.defect(b, "chunk") for b in ("tool", "object")]  # type: ignore[arg-type]
     lines.append(
         f"  {'floor (rounding alone)':24s} "
         + ", ".join(f"{d.body} {d.floor_mm:.2g} mm" for d in floors if d)
         + " after the chunk"
     )
-    r = cell.reward
+    r = result.reward
     lines += [
         f"{'reward, a step':26s} cost {_number(r['cost'], 3)}, dense {_number(r['dense'], 4)}",
         f"{'  by way of the dynamics':26s} cost {_number(r['outcome_cost_chunk'], 3)}, dense "
         f"{_number(r['outcome_dense_chunk'], 4)} a chunk",
-        f"{'observation':26s} {_percent(cell.observation)} of its spread"
-        + (" (random: Gaussians compared)" if cell.random_observation else ""),
+        f"{'observation':26s} {_percent(result.observation)} of its spread"
+        + (" (random: Gaussians compared)" if result.random_observation else ""),
     ]
-    worst = cell.worst_field
+    worst = result.worst_field
     if worst is not None and worst.value.value > EXACT:
         lines.append(f"{'  most in ' + worst.name:26s} {_number(worst.value, 1)} mm")
     lines.append(
-        f"{'resets':26s} energy distance {_number(cell.resets, 3)}, p = {cell.resets_p:.3g}"
+        f"{'resets':26s} energy distance {_number(result.resets, 3)}, p = {result.resets_p:.3g}"
     )
-    if any(cell.origin_mm):
-        x, y = cell.origin_mm
+    if any(result.origin_mm):
+        x, y = result.origin_mm
         lines.append(f"{'origin':26s} the group acts about ({x:.0f}, {y:.0f}) mm, the policy's")
     if s.embodiment != "floating":
-        lines.append(f"{'reach':26s} {cell.unreachable:.1%} of the turned states are out of reach")
-    top = _largest(cell)
+        lines.append(
+            f"{'reach':26s} {result.unreachable:.1%} of the turned states are out of reach"
+        )
+    top = _largest(result)
     if top is not None:
         lines.append(f"{'where':26s} {top}")
-    return "\n".join([*lines, "", meaning(cell), f"({cell.seconds:.1f} s)"])
+    return "\n".join([*lines, "", meaning(result), f"({result.seconds:.1f} s)"])
 
 
-def meaning(cell: Cell) -> str:
-    """One sentence."""
-    tool, thing = cell.defect("tool", "step"), cell.defect("object", "chunk")
+def meaning(result: AuditResult) -> str:
+    """A result in one sentence."""
+    tool, thing = result.defect("tool", "step"), result.defect("object", "chunk")
     parts = []
     if tool is not None and tool.relative is not None:
         parts.append(
-            f"turned with the world, a step takes the tool elsewhere by "
-            f"{tool.relative.value:.2g} of its length"
-            if tool.relative.value >= 1
-            else f"turned with the world, a step takes the tool elsewhere by "
-            f"{100 * tool.relative.value:.2g} % of its length"
+            "turned copies of a step move the tool to places that differ by "
+            + (
+                f"{tool.relative.value:.2g} of its length"
+                if tool.relative.value >= 1
+                else f"{100 * tool.relative.value:.2g} % of its length"
+            )
         )
     if thing is not None and thing.relative is not None:
-        parts.append(f"a chunk the object by {100 * thing.relative.value:.2g} %")
+        parts.append(f"copies of a chunk move the object by {100 * thing.relative.value:.2g} %")
     broken: list[str] = []
     kept: list[str] = []
-    reward = max(cell.reward["cost"].value, cell.reward["dense"].value)
+    reward = max(result.reward["cost"].value, result.reward["dense"].value)
     for name, is_broken in (
         ("reward", reward > EXACT),
-        ("observation", cell.observation.value > EXACT),
-        ("resets", cell.resets_p < SIGNIFICANT),
+        ("observation", result.observation.value > EXACT),
+        ("resets", result.resets_p < SIGNIFICANT),
     ):
         (broken if is_broken else kept).append(name)
     parts.append(
@@ -119,12 +122,12 @@ def _and(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
-def _variant(cell: Cell) -> str:
-    return "unbroken" if cell.settings.variant == "none" else cell.settings.variant
+def _variant(result: AuditResult) -> str:
+    return "unbroken" if result.settings.variant == "none" else result.settings.variant
 
 
-def _largest(cell: Cell) -> str | None:
-    drawn = [b for b in cell.map if b.copies >= MIN_COPIES]
+def _largest(result: AuditResult) -> str | None:
+    drawn = [b for b in result.map if b.copies >= MIN_COPIES]
     tops = []
     for body in ("tool", "object"):
         bins = [b for b in drawn if b.body == body]
@@ -180,7 +183,7 @@ ESTIMATES = {
     "field_mm": lambda c: c.worst_field.value if c.worst_field else None,
     "resets": lambda c: c.resets,
 }
-"""Columns of the table, each a number with its interval."""
+"""Columns of the table that are numbers with an interval."""
 
 PLAIN = {
     "task": lambda c: c.settings.task,
@@ -205,11 +208,11 @@ def _short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.3g}")
 
 
-def summary(cell: Cell) -> dict[str, Any]:
-    """A row of the table: numbers to three digits, an interval as [value, low, high]."""
-    row: dict[str, Any] = {name: get(cell) for name, get in PLAIN.items()}
+def summary(result: AuditResult) -> dict[str, Any]:
+    """A row of the table: numbers with three digits, an interval as [value, low, high]."""
+    row: dict[str, Any] = {name: get(result) for name, get in PLAIN.items()}
     for name, get in ESTIMATES.items():
-        estimate = get(cell)
+        estimate = get(result)
         row[name] = (
             None
             if estimate is None
@@ -235,7 +238,7 @@ def to_csv(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows of :func:`summary` as a table for readers, one row a cell."""
+    """Rows of :func:`summary` as a markdown table."""
     several = len({(r["task"], r["embodiment"], r["group"]) for r in rows}) > 1
     head = ["variant", "tool, step", "tool, chunk", "object, chunk", "object, mm", "cost", "dense"]
     head += ["observed", "field, mm", "resets", "p"]
@@ -245,19 +248,24 @@ def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
         if several:
             name = f"{row['task'].removesuffix('-v1')}, {row['embodiment']}, {name}"
         cells = [name]
-        cells += [_cell(row[c], 100, "%") for c in ("tool_step", "tool_chunk", "object_chunk")]
-        cells += [_cell(row["object_chunk_mm"], 1)]
-        cells += [_cell(row[c], 1, exact=EXACT) for c in ("cost", "dense")]
-        cells += [_cell(row["observation"], 100, "%", EXACT), _cell(row["field_mm"], 1, "", 1e-2)]
+        cells += [_interval(row[c], 100, "%") for c in ("tool_step", "tool_chunk", "object_chunk")]
+        cells += [_interval(row["object_chunk_mm"], 1)]
+        cells += [_interval(row[c], 1, exact=EXACT) for c in ("cost", "dense")]
+        cells += [
+            _interval(row["observation"], 100, "%", EXACT),
+            _interval(row["field_mm"], 1, "", 1e-2),
+        ]
         differ = row["resets_p"] < SIGNIFICANT
-        cells += [_cell(row["resets"], 1) if differ else "alike", f"{row['resets_p']:.3f}"]
+        cells += [_interval(row["resets"], 1) if differ else "alike", f"{row['resets_p']:.3f}"]
         lines.append("| " + " | ".join(cells) + " |")
     rule = "|---|" + "--:|" * (len(head) - 1)
     return "\n".join(["| " + " | ".join(head) + " |", rule, *lines]) + "\n"
 
 
-def _cell(interval: list[float] | None, scale: float, unit: str = "", exact: float = 0.0) -> str:
-    """``value [low, high]``; a plain 0 where all three are below ``exact``."""
+def _interval(
+    interval: list[float] | None, scale: float, unit: str = "", exact: float = 0.0
+) -> str:
+    """``value [low, high]``; just 0 if all three are below ``exact``."""
     if interval is None:
         return "at rest"
     if all(abs(v) < exact for v in interval):
@@ -268,11 +276,11 @@ def _cell(interval: list[float] | None, scale: float, unit: str = "", exact: flo
 
 def percent(interval: list[float] | None) -> str:
     """An interval of shares in per cent."""
-    return _cell(interval, 100, "%")
+    return _interval(interval, 100, "%")
 
 
 def percent_range(intervals: Sequence[list[float] | None], exact: float) -> str:
-    """Smallest to largest value in per cent; a plain 0 where all are below ``exact``."""
+    """Smallest to largest value in per cent; just 0 if all are below ``exact``."""
     values = [i[0] for i in intervals if i is not None]
     if not values:
         return "at rest"
@@ -295,66 +303,71 @@ def _two(value: float) -> str:
 # -------------------------------------------------------------------------- files
 
 
-def write_cell(cell: Cell, folder: Path) -> None:
+def write_result(result: AuditResult, folder: Path) -> None:
     """Write ``audit.json``, ``map.csv`` and ``map.png``.
 
     Raises:
-        UserError: if the folder cannot be written.
+        UserError: the folder cannot be written.
     """
     rows = ["body,x_mm,y_mm,copies,mm"]
-    rows += [f"{b.body},{b.x_mm:g},{b.y_mm:g},{b.copies},{b.mm:.4g}" for b in cell.map]
+    rows += [f"{b.body},{b.x_mm:g},{b.y_mm:g},{b.copies},{b.mm:.4g}" for b in result.map]
     picture = io.BytesIO()
-    map_figure(cell).savefig(picture, format="png", dpi=110, metadata={"Software": None})
-    write_atomically(folder / "map.csv", ("\n".join(rows) + "\n").encode())
-    write_atomically(folder / "map.png", picture.getvalue())
-    # Last: a cell with this file is complete, and is not measured again.
-    write_atomically(folder / "audit.json", (json.dumps(cell.to_json(), indent=1) + "\n").encode())
+    map_figure(result).savefig(picture, format="png", dpi=110, metadata={"Software": None})
+    write_together(
+        {
+            folder / "map.csv": ("\n".join(rows) + "\n").encode(),
+            folder / "map.png": picture.getvalue(),
+            # Last: a folder with this file is complete, and is not measured again.
+            folder / "audit.json": (json.dumps(result.to_json(), indent=1) + "\n").encode(),
+        }
+    )
 
 
-def read_cell(path: Path) -> Cell:
+def read_result(path: Path) -> AuditResult:
     """Read an ``audit.json``.
 
     Raises:
-        UserError: if it is missing or damaged.
+        UserError: the file is missing or damaged.
     """
     try:
-        return Cell.from_json(json.loads(path.read_text()))
+        return AuditResult.from_json(json.loads(path.read_text()))
     except OSError as error:
         raise UserError(
             f"cannot read the audit {path}: {error.strerror}; name another, or run it again"
         ) from error
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is no audit ({error}); run the audit again") from error
+        raise UserError(
+            f"{path} is not the file of an audit ({error}); run the audit again"
+        ) from error
 
 
-def write_table(cells: Sequence[Cell], folder: Path) -> None:
-    """Write ``table.csv``, ``table.md`` and ``summary.json`` of many cells.
+def write_table(results: Sequence[AuditResult], folder: Path) -> None:
+    """Write ``table.csv``, ``table.md`` and ``summary.json`` of many results.
 
     Raises:
-        UserError: if the folder cannot be written.
+        UserError: the folder cannot be written.
     """
-    rows = [summary(cell) for cell in cells]
-    write_atomically(folder / "table.csv", to_csv(rows).encode())
-    write_atomically(folder / "table.md", to_markdown(rows).encode())
-    write_atomically(folder / "summary.json", summary_json(rows).encode())
+    rows = [summary(result) for result in results]
+    write_together(
+        {
+            folder / "table.csv": to_csv(rows).encode(),
+            folder / "table.md": to_markdown(rows).encode(),
+            folder / "summary.json": summary_json(rows).encode(),
+        }
+    )
 
 
 def summary_json(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows of :func:`summary`, a line each."""
+    """JSON of rows of :func:`summary`, one per line."""
     return "[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n"
 
 
-def same_settings(found: Cell, wanted: Settings) -> bool:
-    """Whether a cell on disk is what would be measured."""
-    return found.settings == wanted
-
-
-def map_figure(cell: Cell) -> Figure:
-    """Where in the workspace copies depart from the majority, for tool and object."""
+def map_figure(result: AuditResult) -> Figure:
+    """Map of the workspace: distance of copies from the majority, for tool and object."""
     figure = Figure(figsize=(9, 4.2), layout="constrained")
     axes = figure.subplots(1, 2)
     side = 1e3 * BIN
-    drawn = [b for b in cell.map if b.copies >= MIN_COPIES]
+    drawn = [b for b in result.map if b.copies >= MIN_COPIES]
     reach = max([abs(v) for b in drawn for v in (b.x_mm, b.y_mm)], default=100.0) + side
     for ax, body in zip(axes, ("tool", "object"), strict=True):
         bins = [b for b in drawn if b.body == body]
@@ -376,9 +389,9 @@ def map_figure(cell: Cell) -> Figure:
         ax.plot(0, 0, "+", color="#0072B2", markersize=9)
         ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
         ax.set(xlabel="x from the policy's origin, mm", ylabel="y, mm")
-        ax.set_title(f"{body}: mm after {cell.settings.chunk} steps", fontsize=10)
-    s = cell.settings
-    figure.suptitle(f"{s.task}, {s.embodiment}, {_variant(cell)}, {s.group}", fontsize=11)
+        ax.set_title(f"{body}: mm after {result.settings.chunk} steps", fontsize=10)
+    s = result.settings
+    figure.suptitle(f"{s.task}, {s.embodiment}, {_variant(result)}, {s.group}", fontsize=11)
     return figure
 
 

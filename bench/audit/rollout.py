@@ -1,50 +1,45 @@
-"""How symmetric is a task, measured in simulation.
+"""How symmetric whole episodes of a task are, measured in simulation.
 
-The measure is a whole episode: put a copy of its initial state, turned by each element of a
-planar group, into an environment of its own; let every copy execute the same actions, or decode
-the same latent noise, turned alike; turn the paths back and compare them. In a world with the
-symmetry they coincide.
+Copies of an initial state, turned by each element of a planar group, are put into an environment
+each. Every copy executes the same actions, or decodes the same latent noise, turned by its
+element. The paths are turned back and compared: with the symmetry they coincide.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
 
+from symsteer.bench.audit.states import MOVED, map_trees
 from symsteer.bench.sim.rotations import planar_matrix
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
-from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
 
 Actions = Literal["random", "expert", "policy"]
 
-MOVED = 1e-4
-"""An object that is further than this from where it began (metres) has been touched."""
-
 
 @dataclass(frozen=True)
 class RolloutError:
-    """Rotated episodes against the original, one entry per episode.
+    """Comparison of E episodes with their turned copies; every attribute is ``[E]``.
 
     Attributes:
-        path: length of the original's path of the tool centre point until it succeeds or its
-            time is over, metres, ``[E]``.
-        tcp: largest distance over time and group elements between the turned-back tool centre
-            point and the original's over the same steps, metres, ``[E]``.
-        objects: the same for the task's objects, ``[E]``.
-        contact_free_path, contact_free_tcp: the same up to the first step in which any copy has
-            moved an object.
-        steps: steps before that contact, ``[E]``.
-        contact: whether an object was moved, ``[E]``.
-        success: whether the original succeeded, ``[E]``.
-        same_outcome: whether all copies agree on that, ``[E]``.
+        path: length of the path of the original's tool centre point until success or the time
+            limit, metres.
+        tcp: largest distance between a copy's turned-back tool centre point and the original's,
+            over time and group elements, metres.
+        objects: the same for the task's objects.
+        contact_free_path, contact_free_tcp: the same until any copy first moves an object.
+        steps: number of steps before that contact.
+        contact: whether an object was moved.
+        success: whether the original succeeded.
+        same_outcome: whether success is the same for all copies.
     """
 
     path: np.ndarray
@@ -57,22 +52,21 @@ class RolloutError:
     success: np.ndarray
     same_outcome: np.ndarray
 
-    @property
-    def contact_free_ratio(self) -> np.ndarray:
-        """Error over path length before any contact, ``[E]``."""
-        return self.contact_free_tcp / np.maximum(self.contact_free_path, 1e-9)
-
-    @property
-    def ratio(self) -> np.ndarray:
-        """Error over path length of the whole episode, contacts included, ``[E]``."""
-        return self.tcp / np.maximum(self.path, 1e-9)
-
     def share_within(self, limit: float = 0.01, contacts: bool = False) -> float:
-        """Share of episodes whose error is at most ``limit`` of the path."""
-        return float(np.mean((self.ratio if contacts else self.contact_free_ratio) <= limit))
+        """Share of episodes whose error is at most ``limit`` of the path.
+
+        Args:
+            limit: relative error.
+            contacts: compare whole episodes, not only the part before contact.
+        """
+        if contacts:
+            error, path = self.tcp, self.path
+        else:
+            error, path = self.contact_free_tcp, self.contact_free_path
+        return float(np.mean(error / np.maximum(path, 1e-9) <= limit))
 
     def summary(self) -> str:
-        """A few readable lines."""
+        """Text of three lines."""
         free, full = 1e3 * self.contact_free_tcp, 1e3 * self.tcp
         moved = 1e3 * self.objects
         return (
@@ -100,35 +94,32 @@ def rotated_rollout_error(
     seed: int = 0,
     variant: str = "none",
     batch: int = 25,
-    env_options: dict[str, Any] | None = None,
     policy: ChunkPolicy | None = None,
 ) -> RolloutError:
-    """Compare episodes of the floating gripper with their rotated copies.
+    """Compare episodes of the floating gripper with their turned copies.
 
     Args:
         task: name of a task.
-        episodes: how many, with seeds ``seed``, ``seed + 1``, ...
-        actions: ``random`` (correlated noise in all seven dimensions, heights kept clear of the
-            objects), ``expert`` (the scripted expert of the original; its actions are turned
-            for the copies, no copy sees its own state) or ``policy`` (closed loop: every copy
-            decodes its own observation with the original's latent noise, turned).
+        episodes: number of episodes, with seeds ``seed``, ``seed + 1``, ...
+        actions: ``random`` (open loop: correlated noise, at a height without contacts), ``expert``
+            (open loop: the actions of the scripted expert in the original, turned for the copies)
+            or ``policy`` (closed loop: every copy decodes its own observation with the original's
+            latent noise, turned).
         group: a finite planar group, e.g. ``C8`` or ``D4``.
-        steps: per episode; by default the task's limit.
+        steps: steps per episode; by default the task's limit.
         seed: of the first episode.
-        variant: symmetry-breaking variant that acts on all copies.
-        batch: episodes that run side by side, each with one environment per group element.
-        env_options: further arguments of :func:`symsteer.bench.tasks.make`.
-        policy: the base policy that ``policy`` needs.
+        variant: symmetry-breaking variant of all environments.
+        batch: number of episodes in parallel, with one environment per group element each.
+        policy: the policy for ``actions="policy"``.
 
     Raises:
-        UserError: for an unknown kind of actions, task, group or variant, or a missing policy.
+        UserError: unknown task, group or variant.
+        ValueError: ``actions`` and ``policy`` do not fit together.
     """
-    if actions not in get_args(Actions):
-        raise UserError(f"actions must be 'random' or 'expert' or 'policy', not {actions!r}")
     if (actions == "policy") != (policy is not None):
-        raise UserError("a policy is needed for actions='policy', and only there")
+        raise ValueError("a policy is needed for actions='policy', and only there")
     elements = Group.parse(group).elements
-    env = make(task, num_envs=batch * len(elements), variant=variant, **(env_options or {}))
+    env = make(task, num_envs=batch * len(elements), variant=variant)
     steps = env.max_episode_steps if steps is None else steps
     parts = []
     for start in range(seed, seed + episodes, batch):
@@ -155,7 +146,12 @@ def _rollout(
     env.reset(seed=[start + i for i in range(count)] * order)
     state = env.get_state_dict()
     copies = [env.transform_state(state, angle, reflect) for angle, reflect in elements]
-    env.set_state_dict(_interleave(copies, count))
+    # Rows g * count ... of copy g.
+    env.set_state_dict(
+        map_trees(
+            lambda *c: torch.cat([x[g * count : (g + 1) * count] for g, x in enumerate(c)]), *copies
+        )
+    )
     if policy is not None:
         choose = _policy_actions(env, policy, start, count, elements)
     elif kind == "expert":
@@ -180,7 +176,7 @@ def _rollout(
     touched = ((bodies - bodies[:1]).norm(dim=-1) > MOVED).any(dim=1).any(dim=-1)
     free = (touched.cumsum(dim=0) == 0).sum(dim=0) - 1
     won = torch.stack(success).unflatten(1, (order, count))
-    # An episode ends with its first success; later steps are nobody's.
+    # An episode ends with its first success; later steps do not count.
     end = 1 + (won[:, 0].cumsum(dim=0) == 0).sum(dim=0).clamp(max=steps - 1)
     free = free.minimum(end)
     every = torch.arange(count)
@@ -201,7 +197,7 @@ def _rollout(
 
 
 def _turn_back(points: torch.Tensor, back: list[torch.Tensor], count: int) -> torch.Tensor:
-    """``[steps, order * count, ..., 3]`` to ``[steps, order, count, ..., 3]``, turned back."""
+    """Turn points back: ``[steps, order * count, ..., 3]`` to ``[steps, order, count, ..., 3]``."""
     split = points.unflatten(1, (len(back), count))
     return torch.stack([split[:, g] @ matrix.T for g, matrix in enumerate(back)], dim=1)
 
@@ -211,7 +207,7 @@ def _turned(
     choose: Callable[[int], torch.Tensor],
     elements: tuple[tuple[float, bool], ...],
 ) -> Callable[[int], torch.Tensor]:
-    """The originals' actions ``[count, 7]``, turned for every copy, ``[order * count, 7]``."""
+    """Turn the actions of the originals ``[count, 7]`` for all copies, ``[order * count, 7]``."""
 
     def chosen(step: int) -> torch.Tensor:
         original = choose(step)
@@ -227,7 +223,7 @@ def _policy_actions(
     count: int,
     elements: tuple[tuple[float, bool], ...],
 ) -> Callable[[int], torch.Tensor]:
-    """Each copy's own decoding ``[order * count, 7]`` of noise that is turned alike."""
+    """Actions ``[order * count, 7]`` that each copy decodes from the turned noise."""
     layout = policy.act_layout
     streams = [np.random.default_rng([start + i, 3]) for i in range(count)]
     chunk = torch.zeros(0)
@@ -252,8 +248,8 @@ def _expert_actions(env: SymmetricTask, count: int) -> Callable[[int], torch.Ten
 def _noise(env: SymmetricTask, start: int, count: int, steps: int) -> Callable[[int], torch.Tensor]:
     """Correlated random actions, one stream per episode.
 
-    The vertical action steers towards a random height above the objects, so that the arm-less
-    hand roams without touching anything.
+    The vertical action moves the gripper towards a random height above the objects, so that it
+    touches nothing.
     """
     layout = env.action_layout
     draws = np.stack(
@@ -277,13 +273,6 @@ def _noise(env: SymmetricTask, start: int, count: int, steps: int) -> Callable[[
         return env.body.bound(action)
 
     return choose
-
-
-def _interleave(copies: list[Any], count: int) -> Any:
-    """Rows ``g * count ...`` of copy g, for every tensor of the state."""
-    if isinstance(copies[0], dict):
-        return {key: _interleave([copy[key] for copy in copies], count) for key in copies[0]}
-    return torch.cat([c[g * count : (g + 1) * count] for g, c in enumerate(copies)])
 
 
 def _tcp(env: SymmetricTask) -> torch.Tensor:

@@ -1,14 +1,14 @@
 """States that an expert or a base policy visits, and their turned copies.
 
-Visited are states of the unbroken task, one of each episode, so that they are independent of one
-another. Copies are made by a planar group that acts about a given centre on the whole simulation
-state: bodies, robot, controller targets.
+States are taken from the unbroken task, one from each episode, so they are independent. Their
+copies are turned about a given centre by the elements of a planar group, which act on the whole
+simulation state: bodies, robot, controller targets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -25,20 +25,20 @@ Element = tuple[float, bool]
 """A planar symmetry: angle in radians, and whether the reflection of y comes first."""
 
 MOVED = 1e-4
-"""An object that is further than this from where it was (metres) is in motion."""
+"""An object that moves further than this (metres) counts as moving."""
 
 
 @dataclass(frozen=True)
 class Visited:
-    """S states on the way, with what was done there; tensors on the CPU.
+    """S visited states with the actions that followed; tensors on the CPU.
 
     Attributes:
         state: simulation states, a tree of ``[S, ...]``.
-        actions: the visitor's next actions from there on, ``[S, T, 7]``.
+        actions: the next T actions of the visitor, ``[S, T, 7]``.
         after: the states one control step later.
-        moving: whether the manipulated object moves during these T steps (in the unbroken task:
-            it is pushed, carried, falling), ``[S]`` bool.
-        policy: whether the base policy came by, and not the expert, ``[S]`` bool.
+        moving: whether the manipulated object moves during these T steps of the unbroken task
+            (pushed, carried or falling), ``[S]`` bool.
+        policy: whether the visitor was the base policy, not the expert, ``[S]`` bool.
     """
 
     state: dict[str, Any]
@@ -50,13 +50,6 @@ class Visited:
     def __len__(self) -> int:
         return len(self.actions)
 
-    @staticmethod
-    def join(parts: Sequence[Visited]) -> Visited:
-        """All states of several visits."""
-        return Visited(
-            **{f.name: join_trees([getattr(p, f.name) for p in parts]) for f in fields(Visited)}
-        )
-
 
 def visit(
     env: SymmetricTask,
@@ -66,25 +59,22 @@ def visit(
     seed: int,
     policy: ChunkPolicy | None = None,
 ) -> Visited:
-    """Sample a state from each of ``count`` episodes, uniformly in time until its success.
+    """Sample one state from each of ``count`` episodes, uniformly in time before success.
 
     Args:
-        env: the unbroken task; its parallel environments play an episode each at a time.
+        env: the unbroken task; each of its environments plays one episode at a time.
         visitor: ``expert`` acts in closed loop; ``policy`` decodes standard normal noise and
-            executes its chunks, and its states are those in which it decides.
+            executes its chunks, and only states at the start of a chunk are sampled.
         count: number of states.
         steps: number T of following actions to keep.
-        seed: of episodes, noise and choice.
+        seed: of episodes, noise and sampled times.
         policy: the base policy.
     """
     parts = []
     for start in range(0, count, env.num_envs):
         part = _visit_batch(env, visitor, steps, [seed, start], policy)
-        keep = torch.arange(min(env.num_envs, count - start))
-        parts.append(
-            Visited(**{f.name: rows_of(getattr(part, f.name), keep) for f in fields(Visited)})
-        )
-    return Visited.join(parts)
+        parts.append(rows_of(part, torch.arange(min(env.num_envs, count - start))))
+    return join_trees(parts)
 
 
 def _visit_batch(
@@ -110,7 +100,7 @@ def _visit_batch(
                 noise = torch.randn(
                     env.num_envs, policy.horizon, policy.act_layout.dim, generator=generator
                 )
-                device = next(policy.parameters()).device
+                device = policy.device
                 chunk = policy.decode(obs.to(device), noise.to(device)).to(env.device)
             action = chunk[:, step % policy.execute]
         obs, _, _, _, info = env.step(action)
@@ -139,29 +129,23 @@ def _visit_batch(
 
 def _pick(trail: list[Any], time: torch.Tensor) -> Any:
     """Row i of the tree at ``time[i]``."""
-    if isinstance(trail[0], dict):
-        return {key: _pick([tree[key] for tree in trail], time) for key in trail[0]}
-    return torch.stack([trail[int(t)][i] for i, t in enumerate(time)])
+    return map_trees(
+        lambda *steps: torch.stack([steps[int(t)][i] for i, t in enumerate(time)]), *trail
+    )
 
 
 def task_state(env: SymmetricTask) -> dict[str, Any]:
-    """The simulation state of all environments on the CPU, without what stands still."""
+    """The simulation state of all environments on the CPU, without the table."""
     state = env.get_state_dict()
     actors = {k: v for k, v in state["actors"].items() if k != env.table_scene.table.name}
-    return _to_cpu({**state, "actors": actors})
-
-
-def _to_cpu(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return {key: _to_cpu(value) for key, value in tree.items()}
-    return tree.detach().cpu().clone()
+    return map_trees(lambda x: x.detach().cpu().clone(), {**state, "actors": actors})
 
 
 class Turner:
-    """Acts with planar symmetries on simulation states, about any centre.
+    """Applies planar symmetries about any centre to simulation states.
 
     Args:
-        env: a task that knows how its states turn; it is asked, not stepped.
+        env: a task whose ``transform_state`` is used; it is not stepped.
     """
 
     def __init__(self, env: SymmetricTask) -> None:
@@ -171,12 +155,15 @@ class Turner:
     def turn(
         self, state: dict[str, Any], element: Element, centre: torch.Tensor
     ) -> tuple[dict[str, Any], torch.Tensor]:
-        """Turn states; which of them the robot can take, ``[S]`` bool, comes along.
+        """Transform states.
 
         Args:
             state: tree of ``[S, ...]``.
-            element: what acts; the identity returns the states to the bit.
-            centre: about which it acts, ``[2]`` metres from the workspace centre.
+            element: the symmetry; the identity does not change a bit of the states.
+            centre: fixed point of the symmetry, ``[2]`` metres from the workspace centre.
+
+        Returns:
+            The states, and which of them the robot can reach, ``[S]`` bool.
         """
         count = len(next(iter(state["actors"].values())))
         reached = torch.ones(count, dtype=torch.bool)
@@ -209,9 +196,9 @@ class Turner:
 
 
 def seen_from(state: dict[str, Any], centre: torch.Tensor) -> dict[str, Any]:
-    """The same states with ``centre [2]`` moved to the workspace centre, for observing only.
+    """Shift states so that ``centre [2]`` is at the workspace centre, only to observe them.
 
-    The robot's base moves too, which leaves joint angles as they are but is no state of the task.
+    The robot's base moves with everything else, so the result is not a state of the task.
     """
     offset = -centre.expand(len(next(iter(state["actors"].values()))), 2)
     moved = {
@@ -222,21 +209,29 @@ def seen_from(state: dict[str, Any], centre: torch.Tensor) -> dict[str, Any]:
 
 
 def _shift(state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
-    """Move bodies or robot bases, whose first two numbers are x and y, by ``offset [S, 2]``."""
+    """Move bodies or robot bases by ``offset [S, 2]``; their first two numbers are x and y."""
     moved = state.clone()
     moved[:, :2] += offset
     return moved
 
 
+def map_trees(function: Callable[..., torch.Tensor], *trees: Any) -> Any:
+    """Apply a function to the corresponding tensors of trees (dictionaries and dataclasses)."""
+    first = trees[0]
+    if isinstance(first, dict):
+        return {key: map_trees(function, *(tree[key] for tree in trees)) for key in first}
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [f.name for f in fields(first)]
+        parts = {n: map_trees(function, *(getattr(tree, n) for tree in trees)) for n in names}
+        return type(first)(**parts)
+    return function(*trees)
+
+
 def join_trees(trees: Sequence[Any]) -> Any:
     """Concatenate trees of ``[S_i, ...]``."""
-    if isinstance(trees[0], dict):
-        return {key: join_trees([tree[key] for tree in trees]) for key in trees[0]}
-    return torch.cat(list(trees))
+    return map_trees(lambda *tensors: torch.cat(tensors), *trees)
 
 
 def rows_of(tree: Any, rows: torch.Tensor) -> Any:
     """Some rows of a tree of ``[S, ...]``."""
-    if isinstance(tree, dict):
-        return {key: rows_of(value, rows) for key, value in tree.items()}
-    return tree[rows]
+    return map_trees(lambda tensor: tensor[rows], tree)

@@ -105,9 +105,7 @@ def collect(
     """
     path = Path(out_path)
     if path.suffix != ".h5":
-        raise UserError(
-            f"demonstrations are written to a file, whose name must end in .h5, not {path.name!r}"
-        )
+        raise UserError(f"the file of demonstrations must end in .h5; it is {path.name!r}")
     if path.is_dir():
         raise UserError(f"{path} is a folder; name a file for the demonstrations")
     if count < 1:
@@ -189,7 +187,7 @@ def _disturbances(
     offsets = np.zeros((len(seeds), 3))
     innovation = np.sqrt(1 - settings.correlation**2)
     for i, seed in enumerate(seeds):
-        # A stream of its own: the environment seeds another generator with the same number.
+        # The second number keeps it apart from the environment's generator of the same seed.
         rng = np.random.default_rng([seed, 1])
         tolerance = env.body.noise_scale * env.noise_scale
         scale = settings.noise * tolerance * rng.uniform(*settings.scale)
@@ -201,7 +199,7 @@ def _disturbances(
             if step > 0:
                 level = settings.correlation * level + innovation * draws[step]
             noise[step, i] = scale * level
-    # A noisy finger command would drop the object; a noisy tilt does not help to steer.
+    # Noise on the fingers would drop the object; noise on the tilt does not help steering.
     for name in ("gripper", "tilt"):
         noise[:, :, env.action_layout.slice(name)] = 0.0
     return (

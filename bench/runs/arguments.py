@@ -85,7 +85,7 @@ def parse(arguments: Sequence[str], defaults: RunConfig) -> tuple[RunConfig, Exe
 def last_value(arguments: Sequence[str], option: str) -> str | None:
     """The value of ``--option VALUE`` or ``--option=VALUE``; the last one wins, as with tyro."""
     value = None
-    for word, following in zip(arguments, [*arguments[1:], None], strict=True):
+    for word, following in zip(arguments, [*arguments[1:], None], strict=False):
         if word == option:
             value = following
         elif word.startswith(f"{option}="):

@@ -95,12 +95,16 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
         own["demonstrations"] = world["demonstrations"]
         own["policy_seed"] = world["policy_seed"]
     told = build_config(config.to_json() | own, str(path))
-    default, asked, found = (flat(c.to_json()) for c in (RunConfig(), config, told))
+    # What has its default value was not asked for: the file decides.
+    plain = RunConfig(agent=config.agent, policy_name=config.policy_name)
+    default, asked, found = (flat(c.to_json()) for c in (plain, config, told))
+    default["policy.name"] = RunConfig.policy_name
     for key, value in asked.items():
-        if value not in (default[key], found[key]):
+        if value not in (default[key], found.get(key)):
             raise UserError(
-                f"{path} was trained with {key} {found[key]}, and this run asks for {value}; leave "
-                f"--{key.replace('_', '-')} out, or name no base policy, to train one like that"
+                f"{path} was trained with {key} {found.get(key)}, and this run asks for {value}; "
+                f"leave --{key.replace('_', '-')} out, or name no base policy, to train one like "
+                "that"
             )
     return told
 

@@ -94,7 +94,7 @@ def write_study(path: Path, config: RunConfig, rows: Sequence[dict[str, Any]]) -
             "task": config.task,
             "embodiment": config.embodiment,
             "demonstrations": config.demonstrations.mode,
-            "policy": config.policy.to_json(),
+            "policy": config.to_json()["policy"],
             "rows": list(rows),
         },
     )

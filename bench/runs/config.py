@@ -164,9 +164,7 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
         if not isinstance(name, str):
             raise UserError(f"{source}: {key} must be a text in quotes, not {name!r}")
     try:
-        defaults = RunConfig(agent=agent, policy_name=policy_name)
-        plain = defaults.to_json()
-        del plain["policy"]["name"]
+        defaults, plain = _defaults(agent, policy_name)
         _check_nested_keys({**data, **tables}, plain, source, "")
         chosen = {
             key: _validated(type(getattr(defaults, key)), {**plain[key], **table}, key)
@@ -211,8 +209,19 @@ def content_key(*parts: Any) -> str:
 
 
 @functools.cache
+def _defaults(agent: str, policy_name: str) -> tuple[RunConfig, dict[str, Any]]:
+    """The default configuration of an agent and a policy, and its plain data without their names.
+
+    Made once per pair: a suite has thousands of configurations.
+    """
+    defaults = RunConfig(agent=agent, policy_name=policy_name)
+    plain = defaults.to_json()
+    del plain["policy"]["name"]
+    return defaults, plain
+
+
+@functools.cache
 def _adapter(of: type) -> TypeAdapter[Any]:
-    # Made once: a suite has thousands of configurations, and making it takes longer than using it.
     return TypeAdapter(of)
 
 

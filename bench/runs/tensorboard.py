@@ -15,9 +15,11 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from torch.utils.tensorboard import SummaryWriter
 
-from symsteer.bench.runs.config import flat
+from symsteer.agents import AGENTS
+from symsteer.bench.runs.config import RunConfig, flat
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Provenance, RunRecord
+from symsteer.policies import POLICIES
 
 # The tags of a Multiline chart are regular expressions; a Margin chart takes value, low, high.
 LAYOUT = {
@@ -82,7 +84,8 @@ class RunLog:
             # A continued run may stand on another commit: its text is added to the first one's.
             self.writer.add_text("config", config_text(record), purge_step)
             settings = _settings(record.config)
-            self._hparams(metadata.EXPERIMENT_TAG, experiment=_experiment(settings))
+            known = {**_known_settings(), **settings}
+            self._hparams(metadata.EXPERIMENT_TAG, experiment=_experiment(known))
             self._hparams(
                 metadata.SESSION_START_INFO_TAG, session_start_info=_session(record, settings)
             )
@@ -165,6 +168,17 @@ def _settings(config: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
         return value if isinstance(value, bool | int | float | str) else str(value)
 
     return {name: known(value) for name, value in flat(config).items()}
+
+
+@functools.cache
+def _known_settings() -> dict[str, bool | int | float | str]:
+    """The settings of all agents and policies of SymSteer, with their defaults."""
+    runs = [RunConfig(agent=name) for name in AGENTS.builtin]
+    runs += [RunConfig(policy_name=name) for name in POLICIES.builtin]
+    known: dict[str, bool | int | float | str] = {"evaluation_variant": "none"}
+    for run in runs:
+        known |= _settings(run.to_json())
+    return dict(sorted(known.items()))
 
 
 def config_text(record: RunRecord) -> str:

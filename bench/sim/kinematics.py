@@ -81,11 +81,11 @@ class SerialChain:
         position = shifts[..., 0, :, :].expand(len(q), 3, 1)
         rotations, positions = [rotation], [position]
         for j in range(1, q.shape[1]):
-            position = position + rotation @ shifts[..., j, :, :]
+            position = position + _turned(rotation, shifts[..., j, :, :])
             rotation = rotation @ steps[:, j]
             rotations.append(rotation)
             positions.append(position)
-        end = position + rotation @ self._tool
+        end = position + _turned(rotation, self._tool)
         axis = (torch.stack(rotations, 1) @ self._axis)[..., 0]
         arm = (end[:, None] - torch.stack(positions, 1))[..., 0]
         linear = torch.cross(axis, arm, dim=-1)
@@ -93,3 +93,12 @@ class SerialChain:
             linear = torch.where(self._revolute[:, None], linear, axis)
             axis = axis * self._revolute[:, None]
         return torch.cat([linear, axis], dim=-1).transpose(1, 2)
+
+
+def _turned(rotation: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    """``rotation [B, 3, 3]`` times ``vector [3, 1]`` or ``[B, 3, 1]``.
+
+    As one small product per row. torch multiplies all rows at once with a single vector, and on
+    some processors the last bits of that product depend on the number of rows.
+    """
+    return rotation @ vector.expand(len(rotation), 3, 1)

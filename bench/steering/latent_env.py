@@ -72,7 +72,7 @@ class LatentNoiseEnv:
         self.num_envs: int = self.env.num_envs
         self.execute = self.policy.execute
         self.max_episode_steps: int = self.env.max_episode_steps
-        self.device = next(self.policy.parameters()).device
+        self.device = self.policy.device
         self.control_steps = 0
         self.decisions = 0
 

@@ -30,6 +30,19 @@ NAMED = ("agent", "policy")
 
 
 @dataclass(frozen=True)
+class Grid:
+    """A grid of runs.
+
+    Attributes:
+        keys: whose values it lists.
+        runs: a table for each run: nested plain data, shared settings included.
+    """
+
+    keys: tuple[str, ...]
+    runs: tuple[dict[str, Any], ...]
+
+
+@dataclass(frozen=True)
 class SuiteData:
     """A suite as its file describes it.
 
@@ -37,18 +50,20 @@ class SuiteData:
         name: of the file, without its ending.
         source: file name, to begin messages with.
         description: what the suite is for.
-        grids: for each grid, the tables of its runs: nested plain data, shared settings included.
+        shared: what all runs share; ``agent`` and ``policy`` are tables.
+        grids: in the order of the file.
     """
 
     name: str
     source: str
     description: str
-    grids: tuple[tuple[dict[str, Any], ...], ...]
+    shared: dict[str, Any]
+    grids: tuple[Grid, ...]
 
     @property
     def runs(self) -> list[dict[str, Any]]:
         """The tables of all runs, each once."""
-        return list({repr(run): run for grid in self.grids for run in grid}.values())
+        return list({repr(run): run for grid in self.grids for run in grid.runs}.values())
 
 
 def suite_names() -> list[str]:
@@ -94,17 +109,38 @@ def read_suite(name_or_path: str) -> SuiteData:
         raise UserError(f"{source}: description must be a text in quotes")
     shared = _with_tables(shared, source)
     grids = data.get("grid", {})
-    runs = tuple(
-        tuple(_merge(shared, cell, source) for cell in _cells(grid, source))
-        for grid in (grids if isinstance(grids, list) else [grids])
-    )
-    return SuiteData(path.stem, source, description, runs)
-
-
-def _cells(grid: Any, source: str) -> Iterator[dict[str, Any]]:
-    """Every combination of a grid's values, strengths joined to their variants."""
-    if not isinstance(grid, dict):
+    grids = grids if isinstance(grids, list) else [grids]
+    if not all(isinstance(grid, dict) for grid in grids):
         raise UserError(f"{source}: grid must be a table, [grid], or several, each [[grid]]")
+    return SuiteData(
+        path.stem,
+        source,
+        description,
+        shared,
+        tuple(
+            Grid(tuple(grid), tuple(_merge(shared, cell, source) for cell in _cells(grid, source)))
+            for grid in grids
+        ),
+    )
+
+
+def split_key(key: str) -> list[str]:
+    """The path of a grid's key in nested tables: ``"evaluation.every"`` is evaluation, every.
+
+    The name of an agent or policy may contain dots: ``"agent.package.module:Class.width"`` is
+    agent, package.module:Class, width.
+    """
+    kind, _, rest = key.partition(".")
+    if key in NAMED:
+        return [key, "name"]
+    if kind not in NAMED:
+        return key.split(".")
+    name, _, option = rest.rpartition(".")
+    return [kind, name, option] if name else [kind, option]
+
+
+def _cells(grid: dict[str, Any], source: str) -> Iterator[dict[str, Any]]:
+    """Every combination of a grid's values, strengths joined to their variants."""
     for key, values in grid.items():
         if not isinstance(values, list) or not values:
             raise UserError(f"{source}: grid.{key} must be a list with at least one value")
@@ -149,7 +185,7 @@ def _merge(shared: dict[str, Any], cell: dict[str, Any], source: str) -> dict[st
     merged = copy.deepcopy(shared)
     for key, value in cell.items():
         place = merged
-        *path, last = [key, "name"] if key in NAMED else key.split(".")
+        *path, last = split_key(key)
         for part in path:
             place = place.setdefault(part, {})
             if not isinstance(place, dict):

@@ -41,7 +41,7 @@ class Status:
         return [run for run in self.runs if self.state(run) == state]
 
     def seconds_left(self) -> float | None:
-        """Seconds until all runs are finished, at the present number of workers; None if unknown."""
+        """Seconds until all runs are finished at the present number of workers; None: unknown."""
         estimate = Estimate()
         for run in self.in_state("finished"):
             estimate.add(run, self.runs[run].seconds)

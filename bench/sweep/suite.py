@@ -9,14 +9,13 @@ in the same way, without presets.
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from symsteer.agents import AGENTS
 from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
-from symsteer.bench.sweep.grid import SuiteData, read_suite
+from symsteer.bench.sweep.grid import SuiteData, read_suite, split_key
 from symsteer.errors import UserError
 from symsteer.names import unknown
 from symsteer.policies import POLICIES
@@ -60,7 +59,7 @@ def load_suite(name_or_path: str) -> Suite:
 
 
 class _Options:
-    """The options of the agents, or policies, of a suite.
+    """The options of the agents, or of the policies, of a suite.
 
     Args:
         kind: ``agent`` or ``policy``, the key of the tables.
@@ -69,57 +68,60 @@ class _Options:
         data: the suite.
 
     Raises:
-        UserError: if an option belongs to none of a grid's agents, or an agent does not exist.
+        UserError: if a name does not exist, or none of the agents that an option is for has it.
     """
 
     def __init__(self, kind: str, registry: Registry[Any], default: str, data: SuiteData):
         self.kind, self.default, self.source = kind, default, data.source
-        tables = {repr(run[kind]): run[kind] for run in data.runs}.values()
-        names = dict.fromkeys(self._name(table) for table in tables)
-        self.classes = {name: registry.get(name).Options for name in names}
-        for table in tables:
-            self._check(table)
+        self.reserved = ("name", "preset") if kind == "agent" else ("name",)
+        present = [dict.fromkeys(self._name(run[kind]) for run in grid.runs) for grid in data.grids]
+        everywhere = dict.fromkeys(name for names in present for name in names)
+        self.classes = {name: registry.get(name).Options for name in everywhere}
+        for key, value in data.shared[kind].items():
+            if isinstance(value, dict) and key not in self.reserved:
+                for option in value:
+                    self._check([key, option], list(everywhere))
+            else:
+                self._check([key], list(everywhere))
+        for grid, names in zip(data.grids, present, strict=True):
+            for path in map(split_key, grid.keys):
+                if path[0] == kind:
+                    self._check(path[1:], list(names))
 
     def of(self, table: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-        """Name and options of one run; options that its agent does not have are left out."""
+        """The name and the options of one run's table."""
         name = self._name(table)
+        own = table.get(name, {})
+        options = {key: value for key, value in table.items() if not isinstance(value, dict)}
+        options |= own if isinstance(own, dict) else {}
+        start: dict[str, Any] = {}
+        if self.kind == "agent" and "preset" in options:
+            preset = self._text(options["preset"], "preset")
+            start = preset_options(preset, name, self.classes[name])
         valid = _fields(self.classes[name])
-        options: dict[str, Any] = {}
-        if self.kind == "agent" and "preset" in table:
-            options = preset_options(table["preset"], name, self.classes[name])
-        options |= {key: value for key, value in table.items() if key in valid}
-        return name, options | table.get(name, {})
+        return name, start | {key: value for key, value in options.items() if key in valid}
 
     def _name(self, table: dict[str, Any]) -> str:
-        name = table.get("name", self.default)
-        if not isinstance(name, str):
-            raise UserError(f"{self.source}: {self.kind} must be a text in quotes, not {name!r}")
-        return name
+        return self._text(table.get("name", self.default), "name")
 
-    def _check(self, table: dict[str, Any]) -> None:
-        """Refuse options that no agent of the suite has, and tables of agents that it lacks."""
-        for key, value in table.items():
-            if key == "name":
-                continue
-            if key == "preset" and self.kind == "agent":
-                if not isinstance(value, str):
-                    raise UserError(
-                        f"{self.source}: agent.preset must be a text in quotes, not {value!r}"
-                    )
-            elif isinstance(value, dict):
-                if key not in self.classes:
-                    raise unknown(self.kind, key, self.classes, self.source)
-                for option in value:
-                    self._check_option(option, [key])
-            else:
-                self._check_option(key, list(self.classes))
+    def _text(self, value: Any, key: str) -> str:
+        if not isinstance(value, str):
+            raise UserError(
+                f"{self.source}: {self.kind}.{key} must be a text in quotes, not {value!r}"
+            )
+        return value
 
-    def _check_option(self, option: str, names: list[str]) -> None:
-        valid = dict.fromkeys(key for name in names for key in _fields(self.classes[name]))
-        if option not in valid:
+    def _check(self, path: list[str], names: list[str]) -> None:
+        """Refuse an ``[option]``, or ``[name, option]``, that none of the named agents has."""
+        *owner, option = path
+        if owner and owner[0] not in names:
+            raise unknown(self.kind, owner[0], names, f"{self.source}, {self.kind}.{owner[0]}")
+        names = owner or names
+        valid = dict.fromkeys(field for name in names for field in _fields(self.classes[name]))
+        if option not in (*valid, *self.reserved):
             where = f"{self.source} ({self.kind} {', '.join(names)})"
-            raise unknown("option", option, valid, where)
+            raise unknown(f"{self.kind} option", option, valid, where)
 
 
-def _fields(options: type) -> list[str]:
-    return [field.name for field in dataclasses.fields(options)]
+def _fields(options: Any) -> list[str]:
+    return [field.name for field in fields(options)]

@@ -1,4 +1,4 @@
-"""What every SymSteer task adds to its ManiSkill class: geometry, symmetric resets, variants.
+"""What SymSteer adds to ManiSkill's task classes: geometry, symmetric resets, variants.
 
 Success, reward and assets stay ManiSkill's. The observation is an ordered dictionary of named
 geometric fields whose concatenation is ``observation_layout``; it is a function of poses and
@@ -78,10 +78,10 @@ class SymmetricTask(GymEnv):
     action_layout: ClassVar[Layout] = ACTION_LAYOUT
     workspace_center: ClassVar[tuple[float, float]] = (0.0, 0.0)
     spawn_extent: ClassVar[float]
-    """Radius about the origin, metres, within which every body that can collide stands at a reset
-    as a whole, as far as it is below 10 cm."""
+    """Radius about the origin, metres, within which all colliding bodies lie at a reset; parts of
+    them that are higher than 10 cm do not count."""
     noise_scale: ClassVar[float] = 1.0
-    """How much action noise diverse demonstrations bear in this task, relative to the others."""
+    """Factor on the action noise of diverse demonstrations in this task."""
     mirrored_across_yz: ClassVar[frozenset[str]] = frozenset()
     """Names of actors that are their own mirror image across their body y-z plane but not across
     x-z, the plane by which a reflection mirrors all others."""
@@ -151,7 +151,7 @@ class SymmetricTask(GymEnv):
                 variant.reset(env_idx)
 
     def intent(self, offset: torch.Tensor) -> Intent:
-        """What the scripted expert wants in the present state.
+        """The scripted expert's intent in the present state.
 
         Args:
             offset: moves the point that is grasped or pushed, ``[N, 3]`` metres.
@@ -258,7 +258,7 @@ class SymmetricTask(GymEnv):
             executed = self.body.bound(commanded)
             for variant in self.variants:
                 executed = variant.action(executed)
-            # Where no variant acts, not even the rounding of the bound may.
+            # Where no variant acts, the action must stay the same to the bit.
             action = torch.where(self._broken[:, None], executed, commanded)
         self._hold_forces()
         self._frictions.update()
@@ -271,7 +271,7 @@ class SymmetricTask(GymEnv):
         return action
 
     def _hold_forces(self) -> None:
-        """Let the variants' forces, which depend on masses alone, act in all substeps."""
+        """Apply the variants' forces, which depend on masses only, in all substeps."""
         if self._forces_held:
             return
         self._forces_held = True
@@ -284,8 +284,8 @@ class SymmetricTask(GymEnv):
     def get_info(self) -> dict:
         """As ManiSkill's; where a variant makes steps costly, also ``extra_cost [N]``.
 
-        That is what the last control step cost beside the usual -1: it has been subtracted from
-        the reward, and is 0 at success.
+        It is the cost of the last control step besides the usual -1. The reward already contains
+        it. It is 0 at success.
         """
         info = super().get_info()
         if overriding(self.variants, "extra_cost"):
@@ -297,7 +297,7 @@ class SymmetricTask(GymEnv):
         return info
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """As ManiSkill's, less the ``extra_cost`` of ``info`` (reward mode ``none`` aside)."""
+        """As ManiSkill's minus the ``extra_cost`` of ``info`` (not in reward mode ``none``)."""
         reward = super().get_reward(obs=obs, action=action, info=info)
         if "extra_cost" in info and self.reward_mode != "none":
             reward = reward.float() - info["extra_cost"]
@@ -392,8 +392,9 @@ class SymmetricTask(GymEnv):
     def _advance_episode_keys(self, seeded: bool) -> None:
         """A number for each episode that starts now: its seed, or the successor of the last key.
 
-        ManiSkill keeps an environment's seed over resets without one; variants that draw noise
-        need another key then, and must not draw from the generators that place the objects.
+        ManiSkill keeps an environment's seed over resets without one. Variants that draw noise
+        need a new key then; drawing from the generators that place objects would change the
+        initial states.
         """
         keys = torch.as_tensor(self._episode_seed, dtype=torch.int64, device=self.device)
         if not hasattr(self, "episode_key"):

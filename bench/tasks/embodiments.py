@@ -1,7 +1,7 @@
 """What carries the gripper: nothing (``floating``) or ManiSkill's stock Panda arm (``panda``).
 
-An embodiment says where the robot stands, how it is placed at a reset, what its actions are worth
-in metres and radians, and how its state turns with the world.
+An embodiment says where the robot stands, how it is placed at a reset, how far its actions move
+it, and how its state turns with the world.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class Embodiment:
     root_position: tuple[float, float, float]
     control_mode: str = "pd_ee_delta_pose"
     noise_scale: float = 1.0
-    """How much action noise demonstrations bear here, relative to the floating gripper."""
+    """Factor on the action noise of demonstrations, relative to the floating gripper."""
     horizontal_step: float = PlanarPoseControllerConfig.horizontal_step
     """How far the tool goes in one control step at action 1, metres."""
     drag_gain: float = 1.0
-    """What an expert multiplies displacements by while it drags a load over the table."""
+    """Factor on an expert's displacements while it drags a load over the table."""
 
     def initial_qpos(self, rng: Any, count: int) -> np.ndarray:
         """Joint positions at a reset, ``[count, dof]``, from one random generator per row."""
@@ -64,7 +64,7 @@ class Embodiment:
         raise NotImplementedError
 
     def set_bias(self, agent: Any, bias: torch.Tensor) -> None:
-        """Let the actuator drift: add to every horizontal step, behind the controller's bound.
+        """Let the actuator drift: add to every horizontal step, after the controller's bound.
 
         Args:
             agent: the robot, whose controller is new.
@@ -75,13 +75,14 @@ class Embodiment:
     def reachable_turn(
         self, qpos: torch.Tensor, turn: torch.Tensor, period: float, later: torch.Tensor
     ) -> torch.Tensor:
-        """Which of several turns of the tool that serve alike to take, ``[N]`` radians.
+        """Choose a turn that the joints can reach among equivalent ones, ``[N]`` radians.
 
         Args:
             qpos: joint positions, ``[N, dof]``.
-            turn: the smallest of them, about the vertical, ``[N]``.
-            period: what they differ by; a half turn where the fingers may be exchanged.
-            later: further turn that is to follow, ``[N]``.
+            turn: the smallest of the equivalent turns about the vertical, ``[N]``.
+            period: equivalent turns differ by multiples of it; pi where the fingers may be
+                exchanged.
+            later: a further turn that will follow, ``[N]``.
         """
         return turn
 
@@ -89,11 +90,11 @@ class Embodiment:
         """Act with (angle, reflect) on an articulation state ``[N, 13 + 2 dof]``.
 
         Raises:
-            UserError: if the robot's rotated states are not states of the robot.
+            UserError: if the robot cannot take the rotated states.
         """
         raise UserError(
-            f"states of the {self.name!r} embodiment cannot be rotated exactly: its base stands "
-            "still; use embodiment 'floating'"
+            f"states of the {self.name!r} embodiment cannot be rotated exactly: its base is "
+            "fixed; use embodiment 'floating'"
         )
 
     def transform_controller(self, state: dict, angle: float, reflect: bool) -> dict:
@@ -104,11 +105,11 @@ class Embodiment:
         """Move the hand of articulation states ``[N, 13 + 2 dof]`` by ``offset [N, 2]`` metres.
 
         Raises:
-            UserError: if a shifted hand is not a matter of other joint positions alone.
+            UserError: if the robot cannot take the shifted states.
         """
         raise UserError(
-            f"states of the {self.name!r} embodiment cannot be shifted exactly: its base stands "
-            "still; use embodiment 'floating'"
+            f"states of the {self.name!r} embodiment cannot be shifted exactly: its base is "
+            "fixed; use embodiment 'floating'"
         )
 
     def shift_controller(self, state: dict, offset: torch.Tensor) -> dict:
@@ -196,7 +197,7 @@ class Floating(Embodiment):
         if reflect:
             rotation = rotation * rotation.new_tensor([1.0, -1.0, 1.0])
         near = q[:, 3:].clone()
-        # Seen from above the tool points away, so yaw and the last joint run in opposite senses.
+        # The tool points down, so yaw (seen from above) and the last joint turn in opposite senses.
         near[:, 2] = (-near[:, 2] if reflect else near[:, 2]) - angle
         return torch.cat([q[:, :3] @ world.T, matrix_to_euler_facing_down(rotation, near)], dim=1)
 
@@ -245,7 +246,7 @@ class PandaArm(Embodiment):
         return torch.cat([move, -scale * turn], dim=1)
 
     def set_bias(self, agent: Any, bias: torch.Tensor) -> None:
-        # The stock controller bounds what it is given, so the drift has to come in behind that.
+        # The stock controller bounds its action, so the drift is added after that.
         arm = agent.controller.controllers["arm"]
         scale, drift = arm._clip_and_scale_action, self.step * bias
         xy = ACTION_LAYOUT.slice("xy")
@@ -266,7 +267,7 @@ class PandaArm(Embodiment):
         A grasp may end 0.2 rad short of its turn: closing fingers align the object.
         """
         turns = turn[:, None] + period * turn.new_tensor([0.0, -1.0, 1.0])
-        # Seen from above, the joint runs against the tool's yaw.
+        # The joint turns against the tool's yaw (seen from above).
         there = qpos[:, 6:7] - turns
         excess = (there.abs() - self.wrist_limit - 0.2).maximum(
             (there - later[:, None]).abs() - self.wrist_limit

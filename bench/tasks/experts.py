@@ -2,10 +2,10 @@
 
 A task's ``intent`` is a function of the present state: where to move the tool centre point, how
 to turn it, and whether to close the fingers. It uses relative vectors, heights and yaw differences
-only, so rotating a state rotates its action. Phases follow from geometry rather than from a
-counter (an observer of the state can infer them), and pass into one another through funnels: the
-further from the axis of a grasp, the higher the gripper stays. This module holds what the tasks'
-experts share, and :class:`Expert`, which turns an intent into an action.
+only, so rotating a state rotates its action. The phase follows from the geometry, not from a
+counter, so that it can be inferred from the state. Phases are joined by funnels: the further the
+gripper is from the axis of a grasp, the higher it stays. This module holds the parts that several
+tasks use, and :class:`Expert`, which turns an intent into an action.
 
 An offset [N, 3] moves the point that is grasped or pushed; diverse demonstrations use it.
 """
@@ -45,7 +45,7 @@ class Expert:
     """Solves a task from its privileged state.
 
     Args:
-        env: a task made by ``symsteer.make``, any embodiment; its ``intent`` decides.
+        env: a task made by ``symsteer.make``, with any embodiment.
     """
 
     def __init__(self, env: SymmetricTask):
@@ -103,15 +103,16 @@ def grasp_at(
     width: float,
     haste: float = 1.0,
 ) -> tuple[Intent, torch.Tensor]:
-    """Come down on a point and close the fingers; also whether something is held, ``[N]`` bool.
+    """Come down on a point and close the fingers; also say whether the object is held, ``[N]``.
 
     Args:
         env: the task.
-        target: where the tool centre point shall be when the fingers close, ``[N, 3]``.
+        target: where the tool centre point should be when the fingers close, ``[N, 3]``.
         body: the point of the object that must be near for it to be held, ``[N, 3]``.
-        yaw: turn that sets the fingers right, ``[N]``; zeros where any will do.
+        yaw: turn that aligns the fingers, ``[N]``; zeros if every yaw is right.
         width: of the object between the fingers, metres.
-        haste: share of the last 4 cm that is asked for in one step; less is slower and closer.
+        haste: share of the last 4 cm that is commanded in one step; smaller is slower and more
+            precise.
     """
     tcp = env.agent.tcp_pose.p
     move = target - tcp

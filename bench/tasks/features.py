@@ -76,7 +76,7 @@ def goal_disc_pose(xy: np.ndarray, yaw: np.ndarray, device: Any) -> Pose:
     """Poses of ManiSkill's target discs, flat on the table at ``xy [N, 2]``.
 
     A disc's axis is its body x axis; its body z axis is laid into the direction ``yaw [N]``
-    (rad), so that the pose carries a direction that nobody sees.
+    (rad), so that the pose holds a direction that is not visible.
     """
     upright = flat_pose(xy, 1e-3, yaw, device)
     flat = upright.q.new_tensor([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]).expand_as(upright.q)

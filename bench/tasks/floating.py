@@ -2,7 +2,7 @@
 
 The body is ManiSkill's ``floating_panda_gripper``: three prismatic and three revolute joints
 carry the Panda hand. ManiSkill's own ``pd_ee_delta_pose`` for it goes through inverse kinematics
-and bounds each axis by itself; the control mode of that name here moves a target pose of the tool
+and bounds each axis separately. Here the control mode of that name moves a target pose of the tool
 centre point, bounds each geometric block by its norm, and converts the target to joint angles in
 closed form, so that rotating state and action rotates the target exactly.
 """
@@ -47,8 +47,8 @@ TCP_OFFSET = 0.1034
 def bound_blocks(action: torch.Tensor, layout: Layout) -> torch.Tensor:
     """Shorten each irrep block of ``action [..., dim]`` that is longer than 1 to length 1.
 
-    The rule depends on norms only, hence commutes with rotations and reflections. Applying it
-    twice gives the same bits as once.
+    The rule depends on norms only, so it commutes with rotations and reflections. Applying it
+    twice gives the same bits as applying it once.
     """
     parts = []
     for block in layout.blocks:
@@ -86,7 +86,7 @@ class PlanarPoseController(PDJointPosController):
         position = self._target_qpos[:, :3] + TCP_OFFSET * rotation[:, :, 2]
         actual = self.qpos
         tcp = actual[:, :3] + TCP_OFFSET * euler_to_matrix(actual[:, 3:])[:, :, 2]
-        # A blocked gripper must not wind up its target: at most max_lag ahead of the body.
+        # The target of a blocked gripper must not run away: it stays within max_lag of the body.
         lag = position - tcp
         position = tcp + torch.cat(
             [
@@ -170,7 +170,7 @@ class PlanarPoseControllerConfig(PDJointPosControllerConfig):
 
 @register_agent()
 class FloatingGripper(FloatingPandaGripper):
-    """ManiSkill's floating Panda gripper with the abilities that table-top tasks ask of a robot.
+    """ManiSkill's floating Panda gripper with what table-top tasks need of a robot.
 
     Adds to its parent: ``tcp_pose``, ``tcp_pos``, ``is_grasping`` (the Panda's test), ``is_static``
     and the rotation-equivariant control mode ``pd_ee_delta_pose``.
@@ -230,7 +230,7 @@ class FloatingGripper(FloatingPandaGripper):
         """Whether the hand is slow, ``[N]`` bool.
 
         The Panda compares each joint's speed with ``threshold``; here horizontal speed, vertical
-        speed, tilt rate and yaw rate are compared, so that the direction of motion plays no part.
+        speed, tilt rate and yaw rate are compared, so that the direction of motion does not matter.
         """
         v = self.robot.get_qvel()[..., :6]
         speeds = torch.stack(

@@ -34,11 +34,11 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
     Reset: the peg lies with its centre uniform in a disc of 10 cm radius and its direction
     uniform on the circle (stock: a square, always along x). Success is stock's (axis within
     0.08 rad of the vertical, centre within 5 mm of half the peg's length) with the tilt measured
-    from the axis itself: stock takes it from an Euler angle, which is that tilt only while the
-    peg leans about its own body z axis, and which for some bearings calls any peg upright. The
-    dense reward is ManiSkill's, invariant as it stands.
+    from the axis itself. Stock takes it from an Euler angle, which is that tilt only while the
+    peg leans about its own body z axis; for some bearings it counts any peg as upright. The
+    dense reward is ManiSkill's, which is invariant.
 
-    The peg is a box with a square section whose two ends differ in paint only: it is its own
+    The peg is a box with a square section whose two ends differ in colour only: it is its own
     image under half turns, so its axis is observed up to its sign, as the three irreps of the
     symmetric traceless tensor of the axis.
     """
@@ -63,7 +63,7 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
     grip_from_end = 0.02
     """Where the expert grasps, metres from an end."""
     grip_force = 6.0
-    """How hard it presses with each finger, newtons: closed fingers would hold the peg's tilt."""
+    """Force of each finger, newtons; fully closed fingers would keep the peg's tilt."""
 
     def _place_objects(self, rng: Any, count: int) -> None:
         u = rng.uniform(size=3)
@@ -102,7 +102,7 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
     def intent(self, offset: torch.Tensor) -> Intent:
         """Grasp the peg near an end, raise that end about the other one, let go.
 
-        The grip is so loose that the peg turns between the fingers, while its foot stays on the
+        The grip is loose, so that the peg turns between the fingers and its foot stays on the
         table.
         """
         tcp, peg = self.agent.tcp_pose.p, self.peg.pose
@@ -116,8 +116,8 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         yaw = yaw_along(self, axis[:, :2])
         qpos = self.agent.robot.get_qpos()
         yaw = self.body.reachable_turn(qpos, yaw, math.pi, torch.zeros_like(yaw))
-        # Half the turn, so that fingers come down at twice the misalignment that others allow:
-        # they turn the peg as they close.
+        # Half the turn: the fingers come down at twice the usual misalignment, because they turn
+        # the peg as they close.
         approach, held = grasp_at(self, handle + offset, handle, yaw / 2, 2 * self.peg_half_width)
         approach = replace(approach, yaw=2 * approach.yaw)
         # Along the circle about the other end, in the vertical plane of the axis.
@@ -127,7 +127,7 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         tilt = torch.atan2(flat, rise)
         radius = 2 * self.peg_half_length - self.grip_from_end
         step = (radius * tilt).clamp(0.0, 0.05)
-        # Height of the peg's lowest corner: what was lifted off the table goes down again.
+        # Height of the peg's lowest corner, by which a lifted peg goes down again.
         foot = peg.p[:, 2] - self.peg_half_length * rise - self.peg_half_width * flat
         raise_end = Intent(
             move=torch.cat(

@@ -50,13 +50,13 @@ def snapshot(task: str, embodiment: str, seed: int, steps: int) -> np.ndarray:
 
 
 def task_picture(task: str, axis: int = 1, seed: int = 1, steps: int = 8) -> np.ndarray:
-    """All embodiments at one task along ``axis`` (0: below one another, 1: side by side), uint8."""
+    """One task with all embodiments, along ``axis`` (0: in a column, 1: side by side), uint8."""
     frames = [snapshot(task, e, seed, steps)[SIZE // 5 :] for e in EMBODIMENTS]
     return np.concatenate(frames, axis=axis)
 
 
 def contact_sheet() -> np.ndarray:
-    """Tasks from left to right, in rows; of each the embodiments from top to bottom; uint8."""
+    """All tasks in rows; each with its embodiments from top to bottom; uint8."""
     pictures = [task_picture(task, axis=0) for task in TASKS]
     blank = [np.full_like(pictures[0], 255)] * (-len(pictures) % TASKS_PER_ROW)
     pictures += blank

@@ -30,7 +30,7 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
 
     Reset: the midpoint of sphere and bin is uniform in a disc of 7 cm radius about the centre,
     their bearing uniform on the circle, their distance uniform in 11 to 18 cm (so that open
-    fingers around the sphere clear the bin whichever way they are turned), the bin's yaw uniform
+    fingers around the sphere clear the bin at any yaw), the bin's yaw uniform
     (stock: sphere and bin in two rectangles side by side along x, bin parallel to the axes).
     Success (sphere at rest in the bin, within 5 mm of its centre, let go) and reward are
     ManiSkill's. A square bin is its own image under quarter turns: its yaw has frequency 4. A
@@ -89,16 +89,16 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
     def intent(self, offset: torch.Tensor) -> Intent:
         """Grasp the sphere, carry it over the bin, lower it, let go, rise."""
         sphere, floor = self.obj.pose.p, self.bin.pose.p
-        # Half of an offset: a sphere slips from fingers that close far from its middle. And above
-        # the equator, where the finger tips (9 mm below the tool centre point) clear the
-        # walls of the bin.
+        # Half of an offset: a sphere slips from fingers that close far from its middle. Above its
+        # equator, so that the finger tips (9 mm below the tool centre point) clear the walls of
+        # the bin.
         target = sphere + 0.5 * offset + sphere.new_tensor([0.0, 0.0, 0.005])
         any_yaw = torch.zeros_like(sphere[:, 0])
         approach, held = grasp_at(self, target, sphere, any_yaw, 2 * self.radius, haste=0.6)
         place = floor - sphere
         drop = place[:, 2] + self.radius + self.block_half_size[0]
         aside = place[:, :2].norm(dim=1)
-        # Tips that press on a wall cannot open: let the sphere fall the last millimetres.
+        # Tips that touch a wall cannot open: let the sphere fall the last millimetres.
         wall = floor[:, 2] + self.block_half_size[0] + 2 * self.edge_block_half_size[2]
         lowest = wall + 0.012 - self.agent.tcp_pose.p[:, 2]
         rise = funnel(aside, 0.006, 4.0, 0.05)

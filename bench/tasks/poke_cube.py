@@ -36,15 +36,15 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
     10 cm apart across (stock: up to 20 cm), and the cube is turned by up to 30 degrees against
     the direction, as in stock. The goal disc's pose carries the direction (its body z axis).
 
-    The peg is its own image under a half turn, paint included: its yaw is observed with
-    frequency 2, and the point of it that is observed against the cube is its end that is nearer
-    to the cube. ManiSkill calls the end at the frame's +x the head; at a reset the head is the
-    end that faces the cube, and only the dense reward depends on that name.
+    The peg is its own image under a half turn, colours included: its yaw is observed with
+    frequency 2, and its end that is nearer to the cube is observed relative to the cube.
+    ManiSkill calls the end at the frame's +x the head; at a reset the head is the end that faces
+    the cube. Only the dense reward uses the head.
 
     Success (cube within 5 cm of the goal, robot static) is ManiSkill's. Two quantities of its
     dense reward that pin the world's axes are replaced by what they are in the stock scene: the
-    head's position (stock adds 12 cm along the world's x to the peg's middle, whichever way it
-    is turned) and the angle between peg and cube (stock subtracts Euler angles; here it is the
+    head's position (stock adds 12 cm along the world's x to the peg's middle, for any yaw)
+    and the angle between peg and cube (stock subtracts Euler angles; here it is the
     one to the cube's nearest face).
     """
 
@@ -98,7 +98,7 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         return self.peg_head_pose.p
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """ManiSkill's, with the angle between peg and cube whichever way they lie."""
+        """ManiSkill's, with an angle between peg and cube that is right for any yaw."""
         info = super().evaluate()
         peg, cube = (quaternion_to_matrix(b.pose.q)[:, :2, 0] for b in (self.peg, self.cube))
         yaw = torch.atan2(peg[:, 1], peg[:, 0]) - torch.atan2(cube[:, 1], cube[:, 0])
@@ -145,8 +145,8 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         # Where the fingers are along the peg.
         slide = ((tcp - peg.p) * axis).sum(dim=1, keepdim=True)
         here = peg.p + slide.clamp(-self.peg_half_length, self.peg_half_length) * axis
-        # The peg leaves 15 mm on either side of the fingers, less than an offset may be: most of
-        # it moves the grasp along the peg.
+        # The fingers have 15 mm on either side of the peg, less than the largest offset: most of
+        # the offset moves the grasp along the peg.
         along_peg = (offset * axis).sum(dim=1, keepdim=True) * axis
         target = peg.p + along_peg + 0.3 * (offset - along_peg)
         straddle = self.body.reachable_turn(
@@ -178,6 +178,6 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
             gripper=torch.full_like(turn, CLOSED),
         )
         still = torch.zeros_like(turn)
-        # Letting go: a hand that squeezes a peg is not quite at rest.
+        # Let go: a hand that squeezes a peg is not quite at rest.
         stand = Intent(move=torch.zeros_like(tcp), yaw=still, gripper=torch.full_like(turn, OPEN))
         return choose(distance < 0.045, stand, choose(held, poke, approach))

@@ -17,7 +17,7 @@ class PullCube(MoveCube, PullCubeEnv):
 
     Stock PullCube always pulls along -x, towards the arm, in reset and dense reward; here the
     direction is uniform (see :class:`MoveCube`), which leaves two differences from PushCube:
-    success (cube within 10 cm of the goal) asks nothing of the cube's height, and the dense
+    success (cube within 10 cm of the goal) does not depend on the cube's height, and the dense
     reward wants the tool 1 cm instead of 0.5 cm behind the cube. Success is ManiSkill's; the
     dense reward has ManiSkill's terms with its -x replaced by the direction.
     """

@@ -25,16 +25,16 @@ class PushT(SymmetricTask, PushTEnv):
     ManiSkill's PushT-v1 with a goal anywhere and any gripper.
 
     Reset: block and goal are uniform in discs of 10 and 5 cm radius, each with uniform yaw
-    (stock: one goal for ever, block in a rectangle beside it, yaw uniform). The goal is the pose
+    (stock: one fixed goal, block in a rectangle beside it, yaw uniform). The goal is the pose
     of ManiSkill's goal actor, hence part of the simulation state; stock keeps it in constants.
 
     Success (the block covers 90 % of the goal in ManiSkill's drawing of both) and dense reward
     are ManiSkill's, with these replacements: they read the goal from its actor; the yaw comes
     from an arc tangent (stock's arc cosine loses half the digits where the yaw is near zero, and
     is not a number where rounding makes the quaternion's w exceed 1); and the overlap is the mean
-    of that of block and goal and that of their mirror image, because the drawing is one pixel
-    (4.7 mm) off in both directions. Stock's stick must not return anywhere either, so its marker
-    lies under the goal.
+    of two, of block and goal and of their mirror images, because the drawing is one pixel
+    (4.7 mm) off in both directions. Stock marks where its stick must return to; nothing has to
+    return here, so the marker lies under the goal.
 
     Block and goal are their own mirror image across their body y-z plane.
     """
@@ -62,7 +62,7 @@ class PushT(SymmetricTask, PushTEnv):
     half_thickness = 0.02
     solver_iterations = 60
     """Of PhysX, for the block's contacts: with ManiSkill's 15 the drag of its friction depends on
-    its direction, and one step of the tool with it by 2.3 % instead of 1.5 %."""
+    its direction, and that of one step of the tool by 2.3 % instead of 1.5 %."""
     lowest_grip = 0.014
     """Least height of the tool while it drags, metres."""
     max_turn = math.pi / 2

@@ -20,10 +20,14 @@ _PACKAGE = "symsteer.bench.tasks"
 class TaskSpec(EnvSpec):
     """Takes the limit of episodes from the task's class, which is imported on first use."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.task = self.kwargs["task"]  # gymnasium empties ``kwargs`` in gym.make_vec
+
     @property
     def max_episode_steps(self) -> int | None:  # type: ignore[override]
         """Control steps of an episode."""
-        return self._limit or task_class(self.kwargs["task"]).max_episode_steps
+        return self._limit or task_class(self.task).max_episode_steps
 
     @max_episode_steps.setter
     def max_episode_steps(self, limit: int | None) -> None:

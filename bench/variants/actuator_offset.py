@@ -10,9 +10,9 @@ from symsteer.bench.variants.base import Variant
 class ActuatorOffset(Variant):
     """Adds 0.3 * strength of a full step along +x to every executed horizontal step.
 
-    At strength 1 that is 9 mm a control step for ``floating`` (full step 30 mm) and 30 mm asked of
-    the ``panda``, whose controller covers about 12 of them. It is added behind the controller's
-    bound, so that it is the same for every action, full ones included; an action of zero drifts.
+    At strength 1 that is 9 mm a control step for ``floating`` (full step 30 mm) and a
+    command of 30 mm for the ``panda``, whose controller covers about 12 mm of it. It is added
+    after the controller's bound, so that it is the same for every action, also for zero.
     Breaks actuation, everywhere; the mirror image in the x axis survives.
     """
 

@@ -1,4 +1,4 @@
-"""What variants read off, and do to, SAPIEN's bodies; one value per environment."""
+"""Reads and changes SAPIEN's bodies for the variants; one value per environment."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ STACK_ITERATIONS = 35
 
 
 def prepare_for_force(body: Actor, where: torch.Tensor, stacks: bool) -> None:
-    """Let a body rest under a steady horizontal force that friction can hold.
+    """Let a body rest under a constant horizontal force that friction can hold.
 
-    A round body may not roll about horizontal axes. What may stand on other bodies gets more
-    iterations of the solver: with ManiSkill's 15, stacked cubes on a slope do not move, but have
-    velocities of 2 cm/s left over, which ManiSkill's test of rest (1 cm/s) takes for motion.
+    A round body is kept from rolling about horizontal axes. Bodies that may be stacked get more
+    iterations of the solver: with ManiSkill's 15, stacked cubes on a slope stay in place but keep
+    velocities of 2 cm/s, which ManiSkill's test of rest (1 cm/s) counts as motion.
 
     Call it while the scene is being built: on CUDA neither can be changed later.
 
     Args:
         body: dynamic.
         where: environments, ``[N]`` bool.
-        stacks: whether there are several dynamic bodies; their physics takes half as long again.
+        stacks: whether there are several dynamic bodies; their physics then takes 50 % longer.
     """
     for scene, part in zip(body._scene_idxs.tolist(), body._bodies, strict=True):
         if where[scene]:

@@ -16,7 +16,7 @@ class FrameRotation(Variant):
     Actions stay in the world's axes. Rotations of the plane commute with each other, so that the
     observation of a rotated world is still the rotated observation: every C_n remains a symmetry,
     and an equivariant agent has to learn a constant turn, which its networks can express.
-    Reflections do not commute with it. A control: the audit must find nothing under C_n.
+    Reflections do not commute with it. This is a control: the audit must find no defect under C_n.
     Breaks the observation, everywhere; rotations survive, reflections do not.
     """
 

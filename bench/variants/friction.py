@@ -1,4 +1,4 @@
-"""Friction per environment: what variants add to the coefficients of bodies and table.
+"""Friction per environment: adds what variants want to the coefficients of bodies and table.
 
 PhysX takes the mean of two shapes' coefficients where they touch (SAPIEN does not offer another
 rule). A material may be shared between environments, so bodies in environments where a variant

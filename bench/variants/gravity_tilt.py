@@ -18,10 +18,10 @@ class GravityTilt(Variant):
 
     Each dynamic body of the task feels m (g_tilted - g) at its centre of mass in every substep.
     The robot's links feel no gravity in ManiSkill (its controllers compensate it), hence no tilt.
-    Friction of bodies and table rises by 1.5 tan(tilt), so that what nobody touches stays where
-    it is; round bodies, which friction cannot hold, do not roll about horizontal axes where the
-    strength is above zero. What stands free tips over once the slope is steeper than half its
-    width over the height of its centre: two stacked cubes at 27 degrees, an upright peg at 12.
+    Friction of bodies and table rises by 1.5 tan(tilt), so that untouched objects stay in place;
+    round bodies, which friction cannot hold, do not roll about horizontal axes where the
+    strength is above zero. A free object tips over once the slope exceeds half its width over
+    the height of its centre: two stacked cubes at 27 degrees, an upright peg at 12.
 
     Breaks the dynamics of objects, everywhere; the mirror image in the x axis survives. On CUDA
     materials are written before the simulation starts, which PhysX needs.

@@ -4,15 +4,16 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import h5py
 import pytest
 import torch
-from symsteer.bench.cli import _threads, main
 
 from symsteer.bench.demos import collect
 from symsteer.bench.tasks import task_class
+from symsteer.cli import VERBS, _threads, main
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 
@@ -44,14 +45,16 @@ def sentence(capsys) -> str:
     [
         (["--task", "PickCub-v1"], "PickCube-v1"),
         (["--embodiment", "hand"], "floating, panda"),
-        (["--variant", "gravity"], "action_gain"),
+        (["--variant", "gravity:1"], "gravity_tilt"),
         (["--variant", "action_gain:2"], "[0, 1]"),
         (["--variant", "action_gain:much"], "action_gain:0.5"),
         (["--agent", "ppo"], "equivariant"),
-        (["--sac.group", "E8"], "C8"),
+        (["--agent.group", "E8"], "C8"),
+        (["--agent.preset", "frist"], "did you mean 'first'"),
+        (["--policy.name", "plian"], "did you mean 'plain'"),
         (["--env-steps", "0"], "between 1 and"),
         (["--seed", str(2**32)], "seed is"),
-        (["--sac.free-init", "inf"], "sac.free_init is inf"),
+        (["--agent", "approximate", "--agent.free-init", "inf"], "free_init is inf"),
         (["--variant", "action_gain:0.5,wind:0.5"], "joined with +"),
         (["--demos", "nowhere.h5"], "nowhere.h5"),
         (["--base-policy", "nowhere.safetensors"], "nowhere.safetensors"),
@@ -160,7 +163,7 @@ def test_list_names_everything(monkeypatch, capsys):
     assert symsteer(monkeypatch, "list") == 0
     out = capsys.readouterr().out
     lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
-    for word in ("StackCube-v1", "panda", "action_gain", "approximate", "demo"):
+    for word in ("StackCube-v1", "panda", "action_gain", "approximate", "plain", "demo"):
         assert len(lines[word].split()) > 3, word
 
 
@@ -172,6 +175,45 @@ def test_demos_are_written(monkeypatch, capsys, tmp_path):
     assert path.with_suffix(".json").is_file()
 
 
+def test_the_overview_names_every_verb(monkeypatch, capsys):
+    for arguments in ((), ("--help",)):
+        assert symsteer(monkeypatch, *arguments) == 0
+        out = capsys.readouterr().out
+        assert all(f"\n  {verb} " in out for verb in VERBS)
+
+
+@pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "run"])
+def test_every_verb_has_help(verb, monkeypatch, capsys):
+    assert symsteer(monkeypatch, verb, "--help") == 0
+    assert f"usage: symsteer {verb} " in capsys.readouterr().out
+
+
+def test_an_unknown_verb_is_told_the_nearest(monkeypatch, capsys):
+    assert symsteer(monkeypatch, "swep", "smoke") == 2
+    assert "did you mean 'sweep'" in sentence(capsys)
+
+
+def test_the_version(monkeypatch, capsys):
+    assert symsteer(monkeypatch, "--version") == 0
+    assert capsys.readouterr().out == f"symsteer {version('symsteer')}\n"
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["list"], ["sweep", "--help"]])
+def test_names_and_help_cost_no_import_of_torch_or_maniskill(arguments):
+    program = (
+        "import sys; from symsteer.cli import main; "
+        f"sys.argv = ['symsteer', *{arguments!r}]\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'torch', 'mani_skill', 'sapien', 'gymnasium', 'pandas'} & set(sys.modules)\n"
+        "sys.exit(f'imported: {heavy}' if heavy else 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_doctor_names_what_there_is(monkeypatch, capsys):
     assert symsteer(monkeypatch, "doctor") == 0
     out = capsys.readouterr().out
@@ -181,7 +223,7 @@ def test_doctor_names_what_there_is(monkeypatch, capsys):
 
 def test_the_module_is_the_same_program():
     done = subprocess.run(
-        [sys.executable, "-m", "bench", "run", "--agent", "ppo"],
+        [sys.executable, "-m", "symsteer", "run", "--agent", "ppo"],
         capture_output=True,
         text=True,
         timeout=120,
@@ -196,7 +238,7 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     os.close(reading)
     with open(writing, "wb") as output:
         done = subprocess.run(
-            [sys.executable, "-m", "bench", "list"],
+            [sys.executable, "-m", "symsteer", "list"],
             stdout=output,
             stderr=subprocess.PIPE,
             text=True,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from mani_skill import logger
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.wrappers import CachedResetWrapper
 from mani_skill.utils.wrappers.action_repeat import ActionRepeatWrapper
@@ -135,8 +136,9 @@ def test_one_environment_alone_is_the_one_of_a_batch(embodiment):
     for expected in trace[1:]:
         action = np.stack([np.zeros(7), env.action_space.sample(), np.ones(7)])
         obs, reward, *_ = batch.step(torch.as_tensor(action, dtype=torch.float32))
-        np.testing.assert_allclose(obs[1].numpy(), expected[:-3], atol=1e-5)
-        np.testing.assert_allclose(reward[1].item(), expected[-3], atol=1e-5)
+        # The arm's inverse kinematics rounds differently in a batch, depending on the CPU.
+        np.testing.assert_allclose(obs[1].numpy(), expected[:-3], atol=5e-5)
+        np.testing.assert_allclose(reward[1].item(), expected[-3], atol=5e-5)
 
 
 def test_states_of_one_environment_can_be_set():
@@ -170,20 +172,64 @@ def test_a_seed_seeds_gymnasiums_generator_too():
 # ------------------------------------------------------------------ registration
 
 
+def run(code):
+    """What a fresh interpreter prints."""
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.split("\n")[-2]
+
+
 def test_ids_name_their_module():
-    """``module:id`` needs no import: what a script gets that knows nothing but ``--env-id``."""
+    """``module:id`` needs no import: all that a script has which takes an id only."""
     code = (
         "import gymnasium as gym; "
         "env = gym.make('symsteer.bench.tasks:SymSteer/PushCube-v1', num_envs=2); "
         "print(env.unwrapped.num_envs, "
         "gym.make('symsteer.bench.tasks:SymSteer/PushCube-single-v1').reset(seed=0)[0].shape)"
     )
-    result = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=300
+    assert run(code) == f"2 ({task_class('PushCube-v1').observation_layout.dim},)"
+
+
+def test_importing_the_registries_is_cheap_and_registers_the_ids_later():
+    heavy = ("torch", "numpy", "gymnasium", "mani_skill")
+    code = (
+        "import sys; from symsteer.bench.tasks import TASKS; from symsteer.bench.variants import "
+        f"VARIANTS; seen = [m for m in {heavy} if m in sys.modules]; "
+        "[r.summary(name) for r in (TASKS, VARIANTS) for name in r]; import gymnasium as gym; "
+        "print(seen, 'torch' in sys.modules, 'SymSteer/PickCube-v1' in gym.registry)"
     )
-    assert result.returncode == 0, result.stderr
-    dim = task_class("PushCube-v1").observation_layout.dim
-    assert result.stdout.split("\n")[-2] == f"2 ({dim},)"
+    assert run(code) == "[] False True"
+
+
+def test_rewards_are_dense_where_the_id_says_so():
+    ids = [i for i in gym.registry if i.startswith("SymSteer/")]
+    assert len(ids) == 4 * len(TASKS.names())
+    for task in TASKS:
+        stem = task.removesuffix("-v1")
+        for kind, mode in (("", "sparse"), ("-dense", "normalized_dense")):
+            for single in ("", "-single"):
+                spec = gym.spec(f"SymSteer/{stem}{single}{kind}-v1")
+                assert spec.kwargs.get("reward_mode", "sparse") == mode
+                assert mode in task_class(task).SUPPORTED_REWARD_MODES
+                assert spec.max_episode_steps == task_class(task).max_episode_steps
+    dense = gym.make("SymSteer/PickCube-single-dense-v1")
+    assert dense.unwrapped.reward_mode == "normalized_dense"
+    dense.reset(seed=0)
+    assert 0 < dense.step(dense.action_space.sample())[1] < 1
+    assert gym.make(dense.spec, reward_mode="sparse").unwrapped.reward_mode == "sparse"
+
+
+@pytest.mark.parametrize("mode", ["pd_ee_delta_pose", "pd_joint_delta_pos", "pd_joint_pos"])
+def test_no_control_mode_leaves_out_which_finger_follows(mode, caplog):
+    """ManiSkill warns where it has to assume it, at every reconfiguration."""
+    logger.addHandler(caplog.handler)
+    try:
+        env = gym.make(BATCHED, control_mode=mode)
+        env.reset(seed=0, options={"reconfigure": True})
+    finally:
+        logger.removeHandler(caplog.handler)
+    assert "Mimic" not in caplog.text
 
 
 def test_a_spec_makes_the_same_environment_again():

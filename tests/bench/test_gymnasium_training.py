@@ -1,6 +1,8 @@
 """Other people's training code runs on the environments as it stands."""
 
 import math
+import re
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -18,8 +20,8 @@ from torch.nn import functional
 
 import symsteer.bench.tasks  # noqa: F401  (registers the ids)
 
-SINGLE = "SymSteer/PushCube-single-v1"
-OPTIONS = {"variant": "action_gain:0.5", "reward_mode": "normalized_dense"}
+SINGLE = "SymSteer/PushCube-single-dense-v1"
+OPTIONS = {"variant": "action_gain:0.5"}
 LIMIT = 50
 
 
@@ -42,7 +44,7 @@ def test_stable_baselines3s_checker_passes():
 
 @pytest.mark.slow
 def test_stable_baselines3_trains(tmp_path):
-    env = CPUGymWrapper(gym.make("SymSteer/PushCube-v1", num_envs=1, **OPTIONS))
+    env = CPUGymWrapper(gym.make("SymSteer/PushCube-dense-v1", num_envs=1, **OPTIONS))
     model = SAC("MlpPolicy", Monitor(env), learning_starts=100, batch_size=64, seed=0, device="cpu")
     before = {name: p.clone() for name, p in model.policy.named_parameters()}
     losses = Losses()
@@ -87,6 +89,31 @@ def make_env(env_id, options):
         return env
 
     return thunk
+
+
+def test_cleanrls_ppo_wraps_the_documented_id():
+    """Its wrappers and vector environment, with the three changes that docs/gymnasium.md gives."""
+    page = Path(__file__).parents[2] / "docs" / "gymnasium.md"
+    (env_id,) = set(re.findall(r"--env-id (symsteer\S+)", page.read_text()))
+
+    def thunk():
+        env = gym.wrappers.FlattenObservation(gym.make(env_id))
+        env = gym.wrappers.ClipAction(gym.wrappers.RecordEpisodeStatistics(env))
+        env = gym.wrappers.NormalizeObservation(env)
+        clip = (lambda obs: np.clip(obs, -10, 10), env.observation_space)
+        env = gym.wrappers.NormalizeReward(gym.wrappers.TransformObservation(env, *clip))
+        return gym.wrappers.TransformReward(env, lambda reward: np.clip(reward, -10, 10))
+
+    envs = SyncVectorEnv(autoreset_mode="SameStep", env_fns=[thunk, thunk])
+    envs.reset(seed=1)
+    rewards = []
+    for _ in range(LIMIT):
+        _, reward, *_, infos = envs.step(envs.action_space.sample())
+        rewards.append(reward)
+    assert np.std(rewards) > 0, "the reward is dense"
+    ended = np.flatnonzero(infos["_final_info"])
+    assert [infos["final_info"]["episode"]["l"][i] for i in ended] == [LIMIT, LIMIT]
+    envs.close()
 
 
 class Critic(nn.Module):

@@ -1,4 +1,4 @@
-"""What the throughput verb measures, on parts small enough for a test."""
+"""The parts of `symsteer throughput`, with small numbers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def env_cls():
 
 
 def test_the_limit_moves_the_robots_that_ours_moved(env_cls):
-    """The replayed substeps lead where the recorded episode led: the same work, nothing else."""
+    """The replayed substeps end in the same state as the recorded episode."""
     replay = Replay(env_cls, 2)
     robots = [a.get_qpos() for a in replay.env.scene.px._articulations]
     assert len(replay.targets) == throughput.EPISODE
@@ -82,7 +82,7 @@ def rows() -> list[Row]:
 
 
 def test_summary_compares_like_with_like():
-    """Medians of the best of each kind, in the same number of processes."""
+    """Medians of the best contender of each kind with the same number of processes."""
     found = throughput.summarise(rows(), 2)
     assert found["1"]["num_envs"] == 64
     assert found["1"]["times_stock"] == pytest.approx(1900 / 200)
@@ -109,7 +109,7 @@ def test_table_and_json(env_cls):
 
 
 def test_memory_is_watched():
-    """The numbers of 10,000 steps are a matter of minutes: `symsteer throughput --memory`."""
+    """10,000 steps take minutes: `symsteer throughput --memory`."""
     growth = throughput.memory_growth(TASK, num_envs=2, steps=500)
     assert len(growth["steps"]) == 10
     assert growth["steps"][-1] == 500
@@ -138,7 +138,7 @@ def test_bad_input(options, words):
 
 @pytest.mark.slow
 def test_the_whole_measurement():
-    """All contenders in turns; ours is ahead of stock and behind the limit."""
+    """All contenders in turns; ours is faster than stock and slower than the limit."""
     data = throughput.measure(TASK, num_envs=(16,), repeats=2, seconds=0.2, cores=2)
     kinds = [(row["letter"], row["processes"]) for row in data["rows"]]
     assert [k for k in kinds if k[0] != "g"] == [

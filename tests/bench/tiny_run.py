@@ -4,15 +4,10 @@ import dataclasses
 import json
 
 from symsteer.agents import AGENTS
-from symsteer.bench.runs.config import (
-    DemonstrationConfig,
-    EvaluationConfig,
-    PolicyConfig,
-    RunConfig,
-)
+from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
+from symsteer.policies import POLICIES
 
-
-AGENT = {"width": 16, "batch_size": 16, "warmup": 16, "group": "C4"}
+AGENT = {"width": 16, "batch_size": 16, "warmup": 16, "utd": 1.0, "group": "C4"}
 POLICY = {"channels": 8, "width": 16, "depth": 1, "steps": 20, "batch_size": 32}
 
 

@@ -8,10 +8,10 @@ from unittest.mock import patch
 
 import pytest
 
+from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig, flat
-from symsteer.bench.runs.folder import load_checkpoint
-from symsteer.bench.runs.loop import Loop
 from symsteer.bench.runs.run import execute
+from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep.plan import make_plan, write_manifest
 from symsteer.bench.sweep.suite import Suite
 from symsteer.leaderboard.records import dump_record
@@ -22,34 +22,40 @@ from tests.leaderboard.record_factory import make_record
 CHECKPOINT_EVERY = 20
 
 CONFIG = replace(tiny_config(agent="standard"), checkpoint_every=CHECKPOINT_EVERY)
-OTHER = replace(CONFIG, agent="zero")
+OTHER = tiny_config(agent="zero", checkpoint_every=CHECKPOINT_EVERY)
 
 
 def stop_after(config, out, checkpoints, progress=False):
     """The folder of a run that was interrupted right after some checkpoint."""
     written = []
 
-    def save(loop, with_replay):
-        whole(loop, with_replay)
-        written.append(loop.folder)
+    def save(trainer):
+        whole(trainer)
+        written.append(trainer.folder)
         if len(written) == checkpoints:
             raise KeyboardInterrupt
 
-    whole = Loop._checkpoint
-    with patch.object(Loop, "_checkpoint", save), pytest.raises(KeyboardInterrupt):
+    whole = Trainer._checkpoint
+    with patch.object(Trainer, "_checkpoint", save), pytest.raises(KeyboardInterrupt):
         execute(config, out, progress=progress)
     return written[0]
 
 
 def options_of(config: RunConfig) -> list[str]:
     """The command line that asks for a configuration."""
-    defaults = flat(RunConfig().to_json())
+    named = RunConfig(agent=config.agent, policy_name=config.policy_name)
+    defaults = flat(named.to_json()) | {"agent": RunConfig.agent, "policy.name": None}
     return [
         word
         for key, value in flat(config.to_json()).items()
         if value != defaults[key]
-        for word in ("--" + key.replace("_", "-"), str(value))
+        for word in (option_of(key), str(value))
     ]
+
+
+def option_of(key: str) -> str:
+    """The option of ``symsteer run`` for a key of a configuration."""
+    return "--" + key.replace("agent_options.", "agent.").replace("_", "-")
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
 
-from symsteer.bench import cli
+from symsteer import cli
 
 CURE = re.compile(
     r"\b(must|should|needs?|wanted|valid|did you mean|use|choose|name|give|free|restore|delete|"

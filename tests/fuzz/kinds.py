@@ -1,4 +1,4 @@
-"""The kinds of input, how each is damaged, and what may follow.
+"""The kinds of input, how each is damaged, and what may happen.
 
 ``KINDS[name](workshop, number, folder)`` damages an input in the way that belongs to the number,
 gives it to the command line and returns how that ended. It raises ``BadEndingError`` if it ended in
@@ -15,6 +15,7 @@ import json
 import math
 import os
 import pickle
+import re
 import shutil
 import struct
 import tomllib
@@ -31,12 +32,12 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from symsteer.bench import cli
+from symsteer import cli
 from symsteer.bench.runs import base_policy
 from symsteer.bench.runs import run as run_module
+from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig, flat
-from symsteer.bench.runs.folder import load_checkpoint
-from symsteer.bench.runs.loop import Loop
+from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.bench.tasks import task_class
 from symsteer.leaderboard.records import config_hash, read_record
@@ -115,7 +116,7 @@ SUITE: dict[str, Any] = {
     "run": {
         "env_steps": 20000,
         "policy": {"steps": 800, "learning_rate": 1e-3, "hold": ["gripper"]},
-        "sac": {"gamma": 0.95, "layer_norm": True},
+        "agent": {"gamma": 0.95, "layer_norm": True},
         "evaluation": {"every": 5000, "episodes": 25},
     },
 }
@@ -158,7 +159,7 @@ def suite(workshop: Workshop, number: int, folder: Path) -> Ending:
                     "run = [1]",
                     "grid = 1",
                     "description = 7",
-                    "[grid]\n'sac.lr.more' = [1]",
+                    "[grid]\n'agent.lr.more' = [1]",
                     "[grid]\n'' = [1]",
                     "[grid]\n'.' = [1]",
                     "[grid]\nstrength = [0.5]",
@@ -176,7 +177,8 @@ def suite(workshop: Workshop, number: int, folder: Path) -> Ending:
         wanted = _grid(tomllib.loads(path.read_text()))
         _require(len(found) == len(wanted), f"{len(found)} runs of {len(wanted)}")
         for have, want in zip(found, wanted, strict=True):
-            for key, value in want.items():
+            for name, value in want.items():
+                key = re.sub(r"^agent\.", "agent_options.", name)
                 have_value = list(have[key]) if isinstance(have[key], tuple) else have[key]
                 _require(have_value == value, f"{key} is {have_value!r}, not {value!r}")
     return ending
@@ -211,7 +213,7 @@ def config_file(workshop: Workshop, number: int, folder: Path) -> Ending:
     original = path.read_text()
     path.write_text(poison_json(original, random), "utf-8", "surrogatepass")
     verb = random.choice(("resume", "evaluate"))
-    with stopped_at((run_module, "Loop"), (run_module, "Evaluator")):
+    with stopped_at((run_module, "Trainer"), (run_module, "Evaluator")):
         ending = end_of([verb, run], ["config.json", workshop.run_id])
     if ending.kind == "accepted":
         _require(ending.found[0] == workshop.config, "another configuration was accepted")
@@ -239,10 +241,11 @@ def command(workshop: Workshop, number: int, folder: Path) -> Ending:
     policy = folder / "policy.safetensors"
     policy.write_bytes(workshop.run["policy.safetensors"])
     options = [*workshop.options, "--base-policy", str(policy), "--out", str(folder / "runs")]
-    fields = sorted(flat(RunConfig().to_json()))
-    # One after the other, so that every option has its turn.
+    defaults = flat(workshop.config.to_json())
+    # One after the other, so that every option has its turn; another agent or policy has others.
+    fields = sorted(set(defaults) - {"agent", "policy.name"})
     key = fields[number % len(fields)]
-    option = "--" + key.replace("_", "-")
+    option = "--" + key.replace("agent_options.", "agent.").replace("_", "-")
     kind = random.randrange(8)
     if kind == 0:
         at = random.randrange(3, len(option))
@@ -253,18 +256,18 @@ def command(workshop: Workshop, number: int, folder: Path) -> Ending:
         options += ["--workers", random.choice(NUMBERS)]
     else:
         # Mostly values that the parser lets through.
-        numeric = isinstance(flat(RunConfig().to_json())[key], float | int | None)
+        numeric = isinstance(defaults[key], float | int | None)
         likely, odd = (NUMBERS, WORDS) if numeric else (WORDS, NUMBERS)
         options += [option, random.choice(likely if random.random() < 0.8 else odd)]
     shutil.rmtree(folder / "runs", ignore_errors=True)
-    with stopped_at((Loop, "play")):
+    with stopped_at((Trainer, "play")):
         ending = end_of(["run", "--quiet", *options])
     if ending.kind == "accepted":
-        loop = ending.found[0]
-        loop.evaluator.close()
-        found, asked = flat(loop.config.to_json()), flat(workshop.config.to_json())
+        trainer = ending.found[0]
+        trainer.evaluator.close()
+        found, asked = flat(trainer.config.to_json()), defaults
         if kind >= 3:
-            asked[key] = _read_as(key, options[-1])
+            asked[key] = _read_as(workshop.config, key, options[-1])
         elif options[-1] == option:  # a flag
             asked[key] = True
         for name, value in asked.items():
@@ -272,13 +275,13 @@ def command(workshop: Workshop, number: int, folder: Path) -> Ending:
     return ending
 
 
-def _read_as(key: str, text: str) -> Any:
+def _read_as(config: RunConfig, key: str, text: str) -> Any:
     """What an option's text means."""
-    owner: Any = RunConfig
+    owner: Any = config
     *path, last = key.split(".")
     for part in path:
-        owner = typing.get_type_hints(owner)[part]
-    kind = typing.get_type_hints(owner)[last]
+        owner = getattr(owner, part)
+    kind = typing.get_type_hints(type(owner))[last]
     if typing.get_origin(kind) is tuple:
         return (text,)
     if text == "None" and type(None) in typing.get_args(kind):
@@ -354,12 +357,13 @@ def _record_of_a_run(workshop: Workshop, random: Random, folder: Path) -> Ending
     path = run / "record.json"
     path.write_text(poison_json(path.read_text(), random), "utf-8", "surrogatepass")
     original = json.loads(workshop.run["record.json"])
-    with stopped_at((Loop, "play")):
+    with stopped_at((Trainer, "play")):
         ending = end_of(["resume", run], ["record.json", workshop.run_id])
     if ending.kind == "accepted":
-        loop = ending.found[0]
-        loop.evaluator.close()
-        found = json.loads(loop.record.model_dump_json(by_alias=True))
+        trainer = ending.found[0]
+        trainer.evaluator.close()
+        # The record is written before the run goes on.
+        found = json.loads(path.read_text())
         kept = workshop.state["evaluations"]
         for key in ("run_id", "config", "config_hash"):
             _require(found[key] == original[key], f"another {key} was accepted")
@@ -553,7 +557,7 @@ def policy(workshop: Workshop, number: int, folder: Path) -> Ending:
         if in_run
         else ["run", "--quiet", "--base-policy", path, "--out", folder / "runs", *workshop.options]
     )
-    with stopped_at((run_module, "Loop")):
+    with stopped_at((run_module, "Trainer")):
         ending = end_of(verb, ["policy.safetensors", workshop.run_id])
     if ending.kind == "accepted":
         found, intact = ending.found[3], folder / "intact.safetensors"
@@ -635,7 +639,7 @@ def checkpoint(workshop: Workshop, number: int, folder: Path) -> Ending:
     else:
         path.write_bytes(workshop.other)
     verb = random.choice(("resume", "evaluate"))
-    with stopped_at((Loop, "play"), (run_module, "Evaluator")):
+    with stopped_at((Trainer, "play"), (run_module, "Evaluator")):
         ending = end_of([verb, run], ["checkpoint.pt"])
     _require(not trap.exists(), "code in a checkpoint was executed")
     if ending.kind == "accepted":

@@ -15,11 +15,12 @@ from unittest.mock import patch
 
 import pytest
 
-from symsteer.bench import cli
+from symsteer import cli
 from symsteer.bench.demos import load
-from symsteer.bench.runs.folder import load_checkpoint, state_of
-from symsteer.bench.runs.loop import Loop
+from symsteer.bench.runs.checkpoint import load_checkpoint
+from symsteer.bench.runs.folder import state_of
 from symsteer.bench.runs.run import execute, resume
+from symsteer.bench.runs.trainer import Trainer
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import without_clock
 from tests.fuzz.conftest import CONFIG, options_of
@@ -140,14 +141,14 @@ def leftovers(folder):
 
 def full_after_the_first_checkpoint(full):
     """A patch: the disk is full from the first checkpoint on, until the stack is closed."""
-    whole = Loop._checkpoint
+    whole = Trainer._checkpoint
     stack = contextlib.ExitStack()
 
-    def save(loop, with_replay):
-        whole(loop, with_replay)
+    def save(trainer):
+        whole(trainer)
         stack.enter_context(full())
 
-    stack.enter_context(patch.object(Loop, "_checkpoint", save))
+    stack.enter_context(patch.object(Trainer, "_checkpoint", save))
     return stack
 
 

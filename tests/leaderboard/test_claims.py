@@ -169,7 +169,7 @@ def test_runs_that_broke_off_after_diverging_count() -> None:
     claim = found(standard + diverging("equivariant", []))["divergence"]
     assert (claim.seeds, claim.verdict) == (5, "supported")
     # One that is still running has not been spared yet.
-    running = [make_record(r.evaluations, "running", seed=r.cell.seed) for r in standard]
+    running = [make_record(r.evaluations, "running", seed=r.settings.seed) for r in standard]
     for record in running:
         for evaluation in record.evaluations:
             evaluation.diagnostics["q_violation"] = 0.0

@@ -11,7 +11,7 @@ import pytest
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.defects import (
-    DEFAULT_AUDIT,
+    AUDIT,
     Audit,
     Defect,
     Line,
@@ -56,7 +56,7 @@ def test_the_largest_component_is_the_defect(tmp_path: Path) -> None:
 
 def test_the_committed_audit_can_be_read() -> None:
     audit = read_audit()
-    assert len(audit) == len(json.loads(DEFAULT_AUDIT.read_text()))
+    assert len(audit) == len(json.loads(AUDIT.read_text()))
     place = "PickCube-v1", "floating"
     unbroken, broken = audit[(*place, "none", "C8")], audit[(*place, "action_gain:1", "C8")]
     assert 0 < unbroken.value < 0.01 < 0.1 < broken.value < 0.4
@@ -98,20 +98,19 @@ def test_a_cell_is_audited_once(tmp_path: Path) -> None:
         read_audit(write(tmp_path, [CELL, CELL | {"tool_step": [0.2, 0.1, 0.3]}]))
 
 
-def test_a_missing_audit_is_an_error_only_if_it_was_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_audit_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"cannot be read"):
         read_audit(tmp_path / "nowhere.json")
     with pytest.raises(UserError, match=r"cannot be read"):
         read_audit(tmp_path)
-    monkeypatch.setattr("symsteer.leaderboard.defects.DEFAULT_AUDIT", tmp_path / "nowhere.json")
-    assert read_audit() == {}
 
 
 def test_the_order_of_variants_does_not_matter(tmp_path: Path) -> None:
     audit = read_audit(write(tmp_path, [CELL | {"variant": "wind:0.50+obstacle:1.0"}]))
     assert list(audit) == [("PickCube-v1", "floating", "obstacle:1+wind:0.5", "C8")]
+    # A text that is no variant stands for itself.
+    audit = read_audit(write(tmp_path, [CELL | {"variant": "wind:<b>"}]))
+    assert [place[2] for place in audit] == ["wind:<b>"]
 
 
 def test_defects_are_drawn_within_their_interval() -> None:
@@ -265,7 +264,7 @@ def test_no_crossing_is_said_in_words() -> None:
     )
     assert text(-1, -0.1, [-1.0] * 20, [-0.1] * 20).startswith("none: the line stays below 0 from")
     assert text(1, -0.1, [1.0] * 20, [-0.1] * 20) == (
-        "none: the line rises through 0 from 0.00 to 0.40; the data leave open where"
+        "none: the line rises through 0 from 0.00 to 0.40; the data do not say where"
     )
     assert text(-1, 0.5, [-1.0] * 19 + [-2.0], [0.5] * 20).endswith("it does not lie below 0.25")
     assert text(-1, -0.1, [-1.0] * 20, [-0.1] * 19 + [0.3]).endswith("does not lie beyond 0.30")

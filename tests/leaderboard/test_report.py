@@ -5,24 +5,23 @@ from __future__ import annotations
 import csv
 import math
 import re
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from symsteer.leaderboard import command
 from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.paths import RECORDS
 from symsteer.leaderboard.records import read_record, write_record
-from symsteer.leaderboard.report import RECORDS, generate, slug
+from symsteer.leaderboard.report import generate, slug
 from symsteer.leaderboard.summary import Run, summarize
 from symsteer.leaderboard.text import code, compact, count, number, relative_link
 from tests.leaderboard.command_line import main
 from tests.leaderboard.record_factory import LEARNING, make_curve, make_evaluation, make_record
-
-REPOSITORY = Path(__file__).parents[2]
 
 
 def write_runs(folder: Path, seeds: int = 2) -> None:
@@ -126,15 +125,12 @@ def test_csv_holds_the_numbers_of_the_page(page: Path) -> None:
 
 
 def test_the_same_records_give_the_same_bytes(page: Path, tmp_path: Path) -> None:
-    """In another process, in another order, and over an older output."""
+    """In another order, and over an older output; test_verify.py has another process."""
     folders = sorted((page / "runs").iterdir(), reverse=True)
     again = page / "again"
-    result = call(*folders, "--out", again)
-    assert result.returncode == 0
-    assert "LEADERBOARD.md" in result.stdout
-    assert not result.stderr
-    assert snapshot(again) == snapshot(page / "board")
-    assert main([str(page / "runs"), "--out", str(again)]) == 0
+    again.mkdir()
+    (again / "LEADERBOARD.md").write_text("older")
+    assert main([*map(str, folders), "--out", str(again)]) == 0
     assert snapshot(again) == snapshot(page / "board")
 
 
@@ -296,29 +292,51 @@ def test_numbers_are_readable() -> None:
 # Command line
 
 
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "symsteer", "report", *map(str, arguments)],
-        cwd=REPOSITORY,
-        capture_output=True,
-        text=True,
-    )
+def test_the_page_goes_beside_the_runs_unless_another_folder_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_record(make_record(), tmp_path / "runs" / "one" / "record.json")
+    write_record(make_record(seed=1), tmp_path / "more" / "two" / "record.json")
+    monkeypatch.chdir(tmp_path)
+    committed = tmp_path / "leaderboard"
+    monkeypatch.setattr(command, "PAGE_FOLDER", committed)
+    monkeypatch.setattr(command, "RECORDS", committed / "results" / "records")
+    for arguments, folder in (
+        (["runs"], "runs"),
+        (["more", "runs"], "more"),
+        (["runs/one/record.json"], "runs/one"),
+    ):
+        assert main(arguments) == 0
+        assert main([*arguments, "--verify"]) == 0
+        assert (tmp_path / folder / "leaderboard" / "LEADERBOARD.md").is_file()
+    capsys.readouterr()
+    # The committed page changes only when it is asked for.
+    assert main(["."]) == 2
+    assert "holds the committed leaderboard" in capsys.readouterr().err
+    assert main([]) == 2
+    assert "name run folders: symsteer report RUNS" in capsys.readouterr().err
+    assert not committed.exists()
+    assert main([".", "--out", "leaderboard"]) == 0
+    shutil.copytree(tmp_path / "runs", committed / "results" / "records")
+    assert main([]) == 0
+    assert main(["--verify"]) == 0
 
 
-def test_bad_records_leave_the_output_as_it_was(page: Path, tmp_path: Path) -> None:
+def test_bad_records_leave_the_output_as_it_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     runs, out = tmp_path / "runs", tmp_path / "board"
     write_runs(runs, seeds=1)
     generate([runs], out)
     before = snapshot(out)
     victim = next(iter(sorted(runs.rglob("record.json"))))
     victim.write_bytes(victim.read_bytes()[:-200])
-    result = call(runs, "--out", out)
-    assert result.returncode == 2
-    assert not result.stdout
-    assert result.stderr.count("\n") == 1
-    assert str(victim) in result.stderr
-    assert "Traceback" not in result.stderr
-    assert "run the cell again" in result.stderr
+    assert main([str(runs), "--out", str(out)]) == 2
+    shown = capsys.readouterr()
+    assert not shown.out
+    assert shown.err.count("\n") == 1
+    assert str(victim) in shown.err
+    assert "run the cell again" in shown.err
     assert snapshot(out) == before
     fresh = tmp_path / "fresh"
     assert main([str(runs), "--out", str(fresh)]) == 2
@@ -346,7 +364,8 @@ def test_bad_arguments_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_committed_records_are_valid_and_name_no_machine() -> None:
-    paths = sorted((REPOSITORY / RECORDS).rglob("*.json"))
+    paths = sorted(RECORDS.rglob("*.json"))
+    assert paths
     for path in paths:
         read_record(path)
         found = re.search(r"/(home|root|tmp|work|Users|mnt)/", path.read_text())

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from symsteer.leaderboard.paths import PAGE_FOLDER, RECORDS
 from symsteer.leaderboard.records import write_record
-from symsteer.leaderboard.report import PAGE_FOLDER, RECORDS, generate, slug
+from symsteer.leaderboard.report import generate, slug
 from symsteer.leaderboard.verification import differences, other_versions
 from tests.leaderboard.command_line import main
 from tests.leaderboard.record_factory import make_curve, make_evaluation, make_record

@@ -184,40 +184,26 @@ def test_a_file_of_version_2():
     assert torch.allclose(policy.decode(obs, noise), actions, atol=1e-5)
 
 
-STRANGER = """
-import torch
-from symsteer.policies.contract import ChunkPolicy, PolicyOptions
-
-
-class Echo(ChunkPolicy):
-    name = "echo"
-
-    @classmethod
-    def fit(cls, options, episodes, obs_layout, act_layout, seed=0, progress=None, device="cpu"):
-        return cls(options, obs_layout, act_layout).to(device).freeze()
-
-    def decode(self, obs, noise):
-        return noise.clamp(-1, 1)
-"""
-
-
-def test_a_policy_from_another_package(world, tmp_path, monkeypatch):
-    (tmp_path / "stranger.py").write_text(STRANGER)
+def test_the_policy_of_the_documentation(world, tmp_path, monkeypatch):
+    """As a stranger's module: trained, saved, loaded by name; refused where it is missing."""
+    page = (Path(__file__).parents[2] / "docs" / "policies.md").read_text()
+    code = next(block for block in page.split("```python\n") if "class Mean(" in block)
+    (tmp_path / "stranger.py").write_text(code.partition("```")[0])
     with monkeypatch.context() as patch:
         patch.syspath_prepend(tmp_path)
-        kind = POLICIES.get("stranger:Echo")
+        kind = POLICIES.get("stranger:Mean")
         options = kind.Options(horizon=4, execute=1)
-        policy = kind.fit(options, world.episodes(1), world.obs_layout, world.act_layout)
+        policy = kind.fit(options, world.episodes(2), world.obs_layout, world.act_layout)
         path = save_policy(policy, tmp_path)
         loaded = load_policy(path)
         assert type(loaded) is kind
         assert loaded.options == options
         assert loaded.content_hash() == policy.content_hash()
-        other = kind(kind.Options(horizon=4, execute=2), world.obs_layout, world.act_layout)
-        assert other.content_hash() != policy.content_hash()
         assert torch.equal(decode(loaded, world), decode(policy, world))
+        loaded.options = kind.Options(horizon=4, execute=2)
+        assert loaded.content_hash() != policy.content_hash()
     monkeypatch.delitem(sys.modules, "stranger")
-    refuse(path, "stranger", "not installed")
+    refuse(path, "'stranger:Mean'", "package stranger", "not installed")
 
 
 def test_a_policy_that_no_other_program_can_import_is_not_saved(world, tmp_path):

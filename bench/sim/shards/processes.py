@@ -76,7 +76,8 @@ def _without_main_module() -> Iterator[None]:
     A new process imports the main module again if that has a spec or a file.
     """
     main = vars(sys.modules["__main__"])
-    hidden = {name: main[name] for name in ("__spec__", "__file__") if name in main}
+    names = ("__spec__", "__file__")
+    hidden: dict[str, Any] = {name: main[name] for name in names if name in main}
     main.update(dict.fromkeys(hidden))
     try:
         yield

@@ -1,19 +1,18 @@
-"""`symsteer audit` as a user meets it, and the page that is made from its results."""
+"""The command `symsteer audit`, and the pages that are made from its results."""
 
 import json
 import sys
 
 import pytest
 import torch
-from symsteer.bench.cli import main
 
 from symsteer.bench.audit import page
 from symsteer.bench.audit.study import variant_texts
 from symsteer.bench.tasks import task_class
-from symsteer.bench.variants import VARIANTS
+from symsteer.bench.variants import variant_names
+from symsteer.cli import main
 from symsteer.errors import UserError
-from symsteer.policies.files import save_policy
-from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
+from symsteer.policies.contract import ChunkPolicy, PolicyConfig, save_policy
 
 FAST = ("--count", 8, "--resets", 16)
 
@@ -46,6 +45,9 @@ def symsteer(monkeypatch, *arguments) -> int:
         (["--base-policy", "nowhere.safetensors"], "nowhere.safetensors"),
         (["--base-policy", "x.safetensors", "--states", "expert"], "does not use it"),
         (["--base-policy", "x.safetensors", "--embodiment", "all"], "one task and embodiment"),
+        (["--rollouts", "1", "--embodiment", "panda"], "--embodiment floating"),
+        (["--rollouts", "-1"], "at least 1"),
+        (["--rollouts", "1", "--base-policy", "x.safetensors"], "--actions expert"),
     ],
 )
 def test_mistakes(arguments, words, monkeypatch, capsys, tmp_path):
@@ -64,10 +66,10 @@ def test_cuda_where_there_is_none(monkeypatch, capsys):
     assert "no CUDA device" in capsys.readouterr().err
 
 
-def test_one_cell(monkeypatch, capsys, tmp_path):
+def test_one_audit(monkeypatch, capsys, tmp_path):
     task = task_class("PickCube-v1")
-    options = EquivariantOptions(channels=16, width=32, depth=1, execute=4, sampling_steps=4)
-    policy = EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
+    config = PolicyConfig(channels=16, width=32, depth=1, execute=4, sampling_steps=4)
+    policy = ChunkPolicy(config, task.observation_layout, task.action_layout)
     path = save_policy(policy, tmp_path / "policy")
     arguments = ("--variant", "action_gain:1", "--group", "C4", "--base-policy", path, *FAST)
     assert symsteer(monkeypatch, *arguments, "--json", "--out", tmp_path / "out") == 0
@@ -80,7 +82,7 @@ def test_one_cell(monkeypatch, capsys, tmp_path):
     assert (tmp_path / "out" / "map.csv").read_text().startswith("body,x_mm,y_mm,copies,mm\n")
 
 
-def test_a_table_of_cells(monkeypatch, capsys, tmp_path):
+def test_a_table_of_audits(monkeypatch, capsys, tmp_path):
     arguments = ("--variant", "none", "action_gain", "--strength", 0.5, "--states", "expert")
     arguments = (*arguments, "--group", "C2", *FAST, "--out", tmp_path)
     assert symsteer(monkeypatch, *arguments) == 0
@@ -101,9 +103,16 @@ def test_a_table_of_cells(monkeypatch, capsys, tmp_path):
     assert "damaged" in capsys.readouterr().err
 
 
-def test_names_of_cells():
+def test_whole_episodes(monkeypatch, capsys):
+    assert symsteer(monkeypatch, "--rollouts", 2, "--group", "C2", "--task", "PushCube-v1") == 0
+    out = capsys.readouterr().out
+    assert out.startswith("PushCube-v1-floating-none-C2, expert\n2 episodes, 100% with contact\n")
+    assert "before contact: within 1 % of the path 100.0%" in out
+
+
+def test_variant_texts():
     assert variant_texts(["all"], [1.0])[0] == "none"
-    assert len(variant_texts(["all"], [0.5, 1.0])) == 1 + 2 * len(VARIANTS.names())
+    assert len(variant_texts(["all"], [0.5, 1.0])) == 1 + 2 * len(variant_names())
     both = "action_gain:0.5+perception_bias:1"
     assert variant_texts([both, "action_gain", both], [0.5]) == [both, "action_gain:0.5"]
     assert variant_texts(["action_gain"], [0.0]) == ["none"]
@@ -119,8 +128,15 @@ def test_the_page_says_what_the_data_say():
     for task in {row["task"] for row in rows}:
         text = page.task_page(task).read_text()
         assert text == page.generate_task(text, task, rows)
-    size = sum(f.stat().st_size for f in page.SUMMARY.parent.iterdir())
-    assert size < 300_000
+    assert page.SUMMARY.stat().st_size < 300_000
+
+
+def test_the_page_is_written_in_a_checkout_only(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(page, "PAGE", tmp_path / "docs" / "audit.md")
+    assert page.main([]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert "in a checkout" in lines[0]
 
 
 def test_a_page_without_marks():

@@ -1,4 +1,4 @@
-"""The unbroken floating task has the symmetry; a variant breaks it, and the audit sees that."""
+"""Episodes of the unbroken floating task are symmetric; those with a variant are not."""
 
 import pytest
 import torch
@@ -6,10 +6,8 @@ import torch
 from symsteer.bench.audit import rotated_rollout_error
 from symsteer.bench.demos import collect, load
 from symsteer.bench.tasks import task_class
-from symsteer.errors import UserError
-from symsteer.policies import POLICIES
-from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
+from symsteer.policies.contract import ChunkPolicy, PolicyConfig
+from symsteer.policies.training import train_policy
 
 TASKS = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
 
@@ -29,9 +27,8 @@ def test_rotated_episodes_coincide(actions):
 def fresh_policy(name: str = "edp") -> ChunkPolicy:
     torch.manual_seed(0)
     task = task_class("PickCube-v1")
-    kind = POLICIES.get(name)
-    options = kind.Options.from_json({"channels": 16, "width": 32, "depth": 1})
-    return kind(options, task.observation_layout, task.action_layout)
+    config = PolicyConfig(name=name, channels=16, width=32, depth=1, execute=4, sampling_steps=4)
+    return ChunkPolicy(config, task.observation_layout, task.action_layout)
 
 
 def test_turned_noise_gives_the_turned_episode():
@@ -49,8 +46,8 @@ def test_turned_noise_of_a_trained_policy_over_200(tmp_path):
     """State and noise of whole closed-loop episodes, turned by every element of C8."""
     path = collect("PickCube-v1", "floating", 50, "diverse", 0, tmp_path / "pick.h5")
     demos = load(path, "PickCube-v1", "floating")
-    policy = EquivariantDiffusionPolicy.fit(
-        EquivariantOptions(),
+    policy = train_policy(
+        PolicyConfig(execute=4, sampling_steps=4),
         demos.episodes,
         demos.observation_layout,
         demos.action_layout,
@@ -78,15 +75,11 @@ def test_a_variant_breaks_it():
     assert half_turn.share_within(0.01) == 1.0
 
 
-def test_bad_arguments_are_explained():
-    with pytest.raises(UserError, match="'random' or 'expert'"):
-        rotated_rollout_error("PickCube-v1", episodes=1, actions="none")
-    with pytest.raises(UserError, match="policy is needed"):
+def test_a_policy_is_for_its_actions_only():
+    with pytest.raises(ValueError, match="policy is needed"):
         rotated_rollout_error("PickCube-v1", episodes=1, actions="policy")
-    with pytest.raises(UserError, match="floating"):
-        rotated_rollout_error(
-            "PickCube-v1", episodes=1, batch=1, env_options={"embodiment": "panda"}
-        )
+    with pytest.raises(ValueError, match="only there"):
+        rotated_rollout_error("PickCube-v1", episodes=1, policy=fresh_policy())
 
 
 @pytest.mark.slow

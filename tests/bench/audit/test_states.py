@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from symsteer.bench.audit.measure import check_group
+from symsteer.bench.audit.result import check_group
 from symsteer.bench.audit.states import Turner, visit
 from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
 from symsteer.bench.tasks import make
@@ -64,7 +64,7 @@ def test_turned_tools_stand_where_they_should(visited, reflect):
 
 
 def test_turned_tools_move_as_they_should(visited):
-    """The tool's velocity, seen as the path of one short moment, turns too."""
+    """The tool's velocity turns too."""
     env, states = visited
     turned, reached = Turner(env).turn(states.state, (math.pi / 2, False), torch.zeros(2))
     paths = []

@@ -1,7 +1,7 @@
 """Demonstrations: collected, read back, read by ManiSkill's tools, refused when they are wrong."""
 
-import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -18,10 +18,8 @@ from symsteer.bench.demos import Diversity, collect, load
 from symsteer.bench.sim import make_env_class
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
-from symsteer.files import write_atomically
 
 TASK = "PickCube-v1"
-collecting = importlib.import_module("symsteer.bench.demos.collect")
 
 
 @pytest.fixture(scope="module")
@@ -95,17 +93,17 @@ def test_two_processes_may_write_the_same_demonstrations(tmp_path, monkeypatch):
     path = tmp_path / "demos.h5"
     arguments = (TASK, "floating", 2, "diverse", 7)
     code = (
-        "from pathlib import Path; from bench.demos import collect; "
+        "from pathlib import Path; from symsteer.bench.demos import collect; "
         f"collect(*{arguments!r}, Path({str(path)!r}))"
     )
-    written = []
+    written, replace = [], os.replace
 
-    def write(*file):
-        write_atomically(*file)
+    def interrupted(*paths):
+        replace(*paths)
         if not written:
             written.append(subprocess.run([sys.executable, "-W", "ignore", "-c", code]).returncode)
 
-    monkeypatch.setattr(collecting, "write_atomically", write)
+    monkeypatch.setattr("symsteer.files.os.replace", interrupted)
     collect(*arguments, path)
     assert written == [0]
     assert len(load(path, TASK, "floating")) == 2
@@ -135,7 +133,7 @@ def test_maniskills_tools_read_our_files(clean):
     assert len(dataset) == sum(len(a) for _, a in demos.episodes)
     assert np.array_equal(dataset.actions, torch.cat([a for _, a in demos.episodes]))
     assert dataset.success.sum() == 6
-    assert dataset.env_id == "SymSteer/PickCube-v1"
+    assert dataset.env_id == "symsteer.bench.tasks:SymSteer/PickCube-v1"
     # ManiSkill's way of replaying by states: one unbatched numpy state after the other.
     env = gym.make(dataset.env_id, **dataset.env_kwargs)
     env.reset(seed=0)
@@ -147,18 +145,25 @@ def test_maniskills_tools_read_our_files(clean):
         assert torch.allclose(env.unwrapped.get_obs()[0], expected, atol=1e-5)
 
 
-def test_maniskills_replay_script_replays_our_files(clean, tmp_path, capsys):
-    from mani_skill.trajectory import replay_trajectory
-
-    path = tmp_path / "clean.h5"
-    for source in (clean, clean.with_suffix(".json")):
-        shutil.copy(source, tmp_path / source.name)
+def test_maniskills_replay_script_replays_our_files(copy):
+    """As a command of its own, which imports nothing of ours."""
+    command = [sys.executable, "-W", "ignore", "-m", "mani_skill.trajectory.replay_trajectory"]
+    command += ["--traj-path", str(copy), "--use-env-states", "--save-traj", "--count", "2"]
     # It asks for a render mode without rendering anything.
-    arguments = replay_trajectory.Args(
-        traj_path=str(path), sim_backend="physx_cpu", use_env_states=True, save_traj=True, count=2
-    )
-    replay_trajectory.main(arguments)
-    assert "2/2" in capsys.readouterr().out
+    result = subprocess.run([*command, "-b", "physx_cpu"], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "2/2" in result.stdout
+    # The copies that it writes name the task without our module.
+    (replayed,) = (p for p in copy.parent.glob("*.h5") if p != copy)
+    assert len(load(replayed, TASK, "floating")) == 2
+
+
+@pytest.mark.parametrize("env_id", ["SymSteer/PickCube-v1", "PickCube-v1"])
+def test_ids_of_other_writers_are_read(copy, env_id):
+    edit_json(copy, lambda data: data["env_info"].update(env_id=env_id))
+    # The checksum covers the description: it is the only thing that is wrong now.
+    with pytest.raises(UserError, match="do not match the checksum"):
+        load(copy, TASK, "floating")
 
 
 def record_like_maniskill(path, task, control_mode="pd_ee_delta_pose", robot="panda", steps=70):

@@ -27,5 +27,5 @@ def broken(finished) -> dict[str, Path]:
     change = {"variant": "action_gain:0.5", "env_steps": 240}
     return {
         name: execute(tiny_config(agent=name, **change), folder.parent, progress=False)
-        for name in AGENTS
+        for name in AGENTS.builtin
     }

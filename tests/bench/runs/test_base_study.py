@@ -8,7 +8,7 @@ from tests.bench.tiny_run import tiny_config
 
 
 def test_a_small_study(tmp_path):
-    names, counts = ("edp", "plain-augmented"), (1, 2)
+    names, counts = ("edp", "plain-augmented"), (2,)
     rows = study(tiny_config(), tmp_path, names, counts, seeds=1, episodes=4, workers=1)
     assert [(r["name"], r["count"], r["seed"]) for r in rows] == [
         (name, count, 0) for count in counts for name in names

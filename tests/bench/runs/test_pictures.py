@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from symsteer.agents.episodes import Rollout
 from symsteer.bench.runs.base_policy import prepare_base
-from symsteer.bench.runs.loop import new_agent
-from symsteer.bench.runs.pictures import FAILURE, FRAMES, SUCCESS, draw_paths, film, positions
+from symsteer.bench.runs.pictures import FAILURE, FRAMES, SUCCESS, draw_paths, frames_of, positions
+from symsteer.bench.runs.trainer import new_agent
 from symsteer.bench.sim.headless import rendering_works
-from symsteer.bench.steering.evaluation import Rollout
 from symsteer.bench.tasks import TASKS, task_class
 from tests.bench.tiny_run import tiny_config
 
@@ -97,7 +97,7 @@ def test_what_follows_the_first_success_is_not_drawn():
 def test_frames_of_an_episode_show_it_moving(finished):
     config, folder = finished
     base = prepare_base(tiny_config(), folder.parent, progress=False)
-    picture = film(config, base, new_agent("base", config, base))
+    picture = frames_of(config, base, new_agent(tiny_config(agent="base"), base))
     assert picture.dtype == np.uint8
     rows = np.split(picture.astype(int), 2)
     frames = [frame for row in rows for frame in np.split(row, FRAMES // 2, axis=1)]

@@ -7,17 +7,16 @@ import random
 import shutil
 import signal
 import time
-from dataclasses import replace
 
 import pytest
 import torch
 
+from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.folder import (
     CHECKPOINT,
     RunBusyError,
     claimed,
     is_finished,
-    load_checkpoint,
     read_progress,
     state_of,
 )
@@ -31,11 +30,11 @@ PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(["tests.bench.runs.test_resume", "torch._dynamo"])
 
 # Fractions of an update are owed from one decision to the next.
-CONFIG = replace(
-    tiny_config(env_steps=960),
+CONFIG = tiny_config(
+    env_steps=960,
     checkpoint_every=60,
-    # Behind the first checkpoint some noise is still drawn at random.
-    sac=replace(tiny_config().sac, utd=0.3, warmup=80),
+    # After the first checkpoint some noise is still drawn at random.
+    options={"utd": 0.3, "warmup": 80},
 )
 
 

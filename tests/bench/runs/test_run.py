@@ -8,18 +8,18 @@ import shutil
 import pytest
 import torch
 
-from symsteer.agents import make_agent
-from symsteer.agents.sac import SacConfig
-from symsteer.bench.runs import evaluator, loop
+from symsteer.agents.sac import SacAgent
+from symsteer.bench.runs import trainer
 from symsteer.bench.runs.base_policy import prepare_base
+from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
-from symsteer.bench.runs.folder import is_finished, load_checkpoint, run_id, state_of
+from symsteer.bench.runs.folder import is_finished, run_id, state_of
 from symsteer.bench.runs.run import evaluate, execute
 from symsteer.bench.steering import evaluation
-from symsteer.bench.steering.evaluation import held_out_seeds
+from symsteer.bench.steering.seeds import HELD_OUT_SEED, held_out_seeds
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import HELD_OUT_SEED, read_record
+from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config, without_clock
 
 REFERENCES = ("base", "zero", "golden-ticket")
@@ -34,12 +34,14 @@ def test_the_record_tells_the_whole_run(finished):
     assert steps == [0, 160, record.budget.env_steps]
     # A decision more than the budget at most; time limits cut chunks short.
     assert 320 <= record.budget.env_steps < 320 + config.num_envs * config.policy.execute
-    # No update during the warm-up of 16 decisions, then one a decision.
-    assert record.budget.updates == record.budget.decisions - config.sac.warmup
+    # No update during the warm-up of 16 decisions, then one per decision.
+    assert record.budget.updates == record.budget.decisions - config.agent_options.warmup
     final = record.evaluations[-1]
     assert final.final
     assert final.episodes.seed == held_out_seeds(5)
-    low, high = task_class(config.task).feasible_return(config.sac.gamma, config.policy.execute)
+    low, high = task_class(config.task).feasible_return(
+        config.agent_options.gamma, config.policy.execute
+    )
     assert (record.feasible_q.low, record.feasible_q.high) == (low, high)
     assert final.diagnostics["equivariance_decode"] < 1e-5
     assert final.diagnostics["equivariance_actor"] < 1e-4
@@ -49,7 +51,8 @@ def test_the_record_tells_the_whole_run(finished):
     assert 0 < parts <= clock.total
     stored = json.loads((folder / "config.json").read_text())
     assert stored == record.config
-    assert stored["sac"]["width"] == 16
+    assert stored["agent_options"]["width"] == 16
+    assert record.role == "learner"
 
 
 def test_no_path_of_this_machine_is_recorded(finished):
@@ -63,15 +66,7 @@ def test_the_checkpoint_restores_the_agent(finished):
     config, folder = finished
     state = load_checkpoint(folder)
     base = prepare_base(config, folder.parent, progress=False)
-    agent = make_agent(
-        config.agent,
-        base.obs_layout,
-        base.act_layout,
-        base.horizon,
-        config.sac,
-        seed=99,
-        normalize_obs=base.normalized_observation,
-    )
+    agent = trainer.new_agent(dataclasses.replace(config, seed=99), base)
     obs = torch.randn(4, base.obs_layout.dim)
     before = agent.act(obs, deterministic=True)
     agent.load_state_dict(state["agent"])
@@ -103,12 +98,13 @@ def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
     """No success here, so nothing is terminal, and the last observation is the old episode's."""
     stored = []
 
-    class Spy(loop.ReplayBuffer):
-        def add(self, obs, noise, reward, next_obs, terminal):
-            stored.append((obs.clone(), next_obs.clone(), terminal.clone()))
-            super().add(obs, noise, reward, next_obs, terminal)
+    observe = SacAgent.observe
 
-    monkeypatch.setattr(loop, "ReplayBuffer", Spy)
+    def spy(self, step):
+        stored.append((step.obs.clone(), step.next_obs.clone(), step.terminal.clone()))
+        observe(self, step)
+
+    monkeypatch.setattr(SacAgent, "observe", spy)
     _, folder = finished
     config = tiny_config(seed=2)
     execute(config, folder.parent, progress=False)
@@ -151,7 +147,7 @@ def test_a_strength_written_otherwise_is_the_same_run():
     assert len(ids) == 1
 
 
-@pytest.mark.parametrize("place", [(evaluator, "measure"), (loop, "Evaluator")])
+@pytest.mark.parametrize("place", [(SacAgent, "diagnostics"), (trainer, "Evaluator")])
 def test_a_failed_run_says_so_and_is_continued(place, finished, monkeypatch):
     _, folder = finished
     broken = tiny_config(seed=1)
@@ -185,7 +181,7 @@ def test_a_failed_run_says_so_and_is_continued(place, finished, monkeypatch):
         ({"variant": "wind:0+action_gain:0.5"}, "strength 0, which changes nothing"),
         ({"env_steps": 64}, "within the warm-up of 64"),
         ({"agent": "golden-ticket", "env_steps": 100}, "a search of the best constant noise needs"),
-        ({"sac": SacConfig(width=16, warmup=16, replay_capacity=3)}, "replay_capacity is 3"),
+        ({"options": {"replay_capacity": 3}}, "replay_capacity is 3"),
     ],
 )
 def test_mistakes_are_refused_before_anything_is_built(change, words, tmp_path):
@@ -237,7 +233,7 @@ def test_a_base_policy_of_ones_own_decides_what_the_record_says(finished, tmp_pa
     )
     found = read_record(execute(plain, tmp_path, policy=file, progress=False) / "record.json")
     said = found.config
-    assert said["policy"] == config.policy.to_json()
+    assert said["policy"] == config.to_json()["policy"]
     assert said["demonstrations"]["count"] == 3
     known = read_record(folder / "record.json").base_policy
     assert found.base_policy == known

@@ -13,11 +13,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from symsteer.bench.runs import loop
+from symsteer.bench.runs import observers
 from symsteer.bench.runs.folder import run_id, state_of
-from symsteer.bench.runs.loop import Loop
 from symsteer.bench.runs.run import execute, resume
 from symsteer.bench.runs.tensorboard import FINAL_METRICS, IDENTITY, RunLog
+from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
@@ -53,7 +53,7 @@ def documented_tags():
 def continued(finished):
     """A run that was stopped after an evaluation that no checkpoint knows of, and continued."""
     _, folder = finished
-    evaluate = Loop.evaluate
+    evaluate = Trainer.evaluate
 
     def evaluate_and_stop(self, final=False):
         evaluate(self, final)
@@ -62,7 +62,7 @@ def continued(finished):
 
     config = tiny_config(env_steps=480, checkpoint_every=60)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Loop, "evaluate", evaluate_and_stop)
+        patch.setattr(Trainer, "evaluate", evaluate_and_stop)
         with pytest.raises(RuntimeError, match="stopped"):
             execute(config, folder.parent, progress=False)
     stopped = folder.parent / run_id(config, {})
@@ -152,13 +152,17 @@ def test_hyperparameters_can_be_compared_across_runs(broken):
         )
         values = start.hparams
         assert values["agent"].string_value == name
-        assert values["sac.lr"].number_value == record.config["sac"]["lr"]
+        own = record.config["agent_options"]
+        for key in ("lr", "free_penalty", "candidates"):
+            if key in own:
+                assert values[f"agent_options.{key}"].number_value == own[key]
         assert values["demonstrations.count"].number_value == 3
-        assert values["sac.layer_norm"].bool_value is True
-        assert values["sac.target_entropy"].string_value == "none"
+        if record.role == "learner":
+            assert values["agent_options.layer_norm"].bool_value is True
+            assert values["agent_options.target_entropy"].string_value == "none"
         assert folder.name.endswith(start.group_name)
         experiment = metadata.parse_experiment_plugin_data(content(metadata.EXPERIMENT_TAG))
-        assert {info.name for info in experiment.hparam_infos} == set(values)
+        assert set(values) <= {info.name for info in experiment.hparam_infos}
         assert {info.name for info in experiment.hparam_infos if info.differs} == IDENTITY
         end = metadata.parse_session_end_info_plugin_data(content(metadata.SESSION_END_INFO_TAG))
         assert end.status == api_pb2.STATUS_SUCCESS
@@ -180,7 +184,7 @@ def test_the_text_says_what_was_run(broken):
         assert f"{record.base_policy.base_success:.0%} of 32 episodes" in rows["its success"]
         assert f"{record.base_policy.action_std:.2f}" in rows["its steerability"]
         assert rows["its warning"] == record.base_policy.warning
-        assert rows["sac.lr"] == "0.0005"
+        assert rows.get("agent_options.lr") == ("0.0006" if record.role == "learner" else None)
         assert rows["evaluation.final_episodes"] == "5"
 
 
@@ -198,7 +202,7 @@ def test_a_picture_that_fails_does_not_harm_the_run(finished, monkeypatch, capsy
     def fail(*args):
         raise OSError("no fonts")
 
-    monkeypatch.setattr(loop, "draw_paths", fail)
+    monkeypatch.setattr(observers, "draw_paths", fail)
     _, folder = finished
     other = execute(tiny_config(agent="zero"), folder.parent, progress=True)
     assert read_record(other / "record.json").status == "finished"
@@ -217,7 +221,7 @@ def test_a_full_disk_is_reported_in_one_sentence(finished, tmp_path, monkeypatch
 
     monkeypatch.setattr(log.writer.file_writer.event_writer._async_writer, "write", fail)
     with pytest.raises(UserError, match=r"cannot write TensorBoard's events .*No space left"):
-        log.scalars("eval", {"success_once": 0.5}, 0)
+        log.scalars({"eval/success_once": 0.5}, 0)
     log.finish()
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="cannot write TensorBoard's events"):

@@ -25,7 +25,9 @@ def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, mon
     assert sorted(made) == ["directional_reward:0.5", variant]
     assert record.config["variant"] == variant
     assert record.config["evaluation_variant"] == "directional_reward:0.5"
-    low, _ = task_class(config.task).feasible_return(config.sac.gamma, config.policy.execute)
+    low, _ = task_class(config.task).feasible_return(
+        config.agent_options.gamma, config.policy.execute
+    )
     assert record.feasible_q.low == pytest.approx(1.5 * low)
     for evaluation in record.evaluations:
         for cost, length in zip(

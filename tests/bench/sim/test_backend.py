@@ -82,7 +82,7 @@ def write(env) -> None:
 
 
 def test_every_scene_has_a_ground(playground):
-    """On CUDA one plane serves all scenes; here each needs its own."""
+    """On CUDA all scenes share one plane; here each needs its own."""
     for _ in range(40):
         playground.step(None)
     heights = playground.boxes["dynamic"].pose.p[:, 2]
@@ -114,7 +114,7 @@ def test_free_root(playground):
 
 
 def test_buffers_agree_with_sapien(playground):
-    """Every row says what SAPIEN's own objects say."""
+    """Every row equals the values of SAPIEN's own objects."""
     for _ in range(7):
         playground.step(None)
     px, chain = playground.scene.px, playground.chain
@@ -171,7 +171,7 @@ def test_force_acts_once(playground):
 
 
 def test_held_force_acts_in_every_substep(playground):
-    """A force of m g changes the velocity by g a second, in one scene, until it is lifted."""
+    """A force of m g changes the velocity by g per second, in one scene, until it is removed."""
     box, dt = playground.boxes["dynamic"], playground.scene.timestep
     force = torch.zeros(3, 3)
     force[1, 0] = box.mass[1] * 9.81
@@ -186,7 +186,7 @@ def test_held_force_acts_in_every_substep(playground):
 
 
 def test_held_force_equals_one_set_between_substeps(playground):
-    """Bit for bit what a hook that pushes before each substep does."""
+    """Equal to the bit to a hook that pushes before each substep."""
     force = torch.tensor([[1.0, 2, 0], [0, 0, 0], [-3, 0, 1]])
 
     class Pushed(Playground):
@@ -205,7 +205,7 @@ def test_held_force_equals_one_set_between_substeps(playground):
 
 
 def test_fetch_discards_what_was_not_applied(playground):
-    """As on CUDA: the simulation wins over a buffer that was written and not applied."""
+    """As on CUDA, a fetch overwrites a buffer that was written but not applied."""
     box = playground.boxes["dynamic"]
     before = box.pose.raw_pose.clone()
     box.set_pose(sapien.Pose([5, 5, 5]))
@@ -245,7 +245,7 @@ class Hooked(PickCubeEnv):
 
 
 def test_hooks_see_every_substep():
-    """Where code runs between substeps, the substeps are not put off; results are the same."""
+    """If code runs between substeps, they are not deferred; results are the same."""
     lifted = torch.tensor([[0.0, 0, 0.5, 1, 0, 0, 0]]).repeat(2, 1)
     finals = []
     for cls in (Hooked, PickCubeEnv):
@@ -274,7 +274,7 @@ def test_other_tasks(env_cls):
 
 
 def test_mixin_by_hand():
-    """The mixin can be written into a class, and make_env_class leaves such a class alone."""
+    """make_env_class returns a class that has the mixin already unchanged."""
 
     class Mine(BatchedCpuMixin, PickCubeEnv):
         pass

@@ -1,4 +1,4 @@
-"""Environments do not feel each other, and the same input gives the same numbers."""
+"""Environments do not influence each other, and the same input gives the same numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def bytes_of(env) -> list[bytes]:
 
 @pytest.mark.parametrize("task", ["PushCube", "PickCube", "StackCube"])
 def test_partial_reset_leaves_others_alone(kit, task):
-    """What is not reset keeps every bit, in the simulation and in all that follows."""
+    """Environments that are not reset keep every bit, then and later."""
     env, twin = (kit.batched(task, N, control_mode="pd_ee_delta_pose") for _ in range(2))
     actions = kit.actions(env, 16)
     for e in (env, twin):
@@ -101,10 +101,9 @@ def test_reset_forgets_contacts(kit):
 
 
 def test_memory_stays(kit):
-    """Neither resets nor reconfigurations nor discarded environments pile up memory.
+    """Memory does not grow with resets, reconfigurations or discarded environments.
 
-    A leak takes memory in every round; the allocator, which other tests' threads share, only in
-    some. So the smallest of the rounds' growths is what counts.
+    A leak takes memory in every round, the allocator only in some: the smallest growth counts.
     """
     env = kit.batched("PickCube", 2)
 

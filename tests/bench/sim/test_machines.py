@@ -1,4 +1,4 @@
-"""Machines without Vulkan, without CUDA, without libraries, or with other releases."""
+"""Machines without Vulkan, CUDA or libraries, or with other versions of the simulator."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
 
 
 def test_headless_without_vulkan():
-    """With no driver: states work, stock ManiSkill too, nothing warns, cameras are refused."""
+    """Without a driver, states work, also in stock ManiSkill; cameras are refused; no warnings."""
     code = """
 from symsteer.bench.sim import create, prepare_headless, rendering_works
 from symsteer.errors import UserError
@@ -79,7 +79,7 @@ def test_cameras_with_vulkan():
 
 @pytest.mark.parametrize("package", ["mani-skill", "sapien"])
 def test_other_release_is_refused(monkeypatch, package):
-    """Another ManiSkill or SAPIEN than the one patched gives one sentence with the cure."""
+    """Another version of ManiSkill or SAPIEN gives one sentence with the cure."""
     monkeypatch.setitem(versions.PINNED, package, "9.9.9")
     with pytest.raises(UserError, match=rf"{package} 9\.9\.9.*pip install {package}==9\.9\.9"):
         create(PickCubeEnv, 1)
@@ -114,7 +114,7 @@ def test_bad_settings(monkeypatch, settings, message):
 
 
 def test_more_scenes_than_a_process_can_hold(monkeypatch):
-    """Closed environments make room; what does not fit is refused before PhysX ends the process."""
+    """Closed environments free their scenes; too many scenes are refused before PhysX crashes."""
     gc.collect()
     before = batched._number_of_scenes()
     monkeypatch.setattr("symsteer.bench.sim.environment.MAX_SCENES", before + 12)
@@ -139,7 +139,7 @@ def test_cuda_absent():
 
 
 def test_physx_gpu_library_missing(monkeypatch):
-    """A GPU without PhysX's library, which cannot be downloaded: one sentence, and a way out."""
+    """A GPU without PhysX's library, which cannot be downloaded: one sentence with the cure."""
 
     def no_network():
         raise RuntimeError("<urlopen error [Errno -3] Temporary failure in name resolution>")
@@ -164,7 +164,7 @@ def test_cuda():
 
 
 def test_probe_of_this_machine():
-    """Every finding is one line, and what is required is there."""
+    """Every finding is one line, and nothing required is missing."""
     checks = probe()
     assert len({check.name for check in checks}) == len(checks) == 11
     for check in checks:
@@ -177,7 +177,7 @@ def test_probe_of_this_machine():
     [(True, "make setup", "make setup"), (False, "pip install 'sapien==9.9'", "'symsteer[maths]'")],
 )
 def test_probe_of_an_installation(monkeypatch, checkout, cure, extra):
-    """A wrong version must be mended, an absent extra may stay; a wheel has no Makefile."""
+    """A wrong version is an error, an absent extra is not; the cures depend on the checkout."""
     wanted = ["sapien==9.9", "torch", 'escnnn; extra == "maths"', 'nothing; extra == "dev"']
     monkeypatch.setattr(capabilities, "requires", lambda name: wanted)
     extras = Message()

@@ -1,4 +1,4 @@
-"""The batched scenes follow ManiSkill's own CPU simulation."""
+"""The batched scenes agree with ManiSkill's own CPU simulation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_follows_stock(kit, task):
 
 
 def test_success_equals_stock(kit):
-    """A state of success is one for both, and sleeping bodies do not differ either."""
+    """Both report success in the same state, and sleeping bodies do not differ."""
     env, stock = kit.batched("PickCube", 2), kit.stock("PickCube")
     env.reset(seed=[1, 2])
     stock.reset(seed=3)
@@ -110,7 +110,7 @@ def test_contact_impulses_equal_stock(kit):
 
 
 def test_stock_is_left_alone(kit):
-    """A stock environment gives the same numbers whether or not ours is used beside it."""
+    """A stock environment gives the same numbers with and without ours in the process."""
     stock = kit.stock("PickCube", control_mode="pd_ee_delta_pose")
     stock.reset(seed=1)
     actions = kit.actions(stock, 5)
@@ -125,8 +125,8 @@ def test_stock_is_left_alone(kit):
 
 
 def test_pushed_object_follows_stock(kit):
-    """PushT's stick takes the T along. In contact, two runs of stock from states 1e-7 apart are
-    up to 1e-3 apart as well."""
+    """PushT's stick pushes the T. In contact, two stock runs from states that differ by 1e-7 also
+    differ by up to 1e-3."""
     env, stock = kit.batched("PushT", 2), kit.stock("PushT")
     env.reset(seed=[1, 2])
     stock.reset(seed=4)

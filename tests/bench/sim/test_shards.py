@@ -305,8 +305,8 @@ class Local(PickCubeEnv):
 
 
 def test_errors_of_a_worker():
-    """A mistake is raised as itself, another error with the worker's traceback; both at once end
-    nothing, and the answers of the other workers do not get mixed up."""
+    """A mistake is raised as itself, another error with the worker's traceback; the environment
+    goes on after both, and later answers are not mixed up."""
     env = create(Local, 3, workers=2, robot_uids="panda", obs_mode="state")
     dim = env.action_space.shape[1]
     env.reset(seed=1)
@@ -374,7 +374,7 @@ def test_a_killed_worker_is_reported(when):
 
 
 def test_nothing_is_left_behind():
-    """Closed, forgotten or never finished: no process, no descriptor."""
+    """Closed, deleted or never finished: no process and no file descriptor is left."""
     before = open_files()
     env = make(TASK, num_envs=2, workers=2)
     pids = env.worker_pids
@@ -403,8 +403,8 @@ while True:
     "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
 )
 def test_workers_end_with_the_program(end, tmp_path):
-    """Ctrl-C reaches the whole process group; a killed program cannot say goodbye. The program
-    has no guard against being imported by its workers."""
+    """Ctrl-C goes to the whole process group; SIGKILL to the program only. The program has no
+    guard against being imported by its workers."""
     script = tmp_path / "program.py"
     script.write_text(PROGRAM)
     program = subprocess.Popen(

@@ -3,12 +3,13 @@
 import pytest
 import torch
 
-from symsteer.bench.steering.evaluation import HELD_OUT_SEED, held_out_seeds, rollout, steerability
+from symsteer.bench.steering.evaluation import rollout, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.steering.seeds import HELD_OUT_SEED, held_out_seeds
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
-from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy, PolicyOptions
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 
 TASK = "PickCube-v1"
@@ -21,15 +22,17 @@ def untrained_policy(execute: int = 4) -> ChunkPolicy:
     return EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
 
 
-class NoiseIsAction(torch.nn.Module):
+class NoiseIsAction(ChunkPolicy):
     """A decoder that plays its noise, so that a test decides every action."""
 
     def __init__(self, execute: int):
-        super().__init__()
         task = task_class(TASK)
-        self.obs_layout, self.act_layout = task.observation_layout, task.action_layout
-        self.horizon = self.execute = execute
-        self.nothing = torch.nn.Parameter(torch.zeros(1))
+        options = PolicyOptions(horizon=execute, execute=execute)
+        super().__init__(options, task.observation_layout, task.action_layout)
+
+    @classmethod
+    def fit(cls, *_):
+        raise NotImplementedError
 
     def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         return noise
@@ -53,7 +56,7 @@ def test_step_is_the_decoded_chunk_played_by_hand(env):
         result = latent.step(w)
         assert torch.equal(result.reward, torch.full((4,), -float(policy.execute)))
         assert not result.terminal.any()
-        seen.append(result.obs)
+        seen.append(result.obs_after)
     obs, _ = env.reset(seed=seeds)
     for i, w in enumerate(noise):
         assert torch.equal(obs, seen[i])
@@ -90,7 +93,7 @@ def test_success_ends_an_episode_and_its_cost(env):
             assert torch.equal(result.episodes["episode_len"].float(), length.float())
             assert torch.equal(result.episodes["return"], -(length.float() - 1))
             # The next observation is the end of the old episode, not the start of the new one.
-            assert (result.next_obs[won] != result.obs[won]).any(dim=1).all()
+            assert (result.next_obs[won] != result.obs_after[won]).any(dim=1).all()
             break
     else:
         pytest.fail("the expert never succeeded")

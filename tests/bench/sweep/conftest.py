@@ -3,7 +3,7 @@
 import pytest
 
 from symsteer.bench.runs.run import execute
-from tests.bench.sweep.cells import LONG
+from tests.bench.sweep.long_run import LONG
 
 
 @pytest.fixture(scope="session")

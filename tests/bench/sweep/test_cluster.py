@@ -1,4 +1,4 @@
-"""The cells of a sweep on a Ray cluster of two machines, one of which dies."""
+"""The runs of a sweep on a Ray cluster of two machines, one of which dies."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ from symsteer.bench.sweep.plan import make_plan
 from symsteer.bench.sweep.suite import Suite
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
-from tests.bench.sweep.cells import LONG, wait_for
+from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import tiny_config, without_clock
 
 MACHINE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
@@ -75,7 +75,7 @@ def test_a_folder_that_is_not_shared_is_refused(cluster, tmp_path):
         pytest.skip("this machine allows no mount namespaces")
     out = tmp_path / "runs"
     out.mkdir()
-    sweep = f"{sys.executable} -m bench sweep smoke --out {out} --ray {cluster.address}"
+    sweep = f"{sys.executable} -m symsteer sweep smoke --out {out} --ray {cluster.address}"
     done = subprocess.run(
         [*own, f"mount -t tmpfs tmpfs {out} && exec {sweep}"],
         capture_output=True,
@@ -93,7 +93,7 @@ def test_a_machine_dies_and_nothing_is_lost(cluster, undisturbed, tmp_path, caps
     out = tmp_path / "runs"
     other = tiny_config(agent="zero")
     plan = make_plan(Suite("two", "", (LONG, other)), out)
-    run = out / plan.cells[0].run_id
+    run = out / plan.runs[0].run_id
 
     def kill() -> None:
         # To look for its process takes long; before that, there are demonstrations and a policy.

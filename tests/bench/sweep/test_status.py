@@ -11,48 +11,49 @@ from datetime import UTC, datetime
 import pytest
 from filelock import FileLock
 from rich.console import Console
-from symsteer.bench.cli import main
 
 from symsteer.bench.runs.folder import CONFIG, LOCK, PROGRESS, RECORD
 from symsteer.bench.sweep.display import Display, LiveDisplay
 from symsteer.bench.sweep.estimate import Estimate, duration
-from symsteer.bench.sweep.plan import Cell, make_plan, manifest_path, write_manifest
+from symsteer.bench.sweep.plan import PlannedRun, make_plan, manifest_path, write_manifest
 from symsteer.bench.sweep.schedule import Outcome, Task, tasks_of
 from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite
 from symsteer.bench.sweep.work import Result
+from symsteer.cli import main
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
-from tests.bench.sweep.cells import LONG
+from tests.bench.sweep.long_run import LONG
 from tests.bench.tiny_run import tiny_config
 
 AGENTS = ("equivariant", "standard", "approximate", "standard-matched", "zero")
 
 
-def cell(agent="equivariant", task="PickCube-v1", env_steps=1000, embodiment="floating"):
-    return Cell("x", task, embodiment, "none", agent, 0, env_steps)
+def planned(agent="equivariant", task="PickCube-v1", env_steps=1000, embodiment="floating"):
+    return PlannedRun("x", task, embodiment, "none", agent, 0, env_steps)
 
 
 def test_a_run_is_judged_by_the_most_similar_finished_ones():
     estimate = Estimate()
-    assert estimate.left([cell()], {}, 1) is None
-    estimate.add(cell(), 100.0)
-    estimate.add(cell(), 300.0)
-    estimate.add(cell("standard"), 50.0)
-    estimate.add(cell("zero"), 1.0)
-    assert estimate.left([cell()] * 4, {}, 1) == pytest.approx(800)
-    assert estimate.left([cell()] * 4, {}, 2) == pytest.approx(400)
+    assert estimate.left([planned()], {}, 1) is None
+    estimate.add(planned(), 100.0)
+    estimate.add(planned(), 300.0)
+    estimate.add(planned("standard"), 50.0)
+    estimate.add(planned("zero"), 1.0)
+    assert estimate.left([planned()] * 4, {}, 1) == pytest.approx(800)
+    assert estimate.left([planned()] * 4, {}, 2) == pytest.approx(400)
     # Ten workers are as fast as the longest run.
-    assert estimate.left([cell()] * 4, {}, 10) == pytest.approx(200)
-    assert estimate.left([cell("standard", env_steps=4000)], {}, 1) == pytest.approx(200)
-    assert estimate.left([cell("standard", task="PushCube-v1")], {}, 1) == pytest.approx(50)
-    # Another agent that learns is like those that do; the golden ticket is like none of them.
-    assert estimate.left([cell("approximate")], {}, 1) == pytest.approx(100)
-    assert estimate.left([cell("golden-ticket")], {}, 1) is None
+    assert estimate.left([planned()] * 4, {}, 10) == pytest.approx(200)
+    assert estimate.left([planned("standard", env_steps=4000)], {}, 1) == pytest.approx(200)
+    assert estimate.left([planned("standard", task="PushCube-v1")], {}, 1) == pytest.approx(50)
+    # Learners are alike; other agents are only compared with themselves.
+    assert estimate.left([planned("approximate")], {}, 1) == pytest.approx(100)
+    assert estimate.left([planned("golden-ticket")], {}, 1) is None
     half = {"env_steps": 500, "budget": 1000, "steps_per_second": 10.0}
-    assert estimate.left([], {cell("standard"): half}, 1) == pytest.approx(25)
-    # Before the first of its kind is finished, one that runs tells.
-    ticket = cell("golden-ticket")
+    assert estimate.left([], {planned("standard"): half}, 1) == pytest.approx(25)
+    assert estimate.left([planned("foreign")], {}, 1) is None
+    # Running runs serve as long as none of the agent is finished.
+    ticket = planned("golden-ticket")
     assert estimate.left([ticket], {ticket: half}, 1) == pytest.approx(150)
 
 
@@ -64,9 +65,12 @@ def test_lengths_of_time():
 @pytest.fixture
 def sweep(undisturbed, tmp_path):
     """A sweep of which one run is finished, one runs, one was stopped, one failed, one is to do."""
-    configs = [replace(LONG, agent=agent) for agent in AGENTS]
+    configs = [
+        replace(LONG, agent=agent, agent_options=tiny_config(agent=agent).agent_options)
+        for agent in AGENTS
+    ]
     plan = make_plan(Suite("tiny", "five", tuple(configs)), tmp_path)
-    folders = [tmp_path / one.run_id for one in plan.cells]
+    folders = [tmp_path / one.run_id for one in plan.runs]
     shutil.copytree(undisturbed, folders[0])
     for folder in folders[1:3]:
         shutil.copytree(undisturbed, folder)
@@ -86,14 +90,14 @@ def sweep(undisturbed, tmp_path):
     # What an earlier process left is not what the present one does.
     old = {**progress, "updated": "2026-01-01T00:00:00+00:00"}
     (folders[2] / PROGRESS).write_text(json.dumps(old))
-    write_manifest(plan, 2, {plan.cells[3].run_id: "its process was killed by SIGKILL"})
+    write_manifest(plan, 2, {plan.runs[3].run_id: "its process was killed by SIGKILL"})
     with FileLock(folders[1] / LOCK):
         yield plan
 
 
 def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
     [status] = read_status(sweep.out).found
-    assert [status.state(one) for one in sweep.cells] == [
+    assert [status.state(one) for one in sweep.runs] == [
         "finished",
         "running",
         "interrupted",
@@ -105,7 +109,7 @@ def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
     assert "standard seed 0: 120 of 480 steps, success 25%, 12 steps/s, about 30 s left" in text
     assert "standard-matched seed 0: its process was killed by SIGKILL" in text
     # zero does not learn: nothing is known of it.
-    assert text.endswith("time left: unknown, no such runs are finished yet")
+    assert text.endswith("time left: unknown, no similar run is finished yet")
     monkeypatch.setattr("sys.argv", ["symsteer", "status", str(sweep.out), "--suite", "tiny"])
     assert main() == 0
     assert capsys.readouterr().out == text + "\n"
@@ -119,6 +123,22 @@ def test_runs_of_no_sweep_are_reported_too(sweep, undisturbed, tmp_path):
     [status] = read_status(tmp_path).found
     # The two that never began have left nothing.
     assert len(status.runs) == 4
+
+
+def test_runs_and_sweeps_are_found_at_any_depth(sweep, undisturbed, tmp_path_factory):
+    """As ``symsteer status runs`` after ``symsteer demo``, whose runs are in runs/demo."""
+    top = tmp_path_factory.mktemp("top")
+    (top / "deep").mkdir()
+    sweep.out.rename(top / "deep" / "demo")
+    shutil.copytree(undisturbed, top / "single" / "PickCube-v1-floating-none-equivariant-s7-0")
+    listed, others = read_status(top).found
+    assert listed.title == "deep/demo: tiny: five"
+    assert [len(listed.in_state(state)) for state in ("finished", "missing")] == [1, 1]
+    assert others.title == "runs of no sweep"
+    assert [run.run_id for run in others.runs] == ["PickCube-v1-floating-none-equivariant-s7-0"]
+    [only] = read_status(top, "tiny").found
+    assert only.title == listed.title
+    (top / "deep" / "demo").rename(sweep.out)
 
 
 def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, capsys, monkeypatch):
@@ -156,7 +176,7 @@ def test_folders_of_something_else_are_left_alone(undisturbed, tmp_path):
 def test_mistakes_with_status(sweep, tmp_path):
     with pytest.raises(UserError, match="there is no folder"):
         read_status(tmp_path / "nowhere")
-    with pytest.raises(UserError, match=r"no sweep of a suite 'tin'; there: tiny"):
+    with pytest.raises(UserError, match=r"no sweep of a suite 'tin'; did you mean 'tiny'"):
         read_status(tmp_path, "tin")
     (tmp_path / "empty").mkdir()
     assert to_text(read_status(tmp_path / "empty").found, tmp_path).startswith(
@@ -165,16 +185,16 @@ def test_mistakes_with_status(sweep, tmp_path):
     path = manifest_path(tmp_path, "tiny")
     for damage in (path.read_text()[:-9], "[]", '{"suite": 3}', "\x00"):
         path.write_text(damage)
-        with pytest.raises(UserError, match="run the sweep again to write it anew"):
+        with pytest.raises(UserError, match="run the sweep again to replace it"):
             read_status(tmp_path, "tiny")
 
 
 def screen(sweep, width: int) -> list[str]:
     """The live lines of a sweep, as a terminal of this width shows them."""
     console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
-    todo = sweep.cells[1:]
+    todo = sweep.runs[1:]
     display = LiveDisplay(sweep, todo, Estimate(), 3, console)
-    tasks = [task for task in tasks_of(sweep, todo) if task.cell]
+    tasks = [task for task in tasks_of(sweep, todo) if task.run]
     base = Task("base policy", "edp for PickCube-v1", print, ())
     for task in (tasks[0], tasks[1], base):
         display.started(task)
@@ -197,15 +217,23 @@ def test_the_live_lines(sweep):
     assert max(len(line) for line in narrow) <= 60
 
 
+def test_steps_beyond_the_budget_are_not_shown(sweep):
+    """A run stops after the first decision that reaches its budget, some steps beyond it."""
+    path = sweep.out / sweep.runs[1].run_id / PROGRESS
+    path.write_text(json.dumps({**json.loads(path.read_text()), "env_steps": 488}))
+    assert "480/480" in screen(sweep, 120)[0]
+    assert "standard seed 0: 480 of 480 steps" in to_text(read_status(sweep.out).found, sweep.out)
+
+
 def test_a_pipe_gets_one_plain_line_a_run_that_ended(sweep):
     stream = io.StringIO()
-    one = Task("cell", "c", print, (), sweep.cells[1])
-    with Display(sweep, sweep.cells[1:], Estimate(), 2, Console(file=stream, width=20)) as display:
+    one = Task("run", "c", print, (), sweep.runs[1])
+    with Display(sweep, sweep.runs[1:], Estimate(), 2, Console(file=stream, width=20)) as display:
         display.started(one)
         display.refresh([one])
         display.retried(one, Result("failed", "why"))
         assert stream.getvalue() == ""
-        display.ended(Outcome(sweep.cells[1], "failed", "why " * 30))
+        display.ended(Outcome(sweep.runs[1], "failed", "why " * 30))
     assert stream.getvalue() == (
         "failed    [2/5] PickCube-v1 floating none standard seed 0          " + "why " * 30 + "\n"
     )
@@ -215,8 +243,8 @@ def test_a_sweep_goes_on_when_nobody_reads_its_lines_any_more(sweep):
     reading, writing = os.pipe()
     os.close(reading)
     output = os.fdopen(writing, "w")
-    display = Display(sweep, sweep.cells, Estimate(), 2, Console(file=output))
-    display.ended(Outcome(sweep.cells[0], "finished"))
+    display = Display(sweep, sweep.runs, Estimate(), 2, Console(file=output))
+    display.ended(Outcome(sweep.runs[0], "finished"))
     assert display.counts["finished"] == 1
     with pytest.raises(BrokenPipeError):
         output.close()
@@ -234,13 +262,13 @@ def test_equal_demonstrations_and_bases_are_built_once(tmp_path):
         one,
         replace(one, seed=1),
         replace(one, variant="wind:1"),
-        replace(one, policy=replace(one.policy, name="plain")),
+        tiny_config(policy_name="plain"),
         replace(one, task="PushCube-v1"),
     )
     plan = make_plan(Suite("shared", "", configs), tmp_path)
-    tasks = tasks_of(plan, plan.cells)
+    tasks = tasks_of(plan, plan.runs)
     assert [task.kind for task in tasks] == ["demonstrations"] * 2 + ["base policy"] * 3 + [
-        "cell"
+        "run"
     ] * 5
     assert [task.waits for task in tasks] == [False] * 2 + [True] * 8
     assert [len(task.then) for task in tasks[:5]] == [2, 1, 3, 1, 1]

@@ -1,9 +1,15 @@
 """Suites as data: products, defaults, mistakes."""
 
+import re
+
 import pytest
 
+from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import build_config
-from symsteer.bench.sweep.suite import load_suite, suite_names
+from symsteer.bench.sweep.command import preview
+from symsteer.bench.sweep.grid import read_suite, suite_names
+from symsteer.bench.sweep.plan import make_plan
+from symsteer.bench.sweep.suite import load_suite
 from symsteer.errors import UserError
 
 
@@ -24,8 +30,10 @@ def test_the_grid_is_a_product_over_shared_settings(tmp_path):
             seed = [3, 4]
             [run]
             env_steps = 77
-            [run.sac]
-            width = 32
+            [run.agent]
+            gamma = 0.9
+            [run.policy]
+            steps = 7
             """,
         )
     )
@@ -36,29 +44,104 @@ def test_the_grid_is_a_product_over_shared_settings(tmp_path):
         ("standard", 4),
     ]
     assert {c.env_steps for c in suite.runs} == {77}
-    assert {c.sac.width for c in suite.runs} == {32}
-    assert suite.runs[0].sac.gamma == build_config({}, "").sac.gamma
+    assert {c.policy.steps for c in suite.runs} == {7}
+    # The base policy without an agent has no gamma.
+    standard = suite.runs[2]
+    assert standard.agent_options.gamma == 0.9
+    assert standard.agent_options.width == build_config({}, "").agent_options.width
 
 
-def test_every_suite_that_ships_can_be_read():
-    assert "demo" in suite_names()
-    for name in suite_names():
-        suite = load_suite(name)
-        assert suite.runs
-        assert suite.description
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in ("cpu", "full"))) for n in suite_names()],
+)
+def test_every_suite_that_ships_can_be_read(name):
+    suite = load_suite(name)
+    assert suite.description
+    # `symsteer list` counts the runs without building them.
+    assert len(suite.runs) == len(read_suite(name).runs) > 0
+
+
+def test_an_option_applies_to_the_agents_that_have_it(tmp_path):
+    text = """
+        [grid]
+        agent = ["zero", "standard", "approximate"]
+        "agent.free_penalty" = [0.2, 0.4]
+        [run.agent]
+        preset = "first"
+        gamma = 0.9
+        [run.agent.standard]
+        gamma = 0.8
+    """
+    runs = load_suite(write(tmp_path, text)).runs
+    # A value that changes nothing for an agent does not repeat its run.
+    assert [c.agent for c in runs] == ["zero", "standard", "approximate", "approximate"]
+    assert [c.agent_options.gamma for c in runs[1:]] == [0.8, 0.9, 0.9]
+    assert [c.agent_options.free_penalty for c in runs[2:]] == [0.2, 0.4]
+    preset = preset_options("first", "standard", type(runs[1].agent_options))
+    for key in set(preset) - {"gamma"}:
+        assert getattr(runs[1].agent_options, key) == preset[key]
+
+
+def test_a_grid_may_set_one_agent_only_and_choose_presets_and_policies(tmp_path):
+    text = """
+        [grid]
+        agent = ["standard", "equivariant"]
+        "agent.standard.width" = [32, 64]
+        "policy.name" = ["edp", "plain"]
+        [run]
+        agent = "approximate"
+    """
+    runs = load_suite(write(tmp_path, text)).runs
+    default = build_config({"agent": "equivariant"}, "").agent_options.width
+    assert [(c.agent, c.agent_options.width, c.policy_name) for c in runs] == [
+        ("standard", 32, "edp"),
+        ("standard", 32, "plain"),
+        ("standard", 64, "edp"),
+        ("standard", 64, "plain"),
+        ("equivariant", default, "edp"),
+        ("equivariant", default, "plain"),
+    ]
+
+
+def test_options_in_which_runs_differ_are_shown(tmp_path):
+    """Also where another agent of the suite does not have the option."""
+    text = """
+        [grid]
+        agent = ["zero", "approximate"]
+        "agent.free_penalty" = [0.2, 0.4]
+    """
+    plan = make_plan(load_suite(write(tmp_path, text)), tmp_path)
+    assert [run.extra for run in plan.runs] == [
+        {},
+        {"agent.free_penalty": 0.2},
+        {"agent.free_penalty": 0.4},
+    ]
+    assert "approximate free_penalty 0.2 seed 0" in plan.runs[1].label
+    assert re.search(r"agent.free_penalty +0.2 +1 +0", preview(plan))
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[grid]\nagnt = ['base']", "did you mean agent"),
-        ("[run.sac]\ngama = 0.9", "did you mean sac.gamma"),
+        ("[grid]\nagnt = ['base']", "did you mean 'agent'"),
+        ("[run.agent]\ngama = 0.9", r"\(agent equivariant\): .* did you mean 'gamma'"),
+        ("[grid]\nagent = ['zero']\n'agent.gamma' = [0.9]", r"\(agent zero\): .* 'gamma'"),
+        ("[grid]\nagent = ['zero']\n[run.agent.standard]\ngamma = 0.9", "no agent 'standard'"),
+        ("[run.agent.equivariant]\nfree_penalty = 1", r"\(agent equivariant\)"),
+        ("[run.agent]\nname = 'equivarant'", "did you mean 'equivariant'"),
+        ("[run.agent]\npreset = 'frist'", "did you mean 'first'"),
+        ("[run.agent]\npreset = 1", "agent.preset must be a text"),
+        ("[grid]\n'agent.gamma.more' = [1]", "no agent 'gamma'"),
+        ("[run]\npolicy = 3", "run.policy must be a name or a table"),
+        ("[run.policy]\nwidht = 3", r"\(policy edp\): .* did you mean 'width'"),
+        ("[grid]\n'policy.name' = ['plian']", "did you mean 'plain'"),
         ("[run]\nenv_steps = 'many'", "env_steps"),
-        ("[run]\nsac = 3", "must be a table"),
+        ("[run]\nagent = 3", "must be a name or a table"),
         ("[grid]\nseed = []", "at least one value"),
         ("[run]\nenv_steps = 0", "between 1 and"),
         ("[run]\nseed = 2026-01-31", "must be a number"),
-        ("[run.sac]\nlr = inf", "sac.lr is inf"),
+        ("[run.agent]\nlr = inf", "lr is inf"),
         ("[grid]\nseed = " + "[" * 5000, "cannot be read as TOML"),
         (f"[grid]\nseed = {list(range(1000))}\nnum_envs = {list(range(1000))}", "has 1000000 runs"),
         ("not toml", "cannot be read as TOML"),
@@ -76,7 +159,7 @@ def test_an_unknown_suite_lists_the_known_ones():
         load_suite("dmeo")
 
 
-def test_a_dial_may_begin_at_zero(tmp_path):
+def test_strengths_may_begin_at_zero(tmp_path):
     text = "[grid]\nvariant = ['action_gain', 'wind']\nstrength = [0, 0.5]"
     suite = load_suite(write(tmp_path, text))
     assert [c.variant for c in suite.runs] == ["none", "action_gain:0.5", "wind:0.5"]

@@ -1,4 +1,4 @@
-"""Sweeps with real runs: cells that fail, workers that are killed, Ctrl-C, skipped cells."""
+"""Sweeps with real runs: failures, workers that are killed, Ctrl-C, skipped runs."""
 
 import contextlib
 import json
@@ -13,19 +13,19 @@ import threading
 
 import psutil
 import pytest
-from symsteer.bench.cli import main
 
 from symsteer.bench.runs.base_policy import demonstration_path
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
 from symsteer.bench.runs.folder import CHECKPOINT, state_of
 from symsteer.bench.sweep.plan import Plan, make_plan
 from symsteer.bench.sweep.pool import LocalPool
-from symsteer.bench.sweep.schedule import Outcome, Task, work_off
+from symsteer.bench.sweep.schedule import Outcome, Task, execute_plan
 from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite, load_suite
 from symsteer.bench.sweep.work import Result
+from symsteer.cli import main
 from symsteer.leaderboard.records import read_record
-from tests.bench.sweep.cells import LONG, wait_for
+from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import tiny_config, without_clock
 
 
@@ -37,7 +37,7 @@ class Witness:
         self.again: list[tuple[str, str]] = []
 
     def started(self, task: Task) -> None:
-        self.tasks.append((task.kind, task.cell.agent if task.cell else ""))
+        self.tasks.append((task.kind, task.run.agent if task.run else ""))
 
     def retried(self, task: Task, result: Result) -> None:
         self.again.append((task.kind, result.reason))
@@ -47,11 +47,11 @@ class Witness:
 
 
 def work(plan: Plan, tmp_path, witness: Witness) -> dict[str, Outcome]:
-    """Work off a plan with one worker; the outcomes by agent and variant."""
+    """Execute a plan with one worker; the outcomes by agent and variant."""
     pool = LocalPool(1, tmp_path / "log")
     try:
-        found = work_off(plan, plan.cells, pool, witness)
-        return {f"{o.cell.agent} {o.cell.variant}": o for o in found}
+        found = execute_plan(plan, plan.runs, pool, witness)
+        return {f"{o.run.agent} {o.run.variant}": o for o in found}
     finally:
         pool.stop()
 
@@ -71,8 +71,8 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
     obstacle = demonstration_path(baseless, out)
     obstacle.mkdir(parents=True)
     plan = make_plan(Suite("mixed", "", (LONG, bad, tiny_config(agent="zero"), baseless)), out)
-    folder = out / plan.cells[0].run_id
-    (out / plan.cells[1].run_id / CHECKPOINT).mkdir(parents=True)
+    folder = out / plan.runs[0].run_id
+    (out / plan.runs[1].run_id / CHECKPOINT).mkdir(parents=True)
     killed = []
 
     def kill() -> None:
@@ -99,27 +99,29 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
     reason = outcomes["zero wind:1"].reason
     assert reason.startswith("its demonstrations failed: ")
     assert obstacle.name in reason
-    # What is shared was built once, before the cells; what failed was tried once more, at the end.
+    # What is shared was built once and first; what failed was tried once more, at the end.
     assert witness.tasks == [
         ("demonstrations", ""),
         ("demonstrations", ""),
         ("base policy", ""),
-        ("cell", "equivariant"),
-        ("cell", "standard"),
-        ("cell", "zero"),
+        ("run", "equivariant"),
+        ("run", "standard"),
+        ("run", "zero"),
         ("demonstrations", ""),
-        ("cell", "equivariant"),
-        ("cell", "standard"),
+        ("run", "equivariant"),
+        ("run", "standard"),
     ]
-    assert [kind for kind, _ in witness.again] == ["demonstrations", "cell", "cell"]
+    assert [kind for kind, _ in witness.again] == ["demonstrations", "run", "run"]
     assert "killed by SIGKILL" in witness.again[1][1]
     assert workers() == []
 
 
 def write_suite(tmp_path, config: RunConfig, grid: str) -> str:
-    """A suite file of which every cell is ``config`` but for the grid."""
+    """A suite file of which every run is ``config`` but for the grid."""
     lines = [f"[grid]\n{grid}\n[run]"]
-    for key, value in config.to_json().items():
+    settings = config.to_json()
+    settings["agent"] = {"name": settings["agent"], **settings.pop("agent_options")}
+    for key, value in settings.items():
         if isinstance(value, dict):
             items = {name: item for name, item in value.items() if item is not None}
             lines += [f"{key}.{name} = {json.dumps(item)}" for name, item in items.items()]
@@ -145,7 +147,7 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
     shutil.copytree(undisturbed.parent / "base", out / "base")
     # A test suite that runs in the background has its children ignore interrupts.
     program = (
-        "import signal, sys; from bench.cli import main; "
+        "import signal, sys; from symsteer.cli import main; "
         "signal.signal(signal.SIGINT, signal.default_int_handler); "
         f"sys.argv = ['symsteer', 'sweep', {path!r}, '--out', {str(out)!r}, '--workers', '1']; "
         "sys.exit(main())"
@@ -162,7 +164,7 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
         wait_for(lambda: (folder / CHECKPOINT).is_file() or sweep.poll() is not None)
         assert state_of(folder) == "running"
         [status] = read_status(out).found
-        assert [len(status.cells(state)) for state in ("running", "missing")] == [1, 1]
+        assert [len(status.in_state(state)) for state in ("running", "missing")] == [1, 1]
         if end == signal.SIGINT:
             os.killpg(sweep.pid, end)
         else:
@@ -175,7 +177,7 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
         assert sweep.returncode == 130
         assert errors.splitlines() == [
             "interrupted",
-            "the same command goes on where this one stopped",
+            "the same command continues the sweep",
         ]
         assert output == ""
     text = to_text(read_status(out).found, out)
@@ -194,11 +196,11 @@ def group(leader: int) -> list[int]:
 
 
 def test_the_command_line(undisturbed, monkeypatch, capsys, tmp_path):
-    """Finished cells are skipped, failed ones are named with their reason, and counted."""
+    """Finished runs are skipped, failed ones are named with their reason, and counted."""
     path = write_suite(tmp_path, LONG, 'agent = ["equivariant"]\nenv_steps = [480, 481]')
     out = tmp_path / "runs"
     shutil.copytree(undisturbed, out / undisturbed.name)
-    other = make_plan(load_suite(path), out).cells[1]
+    other = make_plan(load_suite(path), out).runs[1]
     # Whoever comes to this folder cannot make a run of it.
     (out / other.run_id).write_text("in the way")
     before = sorted(out.rglob("*"))
@@ -206,12 +208,12 @@ def test_the_command_line(undisturbed, monkeypatch, capsys, tmp_path):
     text = capsys.readouterr().out
     assert re.search(r"env_steps +480 +1 +1 +0 +0 +0\n +481 +1 +0 +0 +0 +1\n", text)
     assert "base policies to build: 1\n  edp for PickCube-v1 floating, 3 diverse" in text
-    assert "judged by 1 finished run" in text
+    assert "estimated from 1 finished run" in text
     cluster = ("sweep", path, "--out", out, "--dry-run", "--ray", "no-such-head:6379")
     assert symsteer(monkeypatch, *cluster) == 0
-    assert "time: depends on what the cluster has room for" in capsys.readouterr().out
+    assert "time: depends on the size of the cluster" in capsys.readouterr().out
     assert symsteer(monkeypatch, *cluster, "--workers", 7) == 0
-    assert "with 7 workers, judged by 1 finished run" in capsys.readouterr().out
+    assert "with 7 workers, estimated from 1 finished run" in capsys.readouterr().out
     assert sorted(out.rglob("*")) == before
     record = (out / undisturbed.name / "record.json").stat().st_mtime_ns
     shutil.copytree(undisturbed.parent / "base", out / "base")
@@ -237,8 +239,8 @@ def test_the_command_line(undisturbed, monkeypatch, capsys, tmp_path):
         ("agent = 'ppo'", ["--dry-run"], "there is no agent"),
         ("", ["--workers", "-1"], "--workers is -1"),
         ("", ["--workers", "-1", "--dry-run"], "--workers is -1"),
-        ("", ["--ray", "here"], "--ray here is no address"),
-        ("", ["--ray", "here", "--dry-run"], "--ray here is no address"),
+        ("", ["--ray", "here"], "--ray here is not an address"),
+        ("", ["--ray", "here", "--dry-run"], "--ray here is not an address"),
     ],
 )
 def test_what_cannot_run_is_refused_before_anything_happens(

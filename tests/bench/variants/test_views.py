@@ -226,7 +226,7 @@ class TowardsPlusX(torch.nn.Module):
         self.horizon = self.execute = 4
         self.obs_layout, self.act_layout = env.observation_layout, env.action_layout
         self.action = act(env, xy=(1.0, 0.0))
-        self.nothing = torch.nn.Parameter(torch.zeros(1))
+        self.device = torch.device("cpu")
 
     def decode(self, obs, noise):
         return self.action[:, None].repeat(1, self.execute, 1)

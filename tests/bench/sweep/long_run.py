@@ -1,4 +1,4 @@
-"""What the tests of sweeps share: a cell worth killing, and how to wait for it."""
+"""What the tests of sweeps share: a run that is long enough to be killed, and waiting."""
 
 import dataclasses
 import time
@@ -12,11 +12,11 @@ LONG = dataclasses.replace(
     checkpoint_every=120,
     evaluation=dataclasses.replace(_TINY.evaluation, every=240),
 )
-"""Long enough to be killed behind its first checkpoint."""
+"""Long enough to be killed after its first checkpoint."""
 
 
 def wait_for(condition, seconds=240.0):
-    """Wait until something holds; on a busy machine that may take a while."""
+    """Wait until a condition holds; on a busy machine that may take long."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline

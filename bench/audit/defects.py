@@ -1,7 +1,6 @@
-"""One cell of the audit: a task, an embodiment, a variant with its strength, and its numbers.
+"""The audit of one task, embodiment and variant: from simulated copies to defects.
 
-Every number is defined in docs/audit.md. A cell is plain data: :meth:`Cell.to_json` writes it and
-:meth:`Cell.from_json` reads it.
+docs/audit.md defines every number.
 """
 
 from __future__ import annotations
@@ -9,9 +8,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -26,208 +22,35 @@ from symsteer.bench.audit.estimates import (
     ratio,
     root_excess,
 )
-from symsteer.bench.audit.measure import Bench, Copies, Resets, check_group
-from symsteer.bench.audit.states import Visited, visit
-from symsteer.bench.sim.environment import Simulator
-from symsteer.bench.tasks import check_embodiment, make, task_class
+from symsteer.bench.audit.measure import Copies, Experiment, Resets
+from symsteer.bench.audit.result import (
+    BIN,
+    LEAST_STATES,
+    AuditResult,
+    AuditSettings,
+    Bin,
+    Defect,
+    FieldDefect,
+    check_group,
+)
+from symsteer.bench.audit.states import Visited, join_trees, visit
+from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.variants import read
-from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Field, Layout
-from symsteer.variant import file_name
-
-VERSION = 1
-
-Visitors = Literal["both", "expert", "policy"]
 
 LEAST_DISPLACEMENT = 5e-4
-"""Below this mean displacement (metres) a defect is not normalised by it."""
+"""A defect is not divided by a mean displacement (metres) below this."""
 
 LEAST_SPREAD = 1e-3
-"""A field whose spread over the states is smaller is not normalised by it."""
-
-LEAST_STATES = 8
-"""Subsets with fewer states are left out."""
-
-BIN = 0.05
-"""Side of a square of the map, metres."""
+"""A field whose spread over the states is smaller does not enter normalised distances."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is measured, and how finely."""
-
-    task: str = "PickCube-v1"
-    embodiment: str = "floating"
-    variant: str = "none"
-    group: str = "C8"
-    states: Visitors = "both"
-    count: int = 32
-    """States of each visitor."""
-    chunk: int = 4
-    """Steps of an action chunk."""
-    resets: int = 256
-    """Resets that are compared with as many turned ones."""
-    seed: int = 0
-    sim: Simulator = "cpu"
-
-    def check(self) -> None:
-        """Refuse what cannot be measured before anything is built.
-
-        Raises:
-            UserError: for an unknown task, embodiment, variant, group or simulator, or a number
-                out of range.
-        """
-        task_class(self.task)
-        check_embodiment(self.embodiment)
-        read(self.variant)
-        check_group(self.group)
-        for name, least in (("count", LEAST_STATES), ("chunk", 1), ("resets", 16)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name} is {getattr(self, name)}; it must be at least {least}")
-        if not 0 <= self.seed < 2**32:
-            raise UserError(f"seed is {self.seed}; it must lie in [0, 2^32)")
-        if self.chunk > task_class(self.task).max_episode_steps:
-            raise UserError(
-                f"a chunk of {self.chunk} steps is longer than an episode of {self.task}; "
-                "use a smaller --chunk"
-            )
-        if self.sim == "cuda" and not torch.cuda.is_available():
-            raise UserError("--sim cuda was asked for, but torch finds no CUDA device; use cpu")
-
-    @property
-    def name(self) -> str:
-        """A name for files."""
-        return f"{self.task}-{self.embodiment}-{file_name(self.variant)}-{self.group}"
-
-    @property
-    def visitors(self) -> tuple[Literal["expert", "policy"], ...]:
-        """Who visits the states."""
-        return ("expert", "policy") if self.states == "both" else (self.states,)
-
-
-@dataclass(frozen=True)
-class Defect:
-    """Dynamics defect of one body over one window for one subset of the states."""
-
-    body: Literal["tool", "object"]
-    window: Literal["step", "chunk"]
-    subset: Literal["all", "expert", "policy", "still", "moving"]
-    states: int
-    relative: Estimate | None
-    mm: Estimate
-    degrees: Estimate
-    displacement_mm: float
-    floor_mm: float
-    floor_degrees: float
-    p95_mm: float
-
-
-@dataclass(frozen=True)
-class FieldDefect:
-    """Observation defect of one field; ``value`` in mm where ``unit`` says so."""
-
-    name: str
-    unit: Literal["mm", ""]
-    value: Estimate
-    relative: float | None
-
-
-@dataclass(frozen=True)
-class Bin:
-    """A square of the map: mean departure of its copies from the orbit's medoid over a chunk."""
-
-    body: Literal["tool", "object"]
-    x_mm: float
-    y_mm: float
-    copies: int
-    mm: float
-
-
-@dataclass(frozen=True)
-class Cell:
-    """All numbers of one cell."""
-
-    settings: Settings
-    base_policy: str | None
-    """Start of the content hash of the policy that visited states."""
-    states: int
-    moving: int
-    unreachable: float
-    origin_mm: tuple[float, float]
-    dynamics: tuple[Defect, ...]
-    reward: dict[str, Estimate]
-    observation: Estimate
-    fields: tuple[FieldDefect, ...]
-    random_observation: bool
-    resets: Estimate
-    resets_p: float
-    map: tuple[Bin, ...] = ()
-    seconds: float = 0.0
-    version: int = field(default=VERSION)
-
-    def defect(
-        self,
-        body: Literal["tool", "object"],
-        window: Literal["step", "chunk"] = "step",
-        subset: str = "all",
-    ) -> Defect | None:
-        """A row of the dynamics, or None if too few states are of that kind."""
-        rows = (d for d in self.dynamics if (d.body, d.window, d.subset) == (body, window, subset))
-        return next(rows, None)
-
-    @property
-    def worst_field(self) -> FieldDefect | None:
-        """The position field with the largest defect."""
-        positions = [f for f in self.fields if f.unit == "mm"]
-        return max(positions, key=lambda f: f.value.value, default=None)
-
-    def to_json(self) -> dict[str, Any]:
-        """Nested plain data, numbers to six significant digits."""
-        return _rounded(dataclasses.asdict(self))
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> Cell:
-        """Rebuild a cell.
-
-        Raises:
-            UserError: if the data are damaged or of another version.
-        """
-        try:
-            if data["version"] != VERSION:
-                raise UserError(
-                    f"an audit of version {data['version']} was found, and this SymSteer reads "
-                    f"version {VERSION}; run the audit again"
-                )
-            estimate = lambda d: None if d is None else Estimate(**d)  # noqa: E731
-            numbers = ("relative", "mm", "degrees")
-            return cls(
-                **{
-                    **data,
-                    "settings": Settings(**data["settings"]),
-                    "origin_mm": tuple(data["origin_mm"]),
-                    "dynamics": tuple(
-                        Defect(**{**d, **{k: estimate(d[k]) for k in numbers}})
-                        for d in data["dynamics"]
-                    ),
-                    "reward": {k: Estimate(**v) for k, v in data["reward"].items()},
-                    "observation": Estimate(**data["observation"]),
-                    "fields": tuple(
-                        FieldDefect(**{**f, "value": Estimate(**f["value"])})
-                        for f in data["fields"]
-                    ),
-                    "resets": Estimate(**data["resets"]),
-                    "map": tuple(Bin(**b) for b in data["map"]),
-                }
-            )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise UserError(f"an audit file is damaged ({error!r}); run the audit again") from error
-
-
-def visit_all(reference: SymmetricTask, settings: Settings, policy: ChunkPolicy | None) -> Visited:
-    """The states of all visitors that ``settings`` names, in the unbroken task."""
-    return Visited.join(
+def visit_all(
+    reference: SymmetricTask, settings: AuditSettings, policy: ChunkPolicy | None
+) -> Visited:
+    """Sample the states of all visitors of ``settings``, in the unbroken task."""
+    return join_trees(
         [
             visit(
                 reference,
@@ -242,8 +65,8 @@ def visit_all(reference: SymmetricTask, settings: Settings, policy: ChunkPolicy 
     )
 
 
-def reference_task(settings: Settings) -> SymmetricTask:
-    """The unbroken task, with one environment for each state of a visitor."""
+def reference_task(settings: AuditSettings) -> SymmetricTask:
+    """Make the unbroken task, with one environment for each state of a visitor, at most 64."""
     return make(
         settings.task,
         num_envs=min(settings.count, 64),
@@ -253,35 +76,40 @@ def reference_task(settings: Settings) -> SymmetricTask:
 
 
 def audit(
-    settings: Settings,
+    settings: AuditSettings,
     reference: SymmetricTask,
     visited: Visited,
     policy: ChunkPolicy | None = None,
-) -> Cell:
-    """Measure one cell.
+) -> AuditResult:
+    """Measure the defects of one task, embodiment and variant.
 
     Args:
         settings: what to measure.
         reference: the unbroken task, from :func:`reference_task`.
-        visited: its states, from :func:`visit_all`; cells of a task share them.
-        policy: the policy among the visitors, to be named in the result.
+        visited: its states, from :func:`visit_all`; the same for all variants of a task.
+        policy: the policy that visited states; the result stores its content hash.
+
+    Raises:
+        UserError: see :meth:`AuditSettings.check`.
     """
     settings.check()
     begin = time.perf_counter()
     group = check_group(settings.group)
-    bench = Bench(reference, settings.variant, group, visited, settings.seed, settings.sim)
+    experiment = Experiment(
+        reference, settings.variant, group, visited, settings.seed, settings.sim
+    )
     try:
-        copies = bench.copies()
-        resets = bench.resets(settings.resets)
-        undistorted = bench.undistorted().numpy()
-        centre = bench.centre
+        copies = experiment.copies()
+        resets = experiment.resets(settings.resets)
+        undistorted = experiment.undistorted().numpy()
+        centre = experiment.centre
     finally:
-        bench.close()
+        experiment.close()
     layout = reference.observation_layout
     seed = settings.seed
     energy, p_value = _reset_defect(resets, layout, seed)
     observation, fields = _observation_defect(copies, undistorted, layout, seed)
-    return Cell(
+    return AuditResult(
         settings=settings,
         base_policy=policy.content_hash()[:12] if policy is not None else None,
         states=len(visited),
@@ -304,7 +132,7 @@ def audit(
 
 
 def _over_copies(values: torch.Tensor, copies: Copies, first: int = 1) -> Array:
-    """Mean over the copies that exist from ``first`` on, ``[S, G] -> [S]``; nan without any."""
+    """Mean over the reached copies from ``first`` on, ``[S, G] -> [S]``; nan if there is none."""
     mask = copies.reached[:, first:].double()
     total = (values[:, first:].double() * mask).sum(dim=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -312,13 +140,13 @@ def _over_copies(values: torch.Tensor, copies: Copies, first: int = 1) -> Array:
 
 
 def _valid(rows: Array, copies: Copies) -> Array:
-    """Which of ``rows [S]`` (bool) have a turned copy at all."""
+    """Those of ``rows [S]`` (bool) that have at least one turned copy."""
     return rows & copies.reached[:, 1:].any(dim=1).numpy()
 
 
 def _angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Angle between orientations ``[..., 4]``, radians."""
-    # From the chord: exact also for the smallest angles, where the arc cosine is not.
+    # By the chord, since the arc cosine is inaccurate for small angles.
     a, b = a / a.norm(dim=-1, keepdim=True), b / b.norm(dim=-1, keepdim=True)
     chord = torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1))
     return 4 * torch.asin((chord / 2).clamp(max=1.0))
@@ -388,7 +216,7 @@ def _reward_defect(copies: Copies, seed: int) -> dict[str, Estimate]:
 
 
 def in_metres(field: Field) -> bool:
-    """Whether a field of the observation is a length: its name says so."""
+    """Whether a field of the observation is a length, by its name."""
     return field.name.endswith(("_xy", "_z", "_width", "_height"))
 
 
@@ -404,7 +232,7 @@ def _observation_defect(
         own = seen[:, :1, :, here]
         squares = gaussian_distance_squared(seen[:, :, :, here], own)
         by_state = _over_copies(torch.as_tensor(squares), copies)[keep]
-        # Two sets of draws of one and the same distribution are this far apart.
+        # The distance between two sets of draws from the same distribution.
         floor = gaussian_distance_squared(again[:, :, here], own[:, 0])[keep]
         if seen.shape[2] == 1:
             floor = np.zeros_like(floor)
@@ -429,8 +257,8 @@ def _observation_defect(
 
 
 def _spread(values: Array, part: Field) -> float:
-    """Root mean square of a field over states, ``[S, dim]``: about zero for what rotations turn
-    (the turned states' mean), about the mean for scalars."""
+    """Root mean square of a field ``[S, dim]`` over states: about the mean for scalars, about zero
+    (the mean over all rotations) for other fields."""
     centre = 0.0 if part.frequency else values.mean(axis=0)
     return float(np.sqrt(((values - centre) ** 2).sum(axis=-1).mean()))
 
@@ -452,7 +280,7 @@ def _map(copies: Copies) -> list[Bin]:
         end = copies.positions[body][:, :-1, 2]
         apart = (end[:, :, None] - end[:, None]).norm(dim=-1)
         exists = copies.reached.double()
-        # The medoid: the copy that is closest to all others, hence one of the majority.
+        # The medoid is the copy that is closest to all others, so it belongs to the majority.
         cost = (apart * exists[:, None]).sum(dim=-1)
         medoid = torch.where(copies.reached, cost, torch.inf).argmin(dim=1)
         departure = apart[torch.arange(len(apart)), medoid][copies.reached].numpy()
@@ -471,13 +299,3 @@ def _map(copies: Copies) -> list[Bin]:
                 )
             )
     return bins
-
-
-def _rounded(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return {key: _rounded(value) for key, value in tree.items()}
-    if isinstance(tree, Sequence) and not isinstance(tree, str):
-        return [_rounded(value) for value in tree]
-    if isinstance(tree, float):
-        return float(f"{tree:.6g}")
-    return tree

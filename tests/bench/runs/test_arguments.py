@@ -1,0 +1,81 @@
+"""The command line of ``symsteer run``: options of the named agent and policy."""
+
+import pytest
+
+from symsteer.bench.runs.arguments import last_value, parse_run
+from symsteer.bench.runs.config import RunConfig
+from symsteer.errors import UserError
+
+
+def test_without_arguments_the_defaults_are_those_of_a_run():
+    config, execution = parse_run([])
+    assert config == RunConfig()
+    assert (str(execution.out), execution.workers, execution.quiet) == ("runs", 1, False)
+
+
+def test_options_of_the_named_agent_and_policy():
+    config, execution = parse_run(
+        [
+            "--policy.width",
+            "48",
+            "--agent=approximate",
+            "--agent.free-penalty",
+            "0.25",
+            "--agent.no-layer-norm",
+            "--policy.name",
+            "plain",
+            "--task",
+            "PushCube-v1",
+            "--evaluation.every",
+            "77",
+            "--out",
+            "a",
+            "--quiet",
+        ]
+    )
+    assert (config.agent, config.policy_name) == ("approximate", "plain")
+    assert config.agent_options.free_penalty == 0.25
+    assert not config.agent_options.layer_norm
+    assert config.policy == type(config.policy)(width=48)
+    assert (config.task, config.evaluation.every) == ("PushCube-v1", 77)
+    assert (str(execution.out), execution.quiet) == ("a", True)
+
+
+def test_a_preset_replaces_defaults_and_explicit_options_win():
+    preset = parse_run(["--agent.preset", "first"])[0].agent_options
+    assert parse_run(["--agent.preset=first", "--agent.width", "31"])[0].agent_options == type(
+        preset
+    )(**{**vars(preset), "width": 31})
+    # Of a preset, an agent without options takes nothing.
+    assert parse_run(["--agent", "base", "--agent.preset", "first"])[0].agent == "base"
+
+
+def test_help_shows_the_options_of_the_named_agent(capsys):
+    shown = {}
+    for agent in ("approximate", "base"):
+        with pytest.raises(SystemExit) as end:
+            parse_run(["--agent", agent, "--help"])
+        assert end.value.code == 0
+        shown[agent] = capsys.readouterr().out
+    for text in shown.values():
+        assert "--agent STR" in text
+        assert "--policy.width INT" in text
+        assert "Parallel training environments." in text
+    assert "--agent.free-penalty FLOAT" in shown["approximate"]
+    assert "Discount per decision" in shown["approximate"]
+    assert "--agent.gamma" not in shown["base"]
+
+
+def test_unknown_options_name_the_nearest(capsys):
+    with pytest.raises(SystemExit) as end:
+        parse_run(["--agent", "approximate", "--agent.free-penalti", "1"])
+    assert end.value.code == 2
+    assert "--agent.free-penalty" in capsys.readouterr().err
+    with pytest.raises(UserError, match="did you mean 'approximate'"):
+        parse_run(["--agent", "aproximate", "--help"])
+
+
+def test_the_last_value_counts():
+    assert last_value(["--agent", "a", "--agent=b"], "--agent") == "b"
+    assert last_value(["--agent.width", "3", "--agents", "x", "--agent"], "--agent") is None
+    assert parse_run(["--agent", "standard", "--agent", "zero"])[0].agent == "zero"
