@@ -20,17 +20,15 @@ EXAMPLES = REPOSITORY / "examples"
 
 NAMES = {"agent": "smooth", "policy": "flow-mlp", "task": "WidePick-v1", "variant": "dead_zone"}
 
-THEIRS = (
-    "--task WidePick-v1 --variant dead_zone:1 --policy.name flow-mlp "
-    "--agent smooth --agent.smoothness 0.05"
-).split()
-TINY = """
+RUN = """
+    run --task WidePick-v1 --variant dead_zone:1 --policy.name flow-mlp
+    --agent smooth --agent.smoothness 0.05 --quiet
     --num-envs 4 --demonstrations.count 3
     --policy.width 16 --policy.depth 1 --policy.steps 20 --policy.batch-size 32
     --agent.width 16 --agent.batch-size 16 --agent.warmup 16 --agent.group C4
     --evaluation.every 2000 --evaluation.episodes 2 --evaluation.final-episodes 3
     --evaluation.diagnostic-episodes 2 --evaluation.steerability-states 1
-""".split()
+"""
 
 SUITE = """
 [grid]
@@ -140,7 +138,7 @@ def test_run_sweep_report_and_admission(site, tmp_path):
     for name in NAMES.values():
         assert f"\n  {name} " in names
 
-    symsteer(tmp_path, "run", *THEIRS, *TINY, "--env-steps", 160, "--quiet", site=site)
+    symsteer(tmp_path, *RUN.split(), "--env-steps", 160, site=site)
     (folder,) = tmp_path.glob("runs/*-smooth-*")
     record = record_of(folder)
     assert (record["status"], record["role"]) == ("finished", "learner")
@@ -184,9 +182,9 @@ def test_run_sweep_report_and_admission(site, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_of_the_package_is_stopped_resumed_and_evaluated(site, tmp_path):
-    command = [*THEIRS, *TINY, "--env-steps", "1600", "--checkpoint-every", "20", "--quiet"]
+    command = [*RUN.split(), "--env-steps", "1600", "--checkpoint-every", "20"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "symsteer", "run", *command],
+        [sys.executable, "-m", "symsteer", *command],
         cwd=tmp_path,
         env=environment(site),
         stderr=subprocess.PIPE,
