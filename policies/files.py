@@ -130,9 +130,8 @@ def load_policy(
         description = json.loads(metadata["policy"])
         if "config" in description:
             description |= _described_by_config(description["config"])
-        if extension := description["extension"]:
-            keys = ("name", "target", "distribution")
-            POLICIES.require(*(extension[key] for key in keys), path)
+        if found := description["extension"]:
+            POLICIES.require(found["name"], found["target"], found["distribution"], path)
         kind = POLICIES.get(description["name"])
         obs_layout = Layout.from_json(description["obs_layout"])
         act_layout = Layout.from_json(description["act_layout"])
