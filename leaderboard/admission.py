@@ -296,7 +296,7 @@ def _code_from_elsewhere(record: RunRecord) -> Iterator[str]:
     for version, sha256 in dict.fromkeys((p.version, p.sha256) for p in parts if not p.commit):
         if sha256:
             yield f"it ran symsteer {version} as installed, not a checkout; sha256 {sha256[:12]}."
-    extensions = [e for p in parts for e in p.extensions]
+    extensions = [e for p in parts for e in p.extensions if e.distribution]
     used = {(e.kind, e.name, e.distribution, e.version, e.sha256[:12]) for e in extensions}
     for kind, name, distribution, version, sha256 in sorted(used, key=str):
         yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}."

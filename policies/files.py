@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from symsteer.files import write_atomically
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Layout
+from symsteer.registry import NotInstalledError
 
 FORMAT = "symsteer-policy"
 VERSION = 3
@@ -130,7 +130,8 @@ def load_policy(
         description = json.loads(metadata["policy"])
         if "config" in description:
             description |= _described_by_config(description["config"])
-        _require_installed(path, description["name"], description["extension"])
+        if found := description["extension"]:
+            POLICIES.require(found["name"], found["target"], found["distribution"], path)
         kind = POLICIES.get(description["name"])
         obs_layout = Layout.from_json(description["obs_layout"])
         act_layout = Layout.from_json(description["act_layout"])
@@ -140,7 +141,7 @@ def load_policy(
         stored_hash = description["content_hash"]
         policy.training_record = description["training_record"]
         policy.report = description["report"]
-    except _NotInstalledError:
+    except NotInstalledError:
         raise
     except DAMAGE as error:
         reason = " ".join(str(error).split())[:200]
@@ -159,23 +160,6 @@ def load_policy(
     if policy.content_hash() != stored_hash:
         raise UserError(f"{path} is damaged: its contents do not match its checksum; copy it again")
     return policy.freeze().to(device)
-
-
-class _NotInstalledError(UserError):
-    """The file is whole, but its policy's class is missing."""
-
-
-def _require_installed(path: Path, name: str, extension: dict[str, Any] | None) -> None:
-    """Check that the class of a policy from another package can be found."""
-    if extension is None or name in POLICIES:
-        return
-    package = extension["target"].partition(":")[0].partition(".")[0]
-    if name != extension["target"] or importlib.util.find_spec(package) is None:
-        distribution = extension["distribution"]
-        source = f"distribution {distribution}" if distribution else f"package {package}"
-        raise _NotInstalledError(
-            f"{path} holds a policy {name!r} of the {source}, which is not installed; install it"
-        )
 
 
 def _described_by_config(config: dict[str, Any]) -> dict[str, Any]:

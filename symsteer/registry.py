@@ -63,6 +63,10 @@ class Extension:
         return asdict(self)
 
 
+class NotInstalledError(UserError):
+    """A file names a class of a package that is not installed here."""
+
+
 class Registry(Generic[T]):
     """Classes of one kind by name.
 
@@ -165,6 +169,25 @@ class Registry(Generic[T]):
             distribution.name if distribution else None,
             distribution.version if distribution else None,
             code_hash(package),
+        )
+
+    def require(self, name: str, target: str, distribution: str | None, where: Path) -> None:
+        """Check that a class of another package, which a file names, can be found here.
+
+        Args:
+            name, target, distribution: as in :class:`Extension`.
+            where: the file.
+
+        Raises:
+            NotInstalledError: naming the distribution to install.
+        """
+        package = target.partition(":")[0].partition(".")[0]
+        if name in self or (name == target and importlib.util.find_spec(package) is not None):
+            return
+        source = f"distribution {distribution}" if distribution else f"package {package}"
+        raise NotInstalledError(
+            f"{where} needs the {self.kind} {name!r} of the {source}, which is not installed; "
+            "install it"
         )
 
     def _entry_points(self) -> dict[str, list[metadata.EntryPoint]]:

@@ -11,7 +11,8 @@ from typing import Any
 from symsteer.agents.agent import Agent
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig, build_config
-from symsteer.bench.runs.folder import CONFIG, read_config, run_id
+from symsteer.bench.runs.extensions import require_extensions
+from symsteer.bench.runs.folder import CONFIG, RECORD, read_config, run_id
 from symsteer.bench.runs.trainer import new_agent
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
@@ -76,6 +77,7 @@ def stored_config(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
     data = read_config(folder)
     files = data.pop("files", {})
     data.pop("evaluation_variant", None)
+    require_extensions(folder / RECORD)
     config = build_config(data, str(folder / CONFIG))
     if not isinstance(files, dict) or run_id(config, files) != folder.name:
         raise UserError(

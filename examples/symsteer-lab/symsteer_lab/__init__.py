@@ -1,0 +1,1 @@
+"""An agent, a policy, a variant and a task for SymSteer."""
