@@ -52,7 +52,7 @@ def test_bias_of_exact_values_is_zero():
 
 
 def test_a_time_out_neither_counts_as_success_nor_is_guessed():
-    """An agent that fails for ever has Q = -1/(1 - gamma), which a cut return cannot refute."""
+    """An agent that never succeeds has Q = -1/(1 - gamma); a cut return is consistent with it."""
     reward, terminal, truncated = episode_arrays(["...t" * 2])
     q = torch.full_like(reward, -1 / (1 - GAMMA))
     low_high = (-1 / (1 - GAMMA), 0.0)
@@ -62,11 +62,11 @@ def test_a_time_out_neither_counts_as_success_nor_is_guessed():
     assert report["bias_low"] <= 1e-9 <= report["bias_high"] + 2e-9
     assert report["bias_high"] == pytest.approx(0.0, abs=1e-9)
     assert report["bias_low"] < -5
-    # A success in its place would have refuted it.
+    # With a success instead, this Q would be wrong.
     reward, terminal, truncated = episode_arrays(["...s" * 2])
     report = diagnostics.q_bias(q, reward, terminal, truncated, GAMMA, low_high)
     assert report["bias_mean"] < -5
-    # Far from the cut the tail weighs little and the state counts.
+    # Far from the cut, the tail has a small weight and the state is covered.
     reward, terminal, truncated = episode_arrays(["." * 59 + "t"])
     q = torch.full_like(reward, -1 / (1 - GAMMA))
     report = diagnostics.q_bias(q, reward, terminal, truncated, GAMMA, low_high)

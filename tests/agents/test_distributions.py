@@ -10,7 +10,7 @@ from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Group, Layout
 
 LAYOUT = Layout([Field("xy", 1), Field("z", 0), Field("tilt", 1, odd=True), Field("rod", 2)])
-# The same seven numbers with the vectors forgotten: a tanh for each number by itself.
+# The same seven numbers, all as scalars: a separate tanh for each number.
 PER_AXIS = Layout([Field("numbers", 0, LAYOUT.dim)])
 GROUPS = ["C8", "C4", "D4", "D8", "C3"]
 
@@ -86,7 +86,7 @@ def test_samples_turn_with_mean_and_noise(name, dtype, limit):
 
 
 class PerAxis(SquashedGaussian):
-    """One scale per block, but a tanh for each number: what must not be done."""
+    """A wrong squash: one scale per block, but a separate tanh for each number."""
 
     def __init__(self):
         super().__init__(LAYOUT, 1.5)

@@ -1,6 +1,6 @@
-"""Actors turn with the scene and critics do not notice, for every element of the group.
+"""Actors rotate with the scene and critics are invariant, for every element of the group.
 
-Each test has its counterpart with a geometry broken on purpose, which must fail by far.
+Each test has a counterpart with a wrong geometry. Its errors must be large.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ DTYPES = [(torch.float32, 1e-5), (torch.float64, 1e-10)]
 def errors(agent, problem, name, dtype, size=64):
     """Relative errors over the group: mean, deterministic w, samples, log-probability, Q.
 
-    The true layouts are ``problem``'s, whatever the agent believes.
+    The true layouts are those of ``problem``; the agent may have other ones.
     """
     batch = problem.batch(size, seed=5, dtype=dtype)
     chunk = problem.act_layout.repeat(problem.horizon)
@@ -38,7 +38,7 @@ def errors(agent, problem, name, dtype, size=64):
         }
 
     own = quantities(batch.obs, noise, eps)
-    # Nothing below may hold only because the quantity is constant.
+    # A constant quantity would pass the test below.
     assert own["mean"].norm(dim=1).min() > 1e-2
     assert own["q"].std(dim=1).min() > 1e-3
     worst = dict.fromkeys(own, 0.0)

@@ -1,4 +1,4 @@
-"""The search for the best constant noise, where that is known."""
+"""The search for the best constant noise, in a problem with a known answer."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ ENVS, LIMIT, EXECUTE = 8, 50, 4
 
 
 class World:
-    """The cost of an episode is the distance of its noise from a target; nothing ever succeeds."""
+    """The cost of an episode is the distance of its noise from a target; no episode succeeds."""
 
     num_envs, max_episode_steps, execute = ENVS, LIMIT, EXECUTE
 
@@ -52,7 +52,7 @@ def search(problem, target, budget, **options):
 
 def test_the_best_candidate_wins(problem):
     candidates = problem.agent("golden-ticket", seed=1).gaussian_noise(4)
-    # Two rounds of candidates, the smallest budget for four in eight environments, and some rest.
+    # Two rounds: the smallest budget for four candidates in eight environments, and a remainder.
     agent, world = search(problem, candidates[2], 2 * ENVS * LIMIT + 30)
     assert torch.equal(agent.ticket, candidates[2])
     assert world.control_steps == 2 * ENVS * LIMIT

@@ -401,8 +401,8 @@ def test_bad_groups_are_refused(problem):
             problem.agent("equivariant", group=name)
 
 
-# A bandit: the best noise is a known function of what is seen, the reward is minus the squared
-# distance to it. Unbroken, it turns with the scene; broken, a part of it is fixed in the room.
+# A bandit: the best noise is a known function of the observation, the reward is minus the squared
+# distance to it. Unbroken, it rotates with the scene. Broken, a part of it is fixed in the world.
 
 BANDIT_OBS = Layout([Field("xy", 1), Field("height", 0), Field("rod", 2)])
 BANDIT_ACT = Layout([Field("xy", 1), Field("z", 0)])

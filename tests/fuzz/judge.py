@@ -1,7 +1,7 @@
-"""Run the command line in this process, and judge how it ended.
+"""Run the command line in this process, and check how it ended.
 
-Bad input has to end in one sentence and exit code 2. ``Reached`` is raised in place of the work
-that begins when all input has been read: it tells that the input was accepted; no run starts.
+Bad input must end with one sentence and exit code 2. ``Reached`` is raised instead of the work that
+follows after all input has been read. It shows that the input was accepted, and no run starts.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ CURE = re.compile(
     r"remove|train|copy|collect|download|record|run|raise|lower|ask|write|put|wait|convert|start|correct|shorten|undo|mend)\b",
     re.IGNORECASE,
 )
-"""What a sentence has to contain to say how to mend the input."""
+"""A sentence must contain one of these to say how to correct the input."""
 
 LONGEST = 950
 
 
 class Reached(BaseException):
-    """All input was read and accepted; ``found`` is what the work would have begun with."""
+    """All input was read and accepted; ``found`` are the arguments of the work."""
 
     def __init__(self, found: Any = None):
         super().__init__()

@@ -123,7 +123,7 @@ SUITE: dict[str, Any] = {
 
 
 def to_toml(data: dict[str, Any], prefix: str = "") -> str:
-    """A table as TOML; what TOML has no word for is written as JSON has it."""
+    """A table as TOML; values that TOML does not have are written as in JSON."""
     lines, tables = [], []
     for key, value in data.items():
         name = json.dumps(str(key))
@@ -185,7 +185,7 @@ def suite(workshop: Workshop, number: int, folder: Path) -> Ending:
 
 
 def _grid(data: dict[str, Any]) -> list[dict[str, Any]]:
-    """What a suite asks for, read on its own: one flat table a run, without repetitions."""
+    """The runs of a suite, read independently: one flat table per run, without repetitions."""
     shared = flat(data.get("run", {}))
     grids = data.get("grid", {})
     wanted: list[dict[str, Any]] = []
@@ -242,7 +242,7 @@ def command(workshop: Workshop, number: int, folder: Path) -> Ending:
     policy.write_bytes(workshop.run["policy.safetensors"])
     options = [*workshop.options, "--base-policy", str(policy), "--out", str(folder / "runs")]
     defaults = flat(workshop.config.to_json())
-    # One after the other, so that every option has its turn; another agent or policy has others.
+    # In turn, so that every option is tested; another agent or policy has other options.
     fields = sorted(set(defaults) - {"agent", "policy.name"})
     key = fields[number % len(fields)]
     option = "--" + key.replace("agent_options.", "agent.").replace("_", "-")
@@ -609,7 +609,7 @@ def _edit_policy(path: Path, random: Random) -> None:
 
 
 class _Trap:
-    """Unpickled by a careless reader, it makes a folder."""
+    """Creates a folder if a reader unpickles it."""
 
     def __init__(self, path: Path):
         self.path = str(path)
@@ -650,7 +650,7 @@ def checkpoint(workshop: Workshop, number: int, folder: Path) -> Ending:
 
 
 def _trapped(original: bytes, trap: _Trap, random: Random) -> bytes:
-    """Three ways to smuggle code in: a bare pickle, torch's old format, torch's archive."""
+    """Three ways to insert code: a plain pickle, torch's old format, torch's archive."""
     buffer = io.BytesIO()
     kind = random.randrange(4)
     if kind == 0:

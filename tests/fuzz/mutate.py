@@ -15,7 +15,7 @@ POISON: tuple[Any, ...] = (
     *("../../etc/passwd", "<script>alert(1)</script>", "|x|[a](b)", "ünïcode", "'\"`", "%s%n{0}"),
     *([], [1], [[]], [None], {}, {"a": 1}, {"": None}),
 )
-"""Values that belong nowhere, or only in some places."""
+"""Values that are valid nowhere, or only in some places."""
 
 
 def poison_bytes(data: bytes, random: Random) -> bytes:
@@ -40,7 +40,7 @@ def poison_bytes(data: bytes, random: Random) -> bytes:
 
 
 def flip_bits(data: bytes, random: Random, count: int = 1) -> bytes:
-    """Turn ``count`` bits over."""
+    """Flip ``count`` bits."""
     damaged = bytearray(data)
     for _ in range(count):
         damaged[random.randrange(len(damaged))] ^= 1 << random.randrange(8)

@@ -37,8 +37,8 @@ SHORT = replace(CONFIG, env_steps=160)
 def files_end_at(size):
     """Let no file of this process grow beyond ``size`` bytes.
 
-    Writing then fails with EFBIG ("File too large") where a full disk says ENOSPC; both take the
-    same way through Python, and this one needs no rights.
+    Writing then fails with EFBIG ("File too large"); a full disk gives ENOSPC. Python handles both
+    in the same way, and this one needs no permissions.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
@@ -109,7 +109,7 @@ def read_only(tmp_path):
 
 @pytest.fixture(scope="module")
 def undisturbed(workshop, tmp_path_factory):
-    """A run that nothing happened to; its demonstrations and base policy lie beside it."""
+    """A run without errors; its demonstrations and base policy are in the same folder."""
     out = tmp_path_factory.mktemp("undisturbed")
     shutil.copytree(workshop.base, out / "base")
     return execute(SHORT, out, progress=False)
@@ -255,7 +255,7 @@ def test_an_earlier_leaderboard_survives(workshop, tmp_path):
 
 
 def test_read_only_folders(undisturbed, workshop, read_only, tmp_path):
-    """Nothing can be written, and what only reads works all the same."""
+    """Writing fails; commands that only read still work."""
     runs = tmp_path / "runs"
     shutil.copytree(undisturbed.parent, runs)
     stopped = workshop.restore_run(runs)

@@ -194,7 +194,7 @@ def test_each_rule_alone(tmp_path: Path, spoil: Callable[[RunRecord], None], sen
 
 
 def test_every_rule_is_tested() -> None:
-    """A rule that joins the list needs a line above."""
+    """A new rule needs a line above."""
     assert len(RULES) == 7
 
 
@@ -318,7 +318,7 @@ def test_another_base_policy_is_said(tmp_path: Path) -> None:
     assert "submit base, zero on it" in note
     verdicts = judge(learner, on_another_policy("base", 0), committed=committed)
     assert "submit zero on it" in verdicts[0].notes[1]
-    # A table of its own has nothing to agree with.
+    # In a separate table there are no runs to compare with.
     elsewhere = store(admissible(task="PushCube-v1", seed=3), new, "elsewhere.json")
     assert not any("base policy" in n for n in judge(elsewhere, committed=committed)[0].notes)
 

@@ -168,7 +168,7 @@ def test_runs_that_broke_off_after_diverging_count() -> None:
     standard = diverging("standard", range(5), status="failed")
     claim = found(standard + diverging("equivariant", []))["divergence"]
     assert (claim.seeds, claim.verdict) == (5, "supported")
-    # One that is still running has not been spared yet.
+    # A run that has not finished can still diverge.
     running = [make_record(r.evaluations, "running", seed=r.settings.seed) for r in standard]
     for record in running:
         for evaluation in record.evaluations:

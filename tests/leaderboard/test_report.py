@@ -373,7 +373,7 @@ def test_committed_records_are_valid_and_name_no_machine() -> None:
 
 
 def test_the_largest_numbers_are_drawn(tmp_path: Path) -> None:
-    """What a record may hold at most, so that no record can keep the page from being made."""
+    """The largest numbers that a record may contain; the page can still be generated."""
     extremes = {"q_mean": 3.4e38, "q_min": -1e39, "q_max": 1e39, "q_abs_max": 1e39}
     for seed in range(2):
         curve = [

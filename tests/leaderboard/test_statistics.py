@@ -91,14 +91,14 @@ def test_five_runs_without_episodes_get_students_interval() -> None:
 
 
 def test_an_episode_weighs_the_same_for_all_runs() -> None:
-    """Five copies of one evaluation say no more than one of them; other episodes would."""
+    """Five copies of one evaluation have no more information than one; other episodes do."""
     outcomes = np.repeat([0.0, 1.0], 50)
     one = crossed_bootstrap([of(outcomes)])
     copies = crossed_bootstrap([of(outcomes)] * 5)
     assert (copies.low, copies.high) == pytest.approx((one.low, one.high))
     apart = crossed_bootstrap([of(outcomes, 1000 * run) for run in range(5)])
     assert width(apart) < 0.85 * width(copies)
-    # The same episodes in two evaluations of one run say no more, either.
+    # The same holds for the same episodes in two evaluations of one run.
     twice = crossed_bootstrap([Sample.pooled([*enumerate(outcomes), *enumerate(outcomes)])])
     assert (twice.low, twice.high) == pytest.approx((one.low, one.high))
 
@@ -274,7 +274,7 @@ def test_cells_are_averaged_and_not_drawn() -> None:
     cells = [cell(100 * k) for k in range(4)]
     ones = [width(stratified_bootstrap([c])) for c in cells]
     four = stratified_bootstrap(cells)
-    # Twice as narrow, and more so because twenty runs know their spread better than five.
+    # Half as wide, and even less, because twenty runs estimate their spread better than five.
     factors = small_sample_factor(5, 16) / small_sample_factor(5, 4)
     assert factors / 2 * np.mean(ones) * 0.8 < width(four) < np.mean(ones) / 2 * 1.15
     assert four.value == pytest.approx(np.mean([sample.value for c in cells for sample in c]))

@@ -350,13 +350,13 @@ def test_learners_on_different_base_policies_are_not_compared() -> None:
     first, second = row(summary, "standard"), row(summary, "approximate")
     assert success_pairs(first, second) == {}
     assert area_pairs(first, second, 50_000) == {}
-    # The best number has beaten nobody, and nobody has beaten it.
+    # The best agent is not clearly better than any other, and no other is clearly better.
     assert {r.agent: r.rank for r in summary.tables[0].rows} == {
         "equivariant": 1,
         "standard": 2,
         "approximate": None,
     }
-    # Where seeds agree on the policy only in part, those pairs count.
+    # If only some seeds share the policy, these pairs count.
     others[3].record.base_policy.content_hash = first.runs[3].record.base_policy.content_hash
     assert [seed for _, seed in success_pairs(first, second)] == [3]
 

@@ -1,4 +1,4 @@
-"""Finished runs that the tests of this folder look at."""
+"""Finished runs for the tests of this folder."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def finished(tmp_path_factory) -> tuple[RunConfig, Path]:
 
 @pytest.fixture(scope="session")
 def broken(finished) -> dict[str, Path]:
-    """A finished run of every agent where the symmetry is broken: the folders by agent."""
+    """A finished run of every agent in a broken world: folders by agent."""
     from symsteer.agents import AGENTS
     from symsteer.bench.runs.run import execute
 

@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: symmetric where the world is, true to the episodes."""
+"""Pictures of an evaluation: symmetric in a symmetric world, and equal to the episodes."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""A run that is killed and continued ends with the record of an undisturbed one."""
+"""A run that is killed and continued has the same record as one that was not stopped."""
 
 import json
 import multiprocessing
@@ -25,11 +25,11 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config, without_clock
 
-# Fresh processes that have their imports done: a kill then falls into the run, not into these.
+# Processes that have finished their imports: the kill then happens during the run.
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(["tests.bench.runs.test_resume", "torch._dynamo"])
 
-# Fractions of an update are owed from one decision to the next.
+# Fractions of an update are carried over to the next decision.
 CONFIG = tiny_config(
     env_steps=960,
     checkpoint_every=60,
@@ -81,7 +81,7 @@ def kill_after(folder, seconds):
 
 
 def _killed_anywhere(undisturbed, begun, kills, seed):
-    """Kill ``kills`` unfinished runs at random moments, continue them; which used a checkpoint."""
+    """Kill ``kills`` unfinished runs at random times and continue them; which used a checkpoint."""
     generator = random.Random(seed)
     pristine = begun.parent / "pristine"
     shutil.copytree(begun, pristine)
@@ -93,7 +93,7 @@ def _killed_anywhere(undisturbed, begun, kills, seed):
         shutil.rmtree(begun)
         shutil.copytree(pristine, begun)
         kill_after(begun, moment)
-        # Speed varies: some have finished by then. They are no evidence, but may not be damaged.
+        # Speed varies, so some runs have finished before the kill. They must be intact, too.
         finished = is_finished(begun)
         if not finished:
             assert state_of(begun) == "interrupted"
@@ -117,7 +117,7 @@ def test_killed_behind_every_checkpoint(undisturbed, begun):
             process.kill()
             kills += 1
         process.join()
-        # One that it came to behind the look at it.
+        # A checkpoint that was written after the last check.
         seen = _version(begun / CHECKPOINT)
     assert kills >= 3
     assert without_clock(begun) == without_clock(undisturbed)
@@ -130,7 +130,7 @@ def _version(path):
 @pytest.mark.slow
 def test_killed_at_twenty_random_moments(undisturbed, begun):
     resumed = _killed_anywhere(undisturbed, begun, kills=20, seed=1)
-    # Some fall before the first checkpoint, some behind it.
+    # Some kills happen before the first checkpoint, some after it.
     assert 5 <= sum(resumed) <= 20
     print(f"{sum(resumed)} of 20 continued from a checkpoint, the others from the beginning")
 

@@ -1,4 +1,4 @@
-"""One run from demonstrations to the record: what it leaves, what it refuses, that it repeats."""
+"""One run from demonstrations to the record: its files, its errors, its repeatability."""
 
 import dataclasses
 import itertools
@@ -32,7 +32,7 @@ def test_the_record_tells_the_whole_run(finished):
     assert is_finished(folder)
     steps = [e.env_steps for e in record.evaluations]
     assert steps == [0, 160, record.budget.env_steps]
-    # A decision more than the budget at most; time limits cut chunks short.
+    # At most one decision beyond the budget; time limits shorten chunks.
     assert 320 <= record.budget.env_steps < 320 + config.num_envs * config.policy.execute
     # No update during the warm-up of 16 decisions, then one per decision.
     assert record.budget.updates == record.budget.decisions - config.agent_options.warmup
@@ -222,8 +222,8 @@ def test_learner_on_cuda_with_physics_on_the_cpu(tmp_path):
     assert record.status == "finished"
 
 
-def test_a_base_policy_of_ones_own_decides_what_the_record_says(finished, tmp_path):
-    """The file's settings and demonstrations are the run's, whatever the defaults are."""
+def test_the_settings_of_a_given_base_policy_are_recorded(finished, tmp_path):
+    """The run has the settings and demonstrations of the file, not the defaults."""
     config, folder = finished
     file = folder / "policy.safetensors"
     plain = tiny_config(
@@ -237,7 +237,7 @@ def test_a_base_policy_of_ones_own_decides_what_the_record_says(finished, tmp_pa
     assert said["demonstrations"]["count"] == 3
     known = read_record(folder / "record.json").base_policy
     assert found.base_policy == known
-    # Solvable states are counted on as many as this run asks for, not on those of the file.
+    # Steerability is measured on the number of states of this run, not on that of the file.
     more = dataclasses.replace(
         plain, evaluation=dataclasses.replace(plain.evaluation, steerability_states=3)
     )

@@ -51,7 +51,7 @@ def documented_tags():
 
 @pytest.fixture(scope="module")
 def continued(finished):
-    """A run that was stopped after an evaluation that no checkpoint knows of, and continued."""
+    """A run that was stopped after an evaluation that is in no checkpoint, and continued."""
     _, folder = finished
     evaluate = Trainer.evaluate
 
@@ -112,7 +112,7 @@ def test_evaluations_are_those_of_the_record(broken):
 def test_a_continued_run_shows_every_point_once(continued):
     folder, written = continued
     steps = [e.env_steps for e in read_record(folder / "record.json").evaluations]
-    # The stopped process had shown an evaluation that was done again.
+    # The stopped process had written an evaluation that was repeated.
     assert written in steps[:-1]
     assert len(list(folder.glob("events.*"))) == 2
     assert_equals_record(folder)
@@ -167,7 +167,7 @@ def test_hyperparameters_can_be_compared_across_runs(broken):
         end = metadata.parse_session_end_info_plugin_data(content(metadata.SESSION_END_INFO_TAG))
         assert end.status == api_pb2.STATUS_SUCCESS
         experiments.append(experiment)
-    # TensorBoard takes the columns of any one run.
+    # TensorBoard uses the columns of any one run.
     assert all(experiment == experiments[0] for experiment in experiments)
     assert [info.name.tag for info in experiments[0].metric_infos] == list(FINAL_METRICS)
     assert set(FINAL_METRICS) <= scalar_tags(broken["equivariant"])
@@ -213,7 +213,7 @@ def test_a_picture_that_fails_does_not_harm_the_run(finished, monkeypatch, capsy
 def test_a_full_disk_is_reported_in_one_sentence(finished, tmp_path, monkeypatch):
     record = read_record(finished[1] / "record.json")
     log = RunLog(tmp_path, record)
-    # TensorBoard hands on in later calls what its writing thread met.
+    # TensorBoard raises errors of its writing thread in later calls.
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def fail(*args):

@@ -1,4 +1,4 @@
-"""Runs of the steering loop in variants that change what training or its costs are."""
+"""Runs in variants that change training only, or the cost of steps."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from tests.bench.tiny_run import tiny_config
 
 
 def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, monkeypatch):
-    """Evaluation is on the full disc, costs are those of both; the record says so."""
+    """Evaluation uses the full disc, and the costs of both variants; the record says so."""
     _, folder = finished
     made = []
 

@@ -1,4 +1,4 @@
-"""The latent-noise environment against stepping the task by hand."""
+"""The latent-noise environment compared with single steps of the task."""
 
 import pytest
 import torch
@@ -88,7 +88,7 @@ def test_success_ends_an_episode_and_its_cost(env):
         if len(won):
             assert not result.truncated[won].any()
             assert result.episodes["success_once"].all()
-            # A return of -(length - 1): every step costs 1 but the one that succeeds.
+            # A return of -(length - 1): every step costs 1, except the one that succeeds.
             length = before[won] + 1
             assert torch.equal(result.episodes["episode_len"].float(), length.float())
             assert torch.equal(result.episodes["return"], -(length.float() - 1))
@@ -137,7 +137,7 @@ def test_rollout_does_not_depend_on_the_number_of_environments(env):
 
 
 def test_rollout_measures_success_once_and_at_the_end(env):
-    """An expert that then lets go: success once everywhere it worked, at the end rarely."""
+    """An expert that lets go after success: often success once, rarely success at the end."""
     latent = LatentNoiseEnv(env, NoiseIsAction(execute=1), ignore_terminations=True)
     expert: list[Expert] = []
 
