@@ -28,6 +28,8 @@ from symsteer.policies.training.optimizer import GradientOptions, optimize
 class FlowOptions(GradientOptions):
     """Options of the flow policy."""
 
+    steps: int = 6000
+    """Gradient steps."""
     width: int = 256
     """Features of a hidden layer."""
     depth: int = 3
