@@ -7,6 +7,9 @@ from collections.abc import Iterable
 
 from symsteer.errors import UserError
 
+LONGEST_NAME = 80
+"""Characters of a wrong name that are quoted."""
+
 
 def nearest(name: str, valid: Iterable[str]) -> str | None:
     """The valid name that is most similar to ``name``; None if none is similar."""
@@ -23,6 +26,7 @@ def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> User
         where: the file or command with the name; the message begins with it.
     """
     valid = list(valid)
+    name = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..."
     close = nearest(name, valid)
     hint = f"did you mean {close!r}? " if close else ""
     start = f"{where}: " if where else ""

@@ -205,7 +205,7 @@ def test_names_and_help_cost_no_import_of_torch_or_maniskill(arguments):
         f"sys.argv = ['symsteer', *{arguments!r}]\n"
         "try: main()\n"
         "except SystemExit: pass\n"
-        "heavy = {'torch', 'mani_skill', 'sapien', 'gymnasium', 'pandas'} & set(sys.modules)\n"
+        "heavy = {'torch', 'mani_skill', 'sapien', 'pandas'} & set(sys.modules)\n"
         "sys.exit(f'imported: {heavy}' if heavy else 0)"
     )
     done = subprocess.run(

@@ -125,7 +125,7 @@ def problems(text):
     found = {}
     for line in text.splitlines():
         if line.endswith("NOT ADMISSIBLE"):
-            agent = "augmented" if "augmented.AugmentedAgent" in line else "smooth"
+            agent = "augmented" if "augmented=AugmentedAgent" in line else "smooth"
             found[agent] = []
         elif line.startswith("  problem: "):
             found[agent].append(line)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import io
 import itertools
 import json
@@ -35,7 +36,7 @@ from safetensors.torch import save_file
 from symsteer import cli
 from symsteer.bench.runs import base_policy
 from symsteer.bench.runs import run as run_module
-from symsteer.bench.runs.checkpoint import load_checkpoint
+from symsteer.bench.runs.checkpoint import CHECKSUM_BYTES, FORMAT, load_checkpoint
 from symsteer.bench.runs.config import RunConfig, flat
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep.suite import load_suite
@@ -624,18 +625,15 @@ def checkpoint(workshop: Workshop, number: int, folder: Path) -> Ending:
     run = workshop.restore_run(folder)
     path, trap = run / "checkpoint.pt", folder / "sprung"
     original = path.read_bytes()
-    kind = random.randrange(8)
+    kind = random.randrange(7)
     if kind in (0, 1, 2):
         path.write_bytes(flip_bits(original, random, random.choice((1, 1, 1, 4))))
     elif kind == 3:
         path.write_bytes(poison_bytes(original, random))
     elif kind == 4:
-        path.write_bytes(_trapped(original, _Trap(trap), random))
+        path.write_bytes(_trapped(_Trap(trap), random))
     elif kind == 5:
         path.write_bytes(_edited_state(original, random))
-    elif kind == 6:
-        outer = torch.load(path, weights_only=True)
-        torch.save(_poison_tensors(outer, random), path)
     else:
         path.write_bytes(workshop.other)
     verb = random.choice(("resume", "evaluate"))
@@ -649,32 +647,27 @@ def checkpoint(workshop: Workshop, number: int, folder: Path) -> Ending:
     return ending
 
 
-def _trapped(original: bytes, trap: _Trap, random: Random) -> bytes:
-    """Three ways to insert code: a plain pickle, torch's old format, torch's archive."""
+def _trapped(trap: _Trap, random: Random) -> bytes:
+    """Four ways to insert code: with and without a checksum, pickle and torch's two formats."""
     buffer = io.BytesIO()
     kind = random.randrange(4)
     if kind == 0:
         return pickle.dumps(trap)
-    if kind == 3:
-        outer = torch.load(io.BytesIO(original), weights_only=True)
-        inner = io.BytesIO()
-        torch.save({"agent": trap}, inner)
-        outer["state"] = torch.frombuffer(bytearray(inner.getvalue()), dtype=torch.uint8)
-        torch.save(outer, buffer)
-    else:
-        torch.save({"format": 2, "state": trap}, buffer, _use_new_zipfile_serialization=kind == 1)
-    return buffer.getvalue()
+    content = {"format": FORMAT, "state": trap}
+    torch.save(content, buffer, _use_new_zipfile_serialization=kind != 1)
+    return _sealed(buffer.getvalue()) if kind == 3 else buffer.getvalue()
 
 
 def _edited_state(original: bytes, random: Random) -> bytes:
-    """The state inside was edited and the checksum was not."""
-    outer = torch.load(io.BytesIO(original), weights_only=True)
-    state = torch.load(io.BytesIO(outer["state"].numpy().tobytes()), weights_only=True)
-    inner, buffer = io.BytesIO(), io.BytesIO()
-    torch.save(_poison_tensors(state, random), inner)
-    outer["state"] = torch.frombuffer(bytearray(inner.getvalue()), dtype=torch.uint8)
-    torch.save(outer, buffer)
-    return buffer.getvalue()
+    """The state was edited; the checksum is the old one, or there is none."""
+    content = torch.load(io.BytesIO(original[:-CHECKSUM_BYTES]), weights_only=True)
+    buffer = io.BytesIO()
+    torch.save(_poison_tensors(content, random), buffer)
+    return buffer.getvalue() + original[-CHECKSUM_BYTES:] * random.randrange(2)
+
+
+def _sealed(archive: bytes) -> bytes:
+    return archive + hashlib.sha256(archive).digest()
 
 
 def _poison_tensors(state: dict[str, Any], random: Random) -> dict[str, Any]:

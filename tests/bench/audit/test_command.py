@@ -9,10 +9,11 @@ import torch
 from symsteer.bench.audit import page
 from symsteer.bench.audit.study import variant_texts
 from symsteer.bench.tasks import task_class
-from symsteer.bench.variants import variant_names
+from symsteer.bench.variants import VARIANTS
 from symsteer.cli import main
 from symsteer.errors import UserError
-from symsteer.policies.contract import ChunkPolicy, PolicyConfig, save_policy
+from symsteer.policies.files import save_policy
+from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 
 FAST = ("--count", 8, "--resets", 16)
 
@@ -68,8 +69,8 @@ def test_cuda_where_there_is_none(monkeypatch, capsys):
 
 def test_one_audit(monkeypatch, capsys, tmp_path):
     task = task_class("PickCube-v1")
-    config = PolicyConfig(channels=16, width=32, depth=1, execute=4, sampling_steps=4)
-    policy = ChunkPolicy(config, task.observation_layout, task.action_layout)
+    options = EquivariantOptions(channels=16, width=32, depth=1)
+    policy = EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
     path = save_policy(policy, tmp_path / "policy")
     arguments = ("--variant", "action_gain:1", "--group", "C4", "--base-policy", path, *FAST)
     assert symsteer(monkeypatch, *arguments, "--json", "--out", tmp_path / "out") == 0
@@ -112,7 +113,7 @@ def test_whole_episodes(monkeypatch, capsys):
 
 def test_variant_texts():
     assert variant_texts(["all"], [1.0])[0] == "none"
-    assert len(variant_texts(["all"], [0.5, 1.0])) == 1 + 2 * len(variant_names())
+    assert len(variant_texts(["all"], [0.5, 1.0])) == 1 + 2 * len(VARIANTS.names())
     both = "action_gain:0.5+perception_bias:1"
     assert variant_texts([both, "action_gain", both], [0.5]) == [both, "action_gain:0.5"]
     assert variant_texts(["action_gain"], [0.0]) == ["none"]

@@ -6,8 +6,8 @@ import torch
 from symsteer.bench.audit import rotated_rollout_error
 from symsteer.bench.demos import collect, load
 from symsteer.bench.tasks import task_class
-from symsteer.policies.contract import ChunkPolicy, PolicyConfig
-from symsteer.policies.training import train_policy
+from symsteer.policies import POLICIES
+from symsteer.policies.contract import ChunkPolicy
 
 TASKS = ("PushCube-v1", "PickCube-v1", "StackCube-v1")
 
@@ -27,8 +27,9 @@ def test_rotated_episodes_coincide(actions):
 def fresh_policy(name: str = "edp") -> ChunkPolicy:
     torch.manual_seed(0)
     task = task_class("PickCube-v1")
-    config = PolicyConfig(name=name, channels=16, width=32, depth=1, execute=4, sampling_steps=4)
-    return ChunkPolicy(config, task.observation_layout, task.action_layout)
+    kind = POLICIES.get(name)
+    options = kind.Options(channels=16, width=32, depth=1)
+    return kind(options, task.observation_layout, task.action_layout)
 
 
 def test_turned_noise_gives_the_turned_episode():
@@ -46,8 +47,9 @@ def test_turned_noise_of_a_trained_policy_over_200(tmp_path):
     """State and noise of whole closed-loop episodes, turned by every element of C8."""
     path = collect("PickCube-v1", "floating", 50, "diverse", 0, tmp_path / "pick.h5")
     demos = load(path, "PickCube-v1", "floating")
-    policy = train_policy(
-        PolicyConfig(execute=4, sampling_steps=4),
+    kind = POLICIES.get("edp")
+    policy = kind.fit(
+        kind.Options(),
         demos.episodes,
         demos.observation_layout,
         demos.action_layout,

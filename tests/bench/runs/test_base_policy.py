@@ -46,7 +46,7 @@ def test_a_policy_from_another_package(tmp_path, monkeypatch):
     assert again.content_hash() == base.content_hash()
     # A run that names the file takes its settings; other settings are refused.
     path = policy_path(find_base(config, tmp_path))
-    assert with_policy_of(config, path).policy.name == name
+    assert with_policy_of(config, path).policy_name == name
     other = build_config(data | {"policy": {"name": name, "horizon": 6, "execute": 2}}, "test")
     with pytest.raises(UserError, match="horizon 4, and this run asks for 6"):
         with_policy_of(other, path)

@@ -1,5 +1,7 @@
 """A run that is killed and continued has the same record as one that was not stopped."""
 
+import hashlib
+import io
 import json
 import multiprocessing
 import os
@@ -11,7 +13,7 @@ import time
 import pytest
 import torch
 
-from symsteer.bench.runs.checkpoint import load_checkpoint
+from symsteer.bench.runs.checkpoint import CHECKSUM_BYTES, load_checkpoint
 from symsteer.bench.runs.folder import (
     CHECKPOINT,
     RunBusyError,
@@ -192,9 +194,12 @@ def test_what_cannot_be_continued(undisturbed, begun, tmp_path):
 def test_a_damaged_or_foreign_checkpoint_is_refused_and_kept(undisturbed, begun):
     shutil.copy(undisturbed / "policy.safetensors", begun)
     whole = (undisturbed / "checkpoint.pt").read_bytes()
-    state = torch.load(undisturbed / "checkpoint.pt", weights_only=True)
+    content = torch.load(io.BytesIO(whole[:-CHECKSUM_BYTES]), weights_only=True)
     for words, change in (("another run", {"run_id": "else"}), ("version", {"format": 99})):
-        torch.save({**state, **change}, begun / "checkpoint.pt")
+        archive = io.BytesIO()
+        torch.save({**content, **change}, archive)
+        checksum = hashlib.sha256(archive.getvalue()).digest()
+        (begun / "checkpoint.pt").write_bytes(archive.getvalue() + checksum)
         with pytest.raises(UserError, match=words):
             resume(begun, progress=False)
     (begun / "checkpoint.pt").write_bytes(whole[: len(whole) // 2])
