@@ -223,14 +223,14 @@ def test_doctor_names_what_there_is(monkeypatch, capsys):
 
 def test_the_module_is_the_same_program():
     done = subprocess.run(
-        [sys.executable, "-m", "symsteer", "run", "--agent", "ppo"],
+        [sys.executable, "-m", "symsteer", "swep"],
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
     )
     assert done.returncode == 2
-    assert done.stderr.startswith("error: there is no agent 'ppo'")
+    assert done.stderr.startswith("error: there is no verb 'swep'; did you mean 'sweep'?")
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():

@@ -176,12 +176,9 @@ def run_into(full, undisturbed, out):
 # Runs.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "size",
-    [
-        pytest.param(0, id="every file", marks=pytest.mark.slow),
-        pytest.param(25_000, id="large ones"),
-    ],
+    "size", [pytest.param(0, id="every file"), pytest.param(25_000, id="large ones")]
 )
 def test_a_run_outlives_a_full_disk(size, undisturbed, tmp_path):
     run_into(lambda: files_end_at(size), undisturbed, tmp_path)

@@ -7,6 +7,7 @@ from symsteer.errors import UserError
 from tests.bench.tiny_run import tiny_config
 
 
+@pytest.mark.slow
 def test_a_small_study(tmp_path):
     names, counts = ("edp", "plain-augmented"), (2,)
     rows = study(tiny_config(), tmp_path, names, counts, seeds=1, episodes=4, workers=1)

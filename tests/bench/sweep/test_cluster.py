@@ -89,6 +89,7 @@ def test_a_folder_that_is_not_shared_is_refused(cluster, tmp_path):
     assert done.stdout == ""
 
 
+@pytest.mark.slow
 def test_a_machine_dies_and_nothing_is_lost(cluster, undisturbed, tmp_path, capsys):
     out = tmp_path / "runs"
     other = tiny_config(agent="zero")

@@ -156,7 +156,7 @@ def one_of_three(name, embodiment):
     return play(embodiment, variant=name, strength=torch.tensor([0.0, 1.0, 0.0]))
 
 
-@pytest.mark.parametrize("embodiment", ["floating", "panda"])
+@pytest.mark.parametrize("embodiment", ["floating", pytest.param("panda", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NAMES)
 def test_strength_zero_is_the_unbroken_task_to_the_bit(name, embodiment):
     """Also beside environments in which the variant acts."""
