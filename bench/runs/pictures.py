@@ -26,10 +26,12 @@ from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA, SIZE
 from symsteer.bench.variants import evaluation_variant
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.geometry import Layout
+from symsteer.policies.geometry import Field, Layout
 
 EPISODES = 32
 """Number of episodes with drawn paths; more paths would cover each other."""
+
+PLANAR_VECTOR = Layout([Field("xy", 1)])
 
 SECTORS = 12
 """Number of sectors in which successes are counted."""
@@ -122,10 +124,9 @@ def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
 
 
 def _turn(paths: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Turn the paths ``[..., N, 2]`` of episode i by ``angle[i]``."""
-    c, s = np.cos(angle), np.sin(angle)
-    x, y = paths[..., 0], paths[..., 1]
-    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+    """Turn the paths ``[names, T + 1, N, 2]`` of episode i by ``angle[i]``."""
+    episodes = torch.from_numpy(paths).movedim(2, 0)
+    return PLANAR_VECTOR.rotate(episodes, torch.from_numpy(angle)).movedim(0, 2).numpy()
 
 
 def _draw_paths(axes: Axes, paths: np.ndarray, lengths: np.ndarray, success: np.ndarray) -> None:
