@@ -14,13 +14,14 @@ from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import DIAGNOSTIC_SEED, diagnostic_seeds, held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.policies.contract import ChunkPolicy
+from symsteer.variant import VariantSpec
 
 
 def make_env(
     config: RunConfig,
     base: ChunkPolicy,
     num_envs: int,
-    variant: str,
+    variants: Sequence[VariantSpec],
     ignore_terminations: bool,
     workers: int,
 ) -> LatentNoiseEnv:
@@ -29,7 +30,7 @@ def make_env(
         config.task,
         num_envs=num_envs,
         embodiment=config.embodiment,
-        variant=variant,
+        variant=variants,
         sim=config.sim,
         workers=min(workers, num_envs),
     )
@@ -44,7 +45,7 @@ class Evaluator:
         base: the frozen policy.
         agent: the agent that plays.
         feasible: lowest and highest return that the reward allows, per decision.
-        variant: of these episodes.
+        variants: of these episodes.
         workers: processes that share the environments.
 
     Attributes:
@@ -57,14 +58,14 @@ class Evaluator:
         base: ChunkPolicy,
         agent: Agent,
         feasible: tuple[float, float],
-        variant: str,
+        variants: Sequence[VariantSpec],
         workers: int = 1,
     ):
         self.config, self.agent, self.feasible = config, agent, feasible
         self.played: Rollout | None = None
         wanted = config.evaluation
         self.extra = wanted.diagnostic_episodes if isinstance(agent, HasCritic) else 0
-        self.env = make_env(config, base, wanted.episodes + self.extra, variant, True, workers)
+        self.env = make_env(config, base, wanted.episodes + self.extra, variants, True, workers)
 
     def measure(self, count: int) -> tuple[dict[str, torch.Tensor], Mapping[str, float | None]]:
         """Episodes of the deterministic actor on the first ``count`` held-out seeds.

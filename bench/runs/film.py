@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ from symsteer.bench.runs.stored import Restored, restored
 from symsteer.bench.runs.trainer import feasible_return
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import held_out_seeds
-from symsteer.bench.variants import evaluation_variant, read
+from symsteer.bench.variants import evaluation_variants, read
 from symsteer.errors import UserError
-from symsteer.variant import file_name, variant_text
+from symsteer.variant import VariantSpec, file_name, variant_text
 
 FRAMES_PER_SECOND = 20
 """ManiSkill's control frequency: videos run in real time."""
@@ -40,31 +41,31 @@ def film(folder: Path, variant: str | None = None, episodes: int = 3) -> Path:
     if episodes < 1:
         raise UserError(f"--episodes is {episodes}; it must be at least 1")
     run = restored(folder)
-    own = evaluation_variant(run.config.variant)
-    text = own if variant is None else variant_text(read(variant))
-    name = file_name(text)
+    own = evaluation_variants(run.config.variants)
+    variants = own if variant is None else read(variant)
+    name = file_name(variant_text(variants))
     if rendering_works():
         path = run.folder / f"film-{name}.mp4"
         frames: list[Any] = [
             frame
             for seed in held_out_seeds(episodes)
-            for frame in episode_frames(run.config, run.policy, run.agent, text, seed)
+            for frame in episode_frames(run.config, run.policy, run.agent, variants, seed)
         ]
         imageio.mimwrite(path, frames, fps=FRAMES_PER_SECOND, macro_block_size=1)
         return path
     path = run.folder / f"paths-{name}.png"
-    imageio.imwrite(path, _paths(run, text, episodes))
+    imageio.imwrite(path, _paths(run, variants, episodes))
     return path
 
 
-def _paths(run: Restored, variant: str, episodes: int) -> np.ndarray:
+def _paths(run: Restored, variants: Sequence[VariantSpec], episodes: int) -> np.ndarray:
     config = run.config
     feasible = feasible_return(config, run.agent, run.policy)
-    evaluator = Evaluator(config, run.policy, run.agent, feasible, variant)
+    evaluator = Evaluator(config, run.policy, run.agent, feasible, variants)
     try:
         evaluator.measure(episodes)
     finally:
         evaluator.close()
     assert evaluator.played is not None
-    title = f"{config.agent} on {config.task} ({variant}), seed {config.seed}"
+    title = f"{config.agent} on {config.task} ({variant_text(variants)}), seed {config.seed}"
     return draw_paths(evaluator.played, run.policy.obs_layout, title)

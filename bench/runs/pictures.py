@@ -7,7 +7,7 @@ One episode is simulated again for them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -24,9 +24,10 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA, SIZE
-from symsteer.bench.variants import evaluation_variant
+from symsteer.bench.variants import evaluation_variants
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Field, Layout
+from symsteer.variant import VariantSpec
 
 EPISODES = 32
 """Number of episodes with drawn paths; more paths would cover each other."""
@@ -170,8 +171,8 @@ def frames_of(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> np.ndarra
     Raises:
         UserError: if there is no Vulkan driver.
     """
-    variant, seed = evaluation_variant(config.variant), held_out_seeds(1)[0]
-    frames = list(episode_frames(config, policy, agent, variant, seed, every_step=False))
+    variants, seed = evaluation_variants(config.variants), held_out_seeds(1)[0]
+    frames = list(episode_frames(config, policy, agent, variants, seed, every_step=False))
     chosen = np.linspace(0, len(frames) - 1, FRAMES).round().astype(int)
     rows = np.split(np.stack([frames[i] for i in chosen]), 2)
     return np.concatenate([np.concatenate(row, axis=1) for row in rows])
@@ -181,7 +182,7 @@ def episode_frames(
     config: RunConfig,
     policy: ChunkPolicy,
     agent: Agent,
-    variant: str,
+    variants: Sequence[VariantSpec],
     seed: int,
     every_step: bool = True,
 ) -> Iterator[np.ndarray]:
@@ -190,7 +191,7 @@ def episode_frames(
     Args:
         config: task, embodiment and simulator.
         policy, agent: the deterministic actor plays.
-        variant: how the symmetry is broken.
+        variants: how the symmetry is broken.
         seed: of the episode.
         every_step: a frame after each control step, else one after each decision.
 
@@ -201,7 +202,7 @@ def episode_frames(
         config.task,
         num_envs=1,
         embodiment=config.embodiment,
-        variant=variant,
+        variant=variants,
         sim=config.sim,
         render=True,
         render_mode="rgb_array",

@@ -28,7 +28,7 @@ from symsteer.bench.runs.observers import ProgressFile, observers_of
 from symsteer.bench.runs.stored import named, restored, stored_config, stored_policy
 from symsteer.bench.runs.trainer import Trainer, budget_of, feasible_return
 from symsteer.bench.tasks import check_embodiment, task_class
-from symsteer.bench.variants import evaluation_variant, read
+from symsteer.bench.variants import evaluation_variants, read
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, read_record
 from symsteer.policies.contract import ChunkPolicy
@@ -171,13 +171,13 @@ def evaluate(
     run = restored(folder)
     config, folder = run.config, run.folder
     _check_all(config, workers)
-    own = evaluation_variant(config.variant)
-    variant = own if variant is None else variant_text(read(variant))
+    own = evaluation_variants(config.variants)
+    variants = own if variant is None else read(variant)
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}; it must be at least 1")
     feasible = feasible_return(config, run.agent, run.policy)
-    evaluator = Evaluator(config, run.policy, run.agent, feasible, variant, workers)
+    evaluator = Evaluator(config, run.policy, run.agent, feasible, variants, workers)
     begin = time.perf_counter()
     try:
         columns, diagnostics = evaluator.measure(count)
@@ -190,10 +190,10 @@ def evaluate(
         diagnostics=dict(diagnostics),
     )
     final = read_record(folder / RECORD).final if is_finished(folder) else None
-    comparable = final and variant == own and len(final.episodes.seed) == count
+    comparable = final and variants == own and len(final.episodes.seed) == count
     return EvaluationResult(
         run_id=folder.name,
-        variant=variant,
+        variant=variant_text(variants),
         evaluation=evaluation,
         recorded=evaluation.episodes == final.episodes if final and comparable else None,
     )
@@ -220,7 +220,7 @@ def _play(
 ) -> Path:
     resolved = {
         **config.to_json(),
-        "evaluation_variant": evaluation_variant(config.variant),
+        "evaluation_variant": variant_text(evaluation_variants(config.variants)),
         "files": files,
     }
     with claimed(folder):

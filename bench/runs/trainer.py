@@ -24,7 +24,7 @@ from symsteer.bench.runs.evaluator import Evaluator, make_env
 from symsteer.bench.runs.folder import CHECKPOINT
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import task_class
-from symsteer.bench.variants import build, evaluation_variant, highest_cost
+from symsteer.bench.variants import build, evaluation_variants, highest_cost
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation
 from symsteer.policies.contract import ChunkPolicy
@@ -136,9 +136,8 @@ class Trainer:
         for observer in observers:
             observer.began(self, checkpoint)
         try:
-            self.evaluator = Evaluator(
-                config, base, self.agent, self.feasible, evaluation_variant(config.variant), workers
-            )
+            variants = evaluation_variants(config.variants)
+            self.evaluator = Evaluator(config, base, self.agent, self.feasible, variants, workers)
         except BaseException as error:
             self.stop(error)
             raise
@@ -266,7 +265,7 @@ class Trainer:
     def _make_env(self, ignore_terminations: bool) -> LatentNoiseEnv:
         config = self.config
         env = make_env(
-            config, self.base, config.num_envs, config.variant, ignore_terminations, self.workers
+            config, self.base, config.num_envs, config.variants, ignore_terminations, self.workers
         )
         env.clock = self.clock
         return env

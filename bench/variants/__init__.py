@@ -3,7 +3,7 @@
 - `VARIANTS`: all of them by name.
 - `read(...)`: a text such as ``wind:0.5`` as frozen data, names checked.
 - `build(...)`, `parse(...)`: the objects that act in an environment.
-- `evaluation_variant(...)`, `highest_cost(...)`: what evaluation and returns need to know.
+- `evaluation_variants(...)`, `highest_cost(...)`: what evaluation and returns need to know.
 
 Importing this package is cheap: classes are imported when they are first used.
 """
@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 from symsteer.errors import UserError
 from symsteer.names import unknown
 from symsteer.registry import Registry
-from symsteer.variant import UNBROKEN, VariantSpec, parse_variant, variant_text
+from symsteer.variant import UNBROKEN, VariantSpec, parse_variant
 
 if TYPE_CHECKING:
     from symsteer.bench.variants.base import Variant
 
-__all__ = ["VARIANTS", "build", "evaluation_variant", "highest_cost", "parse", "read"]
+__all__ = ["VARIANTS", "build", "evaluation_variants", "highest_cost", "parse", "read"]
 
 VARIANTS: Registry[type[Variant]] = Registry(
     "variant",
@@ -85,13 +85,13 @@ def parse(variant: str | Sequence[VariantSpec], strength: Any = None) -> tuple[V
     return build(read(variant, strength))
 
 
-def evaluation_variant(variant: str | Sequence[VariantSpec]) -> str:
-    """The variants in which agents are evaluated, as text: those of training alone left out.
+def evaluation_variants(specs: Iterable[VariantSpec]) -> tuple[VariantSpec, ...]:
+    """The variants in which agents are evaluated: those of training alone are left out.
 
     Raises:
-        UserError: as :func:`read`.
+        UserError: if a class cannot be imported.
     """
-    return variant_text(s for s in read(variant) if not VARIANTS.get(s.name).training_only)
+    return tuple(spec for spec in specs if not VARIANTS.get(spec.name).training_only)
 
 
 def highest_cost(variants: Iterable[Variant]) -> float:

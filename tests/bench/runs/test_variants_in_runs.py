@@ -6,6 +6,7 @@ from symsteer.bench.runs import evaluator
 from symsteer.bench.runs.run import execute
 from symsteer.bench.tasks import make, task_class
 from symsteer.leaderboard.records import read_record
+from symsteer.variant import variant_text
 from tests.bench.tiny_run import tiny_config
 
 
@@ -15,7 +16,7 @@ def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, mon
     made = []
 
     def noting(task, **kwargs):
-        made.append(kwargs["variant"])
+        made.append(variant_text(kwargs["variant"]))
         return make(task, **kwargs)
 
     monkeypatch.setattr(evaluator, "make", noting)
