@@ -77,6 +77,11 @@ def stored_config(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
     data = read_config(folder)
     files = data.pop("files", {})
     data.pop("evaluation_variant", None)
+    if "sac" in data:
+        raise UserError(
+            f"{folder / CONFIG} is of a run of SymSteer 0.1, which this version reports but cannot "
+            "load or continue; use SymSteer 0.1 for that"
+        )
     require_extensions(folder / RECORD)
     config = build_config(data, str(folder / CONFIG))
     if not isinstance(files, dict) or run_id(config, files) != folder.name:

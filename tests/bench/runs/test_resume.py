@@ -179,6 +179,14 @@ def test_a_run_is_worked_on_by_one_process(undisturbed, begun):
     assert state_of(begun) == "interrupted"
 
 
+def test_a_run_of_version_0_1_is_named(begun):
+    config = json.loads((begun / "config.json").read_text())
+    config["sac"] = config.pop("agent_options")
+    (begun / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"a run of SymSteer 0\.1"):
+        resume(begun, progress=False)
+
+
 def test_what_cannot_be_continued(undisturbed, begun, tmp_path):
     with pytest.raises(UserError, match="finished already"):
         resume(undisturbed, progress=False)
