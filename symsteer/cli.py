@@ -85,6 +85,8 @@ def main() -> int:
     # Warnings of other packages about optional parts that SymSteer does not use.
     warnings.filterwarnings("ignore", message=".*py3nj.*")
     warnings.filterwarnings("ignore", message="Failed to find system libvulkan.*")
+    # For --agent module:Class: a module in the present folder, if no installed one has its name.
+    sys.path.append("")
     try:
         return _run(sys.argv[1:])
     except UserError as error:

@@ -233,6 +233,23 @@ def test_the_module_is_the_same_program():
     assert done.stderr.startswith("error: there is no verb 'swep'; did you mean 'sweep'?")
 
 
+def test_a_class_in_the_present_folder_can_be_tried(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "from symsteer.agents.references import ZeroAgent\n"
+        "class Mine(ZeroAgent):\n    name = 'mine'\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "symsteer", "run", "--agent", "mine:Mine", "--help"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "mine:Mine" in done.stdout
+
+
 def test_a_reader_that_has_seen_enough_is_no_error():
     reading, writing = os.pipe()
     os.close(reading)
