@@ -76,7 +76,10 @@ class _Options:
         self.reserved = ("name", "preset") if kind == "agent" else ("name",)
         present = [dict.fromkeys(self._name(run[kind]) for run in grid.runs) for grid in data.grids]
         everywhere = dict.fromkeys(name for names in present for name in names)
-        self.classes = {name: registry.get(name).Options for name in everywhere}
+        try:
+            self.classes = {name: registry.get(name).Options for name in everywhere}
+        except UserError as error:
+            raise UserError(f"{self.source}: {error}") from error
         for key, value in data.shared[kind].items():
             if isinstance(value, dict) and key not in self.reserved:
                 for option in value:

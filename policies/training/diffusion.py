@@ -21,6 +21,9 @@ from symsteer.names import unknown
 Prediction = Literal["sample", "epsilon"]
 Bound = Callable[[torch.Tensor], torch.Tensor]
 
+MOST_STEPS = 10_000
+"""Noise levels; published models use up to 1,000."""
+
 MINIMUM_WEIGHT = 0.05
 """Least loss weight before normalisation. The sampler starts at the noisiest levels; without it
 they would not be learned."""
@@ -44,8 +47,8 @@ class Diffusion:
     """
 
     def __init__(self, steps: int = 100, prediction: Prediction = "sample", snr_cap: float = 5.0):
-        if steps < 2:
-            raise UserError(f"diffusion needs at least 2 noise levels, not {steps}")
+        if not 2 <= steps <= MOST_STEPS:
+            raise UserError(f"diffusion needs 2 to {MOST_STEPS} noise levels, not {steps}")
         if prediction not in get_args(Prediction):
             raise unknown("prediction", prediction, get_args(Prediction))
         if not snr_cap > 0:

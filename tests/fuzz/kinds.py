@@ -44,6 +44,7 @@ from symsteer.bench.tasks import task_class
 from symsteer.leaderboard.records import config_hash, read_record
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
+from symsteer.variant import parse_variant, variant_text
 from tests.fuzz.judge import BadEndingError, Ending, end_of, stopped_at
 from tests.fuzz.mutate import (
     POISON,
@@ -250,7 +251,7 @@ def command(workshop: Workshop, number: int, folder: Path) -> Ending:
     kind = random.randrange(8)
     if kind == 0:
         at = random.randrange(3, len(option))
-        options += [option[:at] + random.choice(("", "x", "-")) + option[at + 1 :], "3"]
+        options += [option[:at] + random.choice(("", "x", "y")) + option[at + 1 :], "3"]
     elif kind == 1:
         options += random.choice(([option], ["--" + option, "1"], ["-" + key[0]], [key, "1"]))
     elif kind == 2:
@@ -268,7 +269,8 @@ def command(workshop: Workshop, number: int, folder: Path) -> Ending:
         trainer.evaluator.close()
         found, asked = flat(trainer.config.to_json()), defaults
         if kind >= 3:
-            asked[key] = _read_as(workshop.config, key, options[-1])
+            value = _read_as(workshop.config, key, options[-1])
+            asked[key] = variant_text(parse_variant(value)) if key == "variant" else value
         elif options[-1] == option:  # a flag
             asked[key] = True
         for name, value in asked.items():
@@ -561,7 +563,7 @@ def policy(workshop: Workshop, number: int, folder: Path) -> Ending:
     with stopped_at((run_module, "Trainer")):
         ending = end_of(verb, ["policy.safetensors", workshop.run_id])
     if ending.kind == "accepted":
-        found, intact = ending.found[3], folder / "intact.safetensors"
+        found, intact = ending.found[2], folder / "intact.safetensors"
         intact.write_bytes(original)
         (have, said), (want, meant) = _policy_content(path), _policy_content(intact)
         _require(have.keys() == want.keys(), "other tensors were accepted")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from collections import Counter
 from random import Random
 
@@ -31,6 +32,15 @@ def default_numbers(kind):
         first.setdefault(Random(f"{prefix} {number}").randrange(ways), number)
     assert len(first) == ways
     return sorted(first.values())
+
+
+@pytest.fixture(autouse=True)
+def little_memory():
+    """A damaged size may ask for any amount; the machine and other tests shall not suffer."""
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    resource.setrlimit(resource.RLIMIT_DATA, (8 * 2**30, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
 def tried(workshop, kind, numbers, folder):
