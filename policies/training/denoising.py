@@ -7,8 +7,6 @@ and may change the training batches in :meth:`DiffusionPolicy.augment`.
 from __future__ import annotations
 
 import abc
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
@@ -16,13 +14,12 @@ import torch
 
 from symsteer.errors import UserError
 from symsteer.names import unknown
-from symsteer.policies.contract import ChunkPolicy, Episode, Progress
 from symsteer.policies.geometry import Layout
 from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.normalizer import Normalizer, clip_blocks
-from symsteer.policies.training.demonstrations import check_episodes, make_chunks
 from symsteer.policies.training.diffusion import Diffusion, Prediction
-from symsteer.policies.training.optimizer import GradientOptions, optimize
+from symsteer.policies.training.gradient import GradientPolicy
+from symsteer.policies.training.optimizer import GradientOptions
 
 Network = Literal["mlp", "unet"]
 
@@ -81,7 +78,7 @@ class DenoisingOptions(GradientOptions):
         return self
 
 
-class DiffusionPolicy(ChunkPolicy):
+class DiffusionPolicy(GradientPolicy):
     """A diffusion policy: the denoiser of a subclass, trained and sampled in the same way.
 
     Args:
@@ -120,67 +117,19 @@ class DiffusionPolicy(ChunkPolicy):
         """Change a training batch; ``obs [B, obs_dim]`` as it is, ``chunks`` normalised."""
         return obs, chunks
 
-    @classmethod
-    def fit(
-        cls,
-        options: Any,
-        episodes: Sequence[Episode],
-        obs_layout: Layout,
-        act_layout: Layout,
-        seed: int = 0,
-        progress: Progress | None = None,
-        device: torch.device | str = "cpu",
-    ) -> Self:
-        """Train on demonstrations; see :meth:`ChunkPolicy.fit`.
-
-        Batches of chunks drawn with replacement, the denoising loss at uniformly drawn noise
-        levels; optimiser: :func:`symsteer.policies.training.optimizer.optimize`.
-        """
-        check_episodes(episodes, obs_layout, act_layout)
-        start = time.perf_counter()
-        options = options.resolved(obs_layout, act_layout)
-        obs, chunks = make_chunks(episodes, act_layout, options.horizon, options.hold)
-        # The environment bounds actions block by block: train on what it executes.
-        chunks = clip_blocks(chunks, act_layout, 1.0)
-        # CPU draws, so that a seed means the same on every device.
-        generator = torch.Generator().manual_seed(seed)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            policy = cls(
-                options,
-                obs_layout,
-                act_layout,
-                Normalizer.fit(obs_layout, obs),
-                Normalizer.fit(act_layout, chunks),
-            )
-        policy.to(device)
-        obs, chunks = obs.to(device), policy.act_normalizer.normalize(chunks.to(device))
-        network, count = policy.denoiser, options.batch_size
-
-        def batch_loss() -> torch.Tensor:
-            rows = torch.randint(len(obs), (count,), generator=generator).to(device)
-            levels = torch.randint(options.diffusion_steps, (count,), generator=generator)
-            noise = torch.randn(count, options.horizon, act_layout.dim, generator=generator)
-            levels, noise = levels.to(device), noise.to(device)
-            seen, clean = policy.augment(obs[rows], chunks[rows], generator)
-            noisy = policy.diffusion.add_noise(clean, noise, levels)
-            condition = network.encode(policy.normalized_observation(seen))
-            output = network(noisy, condition + network.encode_time(levels))
-            return policy.diffusion.loss(output, clean, noise, levels)
-
-        losses = optimize(network, batch_loss, options, progress)
-        policy.training_record = {
-            "seed": seed,
-            "episodes": len(episodes),
-            "chunks": len(obs),
-            "steps": options.steps,
-            "losses": losses,
-            "seconds": time.perf_counter() - start,
-            "threads": torch.get_num_threads(),
-            "device": str(device),
-            "parameters": policy.parameter_count(),
-        }
-        return policy.freeze()
+    def loss(
+        self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
+    ) -> torch.Tensor:
+        """The denoising loss at uniformly drawn noise levels; see :meth:`GradientPolicy.loss`."""
+        count, device = len(obs), obs.device
+        levels = torch.randint(self.options.diffusion_steps, (count,), generator=generator)
+        noise = torch.randn(chunks.shape, generator=generator)
+        levels, noise = levels.to(device), noise.to(device)
+        obs, clean = self.augment(obs, chunks, generator)
+        noisy = self.diffusion.add_noise(clean, noise, levels)
+        condition = self.denoiser.encode(self.normalized_observation(obs))
+        output = self.denoiser(noisy, condition + self.denoiser.encode_time(levels))
+        return self.diffusion.loss(output, clean, noise, levels)
 
     def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Follow the deterministic sampler from ``noise``; see :meth:`ChunkPolicy.decode`."""

@@ -9,19 +9,15 @@ perceptron knows no symmetry: the policy's group is C1.
 from __future__ import annotations
 
 import itertools
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from torch import nn
 
-from symsteer.policies.contract import ChunkPolicy, Episode, Progress
 from symsteer.policies.geometry import Layout
 from symsteer.policies.normalizer import Normalizer, clip_blocks
-from symsteer.policies.training.demonstrations import check_episodes, make_chunks
-from symsteer.policies.training.optimizer import GradientOptions, optimize
+from symsteer.policies.training.gradient import GradientPolicy
+from symsteer.policies.training.optimizer import GradientOptions
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ class FlowOptions(GradientOptions):
         self.require_positive("width", "depth", "euler_steps")
 
 
-class FlowPolicy(ChunkPolicy):
+class FlowPolicy(GradientPolicy):
     """Conditional flow matching with a perceptron; it knows no symmetry."""
 
     name = "flow-mlp"
@@ -66,53 +62,15 @@ class FlowPolicy(ChunkPolicy):
         self.network = nn.Sequential(*layers, nn.Linear(options.width, chunk))
         self.freeze()
 
-    @classmethod
-    def fit(
-        cls,
-        options: FlowOptions,
-        episodes: Sequence[Episode],
-        obs_layout: Layout,
-        act_layout: Layout,
-        seed: int = 0,
-        progress: Progress | None = None,
-        device: torch.device | str = "cpu",
-    ) -> Self:
-        """Regress velocities on random points of random paths; see :meth:`ChunkPolicy.fit`."""
-        check_episodes(episodes, obs_layout, act_layout)
-        start = time.perf_counter()
-        obs, chunks = make_chunks(episodes, act_layout, options.horizon, options.hold)
-        chunks = clip_blocks(chunks, act_layout, 1.0)  # what the environment executes
-        generator = torch.Generator().manual_seed(seed)
-        with torch.random.fork_rng(devices=[]):  # the caller's generator stays as it is
-            torch.manual_seed(seed)
-            policy = cls(
-                options,
-                obs_layout,
-                act_layout,
-                Normalizer.fit(obs_layout, obs),
-                Normalizer.fit(act_layout, chunks),
-            )
-        policy.to(device)
-        obs = policy.normalized_observation(obs.to(device))
-        chunks = policy.act_normalizer.normalize(chunks.to(device))
-
-        def batch_loss() -> torch.Tensor:
-            rows = torch.randint(len(obs), (options.batch_size,), generator=generator).to(device)
-            t = torch.rand(options.batch_size, 1, 1, generator=generator).to(device)
-            goal = chunks[rows]
-            noise = torch.randn(goal.shape, generator=generator).to(device)
-            velocity = policy.velocity(torch.lerp(noise, goal, t), t, obs[rows])
-            return (velocity - (goal - noise)).square().mean()
-
-        losses = optimize(policy.network, batch_loss, options, progress)
-        policy.training_record = {
-            "seed": seed,
-            "episodes": len(episodes),
-            "chunks": len(obs),
-            "losses": losses,
-            "seconds": time.perf_counter() - start,
-        }
-        return policy.freeze()
+    def loss(
+        self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
+    ) -> torch.Tensor:
+        """Regress velocities on random points of random paths; see :meth:`GradientPolicy.loss`."""
+        t = torch.rand(len(chunks), 1, 1, generator=generator).to(obs.device)
+        noise = torch.randn(chunks.shape, generator=generator).to(obs.device)
+        seen = self.normalized_observation(obs)
+        velocity = self.velocity(torch.lerp(noise, chunks, t), t, seen)
+        return (velocity - (chunks - noise)).square().mean()
 
     def velocity(self, x: torch.Tensor, t: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         """The network's velocity at ``x [B, Tp, Da]``, ``t [B, 1, 1]``, normalised ``obs``."""
