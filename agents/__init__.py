@@ -19,8 +19,10 @@ AGENTS: Registry[type[Agent]] = Registry(
     {
         "standard": "symsteer.agents.standard:StandardAgent",
         "standard-matched": "symsteer.agents.standard:MatchedStandardAgent",
+        "augmented": "symsteer.agents.augmented:AugmentedAgent",
         "equivariant": "symsteer.agents.equivariant:EquivariantAgent",
         "approximate": "symsteer.agents.approximate:ApproximateAgent",
+        "wrong-group": "symsteer.agents.wrong_group:WrongGroupAgent",
         "base": "symsteer.agents.references:BaseAgent",
         "zero": "symsteer.agents.references:ZeroAgent",
         "golden-ticket": "symsteer.agents.golden_ticket:GoldenTicketAgent",

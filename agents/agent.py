@@ -220,8 +220,11 @@ class Agent:
             dtype=self.dtype,
         )
 
-    def _new_generator(self) -> torch.Generator:
-        return torch.Generator(device=self.device).manual_seed(self.context.seed)
+    def _new_generator(self, stream: int = 0) -> torch.Generator:
+        """A generator from the agent's seed; other streams draw other numbers."""
+        # Seeds of runs are below 2^32.
+        seed = self.context.seed + stream * 2**32
+        return torch.Generator(device=self.device).manual_seed(seed)
 
 
 @runtime_checkable

@@ -15,9 +15,10 @@ from torch import nn
 
 from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.agents.networks import Dense, dense, shrink_
+from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Batch
-from symsteer.agents.sac import SacOptions
 from symsteer.errors import UserError
+from symsteer.policies.geometry import Layout
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,9 @@ class ApproximateAgent(EquivariantAgent):
     def actor_layers(self) -> list[nn.Module]:
         return [ResidualPathway(layer, self.options.free_init) for layer in super().actor_layers()]
 
-    def critic_layers(self) -> list[nn.Module]:
-        return [ResidualPathway(layer, self.options.free_init) for layer in super().critic_layers()]
+    def critic_layers(self, inputs: Layout) -> list[nn.Module]:
+        layers = super().critic_layers(inputs)
+        return [ResidualPathway(layer, self.options.free_init) for layer in layers]
 
     def parameter_groups(self, network: nn.Module) -> list[dict[str, Any]]:
         # Adam adds weight_decay * W to the gradient. With weight_decay = 2 w it is that of w |W|^2.
@@ -82,7 +84,7 @@ class ApproximateAgent(EquivariantAgent):
     def after_update(self, batch: Batch) -> dict[str, torch.Tensor]:
         """For each network: norm of the free path / norm of the equivariant path."""
         scalars = {}
-        for name, network in (("actor", self.actor), ("critic", self.critic)):
+        for name, network in self.networks.items():
             free, equivariant = (
                 torch.stack(torch._foreach_norm([p.detach() for p in path])).norm()
                 for path in paths(network)

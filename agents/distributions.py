@@ -31,12 +31,17 @@ from symsteer.policies.geometry import Layout
 SMALL = 1e-4
 
 
+LOG_SCALE_MIN, LOG_SCALE_MAX = -5.0, 1.0
+
+
 class SquashedGaussian(nn.Module):
     """The distribution family of one noise layout; its methods take the parameters.
 
     Args:
         layout: geometry of the flattened noise, ``dim`` numbers in ``blocks`` irrep blocks.
         bound: largest norm of a block, > 0.
+        hard: whether the bound is enforced by the squash. If not, w = u, a plain Gaussian, and
+            :meth:`excess` says by how much w is beyond the bound.
 
     Raises:
         UserError: if the bound is not positive.
@@ -46,11 +51,11 @@ class SquashedGaussian(nn.Module):
     sizes: torch.Tensor
     membership: torch.Tensor
 
-    def __init__(self, layout: Layout, bound: float):
+    def __init__(self, layout: Layout, bound: float, hard: bool = True):
         super().__init__()
         if not bound > 0:
             raise UserError(f"the noise bound must be positive, not {bound}")
-        self.layout, self.bound = layout, bound
+        self.layout, self.bound, self.hard = layout, bound, hard
         self.dim, self.blocks = layout.dim, len(layout.blocks)
         membership = F.one_hot(layout.block_index, self.blocks).to(torch.get_default_dtype())
         self.register_buffer("index", layout.block_index.clone(), persistent=False)
@@ -71,12 +76,24 @@ class SquashedGaussian(nn.Module):
             Noise ``[..., dim]`` and log-probability ``[...]``, both differentiable.
         """
         u = mean + self._spread(log_scale.exp()) * eps
+        log_prob = self._gaussian(eps, log_scale)
+        if not self.hard:
+            return u, log_prob
         noise, log_volume = self._squash(u)
-        return noise, self._gaussian(eps, log_scale) - log_volume
+        return noise, log_prob - log_volume
 
     def mode(self, mean: torch.Tensor) -> torch.Tensor:
-        """The squashed mean, ``[..., dim]``: the noise of the deterministic policy."""
-        return self._squash(mean)[0]
+        """The noise of the deterministic policy, ``[..., dim]``: the mean, squashed if ``hard``."""
+        return self.squash(mean) if self.hard else mean
+
+    def squash(self, u: torch.Tensor) -> torch.Tensor:
+        """``u [..., dim]`` with every block shortened into the ball of radius ``bound``."""
+        return self._squash(u)[0]
+
+    def excess(self, noise: torch.Tensor) -> torch.Tensor:
+        """Squared excess of the blocks' norms over the bound, summed over blocks, ``[...]``."""
+        norms = (noise.square() @ self.membership + 1e-12).sqrt()
+        return (norms - self.bound).relu().square().sum(-1)
 
     def saturated(self, noise: torch.Tensor, share: float = 0.95) -> torch.Tensor:
         """Blocks with a norm above ``share`` of the bound, ``[..., blocks]`` bool."""

@@ -14,7 +14,8 @@ import torch
 from torch import nn
 
 from symsteer.agents.networks import shrink_
-from symsteer.agents.sac import SacAgent, SacOptions
+from symsteer.agents.options import SacOptions
+from symsteer.agents.sac import SacAgent
 from symsteer.policies.geometry import Field, Group, Layout
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
 
@@ -49,8 +50,8 @@ class EquivariantAgent(SacAgent):
     def actor_layers(self) -> list[nn.Module]:
         return equivariant_actor_layers(self)
 
-    def critic_layers(self) -> list[nn.Module]:
-        return equivariant_critic_layers(self)
+    def critic_layers(self, inputs: Layout) -> list[nn.Module]:
+        return equivariant_critic_layers(self, inputs)
 
 
 def equivariant_actor_layers(agent: SacAgent) -> list[nn.Module]:
@@ -60,9 +61,9 @@ def equivariant_actor_layers(agent: SacAgent) -> list[nn.Module]:
     return layers
 
 
-def equivariant_critic_layers(agent: SacAgent) -> list[nn.Module]:
-    """Layers from observation and noise to an invariant value."""
-    return equivariant_layers(agent.critic_layout, VALUE, agent.options)
+def equivariant_critic_layers(agent: SacAgent, inputs: Layout) -> list[nn.Module]:
+    """Layers from ``inputs`` to an invariant value."""
+    return equivariant_layers(inputs, VALUE, agent.options)
 
 
 def equivariant_layers(inputs: Layout, outputs: Layout, options: SacOptions) -> list[nn.Module]:

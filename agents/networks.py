@@ -5,18 +5,20 @@ The agents differ only in their layers. A layer is any module with
 to its dense matrix, or the sum of both. All agents then compute the same matrix products. The
 members of an ensemble share one batched product (instead of one per critic).
 
-The nonlinearity is LayerNorm (optional, without parameters) followed by ReLU. Both commute with
-permutations of the features, so regular fields stay regular fields.
+The nonlinearity is LayerNorm (optional, without parameters) followed by ReLU or tanh. All of them
+commute with permutations of the features, so regular fields stay regular fields.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, cast
+from typing import Literal, Protocol, cast
 
 import torch
 import torch.nn.functional as F
 from torch import nn
+
+Activation = Literal["relu", "tanh"]
 
 # Per layer the matrices [members, out, in] and biases [members, 1, out].
 Weights = list[tuple[torch.Tensor, torch.Tensor]]
@@ -43,15 +45,21 @@ class Ensemble(nn.Module):
     Args:
         members: the layers of each member, first to last.
         layer_norm: whether hidden features are normalised.
+        activation: of the hidden layers.
 
     ``width`` is the number of features of the first hidden layer.
     """
 
-    def __init__(self, members: Sequence[Sequence[nn.Module]], layer_norm: bool):
+    def __init__(
+        self,
+        members: Sequence[Sequence[nn.Module]],
+        layer_norm: bool,
+        activation: Activation = "relu",
+    ):
         super().__init__()
         self.width = len(dense(members[0][0])[1])
         self.members = nn.ModuleList([nn.ModuleList(layers) for layers in members])
-        self.layer_norm = layer_norm
+        self.layer_norm, self.activation = layer_norm, activation
         self._expanded: Weights | None = None
 
     def weights(self) -> Weights:
@@ -83,7 +91,7 @@ class Ensemble(nn.Module):
             if index > 0:
                 if self.layer_norm:
                     out = F.layer_norm(out, out.shape[-1:])
-                out = F.relu(out, inplace=True)
+                out = F.relu(out, inplace=True) if self.activation == "relu" else out.tanh()
             out = torch.baddbmm(bias, out, matrix.mT)
         return out
 

@@ -1,4 +1,4 @@
-"""Replay buffer on the learner's device, with the fields that an agent needs."""
+"""Replay buffer on the learner's device, with named fields."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 import torch
 
 from symsteer.errors import UserError
+
+FOLLOWED = ("reward", "next_obs", "terminal", "truncated")
 
 FIRST_ROWS = 4096
 """Rows allocated at the start. When they are full, the buffer doubles, up to its capacity."""
@@ -52,7 +54,7 @@ class Batch(dict[str, torch.Tensor]):
             return self[field]
         except KeyError as error:
             raise AttributeError(
-                f"the replay holds no {field!r}; add it to the agent's replay_fields"
+                f"the replay holds no {field!r}; it holds {', '.join(self)}"
             ) from error
 
     def replace(self, **changes: torch.Tensor) -> Batch:
@@ -88,6 +90,7 @@ class ReplayBuffer:
         self.storage = {name: self._rows(name, 0) for name in shapes}
         self.position = 0
         self.size = 0
+        self.stride = 1  # rows between successive decisions of one environment
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
 
     def __len__(self) -> int:
@@ -111,10 +114,23 @@ class ReplayBuffer:
         for name, kept in self.storage.items():
             kept.index_copy_(0, rows, new[name].to(kept))
         self.position = (self.position + count) % self.capacity
+        self.stride = count
         self.size = min(self.size + count, self.capacity)
 
-    def sample(self, batch_size: int) -> Batch:
+    def sample(self, batch_size: int, n_step: int = 1, gamma: float = 1.0) -> Batch:
         """Draw ``batch_size`` transitions uniformly, with replacement.
+
+        With ``n_step`` above 1, a transition is joined with those that follow it in its episode, up
+        to this number: ``reward`` is their discounted sum; ``next_obs``, ``terminal`` and
+        ``truncated`` are those of the last one.
+
+        Args:
+            batch_size: number of rows.
+            n_step: decisions in a row.
+            gamma: discount per decision.
+
+        Returns:
+            The fields, and ``discount [B]``: gamma to the power of the decisions that were joined.
 
         Raises:
             UserError: if the buffer is empty.
@@ -122,13 +138,30 @@ class ReplayBuffer:
         if self.size == 0:
             raise UserError("the replay buffer is empty; collect transitions before updating")
         rows = torch.randint(self.size, (batch_size,), generator=self.generator, device=self.device)
-        return Batch({name: kept.index_select(0, rows) for name, kept in self.storage.items()})
+        batch = Batch({name: kept.index_select(0, rows) for name, kept in self.storage.items()})
+        batch["discount"] = torch.full_like(batch.reward, gamma)
+        for _ in range(n_step - 1):
+            following = (rows + self.stride) % self.capacity
+            following = following.clamp(max=self.size - 1)
+            then = {name: self.storage[name][following] for name in FOLLOWED}
+            # A row continues another one if it starts where that one ended. This is never so across
+            # resets, fresh scenes, or the place where the ring buffer is overwritten.
+            joined = (self.storage["obs"][following] == batch.next_obs).all(1)
+            joined &= (batch.terminal + batch.truncated) == 0
+            batch["reward"] = batch.reward + joined * batch.discount * then["reward"]
+            batch["discount"] = torch.where(joined, gamma * batch.discount, batch.discount)
+            for name in ("next_obs", "terminal", "truncated"):
+                old = batch[name]
+                batch[name] = torch.where(joined.view(-1, *[1] * (old.ndim - 1)), then[name], old)
+            rows = torch.where(joined, following, rows)
+        return batch
 
     def state_dict(self) -> dict[str, Any]:
-        """The filled rows, the position and the generator."""
+        """The filled rows, the position, the stride and the generator."""
         return {
             "rows": {name: kept[: self.size].clone() for name, kept in self.storage.items()},
             "position": self.position,
+            "stride": self.stride,
             "generator": self.generator.get_state(),
         }
 
@@ -150,6 +183,7 @@ class ReplayBuffer:
         for name, kept in self.storage.items():
             kept[:size] = rows[name].to(kept)
         self.size, self.position = size, int(state["position"])
+        self.stride = int(state["stride"])
         self.generator.set_state(state["generator"].cpu())
 
     def _rows(self, name: str, count: int) -> torch.Tensor:

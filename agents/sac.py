@@ -2,6 +2,15 @@
 
 After Haarnoja et al., arXiv 1812.05905, used for steering as in DSRL, arXiv 2506.15799. An action
 is the whole noise chunk ``w [Tp, Da]``. A step is one decision of the latent-noise environment.
+
+The critics judge the noise or what it is decoded to (option ``critic``):
+
+- ``noise`` (DSRL-SAC): Q(s, w).
+- ``aliased`` (DSRL-NA): Q(s, a) of the executed actions a. The noise critics Q_W(s, w) are trained
+  towards Q(s, decode(s, w)), head by head, and the actor climbs Q_W.
+- ``sampler``: Q(s, a) again; the actor climbs Q(s, decode(s, w)), its gradient passes through the
+  sampler.
+
 Subclasses override only what they change:
 
 ====================  ===============================================================
@@ -16,12 +25,13 @@ Subclasses override only what they change:
 ``after_update``    called after each update; returns more scalars
 ====================  ===============================================================
 
-Deviations from the paper, numbered as in ``docs/agents.md``:
+Deviations from the papers, numbered as in ``docs/agents.md``:
 
 1. the squash is radial, one scale per irrep block (``distributions.py``);
 2. the target has no entropy bonus (hard backup), except with ``soft_backup``;
-3. time-outs bootstrap; only success is terminal;
-4. LayerNorm in actor and critics; the actor's output layer starts small.
+3. time-outs bootstrap, except with ``timeouts_terminal``;
+4. LayerNorm in actor and critics; the actor's output layer starts small;
+5. most of the noise to distil from is decoded once, when a decision is stored.
 """
 
 from __future__ import annotations
@@ -30,131 +40,41 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import nn
 
-from symsteer.agents.agent import Agent, AgentContext, AgentOptions, Budget, MakeEnv
+from symsteer.agents.agent import Agent, AgentContext, Budget, MakeEnv
 from symsteer.agents.diagnostics import critic_diagnostics
-from symsteer.agents.distributions import SquashedGaussian
+from symsteer.agents.distributions import LOG_SCALE_MAX, LOG_SCALE_MIN, SquashedGaussian
 from symsteer.agents.episodes import Played
 from symsteer.agents.networks import Ensemble, Weights, count, detached
+from symsteer.agents.optimization import Multiplier, adam, descend
+from symsteer.agents.options import NoiseSource, SacOptions
 from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.policies.geometry import Field, Layout
 
-LOG_SCALE_MIN, LOG_SCALE_MAX = -5.0, 1.0
+BANK = ("bank_noise", "bank_actions")
+COUNTERS = ("decisions", "owed", "distillation_owed", "updates")
 
 
-@dataclass(frozen=True)
-class SacOptions(AgentOptions):
-    """Options of all SAC agents.
+@dataclass
+class Drawn:
+    """Noise that the actor drew, one row per state.
 
-    The defaults are for many environments and few updates. Data are cheap here, and the actor
-    exploits a critic that is trained with many updates on few decisions. They were chosen on
-    PickCube, floating, unbroken, with the equivariant and the standard agent, seeds 0 and 1.
+    Attributes:
+        obs: normalised observations, ``[B, obs_dim]``.
+        noise: flat, ``[B, Tp * Da]``.
+        log_prob: ``[B]``.
+        judged: what the target critics see of the noise; see :meth:`SacAgent.judged`.
     """
 
-    gamma: float = 0.95
-    """Discount per decision (not per environment step)."""
-    lr: float = 6e-4
-    """Adam's learning rate of actor and critics."""
-    alpha_lr: float = 6e-4
-    """Adam's learning rate of log alpha."""
-    batch_size: int = 192
-    """Transitions per update."""
-    tau: float = 0.015
-    """Weight of the online critics when the target critics are updated."""
-    critics: int = 2
-    """Number of critics; the smallest of their values is used."""
-    layer_norm: bool = True
-    """Normalise hidden features; without it Q often diverges."""
-    width: int = 128
-    """Hidden features per layer; with a group of order n they are width/n regular fields."""
-    depth: int = 2
-    """Hidden layers."""
-    group: str = "C8"
-    """Symmetry group, C_n or D_n, of equivariant layers and of the measured equivariance errors."""
-    noise_bound: float = 1.5
-    """Largest norm of an irrep block of the noise."""
-    target_entropy: float | None = None
-    """Target of the entropy, nats per decision; default: minus half the noise dimension."""
-    initial_alpha: float = 0.01
-    """Entropy weight at the start."""
-    initial_scale: float = 0.5
-    """Standard deviation of the untrained policy before the squash."""
-    initial_output: float = 0.01
-    """Factor on the actor's output layer at initialisation; small means w starts around 0."""
-    soft_backup: bool = False
-    """Add the entropy bonus to the critics' target, as in the paper."""
-    reward_scale: float = 0.25
-    """Factor on rewards in training (0.25: one decision of four steps costs 1). Reported Q-values
-    are in unscaled reward units."""
-    utd: float = 0.3
-    """Updates per collected decision."""
-    warmup: int = 1280
-    """Decisions with noise from N(0, I) (the base policy) before the first update."""
-    replay_capacity: int = 200_000
-    """Capacity of the replay buffer, in decisions."""
-
-    def __post_init__(self) -> None:
-        positive = (
-            *("lr", "alpha_lr", "batch_size", "critics", "width", "depth", "noise_bound"),
-            *("initial_alpha", "reward_scale", "replay_capacity", "utd"),
-        )
-        for name in positive:
-            if not getattr(self, name) > 0:
-                raise UserError(f"agent option {name} must be positive, not {getattr(self, name)}")
-        for name in ("warmup", "initial_output"):
-            if not getattr(self, name) >= 0:
-                raise UserError(
-                    f"agent option {name} must not be negative, not {getattr(self, name)}"
-                )
-        if not 0 <= self.gamma < 1:
-            raise UserError(f"agent option gamma must lie in [0, 1), not {self.gamma}")
-        if not 0 < self.tau <= 1:
-            raise UserError(f"agent option tau must lie in (0, 1], not {self.tau}")
-        low, high = math.exp(LOG_SCALE_MIN), math.exp(LOG_SCALE_MAX)
-        if not low < self.initial_scale < high:
-            raise UserError(
-                f"agent option initial_scale must lie between {low:.4f} and {high:.2f}, "
-                f"not {self.initial_scale}"
-            )
-        _ = Group.parse(self.group).order
-
-
-class Multiplier:
-    """A positive number ``exp(log)`` that grows while the gap of its constraint is negative.
-
-    Adam minimises its loss ``log * gap``. The gap of the temperature is the entropy minus its
-    target (Haarnoja et al., arXiv 1812.05905, section 5).
-    """
-
-    def __init__(self, initial: float, lr: float, device: torch.device, dtype: torch.dtype):
-        self.log = torch.tensor(math.log(initial), dtype=dtype, device=device, requires_grad=True)
-        self.optimizer = adam([{"params": [self.log]}], lr)
-
-    @property
-    def value(self) -> torch.Tensor:
-        """The current value, without gradient."""
-        return self.log.detach().exp()
-
-    def step(self, gap: torch.Tensor) -> torch.Tensor:
-        """One gradient step; returns the loss."""
-        loss = self.log * gap
-        descend(loss, self.optimizer)
-        return loss.detach()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Value and optimiser."""
-        return {"log": self.log.detach(), "optimizer": self.optimizer.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        self.optimizer.load_state_dict(state["optimizer"])
-        with torch.no_grad():
-            self.log.copy_(state["log"])
+    obs: torch.Tensor
+    noise: torch.Tensor
+    log_prob: torch.Tensor
+    judged: torch.Tensor
 
 
 class SacAgent(Agent):
@@ -164,58 +84,57 @@ class SacAgent(Agent):
     Options = SacOptions
     options: SacOptions
 
-    replay_fields: ClassVar[tuple[str, ...]] = ("obs", "noise", "reward", "next_obs", "terminal")
-    """Fields of :class:`Transition` that the replay stores; a subclass may add ``actions``."""
-
     replay: ReplayBuffer
 
     def __init__(self, context: AgentContext, options: SacOptions | None = None):
         super().__init__(context, options)
         options = self.options
         self.noise_layout = context.noise_layout
-        self.distribution = SquashedGaussian(self.noise_layout, options.noise_bound)
+        hard = options.bound_penalty == 0
+        self.distribution = SquashedGaussian(self.noise_layout, options.noise_bound, hard)
         blocks = Field("log_scales", 0, self.distribution.blocks)
         # Output of the actor: the means, then one invariant number per irrep block.
         self.actor_layout = Layout([*self.noise_layout.fields, blocks])
-        self.critic_layout = _side_by_side(obs=self.obs_layout, noise=self.noise_layout)
-        self.target_entropy = (
-            -0.5 * self.noise_layout.dim
-            if options.target_entropy is None
-            else options.target_entropy
-        )
+        self.noise_inputs = _side_by_side(obs=self.obs_layout, noise=self.noise_layout)
+        executed = self.act_layout.repeat(context.execute)
+        self.action_inputs = _side_by_side(obs=self.obs_layout, actions=executed)
+        self.target_entropy = options.target_entropy * self.noise_layout.dim
         with torch.random.fork_rng(devices=[]):  # does not change the global generator
             torch.manual_seed(context.seed)
-            actor = Ensemble([self.actor_layers()], options.layer_norm)
-            critics = [self.critic_layers() for _ in range(options.critics)]
-            critic = Ensemble(critics, options.layer_norm)
+            self.actor = self._network([self.actor_layers()])
+            judged = self.noise_inputs if options.critic == "noise" else self.action_inputs
+            self.critic = self._critics(judged)
+            self.noise_critic = self.critic
+            if options.critic == "aliased":
+                self.noise_critic = self._critics(self.noise_inputs)
         self.distribution.to(self.device, self.dtype)
-        self.actor = actor.to(self.device, self.dtype)
-        self.critic = critic.to(self.device, self.dtype)
         # The targets are stored as dense matrices. Expansion is linear, so averaging the matrices
         # equals averaging the parameters, and the targets need no expansion.
-        self.target = [(w.clone(), b.clone()) for w, b in detached(self.critic.weights())]
-        self.actor_optimizer = adam(self.parameter_groups(self.actor), options.lr)
-        self.critic_optimizer = adam(self.parameter_groups(self.critic), options.lr)
+        bootstrapping = detached(self.bootstrapping.weights())
+        self.target = [(w.clone(), b.clone()) for w, b in bootstrapping]
+        self.optimizers = {
+            name: adam(self.parameter_groups(network), options.lr)
+            for name, network in self.networks.items()
+        }
         self.multipliers = {
             "alpha": Multiplier(options.initial_alpha, options.alpha_lr, self.device, self.dtype)
         }
         self.warm_up_generator = self._new_generator()
-        self.replay = ReplayBuffer(
-            options.replay_capacity, self._replay_shapes(), self.device, context.seed, self.dtype
-        )
+        self.bank_generator = self._new_generator(1)
+        self.replay = self._new_replay(options.replay_capacity)
         self.decisions = 0
-        self.owed = 0.0
+        self.owed = self.distillation_owed = 0.0
         self.updates = 0
 
     @classmethod
     def check(cls, options: SacOptions, budget: Budget) -> None:
         """Check that training begins within the budget, and that the replay is large enough."""
-        warm_up = options.warmup * budget.execute
+        warm_up = max(options.warmup, options.first_update) * budget.execute
         if budget.env_steps <= warm_up:
             raise UserError(
                 f"env_steps is {budget.env_steps}, which ends within the warm-up of {warm_up} "
                 "environment steps, so that nothing would be learned; raise env_steps or lower "
-                "agent.warmup"
+                "agent.warmup and agent.learning_starts"
             )
         if options.replay_capacity < budget.num_envs:
             raise UserError(
@@ -223,34 +142,47 @@ class SacAgent(Agent):
                 f"each of {budget.num_envs} environments; raise it or lower num_envs"
             )
 
+    @property
+    def bootstrapping(self) -> Ensemble:
+        """The critics whose slow copies judge the next state."""
+        return self.noise_critic if self.options.bootstrap == "noise" else self.critic
+
+    @property
+    def networks(self) -> dict[str, Ensemble]:
+        """All trained networks by name."""
+        found = {"actor": self.actor, "critic": self.critic}
+        if self.noise_critic is not self.critic:
+            found["noise_critic"] = self.noise_critic
+        return found
+
     # What agents change.
 
     def actor_layers(self) -> list[nn.Module]:
         """Layers from an observation to ``actor_layout``."""
         raise NotImplementedError(f"{type(self).__name__} must give the layers of its actor")
 
-    def critic_layers(self) -> list[nn.Module]:
-        """Layers from ``critic_layout`` to one value."""
+    def critic_layers(self, inputs: Layout) -> list[nn.Module]:
+        """Layers from ``inputs`` (observation, and noise or actions) to one value."""
         raise NotImplementedError(f"{type(self).__name__} must give the layers of a critic")
 
     def parameter_groups(self, network: nn.Module) -> list[dict[str, Any]]:
         """Adam's parameter groups of the actor or the critics."""
         return [{"params": list(network.parameters())}]
 
-    def critic_target(self, batch: Batch, next_obs: torch.Tensor) -> torch.Tensor:
+    def critic_target(self, batch: Batch, following: Drawn) -> torch.Tensor:
         """Target of every critic, ``[B]``, in scaled rewards; called without gradients.
 
         Args:
             batch: transitions.
-            next_obs: the normalised next observations, ``[B, obs_dim]``.
+            following: the actor's noise at the next observations.
         """
-        noise, log_prob = self._sample(*self._heads(self.actor.weights(), next_obs))
-        next_q = self._q(self.target, next_obs, noise).amin(0)
+        next_q = self.reduced(self._q(self.target, following.obs, following.judged))
         if self.options.soft_backup:
-            next_q = next_q - self.alpha * log_prob
-        # Only success is terminal; a time-out has terminal 0 and bootstraps.
-        reward = self.options.reward_scale * batch.reward
-        return reward + self.options.gamma * (1 - batch.terminal) * next_q
+            next_q = next_q - self.alpha * following.log_prob
+        ends = batch.terminal
+        if self.options.timeouts_terminal:
+            ends = ends.maximum(batch.truncated)
+        return self.options.reward_scale * batch.reward + batch.discount * (1 - ends) * next_q
 
     def critic_loss(self, q: torch.Tensor, target: torch.Tensor, batch: Batch) -> torch.Tensor:
         """Squared error, mean over the batch, summed over critics; ``q [critics, B]``."""
@@ -259,7 +191,7 @@ class SacAgent(Agent):
     def actor_loss(
         self, q: torch.Tensor, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
     ) -> torch.Tensor:
-        """Mean of alpha log pi - min Q.
+        """Mean of alpha log pi - Q, and the price of noise beyond a soft bound.
 
         Args:
             q: values of ``noise``, ``[critics, B]``; differentiable with respect to ``noise``.
@@ -267,7 +199,12 @@ class SacAgent(Agent):
             log_prob: ``[B]``.
             batch: transitions.
         """
-        return (self.alpha * log_prob - q.amin(0)).mean()
+        # A random subset makes targets pessimistic; the actor follows the mean (REDQ).
+        value = q.mean(0) if self.options.reduce == "subset" else self.reduced(q)
+        loss = (self.alpha * log_prob - value).mean()
+        if not self.distribution.hard:
+            loss = loss + self.options.bound_penalty * self.distribution.excess(noise).mean()
+        return loss
 
     def critic_penalty(self, batch: Batch) -> torch.Tensor | None:
         """A regulariser, added to the critics' loss; None: no regulariser."""
@@ -291,11 +228,11 @@ class SacAgent(Agent):
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
-        """Noise ``[B, Tp, Da]``; N(0, I) during the warm-up, if not ``deterministic``."""
+        """Noise ``[B, Tp, Da]``; random during the warm-up, if not ``deterministic``."""
         if deterministic:
             return self.chunk(self.distribution.mode(self.moments(obs)[0]))
         if self.decisions < self.options.warmup:
-            return self.gaussian_noise(len(obs), self.warm_up_generator)
+            return self.random_noise(self.options.warmup_noise, len(obs), self.warm_up_generator)
         return self.sample(obs)[0]
 
     @torch.no_grad()
@@ -311,9 +248,55 @@ class SacAgent(Agent):
 
     @torch.no_grad()
     def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Every critic's value in the environment's reward units, ``[critics, B]``."""
-        q = self._q(self.critic.weights(), self._features(obs), noise.to(self.dtype).flatten(1))
-        return q / self.options.reward_scale
+        """Every critic's value of ``noise [B, Tp, Da]`` in reward units, ``[critics, B]``."""
+        judged = self.judged(obs, noise.to(self.dtype).flatten(1))
+        return self._q(self.critic.weights(), self._features(obs), judged) / self.reward_scale
+
+    @torch.no_grad()
+    def noise_q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """The same by the critics that the actor climbs (with ``aliased``: the distilled ones)."""
+        if self.options.critic == "sampler":
+            return self.q_values(obs, noise)
+        weights, flat = self.noise_critic.weights(), noise.to(self.dtype).flatten(1)
+        return self._q(weights, self._features(obs), flat) / self.reward_scale
+
+    def judged(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """What the critics see of flat noise ``[B, Tp * Da]``: itself, or the executed actions.
+
+        Args:
+            obs: in environment units.
+            noise: actions are differentiable with respect to it.
+        """
+        if self.options.critic == "noise":
+            return noise
+        return self.executed(obs, self.chunk(noise)).flatten(1)
+
+    def executed(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """The actions ``[B, Ta, Da]`` that noise ``[B, Tp, Da]`` is decoded to."""
+        return self.context.decode(obs, noise)[:, : self.context.execute]
+
+    def reduced(self, q: torch.Tensor) -> torch.Tensor:
+        """One value per state, ``[B]``, of all critics' values ``[critics, B]``."""
+        if self.options.reduce == "mean":
+            return q.mean(0)
+        if self.options.reduce == "subset":
+            order = torch.randperm(len(q), generator=self.generator, device=self.device)
+            q = q[order[: self.options.subset]]
+        return q.amin(0)
+
+    def random_noise(
+        self, source: NoiseSource, count: int, generator: torch.Generator | None = None
+    ) -> torch.Tensor:
+        """``count`` chunks ``[count, Tp, Da]`` from N(0, I), squashed into the bound if wanted."""
+        noise = self.gaussian_noise(count, generator)
+        if source == "gaussian":
+            return noise
+        return self.chunk(self.distribution.squash(noise.flatten(1)))
+
+    @property
+    def reward_scale(self) -> float:
+        """Factor on rewards in training."""
+        return self.options.reward_scale
 
     @property
     def alpha(self) -> torch.Tensor:
@@ -331,17 +314,18 @@ class SacAgent(Agent):
         return budget.env_steps
 
     def observe(self, transition: Transition) -> None:
-        """Store the decisions; after the warm-up, each one adds ``utd`` updates that are due."""
-        self.replay.add(transition)
-        if self.decisions >= self.options.warmup:
+        """Store the decisions; each one after ``learning_starts`` adds ``utd`` due updates."""
+        self.replay.add({**vars(transition), **self._banked(transition.obs)})
+        if self.decisions >= self.options.first_update:
             self.owed += len(transition.reward) * self.options.utd
         self.decisions += len(transition.reward)
 
     def batches(self) -> Iterator[Batch]:
         """One batch for each update that is due."""
+        options = self.options
         while self.owed >= 1:
             self.owed -= 1
-            yield self.replay.sample(self.options.batch_size)
+            yield self.replay.sample(options.batch_size, options.n_step, options.gamma)
 
     def update(self, batch: Batch) -> dict[str, torch.Tensor]:
         """One step of critics, actor, multipliers and target critics.
@@ -349,41 +333,113 @@ class SacAgent(Agent):
         Returns:
             Scalars as tensors on the device; reading them waits for the device.
         """
-        obs, next_obs = self._features(batch.obs), self._features(batch.next_obs)
-        alpha = self.alpha
-
+        obs, alpha = self._features(batch.obs), self.alpha
         with torch.no_grad():
-            target = self.critic_target(batch, next_obs)
-        q = self._q(self.critic.weights(), obs, batch.noise.flatten(1))
+            following = self.drawn(batch.next_obs)
+            target = self.critic_target(batch, following)
+        stored = batch.noise if self.options.critic == "noise" else batch.actions
+        q = self._q(self.critic.weights(), obs, stored.flatten(1))
         critic_loss = self.critic_loss(q, target, batch)
-        descend(critic_loss, self.critic_optimizer, self.critic_penalty(batch))
-        self.critic.changed()
+        self._descend("critic", critic_loss, self.critic_penalty(batch))
+        scalars = {"losses/critic": critic_loss.detach()}
+        judge = detached(self.critic.weights())  # no gradient of other losses in the critics
 
-        noise, log_prob = self._sample(*self._heads(self.actor.weights(), obs))
-        judge = detached(self.critic.weights())  # no gradient of the actor's loss in the critics
-        actor_loss = self.actor_loss(self._q(judge, obs, noise), noise, log_prob, batch)
-        descend(actor_loss, self.actor_optimizer, self.actor_penalty(batch))
-        self.actor.changed()
+        if self.options.critic == "aliased":
+            self.distillation_owed += self.options.distill_steps
+            while self.distillation_owed >= 1:
+                self.distillation_owed -= 1
+                scalars["losses/distillation"] = self._distil(batch, obs, following, judge)
 
-        log_prob = log_prob.detach()
-        gaps = self.constraints(noise.detach(), log_prob, batch)
-        losses = {f"losses/{name}": self.multipliers[name].step(gap) for name, gap in gaps.items()}
+        if self.updates >= self.options.actor_delay:
+            scalars |= self._improve(batch, obs, judge)
 
         with torch.no_grad():
-            torch._foreach_lerp_(_flat(self.target), _flat(judge), self.options.tau)
+            newest = detached(self.bootstrapping.weights())
+            torch._foreach_lerp_(_flat(self.target), _flat(newest), self.options.tau)
         self.updates += 1
-        q = q.detach() / self.options.reward_scale
+        q = q.detach() / self.reward_scale
         return {
-            "losses/critic": critic_loss.detach(),
-            "losses/actor": actor_loss.detach(),
-            **losses,
+            **scalars,
             "train/q_mean": q.mean(),
             "train/q_max_abs": q.abs().max(),
-            "train/target_mean": target.mean() / self.options.reward_scale,
+            "train/target_mean": target.mean() / self.reward_scale,
             "train/alpha": alpha,
-            "train/entropy": -log_prob.mean(),
             **self.after_update(batch),
         }
+
+    def _improve(self, batch: Batch, obs: torch.Tensor, judge: Weights) -> dict[str, torch.Tensor]:
+        """One step of the actor and the multipliers; returns scalars."""
+        noise, log_prob = self._sample(*self._heads(self.actor.weights(), obs))
+        if self.options.critic == "aliased":
+            values = self._q(detached(self.noise_critic.weights()), obs, noise)
+        else:
+            values = self._q(judge, obs, self.judged(batch.obs, noise))
+        actor_loss = self.actor_loss(values, noise, log_prob, batch)
+        self._descend("actor", actor_loss, self.actor_penalty(batch))
+        log_prob = log_prob.detach()
+        gaps = self.constraints(noise.detach(), log_prob, batch)
+        return {
+            "losses/actor": actor_loss.detach(),
+            **{f"losses/{name}": self.multipliers[name].step(gap) for name, gap in gaps.items()},
+            "train/entropy": -log_prob.mean(),
+        }
+
+    def drawn(self, obs: torch.Tensor) -> Drawn:
+        """Noise that the actor draws at observations in environment units."""
+        features = self._features(obs)
+        noise, log_prob = self._sample(*self._heads(self.actor.weights(), features))
+        judged = noise if self.options.bootstrap == "noise" else self.judged(obs, noise)
+        return Drawn(features, noise, log_prob, judged)
+
+    def _distil(
+        self, batch: Batch, obs: torch.Tensor, following: Drawn, judge: Weights
+    ) -> torch.Tensor:
+        """One step of the noise critics towards the action critics; returns the loss.
+
+        No noise is decoded for this. The actor's noise is that of the next observations, which the
+        target has decoded, or else what the actor played.
+        """
+        source, pairs = self.options.distill, []
+        if source != "actor":
+            pairs.append((obs, *self._random_pairs(batch)))
+        if source in ("actor", "mixture"):
+            if self.options.bootstrap == "actions":
+                pairs.append((following.obs, following.noise, following.judged))
+            else:
+                pairs.append((obs, batch.noise.flatten(1), batch.actions.flatten(1)))
+        features, noise, actions = (torch.cat(parts) for parts in zip(*pairs, strict=True))
+        with torch.no_grad():
+            wanted = self._q(judge, features, actions)
+        found = self._q(self.noise_critic.weights(), features, noise)
+        loss = (found - wanted).square().mean(1).sum()
+        self._descend("noise_critic", loss, None)
+        return loss.detach()
+
+    def _random_pairs(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
+        """Random noise for each row and the actions that it is decoded to, both flat."""
+        if not self.options.noise_bank:
+            noise = self.random_noise(self._bank_source, len(batch.obs))
+            return noise.flatten(1), self.executed(batch.obs, noise).flatten(1)
+        rows = torch.arange(len(batch.obs), device=self.device)
+        picked = torch.randint(
+            self.options.noise_bank, rows.shape, generator=self.generator, device=self.device
+        )
+        return tuple(batch[name][rows, picked].flatten(1) for name in BANK)  # type: ignore[return-value]
+
+    @torch.no_grad()
+    def _banked(self, obs: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Random noises for each stored decision and what they are decoded to."""
+        size = self.options.noise_bank
+        if self.options.critic != "aliased" or not size:
+            return {}
+        noise = self.random_noise(self._bank_source, size * len(obs), self.bank_generator)
+        actions = self.executed(obs.repeat_interleave(size, 0), noise)
+        both = (noise, actions)
+        return {name: x.unflatten(0, (len(obs), size)) for name, x in zip(BANK, both, strict=True)}
+
+    @property
+    def _bank_source(self) -> NoiseSource:
+        return "gaussian" if self.options.distill == "gaussian" else "squashed"
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Errors of Q, equivariance errors, temperature (docs/metrics.md)."""
@@ -393,7 +449,10 @@ class SacAgent(Agent):
 
     def description(self) -> dict[str, Any]:
         """Agent, geometry and sizes; a checkpoint must have the same."""
-        keys = ("group", "width", "depth", "critics", "layer_norm", "noise_bound")
+        keys = (
+            *("critic", "group", "width", "depth", "critics", "layer_norm", "activation"),
+            *("noise_bound", "bound_penalty"),
+        )
         return {**super().description(), **{key: getattr(self.options, key) for key in keys}}
 
     def state_dict(self) -> dict[str, Any]:
@@ -401,13 +460,12 @@ class SacAgent(Agent):
         return copy.deepcopy(
             {
                 **super().state_dict(),
-                **{name: getattr(self, name).state_dict() for name in self._parts()},
+                "networks": {k: network.state_dict() for k, network in self.networks.items()},
+                "optimizers": {k: adam.state_dict() for k, adam in self.optimizers.items()},
                 "target": _flat(self.target),
                 "multipliers": {k: m.state_dict() for k, m in self.multipliers.items()},
-                "warm_up_generator": self.warm_up_generator.get_state(),
-                "decisions": self.decisions,
-                "owed": self.owed,
-                "updates": self.updates,
+                "generators": {k: g.get_state() for k, g in self._generators.items()},
+                **{name: getattr(self, name) for name in COUNTERS},
             }
         )
 
@@ -418,47 +476,69 @@ class SacAgent(Agent):
             UserError: if the checkpoint is of another agent, layout or size.
         """
         super().load_state_dict(state)
-        for name in self._parts():
-            getattr(self, name).load_state_dict(state[name])
-        self.actor.changed()
-        self.critic.changed()
+        for name, network in self.networks.items():
+            network.load_state_dict(state["networks"][name])
+            network.changed()
+            self.optimizers[name].load_state_dict(state["optimizers"][name])
         for name, multiplier in self.multipliers.items():
             multiplier.load_state_dict(state["multipliers"][name])
         with torch.no_grad():
             flat = _flat(self.target)
             torch._foreach_copy_(flat, [t.to(flat[0]) for t in state["target"]])
-        self.warm_up_generator.set_state(state["warm_up_generator"].cpu())
-        self.decisions, self.owed = int(state["decisions"]), float(state["owed"])
-        self.updates = int(state["updates"])
+        for name, generator in self._generators.items():
+            generator.set_state(state["generators"][name].cpu())
+        for name in COUNTERS:
+            setattr(self, name, type(getattr(self, name))(state[name]))
 
     def parameter_counts(self) -> dict[str, int]:
         """Numbers of trainable parameters (without target critics), and the actor's width."""
-        actor, critic = count(self.actor), count(self.critic)
+        sizes = {name: count(network) for name, network in self.networks.items()}
+        total, actor = sum(sizes.values()), sizes["actor"]
         return {
             "actor": actor,
-            "critic": critic,
-            "total": actor + critic,
+            "critic": total - actor,
+            "total": total,
             "width": self.actor.width,
         }
 
     # Inner parts.
 
-    @staticmethod
-    def _parts() -> tuple[str, ...]:
-        return ("actor", "critic", "actor_optimizer", "critic_optimizer")
+    @property
+    def _generators(self) -> dict[str, torch.Generator]:
+        return {"warm_up": self.warm_up_generator, "bank": self.bank_generator}
 
-    def _replay_shapes(self) -> dict[str, tuple[int, ...]]:
+    def _network(self, members: list[list[nn.Module]]) -> Ensemble:
+        network = Ensemble(members, self.options.layer_norm, self.options.activation)
+        return network.to(self.device, self.dtype)
+
+    def _critics(self, inputs: Layout) -> Ensemble:
+        return self._network([self.critic_layers(inputs) for _ in range(self.options.critics)])
+
+    def _descend(self, name: str, loss: torch.Tensor, penalty: torch.Tensor | None = None) -> None:
+        descend(loss, self.optimizers[name], penalty)
+        self.networks[name].changed()
+
+    @property
+    def vector_fields(self) -> dict[str, Layout]:
+        """The fields of a batch that turn with the scene, and the geometry of their last axis."""
+        states = dict.fromkeys(("obs", "next_obs"), self.obs_layout)
+        return {**states, **dict.fromkeys(("noise", "actions", *BANK), self.act_layout)}
+
+    def _new_replay(self, capacity: int) -> ReplayBuffer:
         obs, act = (self.obs_layout.dim,), self.act_layout.dim
-        known: dict[str, tuple[int, ...]] = {
+        chunk, executed = (self.horizon, act), (self.context.execute, act)
+        shapes: dict[str, tuple[int, ...]] = {
             "obs": obs,
-            "noise": (self.horizon, act),
-            "actions": (self.context.execute, act),
+            "noise": chunk,
+            "actions": executed,
             "reward": (),
             "next_obs": obs,
             "terminal": (),
             "truncated": (),
         }
-        return {name: known[name] for name in self.replay_fields}
+        if self.options.critic == "aliased" and (size := self.options.noise_bank):
+            shapes |= {"bank_noise": (size, *chunk), "bank_actions": (size, *executed)}
+        return ReplayBuffer(capacity, shapes, self.device, self.context.seed, self.dtype)
 
     def _features(self, obs: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
@@ -473,9 +553,9 @@ class SacAgent(Agent):
         start = math.log(share / (1 - share))
         return mean, LOG_SCALE_MIN + (LOG_SCALE_MAX - LOG_SCALE_MIN) * (raw + start).sigmoid()
 
-    def _q(self, critics: Weights, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Values ``[critics, B]`` of normalised observations and flat noise."""
-        return self.critic.apply_weights(critics, torch.cat([obs, noise], -1)).squeeze(-1)
+    def _q(self, critics: Weights, obs: torch.Tensor, judged: torch.Tensor) -> torch.Tensor:
+        """Values ``[critics, B]`` of normalised observations, and flat noise or actions."""
+        return self.critic.apply_weights(critics, torch.cat([obs, judged], -1)).squeeze(-1)
 
     def _sample(
         self, mean: torch.Tensor, log_scale: torch.Tensor
@@ -484,20 +564,6 @@ class SacAgent(Agent):
             mean.shape, generator=self.generator, device=self.device, dtype=self.dtype
         )
         return self.distribution.sample(mean, log_scale, eps)
-
-
-def adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
-    """The Adam of all parts of the learner."""
-    return torch.optim.Adam(groups, lr=lr, fused=True)
-
-
-def descend(
-    loss: torch.Tensor, optimizer: torch.optim.Optimizer, penalty: torch.Tensor | None = None
-) -> None:
-    """One gradient step on a loss plus its regulariser."""
-    optimizer.zero_grad()
-    (loss if penalty is None else loss + penalty).backward()
-    optimizer.step()
 
 
 def _flat(weights: Weights) -> list[torch.Tensor]:

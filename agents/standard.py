@@ -9,6 +9,7 @@ from torch import nn
 from symsteer.agents.equivariant import equivariant_actor_layers, equivariant_critic_layers
 from symsteer.agents.networks import Dense, count, shrink_
 from symsteer.agents.sac import SacAgent
+from symsteer.policies.geometry import Layout
 
 
 class StandardAgent(SacAgent):
@@ -23,15 +24,15 @@ class StandardAgent(SacAgent):
         shrink_(layers[-1], self.options.initial_output)
         return layers
 
-    def critic_layers(self) -> list[nn.Module]:
-        return plain_layers(self.critic_layout.dim, self.critic_width(), self.options.depth, 1)
+    def critic_layers(self, inputs: Layout) -> list[nn.Module]:
+        return plain_layers(inputs.dim, self.critic_width(inputs), self.options.depth, 1)
 
     def actor_width(self) -> int:
         """Hidden features of the actor."""
         return self.options.width
 
-    def critic_width(self) -> int:
-        """Hidden features of each critic."""
+    def critic_width(self, inputs: Layout) -> int:
+        """Hidden features of each critic of ``inputs``."""
         return self.options.width
 
 
@@ -51,9 +52,9 @@ class MatchedStandardAgent(StandardAgent):
             count(rival), self.obs_layout.dim, self.options.depth, self.actor_layout.dim
         )
 
-    def critic_width(self) -> int:
-        rival = nn.ModuleList(equivariant_critic_layers(self))
-        return matched_width(count(rival), self.critic_layout.dim, self.options.depth, 1)
+    def critic_width(self, inputs: Layout) -> int:
+        rival = nn.ModuleList(equivariant_critic_layers(self, inputs))
+        return matched_width(count(rival), inputs.dim, self.options.depth, 1)
 
 
 def plain_layers(inputs: int, width: int, depth: int, outputs: int) -> list[nn.Module]:

@@ -1,14 +1,16 @@
 """Layouts with every kind of irrep, random transitions, and a bandit with a known best noise."""
 
 import dataclasses
+from dataclasses import fields
 
 import pytest
 import torch
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext
-from symsteer.agents.replay import Batch, ReplayBuffer
+from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.policies.geometry import Field, Layout
+from symsteer.policies.normalizer import clip_blocks
 
 OBS = Layout(
     [
@@ -39,6 +41,8 @@ SMALL = {
     "reward_scale": 1.0,
     "warmup": 0,
 }
+EXECUTE = 2
+BANK = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +57,8 @@ class Problem:
             self.obs_layout,
             self.act_layout,
             self.horizon,
-            2,
-            decode or (lambda obs, noise: noise.clamp(-1, 1)),
+            EXECUTE,
+            decode or (lambda obs, noise: clip_blocks(noise, self.act_layout, 1.0)),
             normalize_obs or (lambda obs: obs),
             seed=seed,
             dtype=dtype,
@@ -69,8 +73,18 @@ class Problem:
 
     def shapes(self):
         obs = (self.obs_layout.dim,)
-        noise = (self.horizon, self.act_layout.dim)
-        return {"obs": obs, "noise": noise, "reward": (), "next_obs": obs, "terminal": ()}
+        noise, actions = ((count, self.act_layout.dim) for count in (self.horizon, EXECUTE))
+        return {
+            "obs": obs,
+            "noise": noise,
+            "actions": actions,
+            "reward": (),
+            "next_obs": obs,
+            "terminal": (),
+            "truncated": (),
+            "bank_noise": (BANK, *noise),
+            "bank_actions": (BANK, *actions),
+        }
 
     def batch(self, size=32, seed=0, dtype=torch.float32, terminal=None):
         g = torch.Generator().manual_seed(seed)
@@ -81,7 +95,13 @@ class Problem:
         ends = (torch.rand(size, generator=g) < 0.3).to(dtype)
         rows = {name: draw(size, *shape) for name, shape in self.shapes().items()}
         rows["terminal"] = ends if terminal is None else torch.full((size,), terminal, dtype=dtype)
+        rows["truncated"] = torch.zeros(size, dtype=dtype)
+        rows["discount"] = torch.full((size,), 0.95, dtype=dtype)
         return Batch(rows)
+
+    def transition(self, size=32, seed=0):
+        batch = self.batch(size, seed)
+        return Transition(**{field.name: batch[field.name] for field in fields(Transition)})
 
     def replay(self, size=128, seed=0, dtype=torch.float32):
         buffer = ReplayBuffer(1000, self.shapes(), seed=seed, dtype=dtype)

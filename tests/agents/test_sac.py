@@ -11,13 +11,14 @@ from symsteer.agents.agent import Budget
 from symsteer.agents.approximate import ApproximateOptions, paths
 from symsteer.agents.diagnostics import actor_equivariance_error, entropy_allowance
 from symsteer.agents.networks import count
-from symsteer.agents.replay import ReplayBuffer
+from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Group, Layout
 
-LEARNERS = ["standard", "standard-matched", "equivariant", "approximate"]
-SAC = ["standard", "equivariant", "approximate"]
+LEARNERS = ["standard", "standard-matched", "augmented", "equivariant", "approximate"]
+SAC = ["standard", "augmented", "equivariant", "approximate"]
+CRITICS = ["noise", "aliased", "sampler"]
 
 
 def tensors(part):
@@ -27,13 +28,12 @@ def tensors(part):
     return [tensor.detach() for layer in part for tensor in layer]
 
 
+@pytest.mark.parametrize("critic", CRITICS)
 @pytest.mark.parametrize("name", LEARNERS)
-def test_update_moves_every_parameter_and_stays_finite(problem, name):
-    agent = problem.agent(name)
-    before = {
-        key: [p.detach().clone() for p in tensors(getattr(agent, key))]
-        for key in ("actor", "critic", "target")
-    }
+def test_update_moves_every_parameter_and_stays_finite(problem, name, critic):
+    agent = problem.agent(name, critic=critic)
+    parts = ("actor", "critic", "noise_critic", "target")
+    before = {key: [p.detach().clone() for p in tensors(getattr(agent, key))] for key in parts}
     for seed in range(3):
         scalars = agent.update(problem.batch(seed=seed))
         assert all(torch.isfinite(value) for value in scalars.values()), scalars
@@ -45,10 +45,13 @@ def test_update_moves_every_parameter_and_stays_finite(problem, name):
     assert agent.updates == 3
 
 
+@pytest.mark.parametrize("critic", CRITICS)
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("terminal", [0.0, 1.0])
-def test_critic_target_is_the_hand_computed_one(problem, terminal, soft):
-    agent = problem.agent("standard", dtype=torch.float64, soft_backup=soft, initial_alpha=0.3)
+def test_critic_target_is_the_hand_computed_one(problem, terminal, soft, critic):
+    agent = problem.agent(
+        "standard", dtype=torch.float64, soft_backup=soft, initial_alpha=0.3, critic=critic
+    )
     batch = problem.batch(dtype=torch.float64, terminal=terminal)
     for seed in range(3):  # so that target and online critics differ
         agent.update(problem.batch(seed=10 + seed, dtype=torch.float64))
@@ -57,17 +60,31 @@ def test_critic_target_is_the_hand_computed_one(problem, terminal, soft):
         generator = copy.deepcopy(agent.generator)
         eps = torch.randn(mean.shape, generator=generator, dtype=torch.float64)
         noise, log_prob = agent.distribution.sample(mean, log_scale, eps)
-        inputs = torch.cat([batch.next_obs, noise], 1)
-        target_q = agent.critic.apply_weights(agent.target, inputs)[..., 0]
-        value = torch.minimum(target_q[0], target_q[1])
+        stored, judged = batch.noise, noise
+        if critic != "noise":
+            chunk = noise.unflatten(1, (problem.horizon, -1))
+            judged = agent.context.decode(batch.next_obs, chunk)[:, :2].flatten(1)
+            stored = batch.actions
+        target_q = agent.critic.apply_weights(agent.target, torch.cat([batch.next_obs, judged], 1))
+        value = torch.minimum(target_q[0], target_q[1])[..., 0]
         if soft:
             value = value - agent.alpha * log_prob
         wanted = batch.reward if terminal else batch.reward + 0.95 * value
-        q = agent.q_values(batch.obs, batch.noise)
+        q = agent.critic(torch.cat([batch.obs, stored.flatten(1)], 1))[..., 0]
         expected = (q[0] - wanted).square().mean() + (q[1] - wanted).square().mean()
     scalars = agent.update(batch)
     assert scalars["losses/critic"].item() == pytest.approx(expected.item(), rel=1e-12)
     assert scalars["train/target_mean"].item() == pytest.approx(wanted.mean().item(), rel=1e-12)
+
+
+@pytest.mark.parametrize("reduce", ["min", "mean", "subset"])
+def test_several_critics_become_one_value(problem, reduce):
+    agent = problem.agent("standard", critics=5, subset=2, reduce=reduce)
+    q = torch.arange(10.0).view(5, 2).flip(0)
+    seen = {tuple(agent.reduced(q).tolist()) for _ in range(60)}
+    # The smaller of each pair of rows; the largest row is never the smaller one.
+    pairs = {(0.0, 1.0), (2.0, 3.0), (4.0, 5.0), (6.0, 7.0)}
+    assert seen == {"min": {(0.0, 1.0)}, "mean": {(4.0, 5.0)}, "subset": pairs}[reduce]
 
 
 def test_time_outs_bootstrap_and_success_does_not(problem):
@@ -77,6 +94,17 @@ def test_time_outs_bootstrap_and_success_does_not(problem):
 
     assert target(1.0) == pytest.approx(problem.batch().reward.mean().item(), abs=1e-6)
     assert abs(target(0.0) - target(1.0)) > 1e-3
+
+
+def test_time_outs_can_be_terminal(problem):
+    def target(**options):
+        batch = problem.batch(terminal=0.0)
+        batch["truncated"] = torch.ones(len(batch.reward))
+        return problem.agent("standard", **options).update(batch)["train/target_mean"].item()
+
+    rewards = problem.batch().reward.mean().item()
+    assert target(timeouts_terminal=True) == pytest.approx(rewards, abs=1e-6)
+    assert abs(target() - rewards) > 1e-3
 
 
 def test_target_critics_follow_by_tau(problem):
@@ -89,34 +117,41 @@ def test_target_critics_follow_by_tau(problem):
         assert torch.allclose(target, 0.75 * before + 0.25 * online, atol=1e-6)
 
 
-def test_actor_step_leaves_the_critics_alone_and_climbs_q(problem):
-    agent = problem.agent("standard", initial_alpha=1e-6)
+@pytest.mark.parametrize("critic", CRITICS)
+def test_actor_step_leaves_the_critics_alone_and_climbs_q(problem, critic):
+    agent = problem.agent("standard", initial_alpha=1e-6, critic=critic)
     obs = problem.batch(256).obs
 
     def value():
         return agent.q_values(obs, agent.act(obs, deterministic=True)).amin(0).mean().item()
 
-    agent.critic_optimizer.param_groups[0]["lr"] = 0.0
+    agent.optimizers["critic"].param_groups[0]["lr"] = 0.0
     frozen = [p.clone() for p in agent.critic.parameters()]
     before = value()
-    for seed in range(30):
+    for seed in range(60):
         agent.update(problem.batch(seed=seed))
     assert all(torch.equal(a, b) for a, b in zip(frozen, agent.critic.parameters(), strict=True))
     assert value() > before + 1e-3
 
 
-def test_actor_loss_is_the_hand_computed_one(problem):
-    agent = problem.agent("equivariant", dtype=torch.float64, initial_alpha=0.3)
+@pytest.mark.parametrize("critic", CRITICS)
+def test_actor_loss_is_the_hand_computed_one(problem, critic):
+    agent = problem.agent("equivariant", dtype=torch.float64, initial_alpha=0.3, critic=critic)
     for seed in range(3):  # so that target and online critics differ
         agent.update(problem.batch(seed=10 + seed, dtype=torch.float64))
-    agent.critic_optimizer.param_groups[0]["lr"] = 0.0
+    for name in ("critic", "noise_critic"):
+        if name in agent.optimizers:
+            agent.optimizers[name].param_groups[0]["lr"] = 0.0
     batch = problem.batch(dtype=torch.float64)
     generator = copy.deepcopy(agent.generator)
     with torch.no_grad():
         mean, log_scale = agent.moments(batch.obs)
-        _, eps = (torch.randn(mean.shape, generator=generator, dtype=mean.dtype) for _ in range(2))
+        torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
+        if critic == "aliased":  # the pair of noise and actions to distil from
+            torch.randint(4, (len(mean),), generator=generator)
+        eps = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
         noise, log_prob = agent.distribution.sample(mean, log_scale, eps)
-        q = agent.q_values(batch.obs, noise.unflatten(1, (problem.horizon, -1)))
+        q = agent.noise_q_values(batch.obs, noise.unflatten(1, (problem.horizon, -1)))
         expected = (agent.alpha * log_prob - torch.minimum(q[0], q[1])).mean()
     scalars = agent.update(batch)
     assert scalars["losses/actor"].item() == pytest.approx(expected.item(), rel=1e-12)
@@ -128,14 +163,14 @@ def test_alpha_moves_towards_the_target_entropy(problem, wanted, sign):
     agent = problem.agent("equivariant", target_entropy=wanted)
     before = agent.multipliers["alpha"].log.item()
     entropy = agent.update(problem.batch())["train/entropy"].item()
-    assert (wanted - entropy) * sign > 0
+    assert (agent.target_entropy - entropy) * sign > 0
     assert (agent.multipliers["alpha"].log.item() - before) * sign > 0
 
 
-def test_default_target_entropy_is_minus_half_the_noise(problem):
+def test_target_entropy_is_per_dimension(problem):
     dim = problem.horizon * problem.act_layout.dim
-    assert problem.agent("standard").target_entropy == -dim / 2
-    assert problem.agent("standard", target_entropy=3.0).target_entropy == 3.0
+    assert problem.agent("standard").target_entropy == 0
+    assert problem.agent("standard", target_entropy=-0.5).target_entropy == -dim / 2
 
 
 def test_reward_scale_leaves_reported_values_in_reward_units(problem):
@@ -148,7 +183,7 @@ def test_reward_scale_leaves_reported_values_in_reward_units(problem):
 
 
 def parameters(agent):
-    parts = (agent.actor, agent.critic, agent.target)
+    parts = (*agent.networks.values(), agent.target)
     return [*(t for part in parts for t in tensors(part)), agent.multipliers["alpha"].log.detach()]
 
 
@@ -226,7 +261,7 @@ def test_a_checkpoint_of_another_agent_is_refused(problem, change, word):
 
 def test_ensemble_is_its_members_one_by_one(problem):
     agent = problem.agent("equivariant", dtype=torch.float64)
-    x = torch.randn(5, agent.critic_layout.dim, dtype=torch.float64)
+    x = torch.randn(5, agent.action_inputs.dim, dtype=torch.float64)
     for member, value in zip(agent.critic.members, agent.critic(x), strict=True):
         lift, hidden, pool = member
         out = lift(x)
@@ -239,7 +274,7 @@ def test_ensemble_is_its_members_one_by_one(problem):
 def test_free_penalty_is_the_gradient_of_the_squared_norm(problem):
     penalised = problem.agent("approximate", free_penalty=0.5, equivariant_penalty=0.1)
     by_hand = problem.agent("approximate", free_penalty=0.0)
-    for network in (by_hand.actor, by_hand.critic):
+    for network in by_hand.networks.values():
         free, equivariant = paths(network)
         for weight, path in ((0.5, free), (0.1, equivariant)):
             for p in path:
@@ -267,7 +302,8 @@ def test_parameter_counts_are_those_of_the_modules(problem):
     agent = problem.agent("approximate")
     counts = agent.parameter_counts()
     assert counts["actor"] == count(agent.actor)
-    assert counts["critic"] == count(agent.critic) == sum(map(count, agent.critic.members))
+    assert counts["critic"] == count(agent.critic) + count(agent.noise_critic)
+    assert count(agent.critic) == sum(map(count, agent.critic.members))
     assert counts["total"] == counts["actor"] + counts["critic"]
 
 
@@ -280,7 +316,7 @@ def test_escnn_counts_the_same_parameters(problem):
     space = gspaces.no_base_space(agent_group := Group.parse("C8").escnn_group(2))
     hidden = escnn.nn.FieldType(space, [agent_group.regular_representation] * 8)
     value = escnn.nn.FieldType(space, [agent_group.trivial_representation])
-    inputs = agent.critic_layout.field_type(Group.parse("C8"))
+    inputs = agent.action_inputs.field_type(Group.parse("C8"))
     theirs = [
         escnn.nn.Linear(inputs, hidden),
         escnn.nn.Linear(hidden, hidden),
@@ -331,7 +367,7 @@ def test_losses_penalties_and_multipliers_of_an_agent_are_used(problem):
             super().__init__(*args)
             self.multipliers["norm"] = Multiplier(0.5, 1e-2, self.device, self.dtype)
 
-        def critic_target(self, batch, next_obs):
+        def critic_target(self, batch, following):
             return torch.full_like(batch.reward, 3.0)
 
         def actor_penalty(self, batch):
@@ -383,7 +419,7 @@ def test_updates_are_paid_for_behind_the_warm_up(problem):
     for step in range(6):
         noise = agent.act(problem.batch(16).obs)
         assert (noise.abs().max() > 1.5) == (step < 3)  # beyond the bound: N(0, I)
-        agent.observe(problem.batch(16, seed=step))
+        agent.observe(problem.transition(16, seed=step))
         updates.append(len(list(agent.batches())))
     assert updates == [0, 0, 0, 4, 4, 4]
 
@@ -422,7 +458,7 @@ def bandit_reward(obs, noise, broken):
     return -(noise - best_noise(obs, broken)).square().sum((1, 2))
 
 
-def solve(problem, name, broken, rounds=400):
+def solve(problem, name, broken, rounds=400, **options):
     """Final reward of the deterministic actor and its equivariance error."""
     bandit = dataclasses.replace(
         problem,
@@ -431,22 +467,23 @@ def solve(problem, name, broken, rounds=400):
         horizon=2,
         options={**problem.options, "width": 128, "batch_size": 128},
     )
-    agent, base = bandit.agent(name), bandit.agent("base", seed=1)
-    replay = ReplayBuffer(30_000, bandit.shapes(), seed=3)
+    agent, base = bandit.agent(name, **options), bandit.agent("base", seed=1)
     g = torch.Generator().manual_seed(2)
     for i in range(rounds):
         obs = torch.randn(64 if i else 512, BANDIT_OBS.dim, generator=g)
         noise = (agent if i else base).act(obs)
-        replay.add(
-            {
-                "obs": obs,
-                "noise": noise,
-                "reward": bandit_reward(obs, noise, broken),
-                "next_obs": obs,
-                "terminal": torch.ones(len(obs)),
-            }
+        agent.observe(
+            Transition(
+                obs=obs,
+                noise=noise,
+                actions=agent.executed(obs, noise),
+                reward=bandit_reward(obs, noise, broken),
+                next_obs=obs,
+                terminal=torch.ones(len(obs)),
+                truncated=torch.zeros(len(obs)),
+            )
         )
-        agent.update(replay.sample(128))
+        agent.update(agent.replay.sample(128))
     obs = torch.randn(512, BANDIT_OBS.dim, generator=g)
     reward = bandit_reward(obs, agent.act(obs, deterministic=True), broken).mean().item()
     error = actor_equivariance_error(agent, obs, Group.parse("C8"))

@@ -15,8 +15,8 @@ import torch
 from symsteer import UserError
 from symsteer.agents.agent import Budget
 from symsteer.agents.equivariant import EquivariantAgent
+from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Batch
-from symsteer.agents.sac import SacOptions
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,6 @@ class SmoothAgent(EquivariantAgent):
     name = "smooth"
     Options = SmoothOptions
     options: SmoothOptions
-
-    replay_fields = (*EquivariantAgent.replay_fields, "actions")
 
     @classmethod
     def check(cls, options: SmoothOptions, budget: Budget) -> None:

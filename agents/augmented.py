@@ -1,0 +1,51 @@
+"""The augmented agent: symmetry from data instead of architecture.
+
+If the world is symmetric, a transition (s, w, a, r, s') that is rotated as a whole is another true
+one with the same reward. The equivariant agent has this built in. This agent is plain and learns it
+from batches in which every transition is rotated at random. It costs as much as the plain agent and
+can leave the symmetry. Where the world breaks the symmetry, some rotated transitions are false.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from symsteer.agents.options import SacOptions
+from symsteer.agents.replay import Batch
+from symsteer.agents.standard import StandardAgent
+from symsteer.policies.geometry import Group
+from symsteer.policies.symmetry.augmented import Augmentation
+
+
+@dataclass(frozen=True)
+class AugmentedOptions(SacOptions):
+    """Options of the augmented agent."""
+
+    augmentation: str = "C8"
+    """Symmetries that turn the transitions of a batch: C_n, D_n or SO2 (any angle)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        Group.parse(self.augmentation)
+
+
+class AugmentedAgent(StandardAgent):
+    """Plain actor, plain critics, every transition of a batch rotated at random."""
+
+    name = "augmented"
+    Options = AugmentedOptions
+    options: AugmentedOptions
+
+    def update(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """One step on a batch in which each row is rotated by a symmetry of its own."""
+        augmentation = Augmentation(Group.parse(self.options.augmentation))
+        # The agent's own generator: its state is in the checkpoint, so a resumed run repeats.
+        drawn = augmentation.draw(len(batch.obs), self.generator)
+        turned = {
+            name: augmentation.apply(drawn, batch[name], layout)
+            for name, layout in self.vector_fields.items()
+            if name in batch
+        }
+        return super().update(batch.replace(**turned))

@@ -1,0 +1,56 @@
+"""Adam steps on networks, and multipliers of constraints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+
+class Multiplier:
+    """A positive number ``exp(log)`` that grows while the gap of its constraint is negative.
+
+    Adam minimises its loss ``log * gap``. The gap of the temperature is the entropy minus its
+    target (Haarnoja et al., arXiv 1812.05905, section 5).
+    """
+
+    def __init__(self, initial: float, lr: float, device: torch.device, dtype: torch.dtype):
+        self.log = torch.tensor(math.log(initial), dtype=dtype, device=device, requires_grad=True)
+        self.optimizer = adam([{"params": [self.log]}], lr)
+
+    @property
+    def value(self) -> torch.Tensor:
+        """The current value, without gradient."""
+        return self.log.detach().exp()
+
+    def step(self, gap: torch.Tensor) -> torch.Tensor:
+        """One gradient step; returns the loss."""
+        loss = self.log * gap
+        descend(loss, self.optimizer)
+        return loss.detach()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Value and optimiser."""
+        return {"log": self.log.detach(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        with torch.no_grad():
+            self.log.copy_(state["log"])
+
+
+def adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
+    """The Adam of all parts of the learner."""
+    return torch.optim.Adam(groups, lr=lr, fused=True)
+
+
+def descend(
+    loss: torch.Tensor, optimizer: torch.optim.Optimizer, penalty: torch.Tensor | None = None
+) -> None:
+    """One gradient step on a loss plus its regulariser."""
+    optimizer.zero_grad()
+    (loss if penalty is None else loss + penalty).backward()
+    optimizer.step()
