@@ -106,7 +106,8 @@ def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
 
     monkeypatch.setattr(SacAgent, "observe", spy)
     _, folder = finished
-    config = tiny_config(seed=2)
+    one_policy = DemonstrationConfig(count=3, seed=0)
+    config = tiny_config(seed=2, policy_seed=0, demonstrations=one_policy)
     execute(config, folder.parent, progress=False)
     assert not any(terminal.any() for _, _, terminal in stored)
     jumps = sum(
@@ -237,6 +238,17 @@ def test_the_settings_of_a_given_base_policy_are_recorded(finished, tmp_path):
     assert said["demonstrations"]["count"] == 3
     known = read_record(folder / "record.json").base_policy
     assert found.base_policy == known
+    # Those of another run's seed, too, because no other policy was asked for.
+    found = read_record(
+        execute(
+            dataclasses.replace(tiny_config(agent="zero", seed=6), policy=RunConfig().policy),
+            tmp_path,
+            policy=file,
+            progress=False,
+        )
+        / "record.json"
+    )
+    assert (found.seeds["run"], found.seeds["policy"], found.seeds["demonstrations"]) == (6, 0, 0)
     # Steerability is measured on the number of states of this run, not on that of the file.
     more = dataclasses.replace(
         plain, evaluation=dataclasses.replace(plain.evaluation, steerability_states=3)
