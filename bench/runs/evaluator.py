@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 
 import torch
@@ -16,6 +17,9 @@ from symsteer.bench.steering.seeds import DIAGNOSTIC_SEED, diagnostic_seeds, hel
 from symsteer.bench.tasks import make
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.variant import VariantSpec
+
+LONG_ENVS = 32
+"""Parallel environments of long episodes, at most."""
 
 
 def make_env(
@@ -64,18 +68,11 @@ class Evaluator:
     ):
         self.config, self.agent, self.feasible = config, agent, feasible
         self.played: Rollout | None = None
-
-        def made(num_envs: int) -> LatentNoiseEnv:
-            return make_env(config, base, num_envs, variants, True, workers)
-
-        self.env = made(config.evaluation.episodes)
+        self.made = functools.partial(
+            make_env, config, base, variants=variants, ignore_terminations=True, workers=workers
+        )
+        self.env = self.made(num_envs=config.evaluation.episodes)
         self.long_env: LatentNoiseEnv | None = None
-        if isinstance(agent, HasCritic):
-            self.long_env = env = made(config.evaluation.diagnostic_episodes)
-            if not timeouts_end(agent):
-                env.max_episode_steps = long_limit(
-                    env.max_episode_steps, env.execute, discount(agent)
-                )
 
     def play(self, count: int) -> Rollout:
         """Episodes of the deterministic actor on the first ``count`` held-out seeds."""
@@ -96,10 +93,9 @@ class Evaluator:
         with self._unchanged_agent() as agent:
             long: LongEpisodes | None = None
             if isinstance(agent, HasCritic):
-                assert self.long_env is not None
                 agent.generator.manual_seed(DIAGNOSTIC_SEED + seed)
                 long = long_episodes(
-                    self.long_env,
+                    self._long_env(min(count, LONG_ENVS)),
                     agent.sample,
                     diagnostic_seeds(count),
                     discount(agent),
@@ -113,6 +109,18 @@ class Evaluator:
         self.env.close()
         if self.long_env is not None:
             self.long_env.close()
+
+    def _long_env(self, num_envs: int) -> LatentNoiseEnv:
+        """Environments whose episodes go on until their returns are known."""
+        if self.long_env is None or self.long_env.num_envs != num_envs:
+            if self.long_env is not None:
+                self.long_env.close()
+            self.long_env = env = self.made(num_envs=num_envs)
+            if not timeouts_end(self.agent):
+                env.max_episode_steps = long_limit(
+                    env.max_episode_steps, env.execute, discount(self.agent)
+                )
+        return self.long_env
 
     @contextlib.contextmanager
     def _unchanged_agent(self) -> Iterator[Agent]:
