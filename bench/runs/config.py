@@ -56,8 +56,11 @@ class EvaluationConfig:
     """Episodes of an evaluation during training."""
     final_episodes: int = 100
     """Episodes of the last evaluation, which tables report."""
-    diagnostic_episodes: int = 32
-    """Stochastic on-policy episodes; Q is compared with their returns at every evaluation."""
+    diagnostic_episodes: int = 8
+    """Long episodes of the stochastic actor at an evaluation; Q is compared with their returns.
+    Half of them begin with noise from N(0, I)."""
+    final_diagnostic_episodes: int = 64
+    """Long episodes at the last evaluation."""
     steerability_states: int = 24
     """Initial states of the base policy's steerability report, each with 16 noise draws."""
 

@@ -47,7 +47,7 @@ def test_the_record_tells_the_whole_run(finished):
     assert final.diagnostics["equivariance_actor"] < 1e-4
     assert record.base_policy.episodes == 2 * 16
     clock = record.wall_clock
-    parts = clock.simulate + clock.decode + clock.update + clock.evaluate
+    parts = clock.simulate + clock.decode + clock.update + clock.evaluate + clock.diagnose
     assert 0 < parts <= clock.total
     stored = json.loads((folder / "config.json").read_text())
     assert stored == record.config
@@ -84,9 +84,7 @@ def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_pat
 
 def test_evaluating_more_often_does_not_change_training(finished, tmp_path):
     config, folder = finished
-    evaluation = type(config.evaluation)(
-        every=80, episodes=3, final_episodes=5, diagnostic_episodes=2, steerability_states=2
-    )
+    evaluation = dataclasses.replace(config.evaluation, every=80)
     often = execute(tiny_config(evaluation=evaluation), tmp_path, progress=False)
     assert len(read_record(often / "record.json").evaluations) == 5
     last = [without_clock(f)["evaluations"][-1] for f in (folder, often)]
