@@ -20,7 +20,7 @@ from symsteer.leaderboard.defects import (
 )
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
-from symsteer.leaderboard.records import DIVERGED_EVALUATIONS, DIVERGED_SHARE, Provenance
+from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
 from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
 from symsteer.leaderboard.tables import Links, cell_name, section, status
 from symsteer.leaderboard.text import (
@@ -66,9 +66,10 @@ demonstrations, the budget and the held-out episodes.
   which success stays at or above {100 * THRESHOLD:.0f} % of the best learner's, and how many seeds
   reached that; `>` means that the median seed did not reach it within the budget. **Dip** is the
   lowest value below the base policy at any evaluation of any seed.
-- **Q diverged** († at a glance) counts the seeds whose Q-values left the range of returns that the
-  reward allows (more than {100 * DIVERGED_SHARE:.0f} % of the states at {DIVERGED_EVALUATIONS}
-  evaluations in a row, once learning has begun) or were not finite.
+- **Q diverged** († at a glance) counts the seeds whose largest |Q| exceeded the largest feasible
+  one after learning had begun, whose Q-values grew out of the feasible interval (|Q| {MAX_GROWTH:g}
+  times as large at the end as in the middle, and {MAX_OVERSHOOT:g} of the interval outside), or
+  were not finite.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
   **Status**. The seeds below the number of seeds and episodes are links to the records.
 """
