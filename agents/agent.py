@@ -2,6 +2,7 @@
 
 The trainer's loop is the same for every agent::
 
+    agent.observe_demonstrations(decisions)        # if it wants them
     wanted = agent.prepare(make_env, budget)       # search or pre-training; 0: no training
     while steps < wanted:
         noise = agent.act(obs)
@@ -143,6 +144,14 @@ class Agent:
         Raises:
             UserError: if they cannot work together; the message says what to change.
         """
+
+    @classmethod
+    def wants_demonstrations(cls, options: Any) -> bool:
+        """Whether the agent learns from the decisions of the base policy's demonstrations."""
+        return False
+
+    def observe_demonstrations(self, decisions: Transition) -> None:
+        """Receive these decisions, before training begins or continues; they have noise 0."""
 
     def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
         """Search or pre-train, with a part of the budget.

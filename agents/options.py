@@ -27,9 +27,6 @@ class SacOptions(AgentOptions):
     """What the critics judge. `noise`: the noise (DSRL-SAC). `aliased`: the executed actions; noise
     critics are distilled from them for the actor (DSRL-NA). `sampler`: the executed actions; the
     actor's gradient passes through the sampler."""
-    bootstrap: Literal["actions", "noise"] = "actions"
-    """What judges the next state with `aliased`: the action critics, which decodes noise in every
-    update (as published), or the distilled noise critics, which does not."""
     gamma: float = 0.95
     """Discount per decision (not per environment step)."""
     lr: float = 6e-4

@@ -40,12 +40,12 @@ import copy
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import nn
 
-from symsteer.agents.agent import Agent, AgentContext, Budget, MakeEnv
+from symsteer.agents.agent import Agent, AgentContext, Budget, MakeEnv, Role
 from symsteer.agents.diagnostics import critic_diagnostics
 from symsteer.agents.distributions import LOG_SCALE_MAX, LOG_SCALE_MIN, SquashedGaussian
 from symsteer.agents.episodes import Played
@@ -68,7 +68,7 @@ class Drawn:
         obs: normalised observations, ``[B, obs_dim]``.
         noise: flat, ``[B, Tp * Da]``.
         log_prob: ``[B]``.
-        judged: what the target critics see of the noise; see :meth:`SacAgent.judged`.
+        judged: what the critics see of the noise; see :meth:`SacAgent.judged`.
     """
 
     obs: torch.Tensor
@@ -80,7 +80,7 @@ class Drawn:
 class SacAgent(Agent):
     """Actor, critics, temperature and their updates; subclasses define the layers."""
 
-    role = "learner"
+    role: ClassVar[Role] = "learner"
     Options = SacOptions
     options: SacOptions
 
@@ -110,8 +110,7 @@ class SacAgent(Agent):
         self.distribution.to(self.device, self.dtype)
         # The targets are stored as dense matrices. Expansion is linear, so averaging the matrices
         # equals averaging the parameters, and the targets need no expansion.
-        bootstrapping = detached(self.bootstrapping.weights())
-        self.target = [(w.clone(), b.clone()) for w, b in bootstrapping]
+        self.target = [(w.clone(), b.clone()) for w, b in detached(self.critic.weights())]
         self.optimizers = {
             name: adam(self.parameter_groups(network), options.lr)
             for name, network in self.networks.items()
@@ -122,6 +121,7 @@ class SacAgent(Agent):
         self.warm_up_generator = self._new_generator()
         self.bank_generator = self._new_generator(1)
         self.replay = self._new_replay(options.replay_capacity)
+        self.demonstrations = self._new_replay(options.replay_capacity)
         self.decisions = 0
         self.owed = self.distillation_owed = 0.0
         self.updates = 0
@@ -141,11 +141,6 @@ class SacAgent(Agent):
                 f"agent.replay_capacity is {options.replay_capacity}, less than one decision of "
                 f"each of {budget.num_envs} environments; raise it or lower num_envs"
             )
-
-    @property
-    def bootstrapping(self) -> Ensemble:
-        """The critics whose slow copies judge the next state."""
-        return self.noise_critic if self.options.bootstrap == "noise" else self.critic
 
     @property
     def networks(self) -> dict[str, Ensemble]:
@@ -309,13 +304,25 @@ class SacAgent(Agent):
 
     # Learning.
 
+    @classmethod
+    def wants_demonstrations(cls, options: SacOptions) -> bool:
+        """Only if they have a share in the batches."""
+        return options.demonstration_share > 0
+
+    def observe_demonstrations(self, decisions: Transition) -> None:
+        """Keep the decisions beside the replay; they are not part of checkpoints."""
+        banked = self._banked(decisions.obs, self._new_generator(2))
+        self.demonstrations.add({**vars(decisions), **banked})
+        # One row begins at every control step.
+        self.demonstrations.stride = self.context.execute
+
     def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
         """Train for the whole budget."""
         return budget.env_steps
 
     def observe(self, transition: Transition) -> None:
         """Store the decisions; each one after ``learning_starts`` adds ``utd`` due updates."""
-        self.replay.add({**vars(transition), **self._banked(transition.obs)})
+        self.replay.add({**vars(transition), **self._banked(transition.obs, self.bank_generator)})
         if self.decisions >= self.options.first_update:
             self.owed += len(transition.reward) * self.options.utd
         self.decisions += len(transition.reward)
@@ -323,9 +330,15 @@ class SacAgent(Agent):
     def batches(self) -> Iterator[Batch]:
         """One batch for each update that is due."""
         options = self.options
+        shown = round(options.demonstration_share * options.batch_size)
         while self.owed >= 1:
             self.owed -= 1
-            yield self.replay.sample(options.batch_size, options.n_step, options.gamma)
+            count = options.batch_size - shown
+            batch = self.replay.sample(count, options.n_step, options.gamma)
+            if shown:
+                more = self.demonstrations.sample(shown, options.n_step, options.gamma)
+                batch = Batch({name: torch.cat([x, more[name]]) for name, x in batch.items()})
+            yield batch
 
     def update(self, batch: Batch) -> dict[str, torch.Tensor]:
         """One step of critics, actor, multipliers and target critics.
@@ -354,8 +367,7 @@ class SacAgent(Agent):
             scalars |= self._improve(batch, obs, judge)
 
         with torch.no_grad():
-            newest = detached(self.bootstrapping.weights())
-            torch._foreach_lerp_(_flat(self.target), _flat(newest), self.options.tau)
+            torch._foreach_lerp_(_flat(self.target), _flat(judge), self.options.tau)
         self.updates += 1
         q = q.detach() / self.reward_scale
         return {
@@ -388,25 +400,20 @@ class SacAgent(Agent):
         """Noise that the actor draws at observations in environment units."""
         features = self._features(obs)
         noise, log_prob = self._sample(*self._heads(self.actor.weights(), features))
-        judged = noise if self.options.bootstrap == "noise" else self.judged(obs, noise)
-        return Drawn(features, noise, log_prob, judged)
+        return Drawn(features, noise, log_prob, self.judged(obs, noise))
 
     def _distil(
         self, batch: Batch, obs: torch.Tensor, following: Drawn, judge: Weights
     ) -> torch.Tensor:
         """One step of the noise critics towards the action critics; returns the loss.
 
-        No noise is decoded for this. The actor's noise is that of the next observations, which the
-        target has decoded, or else what the actor played.
+        The actor's noise is that of the next observations, which the target has decoded already.
         """
         source, pairs = self.options.distill, []
         if source != "actor":
             pairs.append((obs, *self._random_pairs(batch)))
         if source in ("actor", "mixture"):
-            if self.options.bootstrap == "actions":
-                pairs.append((following.obs, following.noise, following.judged))
-            else:
-                pairs.append((obs, batch.noise.flatten(1), batch.actions.flatten(1)))
+            pairs.append((following.obs, following.noise, following.judged))
         features, noise, actions = (torch.cat(parts) for parts in zip(*pairs, strict=True))
         with torch.no_grad():
             wanted = self._q(judge, features, actions)
@@ -427,12 +434,12 @@ class SacAgent(Agent):
         return tuple(batch[name][rows, picked].flatten(1) for name in BANK)  # type: ignore[return-value]
 
     @torch.no_grad()
-    def _banked(self, obs: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _banked(self, obs: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Random noises for each stored decision and what they are decoded to."""
         size = self.options.noise_bank
         if self.options.critic != "aliased" or not size:
             return {}
-        noise = self.random_noise(self._bank_source, size * len(obs), self.bank_generator)
+        noise = self.random_noise(self._bank_source, size * len(obs), generator)
         actions = self.executed(obs.repeat_interleave(size, 0), noise)
         both = (noise, actions)
         return {name: x.unflatten(0, (len(obs), size)) for name, x in zip(BANK, both, strict=True)}
@@ -505,7 +512,11 @@ class SacAgent(Agent):
 
     @property
     def _generators(self) -> dict[str, torch.Generator]:
-        return {"warm_up": self.warm_up_generator, "bank": self.bank_generator}
+        return {
+            "warm_up": self.warm_up_generator,
+            "bank": self.bank_generator,
+            "demonstrations": self.demonstrations.generator,
+        }
 
     def _network(self, members: list[list[nn.Module]]) -> Ensemble:
         network = Ensemble(members, self.options.layer_norm, self.options.activation)

@@ -1,8 +1,8 @@
 """The folder of a run: its files, its lock and its state.
 
 The files: config.json, record.json, policy.safetensors (the base policy that is steered),
-checkpoint.pt, progress.json, the TensorBoard events, and .lock, which is locked by the process that
-works on the run.
+demonstrations.safetensors (if the agent learns from them), checkpoint.pt, progress.json, the
+TensorBoard events, and .lock, which is locked by the process that works on the run.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from symsteer.variant import file_name
 
 State = Literal["missing", "running", "interrupted", "failed", "finished"]
 
+DEMONSTRATIONS = "demonstrations.safetensors"
 CONFIG, RECORD, CHECKPOINT = "config.json", "record.json", "checkpoint.pt"
 PROGRESS, LOCK = "progress.json", ".lock"
 

@@ -11,7 +11,13 @@ from typing import Any
 import torch
 
 from symsteer.agents import AGENTS
-from symsteer.bench.runs.base_policy import origin, prepare_base, with_policy_of
+from symsteer.agents.replay import Transition
+from symsteer.bench.runs.base_policy import (
+    demonstrated_decisions,
+    origin,
+    prepare_base,
+    with_policy_of,
+)
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.evaluator import Evaluator
@@ -25,7 +31,14 @@ from symsteer.bench.runs.folder import (
     write_json,
 )
 from symsteer.bench.runs.observers import ProgressFile, observers_of
-from symsteer.bench.runs.stored import named, restored, stored_config, stored_policy
+from symsteer.bench.runs.stored import (
+    named,
+    restored,
+    store_demonstrations,
+    stored_config,
+    stored_demonstrations,
+    stored_policy,
+)
 from symsteer.bench.runs.trainer import Trainer, budget_of, feasible_return
 from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import evaluation_variants, read
@@ -98,7 +111,16 @@ def execute(
     def prepare() -> ChunkPolicy:
         return prepare_base(config, out, demonstrations, policy, progress, workers)
 
-    return _play(config, out / run_id(config, files), files, prepare, progress, workers)
+    def demonstrated() -> Transition:
+        if policy is not None:
+            raise UserError(
+                f"the agent {config.agent!r} learns from demonstrations, which a base policy of "
+                "yours does not have; set agent.demonstration_share to 0 or name no base policy"
+            )
+        return demonstrated_decisions(config, out, demonstrations, progress)
+
+    folder = out / run_id(config, files)
+    return _play(config, folder, files, prepare, demonstrated, progress, workers)
 
 
 def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
@@ -116,15 +138,22 @@ def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
     config, files = stored_config(folder)
     _check_all(config, workers)
 
-    def prepare() -> ChunkPolicy:
+    def check_own() -> None:
         if files:
             raise UserError(
                 f"the run {folder.name} began from files of yours and was stopped before it had "
                 "its base policy; start it again with `symsteer run` and the same options"
             )
+
+    def prepare() -> ChunkPolicy:
+        check_own()
         return prepare_base(config, folder.parent, None, None, progress, workers)
 
-    return _play(config, folder, files, prepare, progress, workers)
+    def demonstrated() -> Transition:
+        check_own()
+        return demonstrated_decisions(config, folder.parent, None, progress)
+
+    return _play(config, folder, files, prepare, demonstrated, progress, workers)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,6 +245,7 @@ def _play(
     folder: Path,
     files: dict[str, Any],
     prepare: Callable[[], ChunkPolicy],
+    demonstrated: Callable[[], Transition],
     progress: bool,
     workers: int,
 ) -> Path:
@@ -232,11 +262,19 @@ def _play(
                 ProgressFile(folder, config.env_steps).write("base policy", 0)
                 base = prepare()
                 save_policy(base, folder)
+            decisions = None
+            if AGENTS.get(config.agent).wants_demonstrations(config.agent_options):
+                decisions = stored_demonstrations(folder)
+                if decisions is None:
+                    decisions = demonstrated()
+                    store_demonstrations(decisions, folder)
         except BaseException:
             discard_empty(folder)
             raise
         observers = observers_of(config, resolved, progress)
         trainer = Trainer(config, folder, base, load_checkpoint(folder), observers, workers)
+        if decisions is not None:
+            trainer.agent.observe_demonstrations(decisions)
         try:
             trainer.play()
         except BaseException as error:
