@@ -15,7 +15,7 @@ DTYPES = [(torch.float32, 1e-5), (torch.float64, 1e-10)]
 
 
 def errors(agent, problem, name, dtype, size=64):
-    """Relative errors over the group: mean, deterministic w, samples, log-probability, Q.
+    """Relative errors over the group: mean, deterministic w, samples, log-probability, both Q.
 
     The true layouts are those of ``problem``; the agent may have other ones.
     """
@@ -35,12 +35,13 @@ def errors(agent, problem, name, dtype, size=64):
             "sample": sample,
             "sample_log_prob": log_prob,
             "q": agent.q_values(obs, noise),
+            "noise_q": agent.noise_q_values(obs, noise),
         }
 
     own = quantities(batch.obs, noise, eps)
     # A constant quantity would pass the test below.
     assert own["mean"].norm(dim=1).min() > 1e-2
-    assert own["q"].std(dim=1).min() > 1e-3
+    assert min(own[key].std(dim=1).min() for key in ("q", "noise_q")) > 1e-3
     worst = dict.fromkeys(own, 0.0)
     for angle, reflect in Group.parse(name).elements:
         moved = quantities(
@@ -71,12 +72,23 @@ def test_equivariant_agent(problem, name, dtype, limit, updates):
     assert max(errors(agent, problem, name, dtype).values()) < limit
 
 
-@pytest.mark.parametrize("layer_norm", [True, False])
-@pytest.mark.parametrize("depth", [1, 3])
-def test_equivariant_agent_of_other_shapes(problem, depth, layer_norm):
-    agent = problem.agent(
-        "equivariant", depth=depth, layer_norm=layer_norm, dtype=torch.float64, initial_output=1.0
-    )
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"depth": 1},
+        {"depth": 3},
+        {"depth": 1, "layer_norm": False},
+        {"depth": 3, "layer_norm": False},
+        {"activation": "tanh"},
+        {"bound_penalty": 0.1},
+        {"critic": "noise"},
+        {"critic": "sampler"},
+        {"critics": 5, "reduce": "subset"},
+    ],
+    ids=str,
+)
+def test_equivariant_agent_with_other_options(problem, options):
+    agent = problem.agent("equivariant", dtype=torch.float64, initial_output=1.0, **options)
     trained(problem, agent, torch.float64)
     assert max(errors(agent, problem, "C8", torch.float64).values()) < 1e-10
 
@@ -142,7 +154,7 @@ def test_normalizers_must_commute_with_the_group(problem):
         )
         worst = errors(agent, problem, "C8", torch.float64)
         if broken:
-            assert min(worst["mean"], worst["q"]) > 1e-2
+            assert min(worst["mean"], worst["q"], worst["noise_q"]) > 1e-2
         else:
             assert max(worst.values()) < 1e-10
 

@@ -206,30 +206,61 @@ def test_same_seed_same_agent(problem, name):
     assert not same(first, other)
 
 
-@pytest.mark.parametrize("name", LEARNERS)
-def test_a_saved_agent_continues_bit_equal(problem, name):
-    agent, replay = problem.agent(name), problem.replay()
-    for _ in range(4):
-        agent.update(replay.sample(32))
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        *((name, {}) for name in LEARNERS),
+        *(("equivariant", {"critic": critic}) for critic in ("noise", "sampler")),
+        ("standard", {"distill_steps": 0.5, "noise_bank": 0, "distill": "actor"}),
+        ("standard", {"critics": 4, "reduce": "subset", "n_step": 2}),
+        ("augmented", {"augmentation": "SO2", "demonstration_share": 0.25}),
+    ],
+    ids=str,
+)
+def test_a_saved_agent_continues_bit_equal(problem, name, options):
+    """In the middle of the warm-up, and with a part of an update and a distillation step owed."""
+    shown = "demonstration_share" in options
+    options = {**options, "warmup": 80, "learning_starts": 16, "utd": 0.2}
+
+    def play(agent, steps):
+        scalars = {}
+        for step in steps:
+            transition = problem.transition(16, seed=step)
+            transition.noise = agent.act(transition.obs)
+            agent.observe(transition)
+            for batch in agent.batches():
+                scalars = agent.update(batch)
+        return scalars, agent.act(problem.batch().obs)
+
+    def begin(seed):
+        agent = problem.agent(name, seed=seed, **options)
+        assert agent.wants_demonstrations(agent.options) == shown
+        if shown:
+            agent.observe_demonstrations(problem.transition(40, seed=9))
+        return agent
+
+    agent = begin(0)
+    play(agent, range(3))
+    assert agent.updates == 6
+    assert agent.owed > 0
     file = io.BytesIO()
-    torch.save({"agent": agent.state_dict(), "replay": replay.state_dict()}, file)
+    torch.save({"agent": agent.state_dict(), "replay": agent.replay.state_dict()}, file)
+    scalars, noise = play(agent, range(3, 8))
 
-    def go_on(agent, replay):
-        scalars = [agent.update(replay.sample(32)) for _ in range(4)]
-        return scalars[-1], agent.act(problem.batch().obs)
-
-    scalars, noise = go_on(agent, replay)
     file.seek(0)
     saved = torch.load(file, weights_only=True)
-    agent_again, replay_again = problem.agent(name, seed=77), problem.replay(seed=78)
-    agent_again.act(problem.batch().obs)  # expanded weights must not survive the loading
-    agent_again.load_state_dict(saved["agent"])
-    replay_again.load_state_dict(saved["replay"])
-    scalars_again, noise_again = go_on(agent_again, replay_again)
-    assert same(agent, agent_again)
+    # Everything but the demonstrations' bank is loaded; this is drawn from the run's seed again.
+    again = begin(0 if shown else 77)
+    again.act(problem.batch().obs)  # expanded weights must not survive the loading
+    again.load_state_dict(saved["agent"])
+    again.replay.load_state_dict(saved["replay"])
+    scalars_again, noise_again = play(again, range(3, 8))
+    assert same(agent, again)
     assert torch.equal(noise, noise_again)
     assert scalars == scalars_again
-    assert agent_again.updates == 8
+    assert again.updates == agent.updates == 22
+    for field, kept in agent.replay.storage.items():
+        assert torch.equal(kept, again.replay.storage[field])
 
 
 def test_acting_uses_the_newest_weights(problem):
@@ -422,6 +453,28 @@ def test_updates_are_paid_for_behind_the_warm_up(problem):
         agent.observe(problem.transition(16, seed=step))
         updates.append(len(list(agent.batches())))
     assert updates == [0, 0, 0, 4, 4, 4]
+
+
+def test_demonstrations_have_their_share_of_each_batch(problem):
+    agent = problem.agent("standard", demonstration_share=0.25, utd=0.125, n_step=2, gamma=0.5)
+    shown, played = problem.transition(6, seed=1), problem.transition(16, seed=2)
+    shown.reward, played.reward = -torch.arange(1.0, 7), torch.arange(1.0, 17)
+    shown.terminal = torch.tensor([0, 0, 0, 0, 1, 1.0])
+    shown.next_obs[:4] = shown.obs[2:]  # one row a control step, two control steps a decision
+    agent.observe_demonstrations(shown)
+    agent.observe(played)
+    seen = []
+    for batch in agent.batches():
+        assert len(batch.reward) == 32
+        assert batch.reward[:24].min() > 0 > batch.reward[24:].max()
+        seen += batch.reward[24:].tolist()
+        assert all(torch.isfinite(value) for value in agent.update(batch).values())
+    assert set(seen) <= {-1 - 3 / 2, -2 - 4 / 2, -3 - 5 / 2, -4 - 6 / 2, -5, -6}
+    assert len(set(seen)) > 3
+    # Their noise is not known, so critics of noise cannot learn from them.
+    with pytest.raises(UserError, match="choose critic aliased or sampler"):
+        problem.agent("standard", demonstration_share=0.25, critic="noise")
+    assert not agent.wants_demonstrations(problem.agent("standard").options)
 
 
 def test_a_budget_within_the_warm_up_is_refused(problem):
