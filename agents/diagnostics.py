@@ -73,6 +73,7 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
         "q_high": high,
         "q_allowance": allowance,
         **errors,
+        "alias_gap": alias_gap(agent, obs, noise),
         "q_preference": critic_preference(agent, obs, played.generator)["critic_preference"],
         "alpha": statistics["alpha"],
         "entropy": statistics["entropy"],
@@ -105,6 +106,20 @@ def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -
         agent.act_layout,
         group,
     )
+
+
+@torch.no_grad()
+def alias_gap(agent: SacAgent, obs: torch.Tensor, noise: torch.Tensor) -> float | None:
+    """Error of the distilled noise critics: mean |Q_W(s, w) - Q(s, decode(s, w))|, reward units.
+
+    None for agents without distilled critics.
+
+    Args:
+        obs, noise: ``[B, obs_dim]``, ``[B, Tp, Da]``, the actor's own noise.
+    """
+    if agent.options.critic != "aliased":
+        return None
+    return (agent.noise_q_values(obs, noise) - agent.q_values(obs, noise)).abs().mean().item()
 
 
 def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float:
