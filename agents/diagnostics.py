@@ -35,6 +35,9 @@ class HasValues(Protocol):
 SYMMETRY_STATES = 64
 """States on which equivariance errors are measured."""
 
+MIN_PAIRS = 8
+"""Decisions that a correlation of Q with the return needs."""
+
 SAME = 1e-6
 """Values that differ by less, relative to their size, differ by rounding only."""
 
@@ -232,7 +235,7 @@ def agreement(q: torch.Tensor, returns: torch.Tensor) -> Measures:
 
     - ``bias``, ``bias_std`` = mean and standard deviation of Q - G;
     - ``correlation``, ``rank_correlation`` = Pearson's and Spearman's of Q and G; None where one
-      of them has no variance;
+      of them has no variance, and for fewer than ``MIN_PAIRS`` values;
     - ``overestimated`` = share with Q > G;
     - ``decisions`` = number of values. Without values, all others are None.
 
@@ -242,8 +245,9 @@ def agreement(q: torch.Tensor, returns: torch.Tensor) -> Measures:
     gap = q - returns
     bias, spread = _mean_and_std(gap)
     over = torch.where(gap.isnan(), gap, (gap > 0).double())
-    constant = any(bool(x.std() <= SAME * x.abs().max()) for x in (q, returns) if len(x) > 1)
-    measured = len(q) > 1 and not constant
+    measured = len(q) >= MIN_PAIRS and not any(
+        bool(x.std() <= SAME * x.abs().max()) for x in (q, returns)
+    )
     pair = q.numpy(force=True), returns.numpy(force=True)
     return {
         "bias": bias,
