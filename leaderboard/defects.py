@@ -295,7 +295,7 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> L
         return None
     generator = np.random.default_rng(seed)
     x = np.stack([point.defect.draw(resamples, generator) for point in points], axis=1)
-    y = stratified_draws([point.samples for point in points], generator, resamples).T
+    y = stratified_draws([point.samples for point in points], resamples).T
     values = np.array([point.advantage.value for point in points])
     slope, intercept = _least_squares(defects, values)
     expected = np.var(y - slope * x, axis=0).mean()
