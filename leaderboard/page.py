@@ -36,6 +36,7 @@ from symsteer.leaderboard.text import (
     interval,
     number,
     stacked,
+    without_empty,
 )
 
 Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
@@ -215,9 +216,9 @@ def _spreads(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
         "Episodes": [number(spread.episodes, 3) for spread in found.values()],
         "Base policies' share of the variance": [_share(spread) for spread in found.values()],
     }
-    shown = {name: texts for name, texts in columns.items() if set(texts) != {NOTHING}}
-    rows = [[code(agent), *texts] for agent, *texts in zip(found, *shown.values(), strict=True)]
-    return [*parts, grid(["Agent", *shown], rows, left=1)]
+    header, body = without_empty(columns)
+    rows = [[code(agent), *texts] for agent, texts in zip(found, body, strict=True)]
+    return [*parts, grid(["Agent", *header], rows, left=1)]
 
 
 def _share(spread: Spread) -> str:

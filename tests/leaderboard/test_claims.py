@@ -189,7 +189,6 @@ def test_without_enough_pairs_the_effect_is_shown_and_nothing_decided() -> None:
         ({"agents": ["augmented", "standard"]}, "no runs of `augmented` in cells"),
         ({"measure": "bias"}, "not measured over all decisions"),
         ({"measure": "diverged"}, "nobody diverged"),
-        ({"measure": "magnitude"}, "no runs of both agents"),
         ({"effect": "slope"}, "no base policy was steered at two defects"),
         ({"cells": {"demonstrations": "most"}}, "no cell was run with more than one number"),
     ],

@@ -147,9 +147,16 @@ def test_the_best_reference_counts_where_five_runs_steer_its_policy() -> None:
 def test_the_second_table_shows_q_cost_and_device(board: Path) -> None:
     text = text_of(board)
     header, _, *rows = table_after(text, "Q-values, symmetry and cost")
-    assert "Largest \\|Q\\|, highest Q (feasible Q: \u221220 to 0)" in header
+    bounds = "(feasible Q: \u221220 to 0)"
+    assert header[:3] == [
+        "Agent",
+        "Q diverged",
+        f"\\|Q\\| over the largest feasible, overshoot {bounds}",
+    ]
     assert [row[-1] for row in rows] == ["`cpu`"] * 4
-    assert [row[1] for row in rows] == ["0/5"] * 4
+    assert [row[1:3] for row in rows] == [["0/5", "0.5, \u2013"]] * 4
+    # Nobody measured it.
+    assert "TD error" not in header
 
 
 def test_every_claim_has_a_verdict(board: Path) -> None:
