@@ -18,7 +18,7 @@ from symsteer.errors import UserError
 from symsteer.files import write_together
 
 EXACT = 1e-3
-"""Reward and observation defects below this are rounding errors."""
+"""Reward and observation defects below this are rounding errors, also of inverse kinematics."""
 
 SIGNIFICANT = 0.01
 """Resets differ from their turned copies below this p-value."""
@@ -89,7 +89,8 @@ def text(result: AuditResult) -> str:
 
 def breaks_observation(result: AuditResult) -> bool:
     """Whether the observation is broken, beyond rounding."""
-    return max(field.value.value for field in result.fields) > EXACT
+    relative = result.worst_field.relative
+    return relative is not None and relative.value > EXACT
 
 
 def meaning(result: AuditResult) -> str:
