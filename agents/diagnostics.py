@@ -6,30 +6,45 @@ All values are in the environment's reward units, per decision. ``q`` arrays hol
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
+import scipy.stats
 import torch
 
-from symsteer.agents.episodes import Played
-from symsteer.errors import UserError
+from symsteer.agents.episodes import LongEpisodes, Played
 from symsteer.policies.geometry import Group, equivariance_error
 
 if TYPE_CHECKING:
     from symsteer.agents.sac import SacAgent
 
 Scalars = dict[str, float]
+Measures = dict[str, float | None]
+"""None: not measured."""
+
+
+class HasValues(Protocol):
+    """What the errors of Q need of an agent."""
+
+    options: Any
+
+    def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Every critic's value in reward units, ``[critics, B]``."""
+        ...
+
 
 SYMMETRY_STATES = 64
 """States on which equivariance errors are measured."""
 
+SAME = 1e-6
+"""Values that differ by less, relative to their size, differ by rounding only."""
 
-def critic_diagnostics(agent: SacAgent, played: Played) -> Scalars:
+
+def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
     """All diagnostics of a learner at one evaluation, by the names that the record uses.
 
     docs/metrics.md defines them.
     """
-    assert played.on_policy is not None
+    assert played.long is not None
     options, greedy = agent.options, played.greedy
     low, high = played.feasible
     obs, noise = greedy.obs[greedy.running], greedy.noise[greedy.running]
@@ -39,9 +54,9 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Scalars:
     if options.soft_backup:
         allowance = entropy_allowance(options.gamma, alpha, statistics["entropy"])
     q = agent.q_values(obs, noise)
-    bounds = bound_violation(q, low - allowance, high + allowance)
     smallest = q.amin(0)
-    bias = _bias_on_policy(agent, played, alpha)
+    # The critics estimate the soft return only with the soft backup.
+    errors = value_errors(agent, played.long, alpha * options.soft_backup)
     few = torch.randperm(len(obs), generator=torch.Generator().manual_seed(0))[:SYMMETRY_STATES]
     few = few.to(obs.device)
     obs, noise = obs[few], noise[few]
@@ -53,12 +68,11 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Scalars:
         "q_mean": smallest.mean().item(),
         "q_min": smallest.min().item(),
         "q_max": smallest.max().item(),
-        "q_abs_max": bounds["max_abs_q"],
-        "q_violation": bounds["violation_share"],
+        **bound_violation(q, low - allowance, high + allowance),
         "q_low": low,
         "q_high": high,
         "q_allowance": allowance,
-        **bias,
+        **errors,
         "q_preference": critic_preference(agent, obs, played.generator)["critic_preference"],
         "alpha": statistics["alpha"],
         "entropy": statistics["entropy"],
@@ -106,154 +120,129 @@ def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float
     return abs(alpha) * gamma / (1 - gamma) * abs(log_prob_size)
 
 
-def _bias_on_policy(agent: SacAgent, played: Played, alpha: float) -> Scalars:
-    """Bias of Q on the stochastic episodes, each up to its first success."""
-    run, log_prob = played.on_policy, played.log_prob
-    assert run is not None
-    assert log_prob is not None
-    # All episodes in one column, each with its decisions up to the first success.
-    rows = run.running.T
-    truncated = torch.zeros_like(run.running)
-    truncated[-1] = run.running[-1] & ~run.terminal[-1]
-
-    def column(x: torch.Tensor) -> torch.Tensor:
-        return x.transpose(0, 1)[rows]
-
-    values = agent.q_values(column(run.obs), column(run.noise)).mean(0)
-    result = q_bias(
-        values[:, None],
-        column(run.reward)[:, None],
-        column(run.terminal)[:, None],
-        column(truncated)[:, None],
-        agent.options.gamma,
-        played.feasible,
-        column(log_prob)[:, None],
-        alpha,
-    )
-    # The critics estimate the soft return only with the soft backup.
-    kind = "soft_bias" if agent.options.soft_backup else "bias"
-    return {
-        "q_bias": result[f"{kind}_mean"],
-        "q_bias_std": result[f"{kind}_std"],
-        "q_bias_hard": result["bias_mean"],
-        "q_bias_low": result["bias_low"],
-        "q_bias_high": result["bias_high"],
-        "q_bias_covered": result["covered_share"],
-        "return_mean": result["return_mean"],
-    }
-
-
 def bound_violation(q: torch.Tensor, low: float, high: float) -> Scalars:
     """Q-values outside the interval of returns that the task allows.
 
-    - ``violation_share`` = mean over critics and states of [Q < low or Q > high or Q not finite];
-    - ``max_abs_q`` = max |Q|; ``q_min``, ``q_mean``, ``q_max``;
-    - ``finite`` = 1 if every value is finite, else 0.
+    - ``q_abs_max`` = max |Q|;
+    - ``q_magnitude`` = max |Q| / max(|low|, |high|): above 1 is soft divergence (van Hasselt et
+      al., arXiv 1812.02648);
+    - ``q_overshoot`` = max over Q of (Q - high, low - Q, 0) / (high - low);
+    - ``q_violation`` = mean over critics and states of [Q < low or Q > high or Q not finite].
 
     Args:
         q: any shape.
+        low, high: the interval, low < high.
     """
-    finite = torch.isfinite(q)
-    outside = ~finite | (q < low) | (q > high)
+    outside = ~torch.isfinite(q) | (q < low) | (q > high)
+    largest = q.abs().max().item()
+    overshoot = torch.maximum(q - high, low - q).clamp(min=0).max().item()
     return {
-        "violation_share": outside.double().mean().item(),
-        "max_abs_q": q.abs().max().item(),
-        "q_min": q.min().item(),
-        "q_mean": q.mean().item(),
-        "q_max": q.max().item(),
-        "finite": float(finite.all()),
+        "q_abs_max": largest,
+        "q_magnitude": largest / max(abs(low), abs(high)),
+        "q_overshoot": overshoot / (high - low),
+        "q_violation": outside.double().mean().item(),
     }
 
 
-def q_bias(
-    q: torch.Tensor,
-    reward: torch.Tensor,
-    terminal: torch.Tensor,
-    truncated: torch.Tensor,
-    gamma: float,
-    tail: tuple[float, float],
-    log_prob: torch.Tensor | None = None,
-    alpha: float = 0.0,
-    tail_tolerance: float = 0.05,
-) -> Scalars:
-    """Bias of Q against fresh on-policy returns (REDQ's measure, arXiv 2101.05982).
+@torch.no_grad()
+def value_errors(agent: HasValues, played: LongEpisodes, alpha: float = 0.0) -> Measures:
+    """Errors of Q over all decisions that count, successful or not: on-policy and off-policy.
 
-    With d = terminal, the returns are
+    Q compares with :func:`discounted_returns`, the return that the critics are trained towards.
+    :func:`agreement` gives the measures, with names that begin with ``q_``, off-policy ``q_off_``.
 
-        hard:  G(t) = r(t) + gamma (1 - d(t)) G(t+1)
-        soft:  G(t) = r(t) + gamma (1 - d(t)) (G(t+1) - alpha log pi(t+1)).
+    ``td_error`` = root mean square over the on-policy decisions of
 
-    The critics bootstrap through time-outs. If an episode was cut k decisions after state t, its
-    return lacks ``gamma^k`` times an unknown tail. The tail is handled in two ways:
+        r + gamma (1 - d) (min_j Q_j(s', w') - alpha log pi(w'|s')) - mean_j Q_j(s, w),
 
-    - A state is *covered* if ``gamma^k <= tail_tolerance`` (in terminated episodes the weight is
-      0). Its tail is set to the middle of ``tail``. ``bias_mean``, ``bias_std`` = mean and standard
-      deviation of Q - G over covered states. ``bias_normalized``, ``bias_std_normalized`` = both
-      divided by |mean G|. ``covered_share`` = share of covered states. Successful episodes are
-      over-represented in them, so read this share together with the bias.
-    - Over *all* states, ``bias_low`` = mean(Q - G with the highest tail) and ``bias_high`` = mean(Q
-      - G with the lowest tail). The mean hard bias lies between them for every possible tail.
-
-    If ``log_prob`` is given, ``soft_bias_mean`` and ``soft_bias_std`` are the first two with the
-    soft return. If no state is covered, the values are NaN.
+    w' being the noise of the next decision.
 
     Args:
-        q: mean or any one critic's value of the played noise, ``[T, N]``.
-        reward, terminal, truncated, log_prob: per decision, ``[T, N]``; ``terminal`` by success,
-            ``truncated`` by time-out. After the end of an episode, a column continues with the
-            next episode. The last row cuts all episodes that have not ended.
-        gamma, alpha: discount and entropy weight.
-        tail: smallest and largest value that a state can have, the feasible returns.
-        tail_tolerance: largest weight of the unknown tail in a covered state.
-
-    Raises:
-        UserError: if the shapes differ.
+        agent: has ``q_values`` and ``options.gamma``.
+        alpha: entropy weight in reward units; 0 with a hard backup.
     """
-    shapes = {tuple(x.shape) for x in (q, reward, terminal, truncated)}
-    if len(shapes) != 1 or q.ndim != 2:
-        raise UserError(f"Q bias needs arrays of one shape [decisions, environments], not {shapes}")
-    q, reward = q.double(), reward.double()
-    ends = terminal.bool()
-    cut = truncated.bool() & ~ends
-    cut[-1] |= ~ends[-1]
-    bonus = torch.zeros_like(q) if log_prob is None else -alpha * log_prob.double()
+    gamma = agent.options.gamma
+    ends = played.terminal | played.last if played.timeouts_end else played.terminal
+    bonus = -alpha * played.log_prob.double()
+    returns = discounted_returns(played.reward, ends, played.last, gamma, bonus)
+    # What follows the last decision of a column is not known.
+    counts = played.on_policy & (ends | ~played.last)
+    follows = torch.zeros_like(ends)
+    follows[1:] = (counts & ~ends)[:-1]
+    needed = played.on_policy | played.off_policy | follows
+    values = agent.q_values(played.obs[needed], played.noise[needed]).double()
+    mean, smallest = (torch.zeros_like(returns) for _ in range(2))
+    mean[needed], smallest[needed] = values.mean(0), values.amin(0)
+    after = (smallest + bonus).roll(-1, 0).where(~ends, 0)
+    gap = (played.reward + gamma * after - mean)[counts]
+    result: Measures = {"td_error": gap.square().mean().sqrt().item() if len(gap) else None}
+    for kind, chosen in (("", played.on_policy), ("off_", played.off_policy)):
+        found = agreement(mean[chosen], returns[chosen])
+        result |= {f"q_{kind}{name}": value for name, value in found.items()}
+        mean_return, spread = _mean_and_std(returns[chosen])
+        result |= {f"return_{kind}mean": mean_return, f"return_{kind}std": spread}
+    return result
 
-    hard, soft, weight = (torch.empty_like(q) for _ in range(3))
-    next_hard, next_soft, next_weight = (torch.zeros_like(q[0]) for _ in range(3))
-    next_bonus = torch.zeros_like(q[0])
-    for t in reversed(range(len(q))):
-        goes_on = (~ends[t] & ~cut[t]).double()
-        hard[t] = reward[t] + gamma * goes_on * next_hard
-        soft[t] = reward[t] + gamma * goes_on * (next_soft + next_bonus)
-        # Weight of the unknown value after the cut in G(t).
-        weight[t] = gamma * torch.where(cut[t], 1.0, goes_on * next_weight)
-        next_hard, next_soft, next_weight, next_bonus = hard[t], soft[t], weight[t], bonus[t]
 
-    low, high = tail
-    covered = weight <= tail_tolerance
-    middle = weight * (low + high) / 2
+def discounted_returns(
+    reward: torch.Tensor,
+    ends: torch.Tensor,
+    last: torch.Tensor,
+    gamma: float,
+    bonus: torch.Tensor,
+) -> torch.Tensor:
+    """G(t) = r(t) + gamma (1 - ends(t)) (G(t+1) + bonus(t+1)), ``[T, N]`` in double precision.
 
-    def spread(gap: torch.Tensor) -> tuple[float, float]:
-        if not covered.any():
-            return math.nan, math.nan
-        return gap[covered].mean().item(), gap[covered].std(unbiased=False).item()
+    After ``last``, rewards and bonuses are taken to go on as in this decision: an episode that has
+    failed for so long is taken to fail for ever. The weight of this future in the returns that
+    count is at most 5 % (with a discount of at most 0.99).
 
-    mean, std = spread(q - hard - middle)
-    scale = abs((hard + middle)[covered].mean().item()) if covered.any() else math.nan
-    scale = scale if scale > 0 else math.nan
-    scalars = {
-        "bias_mean": mean,
-        "bias_std": std,
-        "bias_normalized": mean / scale,
-        "bias_std_normalized": std / scale,
-        "covered_share": covered.double().mean().item(),
-        "bias_low": (q - hard - weight * high).mean().item(),
-        "bias_high": (q - hard - weight * low).mean().item(),
-        "return_mean": hard.mean().item(),
+    Args:
+        reward, bonus: per decision, ``[T, N]``; the bonus is that of entropy, with a soft backup.
+        ends: nothing follows this decision, ``[T, N]`` bool.
+        last: the column's last decision, where it does not succeed, ``[T, N]`` bool.
+        gamma: discount per decision.
+    """
+    found = torch.empty_like(reward, dtype=torch.float64)
+    after = torch.zeros_like(found[0])
+    for t in reversed(range(len(found))):
+        after = torch.where(last[t], (reward[t] + bonus[t]) / (1 - gamma), after)
+        found[t] = reward[t] + gamma * torch.where(ends[t], 0.0, after)
+        after = found[t] + bonus[t]
+    return found
+
+
+def agreement(q: torch.Tensor, returns: torch.Tensor) -> Measures:
+    """How well Q-values agree with returns.
+
+    - ``bias``, ``bias_std`` = mean and standard deviation of Q - G;
+    - ``correlation``, ``rank_correlation`` = Pearson's and Spearman's of Q and G; None where one
+      of them has no variance;
+    - ``overestimated`` = share with Q > G;
+    - ``decisions`` = number of values. Without values, all others are None.
+
+    Args:
+        q, returns: ``[B]``, double precision.
+    """
+    gap = q - returns
+    bias, spread = _mean_and_std(gap)
+    over = torch.where(gap.isnan(), gap, (gap > 0).double())
+    constant = any(bool(x.std() <= SAME * x.abs().max()) for x in (q, returns) if len(x) > 1)
+    measured = len(q) > 1 and not constant
+    pair = q.numpy(force=True), returns.numpy(force=True)
+    return {
+        "bias": bias,
+        "bias_std": spread,
+        "correlation": float(scipy.stats.pearsonr(*pair).statistic) if measured else None,
+        "rank_correlation": float(scipy.stats.spearmanr(*pair).statistic) if measured else None,
+        "overestimated": _mean_and_std(over)[0],
+        "decisions": float(len(q)),
     }
-    if log_prob is not None:
-        scalars["soft_bias_mean"], scalars["soft_bias_std"] = spread(q - soft - middle)
-    return scalars
+
+
+def _mean_and_std(x: torch.Tensor) -> tuple[float, float] | tuple[None, None]:
+    """Mean and population standard deviation of numbers, if there are any."""
+    return (x.mean().item(), x.std(unbiased=False).item()) if len(x) else (None, None)
 
 
 def critic_preference(agent: SacAgent, obs: torch.Tensor, generator: torch.Generator) -> Scalars:

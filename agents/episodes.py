@@ -32,12 +32,37 @@ class Rollout:
     running: torch.Tensor
     terminal: torch.Tensor
 
-    def episodes_of(self, rows: slice) -> Rollout:
-        """The same data for some of the episodes."""
-        return Rollout(
-            episodes={name: value[rows] for name, value in self.episodes.items()},
-            **{name: getattr(self, name)[:, rows] for name in DECISION_FIELDS},
-        )
+
+@dataclass
+class LongEpisodes:
+    """Episodes of the stochastic actor that go on until their returns are known, ``[T, N, ...]``.
+
+    A column ends with the first success, or where the future has little weight in the return of
+    the last decision that counts; what follows in it means nothing.
+
+    Attributes:
+        obs: observation of every decision, ``[T, N, obs_dim]``.
+        noise: of every decision, ``[T, N, Tp, Da]``.
+        log_prob: of the actor's own draw in that state, ``[T, N]``.
+        reward: summed over the executed steps, ``[T, N]``.
+        terminal: the first success happened in this decision, ``[T, N]`` bool.
+        last: the column's last decision, where that is no success, ``[T, N]`` bool.
+        on_policy: drawn from the actor in a state that it reached by itself, before the first
+            success and within the time limit of an episode, ``[T, N]`` bool.
+        off_policy: drawn from N(0, I), as all decisions before it, and followed by the actor,
+            ``[T, N]`` bool.
+        timeouts_end: nothing follows the last decision, because time-outs end episodes.
+    """
+
+    obs: torch.Tensor
+    noise: torch.Tensor
+    log_prob: torch.Tensor
+    reward: torch.Tensor
+    terminal: torch.Tensor
+    last: torch.Tensor
+    on_policy: torch.Tensor
+    off_policy: torch.Tensor
+    timeouts_end: bool
 
 
 @dataclass
@@ -46,14 +71,12 @@ class Played:
 
     Attributes:
         greedy: of the deterministic actor.
-        on_policy: of the stochastic actor; None for agents without a critic.
-        log_prob: of the noise in ``on_policy``, ``[T, N]``; None if ``on_policy`` is None.
+        long: of the stochastic actor, to compare Q-values with; None for agents without a critic.
         feasible: lowest and highest discounted return that the reward allows, per decision.
         generator: for random noise that diagnostics need, on the agent's device.
     """
 
     greedy: Rollout
-    on_policy: Rollout | None
-    log_prob: torch.Tensor | None
+    long: LongEpisodes | None
     feasible: tuple[float, float]
     generator: torch.Generator

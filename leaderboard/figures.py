@@ -44,10 +44,12 @@ STYLES: dict[str, Style] = {
     "golden-ticket": ("#A8860B", "", (0, (5, 1.5, 1, 1.5))),
     "standard": ("#D55E00", "s", "-"),
     "standard-matched": ("#E69F00", "D", "-"),
+    "augmented": ("#CC79A7", "v", "-"),
     "equivariant": ("#0072B2", "o", "-"),
     "approximate": ("#009E73", "^", "-"),
+    "wrong-group": ("#000000", "X", (0, (3, 1.5))),
 }
-OTHERS: tuple[Style, ...] = (("#CC79A7", "v", "-"), ("#56B4E9", "P", "-"), ("#000000", "X", "-"))
+OTHERS: tuple[Style, ...] = (("#56B4E9", "P", "-"), ("#882255", "<", "-"), ("#332288", "h", "-"))
 FEASIBLE, FEASIBLE_EDGE, FEASIBLE_TEXT = "#DDE7D0", "#7A9A50", "#4F6B2A"
 PLACE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*")
 """Markers of the map, one for each task."""
@@ -174,7 +176,7 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
     bands = [
         success_interval(
             [
-                Sample.pooled(episode_success(run.curve[step]).items())
+                Sample.pooled(episode_success(run.curve[step]).items(), run.policy)
                 for run, step in zip(row.finished, point, strict=True)
             ],
             BAND_RESAMPLES,

@@ -36,7 +36,7 @@ def map_section(summary: Summary, found: DefectMap, figures: Figures) -> list[st
     parts = [MAP.strip()]
     for embodiment in found.embodiments:
         panels = [found.panel(embodiment, a, m) for a in WITH_SYMMETRY for m in MEASURES]
-        parts.append(f"### The map of {code(embodiment)}")
+        parts.append(f"### {code(embodiment)}")
         if drawn := figures.get((embodiment,)):
             parts += [image(*figure) for figure in drawn.values()]
         parts += [_slopes(panels), _numbers(summary, panels)]

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
-from symsteer.leaderboard.claims import NEARLY_SYMMETRIC, STRONGLY_BROKEN, Claim
+from symsteer.leaderboard.claims import SLOPE_UNIT, where
 from symsteer.leaderboard.comparisons import Comparisons
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.map_page import Figures, map_section
-from symsteer.leaderboard.records import DIVERGED_EVALUATIONS, DIVERGED_SHARE, Provenance
+from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
+from symsteer.leaderboard.statistics import Spread
+from symsteer.leaderboard.study import Claim
 from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
 from symsteer.leaderboard.tables import Links, cell_name, section, status
 from symsteer.leaderboard.text import (
     MARKS,
     NOTHING,
+    SPACE,
     code,
     grid,
     image,
@@ -31,13 +34,12 @@ demonstrations, the budget and the held-out episodes.
 
 - **Success** is `success_once` in the final window: all held-out evaluations in the last fifth of
   the budget, their episodes pooled (a reference is evaluated once). Shown are the interquartile
-  mean (IQM) over seeds and its 95 % interval, from a bootstrap over seeds and over episodes: all
-  runs are scored on the same initial states, so an episode is drawn for all of them at once. With
-  fewer than 4 seeds the IQM is the plain mean; with one seed the interval covers its episodes
-  only. No interval covers the training of other base policies. **Last checkpoint** is the same for
-  the final evaluation alone. No number is the best of several evaluations. Below each table is the
-  change of success *from the fourth to the last fifth of the budget*: an agent with ▲ there was
-  still improving, and more steps may change its place.
+  mean (IQM) over base policies and its 95 % interval. The interval draws base policies, each with
+  all its runs, or the runs of a cell with one base policy; and it draws episodes, each for all runs
+  at once, because all are scored on the same initial states. Of fewer than 4 the IQM is the plain
+  mean. **Last checkpoint** is the same for the final evaluation alone. No number is the best of
+  several evaluations. Below each table is the change of success *from the fourth to the last fifth
+  of the budget*: an agent with ▲ there was still improving, and more steps may change its place.
 - **Against base** is the mean difference (not the IQM's) to the base policy on the same episodes
   and seeds, with its 95 % interval. ▲ or ▼ marks an interval that excludes 0; without a mark the
   data do not decide.
@@ -49,9 +51,10 @@ demonstrations, the budget and the held-out episodes.
   which success stays at or above {100 * THRESHOLD:.0f} % of the best learner's, and how many seeds
   reached that; `>` means that the median seed did not reach it within the budget. **Dip** is the
   lowest value below the base policy at any evaluation of any seed.
-- **Q diverged** († at a glance) counts the seeds whose Q-values left the range of returns that the
-  reward allows (more than {100 * DIVERGED_SHARE:.0f} % of the states at {DIVERGED_EVALUATIONS}
-  evaluations in a row, once learning has begun) or were not finite.
+- **Q diverged** († at a glance) counts the seeds whose largest |Q| exceeded the largest feasible
+  one after learning had begun, whose Q-values grew out of the feasible interval (|Q| {MAX_GROWTH:g}
+  times as large at the end as in the middle, and {MAX_OVERSHOOT:g} of the interval outside), or
+  were not finite.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
   **Status**. The seeds below the number of seeds and episodes are links to the records.
 """
@@ -64,28 +67,21 @@ CURVES = (
 )
 
 CLAIMS = f"""\
-The paper is arXiv 2512.11345. A claim is *supported* where the 95 % interval of the effect lies on
-the side of 0 that the claim predicts, *contradicted* where it lies on the other side, and
-otherwise *undecided*. Differences are paired by seed (success and its area by episode, too) and
-averaged over cells; shares of diverged runs are pooled over cells, with Newcombe's interval. Only
-cells with {MIN_SEEDS} paired seeds count, and at least one is needed. There is no correction for
-the number of tests: where there is no effect, up to one interval in twenty still excludes 0.
-*Defect* is the audited defect (next section): cells up to {NEARLY_SYMMETRIC:g} count as symmetric,
-from {STRONGLY_BROKEN:g} on as strongly broken.
+Effects are differences of two agents, paired by base policy and seed (success and its area by
+episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNIT:g} of defect,
+within base policies. *Supported* and *contradicted* need p < 0.05 for "no effect", *equivalent*
+needs it for "an effect of at least the smallest one of interest"; otherwise a claim is *undecided*.
+Both p-values are corrected for the number of tests of a family (Holm), the intervals are not.
 """
 
 PROFILES = (
     "Performance profiles: the share of runs that close at least the given share of the gap "
     "between the frozen base (0, on the same episodes) and certain success (1), in the final "
-    "window. Higher is better; left of 0 steering does harm. Bands are 95 %, from drawing runs "
-    "within each cell."
+    "window. Higher is better; left of 0 steering does harm. Bands are 95 %."
 )
 IMPROVEMENT = (
-    "Probability of improvement: how likely a run of X beats a run of Y in the same cell (ties "
-    "count half), mean over cells, with 95 % intervals from drawing runs within each cell; runs on "
-    "base policies that only one of the two steered are left out. "
-    "Where every run of one beats every run of the other, the interval has no width, which is too "
-    "narrow for few runs."
+    "Probability of improvement: how likely a run of X beats a run of Y on the same base policy of "
+    "the same cell (ties count half), mean over cells, with 95 % intervals."
 )
 
 
@@ -95,15 +91,17 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     parts = [
         "# Leaderboard",
         "This page is generated from run records by `symsteer report`; do not edit it.",
-        "## How to read it",
-        READING.strip(),
     ]
+    parts += [findings.study.notice] if findings.study.notice else []
+    parts += ["## How to read it", READING.strip()]
     if notice := _seed_notice(summary):
         parts.append(notice)
     parts += ["## At a glance", _overview(summary)]
     if beaten := _beaten(summary):
         parts.append(beaten)
-    parts += ["## The paper's claims", CLAIMS.strip(), _claims(findings.claims)]
+    if findings.spreads:
+        parts += ["## How much is the base policy's", *_spreads(summary, findings.spreads)]
+    parts += ["## Claims", CLAIMS.strip(), *_claims(findings)]
     heading = "## The advantage of symmetry against the defect"
     parts += [heading, *map_section(summary, findings.map, figures)]
     if findings.comparisons.cells:
@@ -171,21 +169,104 @@ def _beaten(summary: Summary) -> str:
     return f"Against the best reference of each cell, the frozen policy alone: {'; '.join(texts)}."
 
 
-def _claims(found: Sequence[Claim]) -> str:
-    rows = []
-    for claim in found:
-        effect = interval(claim.effect, sign=True, digits=3)
-        if claim.beside:
-            effect += f"<br>{claim.beside}"
-        verdict = f"**{claim.verdict}**"
-        if claim.reason:
-            verdict += f": {claim.reason}"
-        elif claim.verdict == "undecided":
-            verdict += ": the interval contains 0"
-        seeds = f"{claim.cells}, {claim.seeds}" if claim.cells else NOTHING
-        rows.append([claim.name, claim.test, effect, seeds, verdict])
-    header = ["Claim", "Test", "Effect, 95 % interval", "Cells, paired seeds", "Verdict"]
-    return grid(header, rows, left=5)
+def _spreads(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
+    parts = [
+        "Standard deviations of a run's success in the final window, pooled over cells: between "
+        "base policies, between runs on one policy, and because episodes are a sample."
+    ]
+    alone = sum(len({run.policy for run in table.runs}) == 1 for table in summary.tables)
+    if alone:
+        which = "Each cell steers" if alone == len(summary.tables) else f"{alone} cells steer"
+        parts[0] += (
+            f" {which} one base policy: the intervals there are about this policy alone, and no "
+            "spread of policies can be told."
+        )
+    if any(spread.together is not None for spread in found.values()):
+        parts[0] += " Where each policy has one run, only the sum of both can be told."
+    columns = {
+        "Base policies": [number(spread.policies, 3) for spread in found.values()],
+        "Runs on one": [number(spread.runs, 3) for spread in found.values()],
+        "Both together": [number(spread.together, 3) for spread in found.values()],
+        "Episodes": [number(spread.episodes, 3) for spread in found.values()],
+        "Base policies' share of the variance": [_share(spread) for spread in found.values()],
+    }
+    shown = {name: texts for name, texts in columns.items() if set(texts) != {NOTHING}}
+    rows = [[code(agent), *texts] for agent, *texts in zip(found, *shown.values(), strict=True)]
+    return [*parts, grid(["Agent", *shown], rows, left=1)]
+
+
+def _share(spread: Spread) -> str:
+    """The base policies' share of the variance."""
+    if spread.policies is None or spread.runs is None:
+        return NOTHING
+    total = spread.policies**2 + spread.runs**2 + spread.episodes**2
+    return f"{100 * spread.policies**2 / total:.0f}{SPACE}%" if total else NOTHING
+
+
+MEASURE_WORDS = {
+    "auc": "area under the curve",
+    "success": "success",
+    "diverged": "share of diverged runs",
+    "magnitude": "largest \\|Q\\| over the largest feasible",
+    "bias": "\\|Q bias\\| (reward)",
+}
+
+
+def _claims(findings: Findings) -> list[str]:
+    study = findings.study
+    origin = f"They are declared in {code(study.source)} (sha256 {code(study.sha256[:12])}"
+    if study.declared:
+        origin += f", commit {code(study.declared)})."
+    else:
+        origin += "). The study names no commit that declared them before its runs."
+    rows, untested = [], []
+    for outcome in findings.claims:
+        claim, effect = outcome.claim, outcome.effect
+        if effect is None:
+            untested.append(f"- {claim.name}: {outcome.reason}")
+            continue
+        rows.append(
+            [
+                claim.family,
+                claim.name,
+                _test(claim),
+                interval(effect.interval(), sign=True, digits=3)
+                + (f"<br>{outcome.counts}" if outcome.counts else ""),
+                f"{claim.smallest:g}",
+                *([NOTHING] * 2 if outcome.reason else map(_p, (outcome.p, outcome.p_equal))),
+                f"{outcome.cells}, {outcome.pairs}, {outcome.policies}",
+                f"**{outcome.verdict}**" + (f": {outcome.reason}" if outcome.reason else ""),
+            ]
+        )
+    parts = [origin]
+    if rows:
+        header = [
+            "Family",
+            "Claim",
+            "Effect",
+            "Size, 95 % interval",
+            "Smallest of interest",
+            "p (none)",
+            "p (at least the smallest)",
+            "Cells, pairs, policies",
+            "Verdict",
+        ]
+        parts.append(grid(header, rows, left=3))
+    if untested:
+        parts.append("Not tested:\n\n" + "\n".join(untested))
+    return parts
+
+
+def _test(claim: Claim) -> str:
+    first, second = map(code, claim.agents)
+    text = f"{MEASURE_WORDS[claim.measure]}, {first} minus {second}, {where(claim.cells)}"
+    if claim.minus is not None:
+        text += f" minus the same in {where(claim.minus)}"
+    return f"slope of {text}" if claim.effect == "slope" else text
+
+
+def _p(value: float) -> str:
+    return "< 0.001".replace(" ", SPACE) if value < 0.001 else number(value, 3)
 
 
 def _comparisons(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> list[str]:

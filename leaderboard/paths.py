@@ -16,6 +16,9 @@ PAGE_FOLDER = Path(__file__).resolve().parent
 RECORDS = PAGE_FOLDER / "results" / "records"
 """The committed records; an installed package has none."""
 
+STUDY = "first"
+"""The study that the committed records belong to."""
+
 RECORD = "record.json"
 """The record's name in a run folder; committed records are called by their run_id."""
 

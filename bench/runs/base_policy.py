@@ -96,7 +96,7 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
         own["policy_seed"] = world["policy_seed"]
     told = build_config(config.to_json() | own, str(path))
     # A setting with its default value was not asked for: the value of the file is used.
-    plain = RunConfig(agent=config.agent, policy_name=config.policy_name)
+    plain = RunConfig(agent=config.agent, policy_name=config.policy_name, seed=config.seed)
     default, asked, found = (flat(c.to_json()) for c in (plain, config, told))
     default["policy.name"] = RunConfig.policy_name
     for key, value in asked.items():

@@ -13,7 +13,7 @@ from symsteer.bench.runs.folder import CHECKPOINT
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
 
-FORMAT = 3
+FORMAT = 4
 CHECKSUM_BYTES = 32
 
 

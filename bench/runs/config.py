@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -27,6 +27,11 @@ LARGEST_BATCH = 100_000
 LONGEST_VARIANT = 120
 """In characters; the variant is part of the run's name."""
 
+if TYPE_CHECKING:
+    LaterSeed = int
+else:  # None may be given; it is a number once the run's configuration is complete
+    LaterSeed = int | None
+
 
 @dataclass(frozen=True)
 class DemonstrationConfig:
@@ -37,8 +42,8 @@ class DemonstrationConfig:
     little to steer."""
     count: int = 50
     """Number of demonstrations."""
-    seed: int = 0
-    """Seed of the collection."""
+    seed: LaterSeed = None  # type: ignore[assignment]
+    """Seed of the collection; None: the run's seed."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +56,11 @@ class EvaluationConfig:
     """Episodes of an evaluation during training."""
     final_episodes: int = 100
     """Episodes of the last evaluation, which tables report."""
-    diagnostic_episodes: int = 32
-    """Stochastic on-policy episodes; Q is compared with their returns at every evaluation."""
+    diagnostic_episodes: int = 8
+    """Long episodes of the stochastic actor at an evaluation; Q is compared with their returns.
+    Half of them begin with noise from N(0, I)."""
+    final_diagnostic_episodes: int = 64
+    """Long episodes at the last evaluation."""
     steerability_states: int = 24
     """Initial states of the base policy's steerability report, each with 16 noise draws."""
 
@@ -61,7 +69,9 @@ class EvaluationConfig:
 class RunConfig:
     """One steering run.
 
-    Options of the agent and of the policy that are not given have their defaults.
+    Options of the agent and of the policy that are not given have their defaults. Seeds of the base
+    policy and of the demonstrations that are not given are the run's seed: run and base policy are
+    one factor, so several runs say something about base policies, not about one of them.
     """
 
     task: str = "PickCube-v1"
@@ -73,7 +83,8 @@ class RunConfig:
     agent: str = "equivariant"
     """Agent; `symsteer list` names them. Your own class: `package.module:Class`."""
     seed: int = 0
-    """Seed of the run: networks, exploration, training episodes."""
+    """Seed of the run: networks, exploration, training episodes, and the base policy with its
+    demonstrations."""
     env_steps: int = 50_000
     """Budget in control steps, summed over the parallel environments."""
     num_envs: int = 64
@@ -90,8 +101,8 @@ class RunConfig:
     policy_name: str = "edp"
     """Base policy; `symsteer list` names them. Your own class: `package.module:Class`."""
     policy: PolicyOptions = None  # type: ignore[assignment]
-    policy_seed: int = 0
-    """Seed of the base policy's training; runs that share it share the base policy."""
+    policy_seed: LaterSeed = None  # type: ignore[assignment]
+    """Seed of the base policy's training; None: the run's seed."""
     agent_options: AgentOptions = None  # type: ignore[assignment]
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
@@ -107,6 +118,11 @@ class RunConfig:
                 raise UserError(
                     f"{kind} are {type(given).__name__}, but {name!r} takes {options.__name__}"
                 )
+        if self.policy_seed is None:
+            object.__setattr__(self, "policy_seed", self.seed)
+        if self.demonstrations.seed is None:
+            drawn = dataclasses.replace(self.demonstrations, seed=self.seed)
+            object.__setattr__(self, "demonstrations", drawn)
         _check_plain(dataclasses.asdict(self), "", "")
         counts = {
             **{name: getattr(self, name) for name in ("env_steps", "num_envs", "checkpoint_every")},
@@ -218,6 +234,8 @@ def _defaults(agent: str, policy_name: str) -> tuple[RunConfig, dict[str, Any]]:
     defaults = RunConfig(agent=agent, policy_name=policy_name)
     plain = defaults.to_json()
     del plain["policy"]["name"]
+    # Not those of these defaults: each run resolves them with its own seed.
+    plain["policy_seed"] = plain["demonstrations"]["seed"] = None
     return defaults, plain
 
 

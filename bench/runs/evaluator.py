@@ -1,20 +1,25 @@
-"""Held-out episodes of an agent, and on-policy episodes to compare its Q-values with."""
+"""Held-out episodes of an agent, and longer ones to compare its Q-values with."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import functools
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 
 from symsteer.agents.agent import Agent, HasCritic
-from symsteer.agents.episodes import Played, Rollout
+from symsteer.agents.episodes import LongEpisodes, Played, Rollout
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.steering.evaluation import rollout
+from symsteer.bench.steering.evaluation import long_episodes, long_limit, rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import DIAGNOSTIC_SEED, diagnostic_seeds, held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.variant import VariantSpec
+
+LONG_ENVS = 32
+"""Parallel environments of long episodes, at most."""
 
 
 def make_env(
@@ -49,7 +54,7 @@ class Evaluator:
         workers: processes that share the environments.
 
     Attributes:
-        played: the deterministic episodes of the last measurement; None before the first one.
+        played: the deterministic episodes of the last :meth:`play`; None before the first one.
     """
 
     def __init__(
@@ -63,64 +68,75 @@ class Evaluator:
     ):
         self.config, self.agent, self.feasible = config, agent, feasible
         self.played: Rollout | None = None
-        wanted = config.evaluation
-        self.extra = wanted.diagnostic_episodes if isinstance(agent, HasCritic) else 0
-        self.env = make_env(config, base, wanted.episodes + self.extra, variants, True, workers)
+        self.made = functools.partial(
+            make_env, config, base, variants=variants, ignore_terminations=True, workers=workers
+        )
+        self.env = self.made(num_envs=config.evaluation.episodes)
+        self.long_env: LatentNoiseEnv | None = None
 
-    def measure(self, count: int) -> tuple[dict[str, torch.Tensor], Mapping[str, float | None]]:
-        """Episodes of the deterministic actor on the first ``count`` held-out seeds.
+    def play(self, count: int) -> Rollout:
+        """Episodes of the deterministic actor on the first ``count`` held-out seeds."""
+        with self._unchanged_agent() as agent:
+            self.played = rollout(
+                self.env, lambda obs, _: agent.act(obs, True), held_out_seeds(count)
+            )
+        return self.played
 
-        Returns:
-            ManiSkill's metrics (columns of ``count`` values) and the diagnostics.
+    def diagnose(self, count: int) -> Mapping[str, float | None]:
+        """Diagnostics of the agent on the episodes of the last :meth:`play`.
+
+        Args:
+            count: episodes of the stochastic actor, with whose returns Q-values are compared.
         """
-        agent, seeds = self.agent, held_out_seeds(count)
-        state = agent.generator.get_state()
-        try:
-            on_policy: Rollout | None = None
-            log_prob: torch.Tensor | None = None
+        assert self.played is not None
+        seed, device = self.config.seed, self.agent.device
+        with self._unchanged_agent() as agent:
+            long: LongEpisodes | None = None
             if isinstance(agent, HasCritic):
-                agent.generator.manual_seed(DIAGNOSTIC_SEED + self.config.seed)
-                greedy, on_policy, log_prob = self._with_on_policy(agent, seeds)
-            else:
-                greedy = rollout(self.env, lambda obs, rows: agent.act(obs, True), seeds)
-            generator = torch.Generator(agent.device).manual_seed(self.config.seed)
-            played = Played(greedy, on_policy, log_prob, self.feasible, generator)
-            self.played = greedy
-            return greedy.episodes, agent.diagnostics(played)
-        finally:
-            # An evaluation must not change the random numbers of the training after it.
-            agent.generator.set_state(state)
+                agent.generator.manual_seed(DIAGNOSTIC_SEED + seed)
+                long = long_episodes(
+                    self._long_env(min(count, LONG_ENVS)),
+                    agent.sample,
+                    diagnostic_seeds(count),
+                    discount(agent),
+                    torch.Generator(device).manual_seed(DIAGNOSTIC_SEED + seed + 1),
+                )
+            generator = torch.Generator(device).manual_seed(seed)
+            return agent.diagnostics(Played(self.played, long, self.feasible, generator))
 
     def close(self) -> None:
         """Free the simulation."""
         self.env.close()
+        if self.long_env is not None:
+            self.long_env.close()
 
-    def _with_on_policy(
-        self, agent: Agent, seeds: Sequence[int]
-    ) -> tuple[Rollout, Rollout, torch.Tensor]:
-        """Deterministic episodes from ``seeds``, and stochastic ones in the same batches."""
-        assert isinstance(agent, HasCritic)
-        greedy_count = len(seeds)
-        extra = diagnostic_seeds(self.extra)
-        log_probs: list[torch.Tensor] = []
+    def _long_env(self, num_envs: int) -> LatentNoiseEnv:
+        """Environments whose episodes go on until their returns are known."""
+        if self.long_env is None or self.long_env.num_envs != num_envs:
+            if self.long_env is not None:
+                self.long_env.close()
+            self.long_env = env = self.made(num_envs=num_envs)
+            if not timeouts_end(self.agent):
+                env.max_episode_steps = long_limit(
+                    env.max_episode_steps, env.execute, discount(self.agent)
+                )
+        return self.long_env
 
-        def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-            noise, log_prob = agent.sample(obs)
-            log_probs.append(log_prob)
-            deterministic = (rows < greedy_count).to(obs.device)
-            return torch.where(
-                deterministic[:, None, None], agent.act(obs, deterministic=True), noise
-            )
+    @contextlib.contextmanager
+    def _unchanged_agent(self) -> Iterator[Agent]:
+        """The agent; its random numbers continue afterwards as if nothing had happened."""
+        state = self.agent.generator.get_state()
+        try:
+            yield self.agent
+        finally:
+            self.agent.generator.set_state(state)
 
-        whole = rollout(self.env, act, [*seeds, *extra])
-        # One entry per decision and batch: [batches * T] x [N] -> [T, batches * N].
-        steps = len(whole.obs)
-        log_prob = torch.cat(
-            [torch.stack(log_probs[i : i + steps]) for i in range(0, len(log_probs), steps)], dim=1
-        )
-        on_policy = whole.episodes_of(slice(greedy_count, None))
-        return (
-            whole.episodes_of(slice(0, greedy_count)),
-            on_policy,
-            log_prob[:, greedy_count : greedy_count + len(extra)],
-        )
+
+def discount(agent: Agent) -> float:
+    """The discount per decision of an agent's Q-values; 0 for an agent without one."""
+    return getattr(agent.options, "gamma", 0.0)
+
+
+def timeouts_end(agent: Agent) -> bool:
+    """Whether an agent's Q-values count nothing after a time-out, rather than bootstrap."""
+    return getattr(agent.options, "timeouts_terminal", False)

@@ -63,9 +63,8 @@ def _paths(run: Restored, variants: Sequence[VariantSpec], episodes: int) -> np.
     feasible = feasible_return(config, run.agent, run.policy)
     evaluator = Evaluator(config, run.policy, run.agent, feasible, variants)
     try:
-        evaluator.measure(episodes)
+        played = evaluator.play(episodes)
     finally:
         evaluator.close()
-    assert evaluator.played is not None
     title = f"{config.agent} on {config.task} ({variant_text(variants)}), seed {config.seed}"
-    return draw_paths(evaluator.played, run.policy.obs_layout, title)
+    return draw_paths(played, run.policy.obs_layout, title)

@@ -186,6 +186,8 @@ class TensorBoard(Observer):
             # The record holds null for a number that is not finite, and says which.
             kind = evaluation.nonfinite.get(f"diagnostics/{name}")
             values[f"diag/{name}"] = float(kind) if kind else value
+        if "diag/q_magnitude" in values:
+            values["limits/q_magnitude"] = 1.0
         self.log.scalars(values, run.env_steps)
 
     def saving(self, run: Trainer) -> Mapping[str, Any]:

@@ -180,7 +180,8 @@ def evaluate(
     evaluator = Evaluator(config, run.policy, run.agent, feasible, variants, workers)
     begin = time.perf_counter()
     try:
-        columns, diagnostics = evaluator.measure(count)
+        columns = evaluator.play(count).episodes
+        diagnostics = evaluator.diagnose(config.evaluation.final_diagnostic_episodes)
     finally:
         evaluator.close()
     evaluation = Evaluation(

@@ -26,8 +26,10 @@ LAYOUT = {
     "SymSteer": {
         "Success on held-out episodes": ["Multiline", ["^eval/success_once$"]],
         "Q against its feasible band": ["Margin", ["diag/q_mean", "diag/q_low", "diag/q_high"]],
-        "Share of Q outside its band": ["Multiline", ["^diag/q_violation$"]],
-        "Q bias against fresh returns": ["Multiline", ["^diag/q_bias$"]],
+        "Largest |Q|, where 1 is feasible": ["Multiline", ["^(diag|limits)/q_magnitude$"]],
+        "Q bias, on- and off-policy": ["Multiline", ["^diag/q_(off_)?bias$"]],
+        "Correlation of Q with the return": ["Multiline", ["^diag/q_(off_)?correlation$"]],
+        "Temporal-difference error": ["Multiline", ["^diag/td_error$"]],
         "Equivariance errors": ["Multiline", ["^diag/equivariance_(decode|actor|critic)$"]],
         "Temperature alpha": ["Multiline", ["^diag/alpha$"]],
     },
@@ -49,7 +51,9 @@ FINAL_METRICS = (
     "eval/episode_len",
     "diag/q_mean",
     "diag/q_bias",
-    "diag/q_violation",
+    "diag/q_correlation",
+    "diag/q_magnitude",
+    "diag/td_error",
     "diag/equivariance_actor",
     "diag/equivariance_critic",
     "diag/alpha",
@@ -62,8 +66,8 @@ class RunLog:
     """TensorBoard's view of one run: scalars against control steps, settings, pictures.
 
     Namespaces: ``eval/`` held-out episodes, ``train/`` training episodes and batches, ``losses/``,
-    ``time/`` seconds and rates, ``diag/`` Q and equivariance diagnostics. docs/metrics.md has the
-    formulas.
+    ``time/`` seconds and rates, ``diag/`` Q and equivariance diagnostics, ``limits/`` lines to
+    compare them with. docs/metrics.md has the formulas.
 
     Args:
         folder: the run's folder.

@@ -20,7 +20,7 @@ from symsteer.agents import AGENTS
 from symsteer.agents.agent import Agent, AgentContext, Budget, HasCritic
 from symsteer.bench.runs.checkpoint import save_checkpoint
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.evaluator import Evaluator, make_env
+from symsteer.bench.runs.evaluator import Evaluator, discount, make_env, timeouts_end
 from symsteer.bench.runs.folder import CHECKPOINT
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import task_class
@@ -61,8 +61,9 @@ def feasible_return(config: RunConfig, agent: Agent, base: ChunkPolicy) -> tuple
     The discount is the agent's; 0 for an agent without one.
     """
     return task_class(config.task).feasible_return(
-        getattr(agent.options, "gamma", 0.0),
+        discount(agent),
         base.execute,
+        bootstrap_truncation=not timeouts_end(agent),
         step_cost=highest_cost(build(config.variants)),
     )
 
@@ -130,7 +131,7 @@ class Trainer:
         self.fresh_starts = 0
         self.final = False
         self.clock = Clock()
-        self.update_seconds = self.evaluate_seconds = 0.0
+        self.update_seconds = self.evaluate_seconds = self.diagnose_seconds = 0.0
         earlier = self._restore(checkpoint) if checkpoint else 0.0
         self.start = time.perf_counter() - earlier
         for observer in observers:
@@ -161,6 +162,7 @@ class Trainer:
             "decode": self.clock.decode,
             "update": self.update_seconds,
             "evaluate": self.evaluate_seconds,
+            "diagnose": self.diagnose_seconds,
             "total": time.perf_counter() - self.start,
         }
 
@@ -188,9 +190,13 @@ class Trainer:
         for observer in self.observers:
             observer.entered(self, "evaluation")
         wanted = self.config.evaluation
-        count = wanted.final_episodes if final else wanted.episodes
-        columns, diagnostics = self.evaluator.measure(count)
-        self.evaluate_seconds += time.perf_counter() - begin
+        columns = self.evaluator.play(wanted.final_episodes if final else wanted.episodes).episodes
+        played = time.perf_counter()
+        diagnostics = self.evaluator.diagnose(
+            wanted.final_diagnostic_episodes if final else wanted.diagnostic_episodes
+        )
+        self.evaluate_seconds += played - begin
+        self.diagnose_seconds += time.perf_counter() - played
         evaluation = Evaluation(
             env_steps=self.env_steps,
             decisions=self.decisions,
@@ -308,4 +314,5 @@ class Trainer:
         seconds = state["seconds"]
         self.clock.simulate, self.clock.decode = seconds["simulate"], seconds["decode"]
         self.update_seconds, self.evaluate_seconds = seconds["update"], seconds["evaluate"]
+        self.diagnose_seconds = seconds["diagnose"]
         return seconds["total"]

@@ -1,4 +1,4 @@
-"""Whole episodes from a fixed list of seeds, and the steerability of a base policy."""
+"""Whole episodes from fixed seeds, episodes with known returns, steerability of a base policy."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from symsteer.agents.episodes import DECISION_FIELDS, Rollout
+from symsteer.agents.episodes import DECISION_FIELDS, LongEpisodes, Rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import steerability_seeds
 from symsteer.errors import UserError
@@ -64,6 +64,136 @@ def _rollout_batch(
     episodes = {name: value[:keep] for name, value in result.episodes.items()}
     episodes["seed"] = torch.tensor(seeds[:keep])
     return Rollout(episodes=episodes, **{k: torch.stack(v) for k, v in steps.items()})
+
+
+Sample = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+"""``obs [N, obs_dim] -> noise [N, Tp, Da], its log-probability [N]``, drawn from the actor."""
+
+TAIL_WEIGHT = 0.05
+"""Largest weight of the unknown future in a return that Q-values are compared with."""
+
+MAX_TAIL = 300
+"""Decisions after the last one that counts, at most: what a discount of 0.99 needs."""
+
+
+def tail_decisions(gamma: float) -> int:
+    """Decisions until the future has a weight of at most :data:`TAIL_WEIGHT`.
+
+    Args:
+        gamma: discount per decision, in [0, 1).
+    """
+    return next((k for k in range(1, MAX_TAIL) if gamma**k <= TAIL_WEIGHT), MAX_TAIL)
+
+
+def long_limit(max_episode_steps: int, execute: int, gamma: float) -> int:
+    """The time limit in control steps that :func:`long_episodes` needs.
+
+    Args:
+        max_episode_steps: time limit of the task.
+        execute: control steps per decision.
+        gamma: discount per decision.
+    """
+    return execute * (math.ceil(max_episode_steps / execute) + tail_decisions(gamma))
+
+
+def random_beginnings(count: int, decisions: int) -> list[int]:
+    """How many decisions of each long episode begin it with noise from N(0, I).
+
+    Every other episode has none. The numbers of the others are spread evenly over the
+    ``decisions`` of an episode.
+    """
+    half = count // 2
+    return [1 + (i // 2) * decisions // half if i % 2 else 0 for i in range(count)]
+
+
+def long_episodes(
+    env: LatentNoiseEnv,
+    sample: Sample,
+    seeds: Sequence[int],
+    gamma: float,
+    generator: torch.Generator,
+) -> LongEpisodes:
+    """Play one episode of the stochastic actor from each seed until its return is known.
+
+    All environments of a batch stop together, when the last of them is done. See
+    :class:`~symsteer.agents.episodes.LongEpisodes` for what counts, :func:`random_beginnings` for
+    the noise.
+
+    Args:
+        env: with ``ignore_terminations``. Its time limit is that of :func:`long_limit`, or the
+            task's own, if time-outs end episodes.
+        sample: the actor; called once per decision for the N parallel environments.
+        seeds: any number; they are played in batches of N.
+        gamma: discount per decision.
+        generator: draws the noise from N(0, I), on the environment's device.
+    """
+    within = math.ceil(env.env.max_episode_steps / env.execute)
+    begin = random_beginnings(len(seeds), within)
+    parts = []
+    for start in range(0, len(seeds), env.num_envs):
+        # As in rollout(): the rest of the last batch repeats a seed and is dropped.
+        rows = [min(start + i, len(seeds) - 1) for i in range(env.num_envs)]
+        part = _long_batch(
+            env,
+            sample,
+            [seeds[row] for row in rows],
+            torch.tensor([begin[row] for row in rows], device=env.device),
+            tail_decisions(gamma),
+            generator,
+        )
+        parts.append({name: value[:, : len(seeds) - start] for name, value in part.items()})
+    longest = max(len(part["reward"]) for part in parts)
+
+    def joined(name: str) -> torch.Tensor:
+        padded = [
+            torch.cat([x, x.new_zeros(longest - len(x), *x.shape[1:])])
+            for x in (part[name] for part in parts)
+        ]
+        return torch.cat(padded, dim=1)
+
+    return LongEpisodes(
+        **{name: joined(name) for name in parts[0]},
+        timeouts_end=env.max_episode_steps <= env.env.max_episode_steps,
+    )
+
+
+def _long_batch(
+    env: LatentNoiseEnv,
+    sample: Sample,
+    seeds: list[int],
+    begin: torch.Tensor,
+    tail: int,
+    generator: torch.Generator,
+) -> dict[str, torch.Tensor]:
+    """Fields of LongEpisodes of one batch; ``begin [N]`` decisions begin with N(0, I)."""
+    obs = env.reset(seeds)
+    within = math.ceil(env.env.max_episode_steps / env.execute)
+    limit = math.ceil(env.max_episode_steps / env.execute)
+    counted_last = torch.where(begin > 0, begin - 1, within - 1)
+    # Decisions of each column. Where a time-out ends episodes, returns end with it.
+    wanted = counted_last + tail if limit > within else torch.full_like(begin, limit)
+    names = ("obs", "noise", "log_prob", "reward", "terminal", "last", "on_policy", "off_policy")
+    steps: dict[str, list[torch.Tensor]] = {name: [] for name in names}
+    running = torch.ones_like(begin, dtype=torch.bool)
+    for t in range(int(wanted.max())):
+        noise, log_prob = sample(obs)
+        normal = torch.randn(
+            noise.shape, generator=generator, dtype=noise.dtype, device=noise.device
+        )
+        noise = torch.where((t < begin)[:, None, None], normal, noise)
+        result = env.step(noise)
+        succeeded = running & result.success_once
+        last = running & ~succeeded & (t + 1 == wanted)
+        on = running & (begin == 0) & (t < within)
+        off = running & (begin == t + 1)
+        row = (obs, noise, log_prob, result.reward, succeeded, last, on, off)
+        for name, value in zip(names, row, strict=True):
+            steps[name].append(value)
+        running = running & ~succeeded & ~last
+        if not running.any():
+            break
+        obs = result.obs_after
+    return {name: torch.stack(values) for name, values in steps.items()}
 
 
 @dataclass

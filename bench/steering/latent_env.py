@@ -56,6 +56,7 @@ class LatentNoiseEnv:
         ignore_terminations: episodes go on to the time limit after a success, as in ManiSkill's
             evaluation. If False, a success ends the episode.
         seed: of the run, for :meth:`training_seeds`.
+        max_episode_steps: time limit of an episode; 0 for the task's own.
 
     Attributes:
         control_steps: executed so far, summed over the environments.
@@ -66,12 +67,13 @@ class LatentNoiseEnv:
     policy: ChunkPolicy
     ignore_terminations: bool = False
     seed: int = 0
+    max_episode_steps: int = 0
     clock: Clock = field(default_factory=Clock)
 
     def __post_init__(self) -> None:
         self.num_envs: int = self.env.num_envs
         self.execute = self.policy.execute
-        self.max_episode_steps: int = self.env.max_episode_steps
+        self.max_episode_steps = self.max_episode_steps or self.env.max_episode_steps
         self.device = self.policy.device
         self.control_steps = 0
         self.decisions = 0

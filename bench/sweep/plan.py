@@ -20,6 +20,9 @@ from symsteer.errors import UserError
 BASIC = ("task", "embodiment", "variant", "agent", "seed")
 """Keys of a configuration that all tables and lines show."""
 
+FOLLOWERS = ("policy_seed", "demonstrations.seed")
+"""Keys that say nothing new where they are the run's seed."""
+
 OWNERS = {"agent": "agent", "policy": "policy.name"}
 """The key with the name of the agent or policy that has the options ``agent.X`` or ``policy.X``."""
 
@@ -158,10 +161,11 @@ def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
             owner_key = OWNERS.get(key.partition(".")[0])
             owner = one[owner_key] if owner_key and owner_key != key else None
             values.setdefault(key, {}).setdefault(owner, set()).add(repr(value))
+    told = {*BASIC, *(k for k in FOLLOWERS if all(one[k] == one["seed"] for one in settings))}
     return [
         key
         for key, found in values.items()
-        if key not in BASIC and any(len(texts) > 1 for texts in found.values())
+        if key not in told and any(len(texts) > 1 for texts in found.values())
     ]
 
 

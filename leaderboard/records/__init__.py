@@ -11,13 +11,14 @@ packages, `files` reads and writes. This package imports nothing of the leaderbo
 from symsteer.leaderboard.records.files import dump_record, read_record, write_record
 from symsteer.leaderboard.records.provenance import Provenance, RecordedExtension
 from symsteer.leaderboard.records.schema import (
-    DIVERGED_EVALUATIONS,
-    DIVERGED_SHARE,
     HELD_OUT_SEED,
+    MAX_GROWTH,
+    MAX_OVERSHOOT,
     ROLES,
     SCHEMA_VERSION,
     BasePolicy,
     Budget,
+    Divergence,
     Episodes,
     Evaluation,
     FeasibleQ,
@@ -30,13 +31,14 @@ from symsteer.leaderboard.records.schema import (
 from symsteer.leaderboard.records.values import canonical_json, config_hash, portable
 
 __all__ = [
-    "DIVERGED_EVALUATIONS",
-    "DIVERGED_SHARE",
     "HELD_OUT_SEED",
+    "MAX_GROWTH",
+    "MAX_OVERSHOOT",
     "ROLES",
     "SCHEMA_VERSION",
     "BasePolicy",
     "Budget",
+    "Divergence",
     "Episodes",
     "Evaluation",
     "FeasibleQ",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -37,15 +38,18 @@ from symsteer.leaderboard.records.values import (
     portable,
 )
 
-SCHEMA_VERSION: Literal[4] = 4
+SCHEMA_VERSION: Literal[5] = 5
 
 HELD_OUT_SEED = 1_000_000
 """Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
 and run. Steerability draws its seeds below it, training far above it (from 2^22 on), and
 demonstrations anywhere below 2^31."""
 
-DIVERGED_SHARE = 0.05
-DIVERGED_EVALUATIONS = 3
+MAX_GROWTH = 2.0
+MAX_OVERSHOOT = 0.1
+"""Q-values that double in the second half of a run and end further than this outside what is
+feasible, in units of the feasible interval, diverge. With a discount of 0.95 it is the cost of two
+decisions."""
 
 Q_VALUES = ("q_mean", "q_min", "q_max", "q_abs_max")
 """Diagnostics that are Q-values themselves: an agent that has them has a critic."""
@@ -92,16 +96,19 @@ class Parameters(Block):
 
 
 class WallClock(Block):
-    """Seconds spent; `total` also holds what the four named parts do not.
+    """Seconds spent; `total` also holds what the five named parts do not.
 
-    `resumed` counts how often the run was continued from a checkpoint. What an interrupted process
-    did after its last checkpoint was done again and is not part of the seconds.
+    `evaluate` is for the held-out episodes, `diagnose` for the long episodes and all diagnostics;
+    null in records before version 5, where `evaluate` holds both. `resumed` counts how often the
+    run was continued from a checkpoint. What an interrupted process did after its last checkpoint
+    was done again and is not part of the seconds.
     """
 
     simulate: Seconds = 0.0
     decode: Seconds = 0.0
     update: Seconds = 0.0
     evaluate: Seconds = 0.0
+    diagnose: Seconds | None = 0.0
     total: Seconds = 0.0
     resumed: Count = 0
 
@@ -198,10 +205,36 @@ class Evaluation(Measured):
         return sum(self.episodes.success_once) / len(self.episodes.success_once)
 
 
+@dataclass(frozen=True)
+class Divergence:
+    """How far the Q-values of a run left what is feasible; docs/metrics.md has the formulas.
+
+    None where no evaluation has measured it. Evaluations before the first update do not count: an
+    untrained critic has not diverged from anything.
+
+    Attributes:
+        magnitude: largest |Q| over the largest feasible magnitude, largest over the evaluations.
+        overshoot: distance of the worst Q from the feasible interval, in units of its width,
+            largest over the evaluations.
+        growth: largest |Q| at the last evaluation over that at the middle one.
+        td_error: root mean square temporal-difference error at the last evaluation, in reward.
+        diverged: a Q-value was not finite, or `magnitude` is above 1 (soft divergence, van Hasselt
+            et al., arXiv 1812.02648), or Q grew out of the interval: `growth` of at least
+            `MAX_GROWTH`, and an overshoot above `MAX_OVERSHOOT` at the last evaluation, which is
+            larger than that at the middle one.
+    """
+
+    magnitude: float | None
+    overshoot: float | None
+    growth: float | None
+    td_error: float | None
+    diverged: bool
+
+
 class RunRecord(Block):
     """Everything the leaderboard may know about one run."""
 
-    schema_version: Literal[4] = SCHEMA_VERSION
+    schema_version: Literal[5] = SCHEMA_VERSION
     run_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+=:,@-]{0,199}$")]
     config: dict[str, JsonValue]
     config_hash: str = ""
@@ -302,23 +335,42 @@ class RunRecord(Block):
         )
 
     @property
-    def diverged(self) -> bool | None:
-        """Whether the Q-values diverged; None for runs without a critic.
-
-        The rule: `q_violation` above 5 % at 3 consecutive evaluations, or Q-values that are not
-        finite. Evaluations before the first update do not count: what an untrained critic says
-        has not diverged from anything.
-        """
+    def divergence(self) -> Divergence | None:
+        """How far the Q-values left what is feasible; None for runs without a critic."""
         if not self.has_critic:
             return None
-        if self.nonfinite_q:
-            return True
-        streak = 0
-        for evaluation in self.evaluations:
-            if evaluation.updates == 0:
-                continue
-            violation = evaluation.diagnostics.get("q_violation")
-            streak = streak + 1 if violation is not None and violation > DIVERGED_SHARE else 0
-            if streak == DIVERGED_EVALUATIONS:
-                return True
-        return False
+        trained = [evaluation for evaluation in self.evaluations if evaluation.updates > 0]
+        last = trained[-1] if trained else None
+        middle = None
+        if last is not None and len(trained) > 1:
+            half = last.env_steps / 2
+            middle = min(trained[:-1], key=lambda evaluation: abs(evaluation.env_steps - half))
+
+        def at(evaluation: Evaluation | None, name: str) -> float | None:
+            return evaluation.diagnostics.get(name) if evaluation else None
+
+        def largest(name: str) -> float | None:
+            return max((v for e in trained if (v := at(e, name)) is not None), default=None)
+
+        magnitude, ends, was = (
+            largest("q_magnitude"),
+            at(last, "q_abs_max"),
+            at(middle, "q_abs_max"),
+        )
+        growth = ends / was if ends is not None and was else None
+        outside, before = at(last, "q_overshoot") or 0.0, at(middle, "q_overshoot") or 0.0
+        grew = growth is not None and growth >= MAX_GROWTH
+        return Divergence(
+            magnitude=magnitude,
+            overshoot=largest("q_overshoot"),
+            growth=growth,
+            td_error=at(last, "td_error"),
+            diverged=self.nonfinite_q
+            or (magnitude is not None and magnitude > 1)
+            or (grew and outside > max(MAX_OVERSHOOT, before)),
+        )
+
+    @property
+    def diverged(self) -> bool | None:
+        """Whether the Q-values diverged; None for runs without a critic."""
+        return None if (found := self.divergence) is None else found.diverged

@@ -6,105 +6,62 @@ import pytest
 import torch
 
 from symsteer.agents import diagnostics
-from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 
-GAMMA = 0.9
 C8 = Group.parse("C8")
 
 
-def test_bound_violation_counts_what_is_outside():
+def test_bound_violation_counts_and_measures_what_is_outside():
     q = torch.tensor([[-25.0, -20.0, -3.0, 0.0], [0.1, 5.0, -1.0, -2.0]])
     report = diagnostics.bound_violation(q, -20.0, 0.0)
-    assert report["violation_share"] == pytest.approx(3 / 8)
-    assert report["max_abs_q"] == 25.0
-    assert report["finite"] == 1.0
-    q[0, 1] = math.nan
-    report = diagnostics.bound_violation(q, -20.0, 0.0)
-    assert report["violation_share"] == pytest.approx(4 / 8)
-    assert report["finite"] == 0.0
+    assert report == {
+        "q_abs_max": 25.0,
+        "q_magnitude": 25 / 20,
+        "q_overshoot": 5 / 20,
+        "q_violation": 3 / 8,
+    }
+    # Above the interval by more than below it, and of a feasible size.
+    above = diagnostics.bound_violation(q[1], -20.0, 0.0)
+    assert (above["q_magnitude"], above["q_overshoot"]) == (5 / 20, 5 / 20)
+    inside = diagnostics.bound_violation(q[0, 1:], -20.0, 0.0)
+    assert (inside["q_magnitude"], inside["q_overshoot"], inside["q_violation"]) == (1, 0, 0)
+    for value in (math.nan, math.inf):
+        q[0, 1] = value
+        report = diagnostics.bound_violation(q, -20.0, 0.0)
+        assert report["q_violation"] == 4 / 8
+        assert not math.isfinite(report["q_magnitude"])
+        assert not math.isfinite(report["q_overshoot"])
 
 
-def episode_arrays(columns):
-    """Reward, terminal, truncated ``[T, N]``; '.' goes on, 's' is success, 't' a time-out."""
-    steps = torch.tensor([[".st".index(c) for c in column] for column in columns]).T
-    reward = torch.where(steps == 1, 0.0, -1.0).double()
-    return reward, (steps == 1).double(), (steps == 2).double()
+def test_returns_by_hand():
+    """Success, time-out with an unknown future, and a column that goes on after its end."""
+    reward = torch.tensor([[-1.0, -1.0, -1.0], [-1.0, -1.0, 0.0], [0.0, -1.0, -9.0]])
+    ends = torch.tensor([[0, 0, 0], [0, 0, 1], [1, 0, 0]]).bool()
+    last = torch.tensor([[0, 0, 0], [0, 0, 0], [0, 1, 0]]).bool()
+    bonus = torch.tensor([[7.0] * 3, [0.5] * 3, [0.25] * 3])
+    found = diagnostics.discounted_returns(reward, ends, last, 0.5, bonus)
+    # The last decision, with -1 and a bonus of 0.25, goes on for ever.
+    third = -1 + 0.5 * 2 * (-1 + 0.25)
+    second = -1 + 0.5 * (third + 0.25)
+    assert found[:, 0].tolist() == [-1 + 0.5 * (-0.875 + 0.5), -1 + 0.5 * 0.25, 0.0]
+    assert found[:, 1].tolist() == [-1 + 0.5 * (second + 0.5), second, third]
+    assert found[:2, 2].tolist() == [-1 + 0.5 * 0.5, 0.0]
 
 
-def test_bias_of_exact_values_is_zero():
-    """Episodes that succeed have exact returns; Q equal to them has no bias."""
-    reward, terminal, truncated = episode_arrays(["..s", ".s.", "s.."])
-    exact = torch.tensor(
-        [[-1 - GAMMA, -1.0, 0.0], [-1.0, 0.0, math.nan], [0.0, math.nan, math.nan]],
-        dtype=torch.float64,
+def test_agreement_by_hand():
+    q = torch.tensor([1.0, 2.0, 3.0, 9.0], dtype=torch.float64)
+    found = diagnostics.agreement(q, torch.tensor([2.0, 1.0, 4.0, 5.0], dtype=torch.float64))
+    assert found["bias"] == 0.75
+    assert found["bias_std"] == pytest.approx(
+        torch.tensor([-1.75, 0.25, -1.75, 3.25]).std(0, False)
     )
-    # The unfinished rest of columns two and three is cut by the end of the record.
-    q = torch.nan_to_num(exact)
-    report = diagnostics.q_bias(q, reward, terminal, truncated, GAMMA, (-10.0, 0.0))
-    assert report["bias_mean"] == pytest.approx(0.0, abs=1e-12)
-    assert report["bias_std"] == pytest.approx(0.0, abs=1e-12)
-    assert report["covered_share"] == pytest.approx(6 / 9)
-    shifted = diagnostics.q_bias(q + 2.0, reward, terminal, truncated, GAMMA, (-10.0, 0.0))
-    assert shifted["bias_mean"] == pytest.approx(2.0)
-    covered_mean = (-1 - GAMMA - 1 - 1) / 6
-    assert shifted["bias_normalized"] == pytest.approx(2.0 / abs(covered_mean))
-
-
-def test_a_time_out_neither_counts_as_success_nor_is_guessed():
-    """An agent that never succeeds has Q = -1/(1 - gamma); a cut return is consistent with it."""
-    reward, terminal, truncated = episode_arrays(["...t" * 2])
-    q = torch.full_like(reward, -1 / (1 - GAMMA))
-    low_high = (-1 / (1 - GAMMA), 0.0)
-    report = diagnostics.q_bias(q, reward, terminal, truncated, GAMMA, low_high)
-    assert report["covered_share"] == 0.0
-    assert math.isnan(report["bias_mean"])
-    assert report["bias_low"] <= 1e-9 <= report["bias_high"] + 2e-9
-    assert report["bias_high"] == pytest.approx(0.0, abs=1e-9)
-    assert report["bias_low"] < -5
-    # With a success instead, this Q would be wrong.
-    reward, terminal, truncated = episode_arrays(["...s" * 2])
-    report = diagnostics.q_bias(q, reward, terminal, truncated, GAMMA, low_high)
-    assert report["bias_mean"] < -5
-    # Far from the cut, the tail has a small weight and the state is covered.
-    reward, terminal, truncated = episode_arrays(["." * 59 + "t"])
-    q = torch.full_like(reward, -1 / (1 - GAMMA))
-    report = diagnostics.q_bias(q, reward, terminal, truncated, GAMMA, low_high)
-    assert 0.4 < report["covered_share"] < 0.6
-    assert abs(report["bias_mean"]) < 0.05 * 10
-
-
-def test_returns_do_not_leak_across_episodes():
-    reward, terminal, truncated = episode_arrays(["s..s", "t..s"])
-    q = torch.zeros_like(reward)
-    report = diagnostics.q_bias(q, reward, terminal, truncated, GAMMA, (-10.0, 0.0))
-    first = [0.0, -1.0]  # return of row 0: success at once; cut after one step
-    rest = 2 * (-1 - GAMMA - 1.0)
-    assert report["return_mean"] == pytest.approx((sum(first) + rest) / 8)
-    assert report["covered_share"] == pytest.approx(7 / 8)
-
-
-def test_soft_bias_adds_the_later_entropy():
-    reward, terminal, truncated = episode_arrays(["..s"])
-    log_prob = torch.tensor([[5.0], [-2.0], [-3.0]]).double()
-    alpha = 0.1
-    soft = [
-        -1 + GAMMA * (-1 + GAMMA * 0.3 + 0.2),
-        -1 + GAMMA * 0.3,
-        0.0,
-    ]
-    q = torch.tensor(soft, dtype=torch.float64)[:, None]
-    report = diagnostics.q_bias(
-        q, reward, terminal, truncated, GAMMA, (-10.0, 0.0), log_prob=log_prob, alpha=alpha
-    )
-    assert report["soft_bias_mean"] == pytest.approx(0.0, abs=1e-12)
-    assert report["soft_bias_std"] == pytest.approx(0.0, abs=1e-12)
-    assert report["bias_mean"] > 0.1
-
-
-def test_bias_refuses_unequal_shapes():
-    with pytest.raises(UserError, match="one shape"):
-        diagnostics.q_bias(torch.zeros(3, 2), *[torch.zeros(3, 1)] * 3, GAMMA, (-1.0, 0.0))
+    assert found["correlation"] == pytest.approx(16 / (38.75 * 10) ** 0.5)
+    assert found["rank_correlation"] == pytest.approx(0.8)
+    assert found["overestimated"] == 0.5
+    assert found["decisions"] == 4
+    nothing = diagnostics.agreement(q[:0], q[:0])
+    assert nothing.pop("decisions") == 0
+    assert set(nothing.values()) == {None}
 
 
 def test_orbit_variance_and_actor_error_tell_the_agents_apart(problem):

@@ -25,7 +25,12 @@ def tiny_config(agent="equivariant", policy_name="edp", options=None, **changes)
         "policy_name": policy_name,
         "policy": POLICIES.get(policy_name).Options(**POLICY),
         "evaluation": EvaluationConfig(
-            every=160, episodes=3, final_episodes=5, diagnostic_episodes=2, steerability_states=2
+            every=160,
+            episodes=3,
+            final_episodes=5,
+            diagnostic_episodes=2,
+            final_diagnostic_episodes=4,
+            steerability_states=2,
         ),
     }
     return RunConfig(**{**values, **changes})

@@ -26,7 +26,8 @@ RUN = """
     --policy.width 16 --policy.depth 1 --policy.steps 20 --policy.batch-size 32
     --agent.width 16 --agent.batch-size 16 --agent.warmup 16 --agent.group C4
     --evaluation.every 2000 --evaluation.episodes 2 --evaluation.final-episodes 3
-    --evaluation.diagnostic-episodes 2 --evaluation.steerability-states 1
+    --evaluation.diagnostic-episodes 2 --evaluation.final-diagnostic-episodes 2
+    --evaluation.steerability-states 1
 """
 
 SUITE = """
@@ -48,6 +49,7 @@ every = 2000
 episodes = 2
 final_episodes = 3
 diagnostic_episodes = 2
+final_diagnostic_episodes = 2
 steerability_states = 1
 """
 

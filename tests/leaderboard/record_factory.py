@@ -104,7 +104,9 @@ def make_record(
         parameters=Parameters(
             actor=60_000 * learns, critic=90_000 * learns, total=150_000 * learns, width=128
         ),
-        wall_clock=WallClock(simulate=100, decode=5, update=90, evaluate=45, total=250),
+        wall_clock=WallClock(
+            simulate=100, decode=5, update=90, evaluate=30, diagnose=15, total=250
+        ),
         budget=Budget(env_steps=config["env_steps"], decisions=6_250, updates=6_250 * learns),
         base_policy=BasePolicy(
             name="edp",
@@ -139,9 +141,23 @@ def make_curve(
             "q_min": q - 3,
             "q_max": q + 2,
             "q_abs_max": abs(q) + 4,
+            "q_magnitude": (abs(q) + 4) / 20,
+            "q_overshoot": max(0.0, q + 2, -20 - (q - 3)) / 20,
             "q_violation": 0.2 if q > 0 else 0.01,
-            "q_bias": 0.6 + q_shift,
+            "td_error": 1.5,
+            **{
+                f"q_{kind}{name}": value
+                for kind in ("", "off_")
+                for name, value in (
+                    ("bias", 0.6 + q_shift),
+                    ("bias_std", 2.5),
+                    ("correlation", 0.9),
+                    ("rank_correlation", 0.8),
+                    ("overestimated", 0.55),
+                )
+            },
             "return_mean": -16 + 10 * rate,
+            "return_std": 5.0,
             "alpha": 0.01,
             "orbit_variance": 0.04,
             "equivariance_actor": 0.31,

@@ -371,7 +371,7 @@ def test_the_command_says_what_to_mend(tmp_path: Path, capsys: pytest.CaptureFix
     ]
     edit(paths[4], status="running", ended=None)
     (tmp_path / "new" / "hostile.json").write_text(
-        '{"schema_version": 4, "config_hash": "", "\\u001b[2J\\nadmissible": 1}'
+        '{"schema_version": 5, "config_hash": "", "\\u001b[2J\\nadmissible": 1}'
     )
     assert main(["--check", str(tmp_path / "new")]) == 2
     lines = capsys.readouterr().out.splitlines()

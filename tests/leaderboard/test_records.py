@@ -49,10 +49,13 @@ def older(tmp_path: Path, version: int) -> tuple[RunRecord, Path, dict[str, Any]
     record = make_record([make_evaluation([1, 0, 1, 1], q_mean=-3.25)])
     data = json.loads(dump_record(record))
     data["schema_version"] = version
-    del data["role"]
-    for key in ("version", "sha256", "extensions"):
-        del data["provenance"][key]
-    record.provenance.version = None
+    del data["wall_clock"]["diagnose"]
+    record.wall_clock.diagnose = None
+    if version < 4:
+        del data["role"]
+        for key in ("version", "sha256", "extensions"):
+            del data["provenance"][key]
+        record.provenance.version = None
     if version < 3:
         data["training"] = None
         data["feasible_q"]["entropy_allowance"] = 0.0
@@ -64,7 +67,7 @@ def older(tmp_path: Path, version: int) -> tuple[RunRecord, Path, dict[str, Any]
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_older_records_are_read_as_new_ones(tmp_path: Path, version: int) -> None:
+def test_records_without_a_role_are_read_as_new_ones(tmp_path: Path, version: int) -> None:
     record, path, data = older(tmp_path, version)
     assert read_record(path) == record
     for agent, role in (("zero", "reference"), ("golden-ticket", "reference"), ("my", "learner")):
@@ -72,6 +75,48 @@ def test_older_records_are_read_as_new_ones(tmp_path: Path, version: int) -> Non
         data["config_hash"] = config_hash(data["config"])
         path.write_text(json.dumps(data))
         assert read_record(path).role == role
+
+
+def test_conditional_biases_of_version_4_are_never_read_as_those_of_version_5(
+    tmp_path: Path,
+) -> None:
+    _, path, data = older(tmp_path, 4)
+    old = {
+        **{"q_mean": -5.0, "q_min": -24.0, "q_max": 1.0, "q_abs_max": 25.0, "q_allowance": 1.0},
+        **{"q_bias": 3.0, "q_bias_std": None, "q_bias_hard": 2.0, "q_bias_covered": 0.25},
+        **{"q_bias_low": -2.0, "return_mean": -9.0},
+    }
+    data["evaluations"][0] |= {"diagnostics": old, "nonfinite": {"diagnostics/q_bias_std": "nan"}}
+    path.write_text(json.dumps(data))
+    [evaluation] = (record := read_record(path)).evaluations
+    assert evaluation.diagnostics == {
+        **{name: old[name] for name in ("q_mean", "q_min", "q_max", "q_abs_max", "q_allowance")},
+        "q_bias_successful": 3.0,
+        "q_bias_successful_std": None,
+        "q_bias_successful_hard": 2.0,
+        "q_bias_successful_share": 0.25,
+        "q_bias_low": -2.0,
+        "return_mean_within_limit": -9.0,
+        # The feasible interval is [-20, 0], extended by the allowance.
+        "q_magnitude": pytest.approx(25 / 21),
+        "q_overshoot": pytest.approx(4 / 22),
+    }
+    assert evaluation.nonfinite == {"diagnostics/q_bias_successful_std": "nan"}
+    assert record.diverged is True
+    assert json.loads(dump_record(record))["schema_version"] == 5
+
+
+@pytest.mark.parametrize("value", [None, "5", {}, 10**400])
+def test_what_is_no_number_of_a_measurement_is_not_divided(tmp_path: Path, value: Any) -> None:
+    _, path, data = older(tmp_path, 4)
+    values = {"q_mean": -5.0, "q_min": -24.0, "q_max": 1.0, "q_abs_max": value}
+    data["evaluations"][0]["diagnostics"] = values
+    path.write_text(json.dumps(data))
+    if value is None:
+        assert "q_magnitude" not in read_record(path).evaluations[0].diagnostics
+        return
+    with pytest.raises(UserError, match=r"q_abs_max|nonfinite"):
+        read_record(path)
 
 
 def test_parts_of_an_older_continued_run_are_read(tmp_path: Path) -> None:
@@ -96,6 +141,9 @@ def test_parts_of_an_older_continued_run_are_read(tmp_path: Path) -> None:
         (3, "feasible_q/entropy_allowance", 0.0, "entropy_allowance"),
         (3, "role", "learner", "role does not belong"),
         (3, "provenance/extensions", [], "extensions does not belong"),
+        (4, "wall_clock/diagnose", 0.0, "diagnose does not belong"),
+        (4, "evaluations/0/diagnostics/q_magnitude", 0.5, "q_magnitude does not belong"),
+        (4, "evaluations/0/diagnostics/q_bias_successful", 0.5, "does not belong"),
     ],
 )
 def test_what_an_older_version_did_not_have_is_refused(
@@ -253,34 +301,60 @@ def test_feasible_bounds_are_ordered() -> None:
         FeasibleQ(low=1.0, high=0.0)
 
 
-def violations(*values: float | None) -> list[Evaluation]:
+def q_curve(*points: tuple[float, float]) -> list[Evaluation]:
+    """Evaluations at even distances with (largest |Q|, overshoot) in the interval [-20, 0]."""
     return [
-        make_evaluation([1], 1000 * (i + 1), i == len(values) - 1, q_mean=-1.0, q_violation=value)
-        for i, value in enumerate(values)
+        make_evaluation(
+            [1],
+            10_000 * i,
+            i == len(points) - 1,
+            **{"q_mean": -1.0, "q_abs_max": size, "q_magnitude": size / 20, "q_overshoot": outside},
+        )
+        for i, (size, outside) in enumerate(points)
     ]
 
 
 @pytest.mark.parametrize(
-    ("shares", "expected"),
+    ("points", "expected"),
     [
-        ((0.06, 0.06, 0.06), True),
-        ((0.0, 1.0, 0.051, 0.2, 0.0), True),
-        ((0.06, 0.06, 0.05, 0.06, 0.06), False),
-        ((0.06, 0.06, None, 0.06), False),
-        ((0.9, 0.9), False),
-        ((0.0, 0.0, 0.0, 0.0), False),
+        # Soft divergence: beyond the largest feasible magnitude, once is enough.
+        ([(5, 0.0), (21, 0.05), (5, 0.0)], True),
+        ([(5, 0.0), (20, 0.0), (5, 0.0)], False),
+        # Growth out of the feasible interval.
+        ([(4, 0.0), (4, 0.05), (8, 0.4)], True),
+        ([(4, 0.0), (4, 0.4), (8, 0.4)], False),
+        ([(4, 0.0), (4, 0.05), (8, 0.1)], False),
+        ([(4, 0.0), (4.1, 0.05), (8, 0.4)], False),
+        # A failing agent's critic that learns what failure costs.
+        ([(1, 0.0), (6, 0.0), (19, 0.0)], False),
+        # A good agent whose values approach the upper end.
+        ([(15, 0.0), (8, 0.1), (4, 0.2)], False),
+        ([(5, 0.0)], False),
     ],
 )
-def test_diverged_needs_three_violations_in_a_row(
-    shares: tuple[float | None, ...], expected: bool
-) -> None:
-    assert make_record(violations(*shares)).diverged is expected
+def test_divergence(points: list[tuple[float, float]], expected: bool) -> None:
+    record = make_record(q_curve(*points))
+    assert record.diverged is expected
+    found = record.divergence
+    assert found is not None
+    # At step 0 there was no update.
+    sizes, outside = zip(*points[1:], strict=True) if points[1:] else ((), ())
+    assert found.magnitude == (max(sizes) / 20 if sizes else None)
+    assert found.overshoot == max(outside, default=None)
+    assert found.growth == (points[-1][0] / points[1][0] if len(points) == 3 else None)
+
+
+def test_growth_is_from_the_middle_of_the_run_to_its_end() -> None:
+    record = make_record(q_curve((9, 0), (1, 0), (3, 0), (7, 0), (12, 0)))
+    assert record.divergence.growth == 4
+    record.evaluations[-1].diagnostics["td_error"] = 0.5
+    assert record.divergence.td_error == 0.5
+    assert make_record(q_curve((0, 0), (0, 0), (1, 0))).divergence.growth is None
 
 
 def test_untrained_critics_have_not_diverged() -> None:
-    evaluations = violations(0.9, 0.9, 0.9, 0.9, 0.0)
-    for evaluation in evaluations[:2]:
-        evaluation.updates = 0
+    evaluations = q_curve((90, 4.0), (30, 0.5), (10, 0.0))
+    evaluations[1].updates = 0
     assert make_record(evaluations).diverged is False
     evaluations[1].updates = 1
     assert make_record(evaluations).diverged is True
@@ -290,7 +364,9 @@ def test_q_values_that_are_not_finite_are_divergence_and_a_missing_bias_is_not()
     assert make_record([make_evaluation([1], q_mean=math.nan)]).diverged is True
     assert make_record([make_evaluation([1], q_mean=-1.0, q_abs_max=math.inf)]).diverged is True
     assert make_record([make_evaluation([1], q_mean=-1.0, q_bias=math.nan)]).diverged is False
-    assert make_record([make_evaluation([1])], agent="base").diverged is None
+    reference = make_record([make_evaluation([1])], agent="base")
+    assert reference.divergence is None
+    assert reference.diverged is None
 
 
 def test_importing_the_leaderboard_does_not_import_torch() -> None:
@@ -322,7 +398,7 @@ def change(data: dict[str, Any], where: str, value: Any) -> None:
 
 
 EDITS: list[tuple[str, Any, str]] = [
-    ("schema_version", 5, "schema_version"),
+    ("schema_version", 6, "schema_version"),
     ("schema_version", 0, "schema_version"),
     ("schema_version", "1", "schema_version"),
     ("schema_version", True, "schema_version"),

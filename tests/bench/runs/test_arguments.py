@@ -3,7 +3,7 @@
 import pytest
 
 from symsteer.bench.runs.arguments import last_value, parse_run
-from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.errors import UserError
 
 
@@ -39,6 +39,19 @@ def test_options_of_the_named_agent_and_policy():
     assert config.policy == type(config.policy)(width=48)
     assert (config.task, config.evaluation.every) == ("PushCube-v1", 77)
     assert (str(execution.out), execution.quiet) == ("a", True)
+
+
+@pytest.mark.parametrize("preset", [[], ["--agent.preset", "first"]])
+def test_base_policy_and_demonstrations_follow_the_runs_seed(preset):
+    def seeds(*arguments: str) -> tuple[int, int, int]:
+        config = parse_run([*arguments, *preset])[0]
+        assert build_config(config.to_json(), "") == config
+        return config.seed, config.policy_seed, config.demonstrations.seed
+
+    assert seeds() == (0, 0, 0)
+    assert seeds("--seed", "5") == (5, 5, 5)
+    assert seeds("--seed", "5", "--policy-seed", "0") == (5, 0, 5)
+    assert seeds("--demonstrations.seed", "2", "--seed", "5") == (5, 5, 2)
 
 
 def test_a_preset_replaces_defaults_and_explicit_options_win():

@@ -47,7 +47,7 @@ def test_the_record_tells_the_whole_run(finished):
     assert final.diagnostics["equivariance_actor"] < 1e-4
     assert record.base_policy.episodes == 2 * 16
     clock = record.wall_clock
-    parts = clock.simulate + clock.decode + clock.update + clock.evaluate
+    parts = clock.simulate + clock.decode + clock.update + clock.evaluate + clock.diagnose
     assert 0 < parts <= clock.total
     stored = json.loads((folder / "config.json").read_text())
     assert stored == record.config
@@ -84,9 +84,7 @@ def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_pat
 
 def test_evaluating_more_often_does_not_change_training(finished, tmp_path):
     config, folder = finished
-    evaluation = type(config.evaluation)(
-        every=80, episodes=3, final_episodes=5, diagnostic_episodes=2, steerability_states=2
-    )
+    evaluation = dataclasses.replace(config.evaluation, every=80)
     often = execute(tiny_config(evaluation=evaluation), tmp_path, progress=False)
     assert len(read_record(often / "record.json").evaluations) == 5
     last = [without_clock(f)["evaluations"][-1] for f in (folder, often)]
@@ -106,7 +104,8 @@ def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
 
     monkeypatch.setattr(SacAgent, "observe", spy)
     _, folder = finished
-    config = tiny_config(seed=2)
+    one_policy = DemonstrationConfig(count=3, seed=0)
+    config = tiny_config(seed=2, policy_seed=0, demonstrations=one_policy)
     execute(config, folder.parent, progress=False)
     assert not any(terminal.any() for _, _, terminal in stored)
     jumps = sum(
@@ -237,6 +236,17 @@ def test_the_settings_of_a_given_base_policy_are_recorded(finished, tmp_path):
     assert said["demonstrations"]["count"] == 3
     known = read_record(folder / "record.json").base_policy
     assert found.base_policy == known
+    # Those of another run's seed, too, because no other policy was asked for.
+    found = read_record(
+        execute(
+            dataclasses.replace(tiny_config(agent="zero", seed=6), policy=RunConfig().policy),
+            tmp_path,
+            policy=file,
+            progress=False,
+        )
+        / "record.json"
+    )
+    assert (found.seeds["run"], found.seeds["policy"], found.seeds["demonstrations"]) == (6, 0, 0)
     # Steerability is measured on the number of states of this run, not on that of the file.
     more = dataclasses.replace(
         plain, evaluation=dataclasses.replace(plain.evaluation, steerability_states=3)

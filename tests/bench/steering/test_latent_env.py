@@ -116,6 +116,24 @@ def test_time_out_truncates_without_terminal(env):
     assert env.elapsed_steps.tolist() == [0] * 4
 
 
+def test_a_longer_limit_does_not_end_an_episode_at_the_limit_of_the_task(env):
+    latent = LatentNoiseEnv(
+        env, NoiseIsAction(execute=8), True, max_episode_steps=env.max_episode_steps + 20
+    )
+    obs = latent.reset([0, 1, 2, 3])
+    still = torch.zeros(4, 8, latent.policy.act_layout.dim)
+    for _ in range(-(-env.max_episode_steps // 8)):
+        result = latent.step(still)
+        # Also the decision across the task's limit is complete.
+        assert result.reward.tolist() == [-8.0] * 4
+        assert not result.truncated.any()
+    assert (result.obs_after - obs).abs().max() < 0.1
+    # The observation does not hold the time, so that values beyond the limit are defined.
+    assert not any(
+        "time" in field.name or "step" in field.name for field in env.observation_layout.fields
+    )
+
+
 def test_rollout_does_not_depend_on_the_number_of_environments(env):
     # A network's products differ in the last bit with the size of the batch; this decoder has none.
     policy = NoiseIsAction(execute=4)

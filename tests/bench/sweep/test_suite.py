@@ -1,5 +1,6 @@
 """Suites as data: products, defaults, mistakes."""
 
+import json
 import re
 
 import pytest
@@ -8,9 +9,11 @@ from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import build_config
 from symsteer.bench.sweep.command import preview
 from symsteer.bench.sweep.grid import read_suite, suite_names
-from symsteer.bench.sweep.plan import make_plan
+from symsteer.bench.sweep.plan import BASIC, make_plan
+from symsteer.bench.sweep.schedule import tasks_of
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.errors import UserError
+from symsteer.leaderboard.paths import RECORDS
 
 
 def write(tmp_path, text: str) -> str:
@@ -60,6 +63,46 @@ def test_every_suite_that_ships_can_be_read(name):
     assert suite.description
     # `symsteer list` counts the runs without building them.
     assert len(suite.runs) == len(read_suite(name).runs) > 0
+
+
+def test_the_suite_first_describes_the_committed_records():
+    """Its records are of one base policy, unlike those of suites that name no policy seed."""
+    recorded = {}
+    for path in RECORDS.glob("first/*.json"):
+        config = json.loads(path.read_text())["config"]
+        recorded[tuple(config[key] for key in BASIC)] = config
+    for run in load_suite("first").runs:
+        plain = run.to_json()
+        config = recorded.pop(tuple(plain[key] for key in BASIC))
+        # Options that did not exist, or exist no longer, cannot be compared.
+        for mine, theirs in (
+            (plain, config),
+            (plain["policy"], config["policy"]),
+            (plain["agent_options"], config["sac"]),
+        ):
+            shared = mine.keys() & theirs.keys() - {"policy"}
+            assert {key: mine[key] for key in shared} == {key: theirs[key] for key in shared}
+        assert config["policy_seed"] == config["demonstrations"]["seed"] == 0
+    assert not recorded
+
+
+def test_agents_and_variants_of_a_seed_share_its_base_policy(tmp_path):
+    grid = """
+        [grid]
+        agent = ["zero", "equivariant"]
+        variant = ["none", "wind:1"]
+        seed = [2, 3]
+    """
+
+    def shared(text: str) -> list[str]:
+        plan = make_plan(load_suite(write(tmp_path, text)), tmp_path)
+        # The seeds are not repeated in the runs' labels.
+        assert not any(run.extra for run in plan.runs)
+        return [task.kind for task in tasks_of(plan, plan.runs) if task.kind != "run"]
+
+    assert shared(grid) == ["demonstrations"] * 2 + ["base policy"] * 2
+    one = "[run]\npolicy_seed = 7\ndemonstrations.seed = 7"
+    assert shared(grid + one) == ["demonstrations", "base policy"]
 
 
 def test_an_option_applies_to_the_agents_that_have_it(tmp_path):
