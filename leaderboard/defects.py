@@ -249,6 +249,11 @@ class Fit:
     lines: tuple[Line, ...]
 
     @property
+    def settings(self) -> set[Key]:
+        """The settings whose points it is about."""
+        return {line.setting for line in self.lines}
+
+    @property
     def reason(self) -> str:
         """Why the slope decides nothing, whatever its interval; empty if it may."""
         if self.policies >= MIN_SEEDS:
