@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from symsteer.leaderboard.defects import Audit, advantage, defect_of
+from symsteer.leaderboard.defects import Audit, Point, advantage, defect_of, fit
 from symsteer.leaderboard.paper import ROW_ORDER
 from symsteer.leaderboard.statistics import (
     CONFIDENCE,
@@ -140,13 +139,18 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> Outcome:
     weights = [sign / len(side) for sign, side in zip((1, -1), sides, strict=False) for _ in side]
     everything = [cell for side in sides for cell in side]
     if claim.effect == "slope":
-        weights = _slope_weights([table.key for table, _ in everything], audit)
-        everything = [cell for cell, weight in zip(everything, weights, strict=True) if weight]
-        weights = [weight for weight in weights if weight]
-        if not weights:
+        points = [
+            Point(table, defect, pairs)
+            for table, pairs in everything
+            if (defect := defect_of(table.key, audit))
+        ]
+        found = fit(points)
+        if found is None:
             return Outcome(claim, reason="no base policy was steered at two defects")
-    samples = [list(pairs.values()) for _, pairs in everything]
-    drawn = combined(cell_estimates(samples), weights)
+        everything = [(p.table, dict(p.pairs)) for p in points if p.setting in found.settings]
+        drawn, reason = combined([found.slope], [SLOPE_UNIT]), reason or found.reason
+    else:
+        drawn = combined(cell_estimates([list(p.values()) for _, p in everything]), weights)
     effect, counts = (
         (drawn, "") if claim.measure != "diverged" else _shares(everything, claim, drawn)
     )
@@ -157,7 +161,7 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> Outcome:
         claim,
         effect,
         len(everything),
-        sum(map(len, samples)),
+        sum(len(pairs) for _, pairs in everything),
         len({policy for policy, _ in runs}),
         reason,
         counts,
@@ -271,23 +275,3 @@ def _shares(cells: Used, claim: Claim, drawn: Estimate) -> tuple[Effect | None, 
     units = len({name for units in named for name in units})
     first, second = ((units * count / number, units) for count in counts)
     return ShareDifference(first, second), text
-
-
-def _slope_weights(keys: Sequence[Key], audit: Audit) -> list[float]:
-    """What each cell's difference weighs in the slope of the difference with the defect.
-
-    Least squares within groups of cells that steer the same base policies: their defects, less the
-    group's mean, over the sum of squares of these. 0 where there is no other defect in the group,
-    or no audit.
-    """
-    groups: dict[Key, list[int]] = defaultdict(list)
-    defects = [defect.value if (defect := defect_of(key, audit)) else math.nan for key in keys]
-    for index, key in enumerate(keys):
-        if not math.isnan(defects[index]):
-            groups[replace(key, breaking=(False, ""))].append(index)
-    centred = np.zeros(len(keys))
-    for members in groups.values():
-        values = np.array([defects[i] for i in members])
-        centred[members] = values - values.mean()
-    total = float((centred**2).sum())
-    return (SLOPE_UNIT * centred / total).tolist() if total else [0.0] * len(keys)

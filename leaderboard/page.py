@@ -4,22 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-import numpy as np
-
 from symsteer.leaderboard.claims import SLOPE_UNIT, where
 from symsteer.leaderboard.comparisons import Comparisons
-from symsteer.leaderboard.defects import (
-    COMPONENTS,
-    MEASURES,
-    MIN_CELLS,
-    Crossing,
-    DefectMap,
-    Line,
-    Panel,
-    audit_commands,
-)
 from symsteer.leaderboard.findings import Findings
-from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.map_page import Figures, map_section
 from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
 from symsteer.leaderboard.statistics import Spread
 from symsteer.leaderboard.study import Claim
@@ -30,7 +18,6 @@ from symsteer.leaderboard.text import (
     NOTHING,
     SPACE,
     code,
-    difference,
     grid,
     image,
     interval,
@@ -38,9 +25,6 @@ from symsteer.leaderboard.text import (
     stacked,
     without_empty,
 )
-
-Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
-"""By place, (task, embodiment) or () for all of them, then by kind: description and address."""
 
 READING = f"""\
 Each agent steers a frozen diffusion policy by choosing the noise that it starts from. References
@@ -91,16 +75,6 @@ needs it for "an effect of at least the smallest one of interest"; otherwise a c
 Both p-values are corrected for the number of tests of a family (Holm), the intervals are not.
 """
 
-MAP = f"""\
-Each point is a cell: the advantage over `{STANDARD}`, paired by seed, against the *audited
-defect*. The defect is measured in simulation: it is the largest of the defects of dynamics (as a
-share of a step's own displacement), reward and observation. Bars are 95 % intervals; hollow points
-have fewer than {MIN_SEEDS} paired seeds and are not used for the line, which needs {MIN_CELLS}
-cells. The intervals of line, slope and crossing come from drawing seeds and episodes within the
-cells, defects within their intervals, and the scatter of the cells about the line that these do
-not explain.
-"""
-
 PROFILES = (
     "Performance profiles: the share of runs that close at least the given share of the gap "
     "between the frozen base (0, on the same episodes) and certain success (1), in the final "
@@ -129,7 +103,8 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     if findings.spreads:
         parts += ["## How much is the base policy's", *_spreads(summary, findings.spreads)]
     parts += ["## Claims", CLAIMS.strip(), *_claims(findings)]
-    parts += ["## Where symmetry stops paying", *_map(summary, findings.map, overall)]
+    heading = "## The advantage of symmetry against the defect"
+    parts += [heading, *map_section(summary, findings.map, figures)]
     if findings.comparisons.cells:
         parts += ["## All cells together", *_comparisons(findings.comparisons, overall)]
     place = None
@@ -293,117 +268,6 @@ def _test(claim: Claim) -> str:
 
 def _p(value: float) -> str:
     return "< 0.001".replace(" ", SPACE) if value < 0.001 else number(value, 3)
-
-
-def _map(summary: Summary, found: DefectMap, figures: Mapping[str, tuple[str, str]]) -> list[str]:
-    parts = [MAP.strip()]
-    if "map" in figures:
-        parts += [image(*figures["map"]), _lines(found), _map_numbers(summary, found)]
-    else:
-        parts.append("There is no map yet: no audited cell has paired runs of these agents.")
-    if found.unaudited:
-        names = {t.key: cell_name(t, summary) for t in summary.tables}
-        listed = ", ".join(dict.fromkeys(names[key] for key in found.unaudited))
-        text = f"Not audited, so not in the map: {listed}."
-        if commands := audit_commands(found.unaudited):
-            measured = ", ".join(code(command, 1000) for command in commands)
-            text += (
-                f" To measure them: {measured}; then "
-                "`python -m symsteer.bench.audit.page leaderboard/results/audit/summary.json "
-                "runs/audit/summary.json`."
-            )
-        parts.append(text)
-    return parts
-
-
-def _lines(found: DefectMap) -> str:
-    rows = []
-    for agent in WITH_SYMMETRY:
-        for measure in MEASURES:
-            panel = found.panels[agent, measure]
-            counted = sum(point.counts for point in panel.points)
-            slope = NOTHING
-            if panel.line:
-                s = panel.line.slope
-                slope = f"{number(s.value, sign=True)} [{number(s.low, sign=True)}, "
-                slope = f"{slope}{number(s.high, sign=True)}]".replace(" ", SPACE)
-            rows.append(
-                [
-                    code(agent),
-                    {"auc": "AUC", "success": "success"}[measure],
-                    f"{counted} of {len(panel.points)}",
-                    slope,
-                    crossing_text(panel),
-                ]
-            )
-    header = [
-        "Agent",
-        "Advantage in",
-        "Cells in the line",
-        "Slope (per 1 of defect)",
-        "The line falls through 0 at a defect of",
-    ]
-    return grid(header, rows, left=5)
-
-
-def crossing_text(panel: Panel) -> str:
-    """Where the advantage ends, or in words why there is no such place."""
-    line = panel.line
-    if line is None:
-        return f"no line: fewer than {MIN_CELLS} different defects with {MIN_SEEDS} paired seeds"
-    crossing = line.crossing
-    if crossing.value is not None:
-        low = number(crossing.low) if np.isfinite(crossing.low) else "below all audited"
-        high = number(crossing.high) if np.isfinite(crossing.high) else "beyond all audited"
-        return f"{number(crossing.value)} [{low}, {high}]"
-    return f"none: {_no_crossing(line)}{_excluded(crossing)}"
-
-
-def _no_crossing(line: Line) -> str:
-    low, high = line.span
-    ends = [line.intercept + line.slope.value * x for x in line.span]
-    where = f"from {number(low)} to {number(high)}"
-    if min(ends) > 0:
-        return f"the line stays above 0 {where}"
-    return f"the line {'rises through' if max(ends) > 0 else 'stays below'} 0 {where}"
-
-
-def _excluded(crossing: Crossing) -> str:
-    """What the interval says about a crossing inside the audited range."""
-    if crossing.low == crossing.high:
-        return "; at 95 % there is none in this range"
-    if np.isfinite(crossing.low):
-        return f"; at 95 % it does not lie below {number(crossing.low)}"
-    if np.isfinite(crossing.high):
-        return f"; at 95 % it does not lie beyond {number(crossing.high)}"
-    return "; the data do not say where"
-
-
-def _map_numbers(summary: Summary, found: DefectMap) -> str:
-    cells: dict[int, dict[tuple[str, str], str]] = {}
-    tables, defects = {}, {}
-    for which, panel in found.panels.items():
-        for point in panel.points:
-            place = id(point.table)
-            tables[place], defects[place] = point.table, point.defect
-            cells.setdefault(place, {})[which] = (
-                f"{difference(point.advantage)} ({len(point.samples)})"
-            )
-    rows = []
-    for place in sorted(cells, key=lambda p: (defects[p].value, tables[p].key)):
-        defect = defects[place]
-        rows.append(
-            [
-                cell_name(tables[place], summary),
-                f"{interval(defect.interval, digits=3)} {COMPONENTS[defect.component]}",
-                *(cells[place].get(which, NOTHING) for which in found.panels),
-            ]
-        )
-    header = ["Cell", "Audited defect"]
-    for agent, measure in found.panels:
-        header.append(f"{code(agent)}, {'AUC' if measure == 'auc' else measure} (seeds)")
-    table = grid(header, rows, left=1)
-    return f"<details>\n<summary>The map's numbers</summary>\n\n{table}\n\n</details>"
 
 
 def _comparisons(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> list[str]:

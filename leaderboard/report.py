@@ -21,7 +21,7 @@ from symsteer.leaderboard.tables import render_csv
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
 
-FIGURE_NAME = re.compile(r"(map|profiles|improvement|(success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
+FIGURE_NAME = re.compile(r"(map|profiles|improvement|(map|success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
 
 
 def generate(

@@ -23,7 +23,7 @@ DEFECTS = {"none": 0.01, "wind:0.1": 0.04, "wind:0.5": 0.1, "wind:0.8": 0.26, "w
 
 def audit_of(defects: dict[str, float], embodiment: str = "floating") -> Audit:
     return {
-        ("PickCube-v1", embodiment, variant, "C8"): Defect(Interval(d, d, d), "tool_step")
+        ("PickCube-v1", embodiment, variant, "C8"): Defect(Interval(d, d, d), "tool")
         for variant, d in defects.items()
     }
 

@@ -31,9 +31,11 @@ def audit(folder: Path, group: str = "C8", variants: dict[str, float] = DEFECTS)
             "embodiment": "floating",
             "variant": variant,
             "group": group,
-            "tool_step": [defect, 0.9 * defect, 1.1 * defect],
-            "cost": [0.0, 0.0, 0.0],
-            "observation": [0.0, 0.0, 0.0],
+            "version": 2,
+            "part": "object" if variant == "none" else "tool",
+            "decision": [defect, 0.9 * defect, 1.1 * defect],
+            "resets": [0.0, -0.001, 0.001],
+            "resets_p": 0.5,
         }
         for variant, defect in variants.items()
     ]
@@ -234,14 +236,16 @@ def test_the_page_says_how_much_of_the_spread_is_the_policys() -> None:
     assert "only the sum of both can be told" in text
 
 
-def test_the_map_names_the_crossing_and_what_is_missing(board: Path) -> None:
+def test_the_map_names_slopes_parts_and_what_is_missing(board: Path) -> None:
     text = text_of(board)
-    _, _, *rows = table_after(text, "## Where symmetry stops paying")
+    _, _, *rows = table_after(text, "## The advantage of symmetry against the defect")
     by_agent = {(row[0], row[1]): row for row in rows}
     strict = by_agent["`equivariant`", "success"]
-    assert strict[2] == "4 of 4"
-    assert strict[4].startswith("0.30 [0.2")
-    assert "stays above 0" in by_agent["`approximate`", "success"][4]
+    assert strict[2:4] == ["`wind`", "1"]
+    assert strict[4].startswith("\u22121.00 [\u22121.")
+    # With one base policy no slope is marked as a finding.
+    assert not strict[4].endswith("\u25bc")
+    assert strict[5] == "base policies at several defects: 1, 5 are needed"
     assert "Not audited, so not in the map: `PickCube-v1` `floating` `wind:0.75`." in text
     assert (
         "`symsteer audit --task PickCube-v1 --embodiment floating --group C8 "
@@ -249,6 +253,7 @@ def test_the_map_names_the_crossing_and_what_is_missing(board: Path) -> None:
     )
     _, _, *cells = table_after(text, "<summary>The map's numbers")
     assert [cell[1].split(" ")[0] for cell in cells] == ["0.002", "0.100", "0.200", "0.400"]
+    assert [cell[2] for cell in cells] == ["object", "tool", "tool", "tool"]
 
 
 def test_provenance_names_every_session(board: Path) -> None:
@@ -261,7 +266,8 @@ def test_provenance_names_every_session(board: Path) -> None:
 
 def test_all_figures_are_there(board: Path) -> None:
     names = sorted(path.name for path in (board / "figures").iterdir())
-    assert names[:2] == ["improvement.svg", "map.svg"]
+    assert names[0] == "improvement.svg"
+    assert re.fullmatch(r"map-floating-[0-9a-f]{6}\.svg", names[1])
     assert "profiles.svg" in names
     for name in names:
         root = ElementTree.fromstring((board / "figures" / name).read_bytes())
@@ -302,10 +308,10 @@ def test_the_audit_changes_the_page_and_the_order_of_records_does_not(
     for path in files:
         assert path.read_bytes() == (other / path.relative_to(again)).read_bytes()
     assert "no base policy was steered at two defects" in text_of(again)
-    assert (again / "figures" / "map.svg").exists()
+    assert len(list((again / "figures").glob("map-*.svg"))) == 1
     generate(few, again, audit(tmp_path, group="D4"))
     assert "There is no map yet" in text_of(again)
-    assert not (again / "figures" / "map.svg").exists()
+    assert not list((again / "figures").glob("map*"))
 
 
 def test_hostile_names_stay_text_in_every_section(tmp_path: Path) -> None:
@@ -334,7 +340,7 @@ def test_hostile_names_stay_text_in_every_section(tmp_path: Path) -> None:
     plain = " ".join(t.content for t in tokens if t.type == "text")
     assert "alert" not in plain
     assert "symsteer audit --task" not in page
-    assert (tmp_path / "figures" / "map.svg").exists()
+    assert len(list((tmp_path / "figures").glob("map-*.svg"))) == 1
     for path in (tmp_path / "figures").iterdir():
         assert re.fullmatch(r"[a-z0-9-]+\.svg", path.name)
         ElementTree.fromstring(path.read_bytes())

@@ -181,7 +181,7 @@ HEADINGS = (
     "At a glance",
     "How much is the base policy's",
     "Claims",
-    "Where symmetry stops paying",
+    "The advantage of symmetry against the defect",
     "All cells together",
     "Unbroken symmetry",
     "Provenance",
