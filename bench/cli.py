@@ -332,7 +332,7 @@ def audit(
         states: Whose states: those of the scripted expert, of the base policy with random noise,
             or both.
         count: Number of states of each, every one from a different episode.
-        chunk: Control steps of an action chunk.
+        chunk: Control steps of a decision: those that are executed of an action chunk.
         resets: Number of initial states that are compared with as many rotated ones.
         seed: Seed of states, draws and intervals.
         sim: Where physics runs.
