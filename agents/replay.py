@@ -144,9 +144,10 @@ class ReplayBuffer:
             following = (rows + self.stride) % self.capacity
             following = following.clamp(max=self.size - 1)
             then = {name: self.storage[name][following] for name in FOLLOWED}
-            # A row continues another one if it starts where that one ended. This is never so across
-            # resets, fresh scenes, or the place where the ring buffer is overwritten.
+            # A row continues another one if it is newer and starts where that one ended. This is
+            # never so across resets, fresh scenes, or the place where the ring is overwritten.
             joined = (self.storage["obs"][following] == batch.next_obs).all(1)
+            joined &= (self.position - 1 - rows) % self.capacity >= self.stride
             joined &= (batch.terminal + batch.truncated) == 0
             batch["reward"] = batch.reward + joined * batch.discount * then["reward"]
             batch["discount"] = torch.where(joined, gamma * batch.discount, batch.discount)

@@ -66,9 +66,10 @@ def entry_points(monkeypatch):
 
 
 def test_the_order_is_that_of_a_comparison():
-    assert AGENTS.names()[:4] == ["standard", "standard-matched", "equivariant", "approximate"]
+    learners = ["standard", "standard-matched", "augmented", "equivariant", "approximate"]
+    assert AGENTS.names()[:6] == [*learners, "wrong-group"]
     roles = [AGENTS.get(name).role for name in AGENTS.builtin]
-    assert roles == ["learner"] * 4 + ["reference"] * 3
+    assert roles == ["learner"] * 5 + ["control"] + ["reference"] * 3
 
 
 @pytest.mark.parametrize("name", AGENTS.builtin)

@@ -8,6 +8,7 @@ import torch
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext, Budget
+from symsteer.agents.replay import Transition
 from symsteer.bench.tasks import task_class
 from symsteer.bench.variants import parse
 from symsteer.errors import UserError
@@ -34,12 +35,12 @@ def test_the_smooth_agent_learns_noise_that_decodes_to_smooth_chunks():
     def draw(*shape):
         return torch.randn(64, *shape, generator=generator)
 
-    rows = {"obs": draw(3), "noise": draw(4, 4), "reward": draw(), "next_obs": draw(3)}
-    rows |= {"terminal": torch.ones(64), "actions": draw(2, 4)}
+    ends = {"terminal": torch.ones(64), "truncated": torch.zeros(64)}
+    step = Transition(draw(3), draw(4, 4), draw(2, 4), draw(), draw(3), **ends)
 
     def roughness(weight):
         agent = kind(context, kind.Options(width=32, lr=3e-3, smoothness=weight))
-        agent.replay.add(rows)
+        agent.observe(step)
         for _ in range(100):
             scalars = agent.update(agent.replay.sample(32))
         assert scalars["train/executed_roughness"] > 0

@@ -32,7 +32,7 @@ RUN = """
 
 SUITE = """
 [grid]
-agent = ["smooth", "augmented:AugmentedAgent"]
+agent = ["smooth", "leashed:LeashedAgent"]
 "agent.smoothness" = [0.05]
 
 [run]
@@ -127,7 +127,7 @@ def problems(text):
     found = {}
     for line in text.splitlines():
         if line.endswith("NOT ADMISSIBLE"):
-            agent = "augmented" if "augmented=AugmentedAgent" in line else "smooth"
+            agent = "leashed" if "leashed=LeashedAgent" in line else "smooth"
             found[agent] = []
         elif line.startswith("  problem: "):
             found[agent].append(line)
@@ -157,7 +157,7 @@ def test_run_sweep_report_and_admission(site, tmp_path):
     # Reading records needs no code of the agents.
     symsteer(tmp_path, "report", "runs")
     page = (tmp_path / "runs" / "leaderboard" / "LEADERBOARD.md").read_text()
-    for name in ("WidePick-v1", "dead_zone:1", "smooth", "augmented:AugmentedAgent"):
+    for name in ("WidePick-v1", "dead_zone:1", "smooth", "leashed:LeashedAgent"):
         assert name in page
 
     (tmp_path / "committed").mkdir()
@@ -171,8 +171,8 @@ def test_run_sweep_report_and_admission(site, tmp_path):
         for agent, texts in problems(said).items()
     }
     assert unfair["smooth"] == []
-    (refused,) = unfair["augmented"]
-    assert "augmented:AugmentedAgent, which belongs to no installed distribution" in refused
+    (refused,) = unfair["leashed"]
+    assert "leashed:LeashedAgent, which belongs to no installed distribution" in refused
 
     # Without the package, as here.
     missing = "'smooth' of the distribution symsteer-lab, which is not installed; install it"
