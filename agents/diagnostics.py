@@ -35,6 +35,9 @@ class HasValues(Protocol):
 SYMMETRY_STATES = 64
 """States on which equivariance errors are measured."""
 
+MIN_PAIRS = 8
+"""Decisions that a correlation of Q with the return needs."""
+
 SAME = 1e-6
 """Values that differ by less, relative to their size, differ by rounding only."""
 
@@ -73,6 +76,7 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
         "q_high": high,
         "q_allowance": allowance,
         **errors,
+        "alias_gap": alias_gap(agent, obs, noise),
         "q_preference": critic_preference(agent, obs, played.generator)["critic_preference"],
         "alpha": statistics["alpha"],
         "entropy": statistics["entropy"],
@@ -105,6 +109,20 @@ def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -
         agent.act_layout,
         group,
     )
+
+
+@torch.no_grad()
+def alias_gap(agent: SacAgent, obs: torch.Tensor, noise: torch.Tensor) -> float | None:
+    """Error of the distilled noise critics: mean |Q_W(s, w) - Q(s, decode(s, w))|, reward units.
+
+    None for agents without distilled critics.
+
+    Args:
+        obs, noise: ``[B, obs_dim]``, ``[B, Tp, Da]``, the actor's own noise.
+    """
+    if agent.options.critic != "aliased":
+        return None
+    return (agent.noise_q_values(obs, noise) - agent.q_values(obs, noise)).abs().mean().item()
 
 
 def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float:
@@ -217,7 +235,7 @@ def agreement(q: torch.Tensor, returns: torch.Tensor) -> Measures:
 
     - ``bias``, ``bias_std`` = mean and standard deviation of Q - G;
     - ``correlation``, ``rank_correlation`` = Pearson's and Spearman's of Q and G; None where one
-      of them has no variance;
+      of them has no variance, and for fewer than ``MIN_PAIRS`` values;
     - ``overestimated`` = share with Q > G;
     - ``decisions`` = number of values. Without values, all others are None.
 
@@ -227,8 +245,9 @@ def agreement(q: torch.Tensor, returns: torch.Tensor) -> Measures:
     gap = q - returns
     bias, spread = _mean_and_std(gap)
     over = torch.where(gap.isnan(), gap, (gap > 0).double())
-    constant = any(bool(x.std() <= SAME * x.abs().max()) for x in (q, returns) if len(x) > 1)
-    measured = len(q) > 1 and not constant
+    measured = len(q) >= MIN_PAIRS and not any(
+        bool(x.std() <= SAME * x.abs().max()) for x in (q, returns)
+    )
     pair = q.numpy(force=True), returns.numpy(force=True)
     return {
         "bias": bias,

@@ -332,7 +332,7 @@ def audit(
         states: Whose states: those of the scripted expert, of the base policy with random noise,
             or both.
         count: Number of states of each, every one from a different episode.
-        chunk: Control steps of an action chunk.
+        chunk: Control steps of a decision: those that are executed of an action chunk.
         resets: Number of initial states that are compared with as many rotated ones.
         seed: Seed of states, draws and intervals.
         sim: Where physics runs.
@@ -390,6 +390,7 @@ def throughput(
     seconds: float = 0.7,
     cores: int = 0,
     memory: bool = False,
+    learner: bool = False,
     json: bool = False,
 ) -> int:
     """Compare the speed of simulation with stock ManiSkill and with PhysX alone, in minutes.
@@ -401,6 +402,7 @@ def throughput(
         seconds: Minimum length of a measurement.
         cores: Processes in the measurement on all cores; 0: one per core.
         memory: Only measure how memory grows over 10,000 steps with resets.
+        learner: Only measure the CPU time of an update of each learner.
         json: Print only JSON.
     """
     from symsteer.bench import throughput as speed
@@ -408,6 +410,12 @@ def throughput(
     def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
+    if learner:
+        from symsteer.bench import learner_throughput
+
+        rows = learner_throughput.measure(task, updates=20, repeats=repeats, report=report)
+        print(speed.dump({"rows": rows}) if json else learner_throughput.table(rows))
+        return 0
     if memory:
         growth = speed.memory_growth(task, report=report)
         print(

@@ -1,309 +1,277 @@
-"""The claims of arXiv 2512.11345, each with a test, an effect, an interval and a verdict.
-
-A verdict follows a fixed rule: the 95 % interval of the effect lies wholly on the side that the
-claim predicts (supported), wholly on the other one (contradicted), or neither (undecided). A test
-without enough data is undecided and says why; it is never left out.
-"""
+"""Declared claims (`symsteer.leaderboard.study`), each with an effect, p-values and a verdict."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
-from symsteer.leaderboard.defects import (
-    MIN_CELLS,
-    Audit,
-    DefectMap,
-    Panel,
-    advantage,
-    defect_of,
-)
-from symsteer.leaderboard.paper import (
-    APPROXIMATE,
-    EQUIVARIANT,
-    STANDARD,
-    WITHOUT_SYMMETRY,
-)
+from symsteer.leaderboard.defects import Audit, Point, advantage, defect_of, fit
+from symsteer.leaderboard.paper import ROW_ORDER
 from symsteer.leaderboard.statistics import (
-    Interval,
+    CONFIDENCE,
+    Effect,
+    Estimate,
     Sample,
-    censored_median,
-    newcombe,
-    percentile,
-    stratified_bootstrap,
-    stratified_draws,
+    ShareDifference,
+    cell_estimates,
+    combined,
+    holm,
+    p_difference,
+    p_equivalence,
+    units_of,
 )
-from symsteer.leaderboard.summary import MIN_SEEDS, Key, Pair, Summary, Table
-
-NEARLY_SYMMETRIC = 0.05
-"""Cells with an audited defect up to this are where the paper expects symmetry to help."""
-
-STRONGLY_BROKEN = 0.25
-"""Cells with an audited defect from this on are where the paper expects strictness to hurt."""
+from symsteer.leaderboard.study import Cells, Claim, Study
+from symsteer.leaderboard.summary import MIN_SEEDS, Key, Pair, Run, Summary, Table
+from symsteer.leaderboard.text import code
+from symsteer.names import unknown
 
 SLOPE_UNIT = 0.1
 """Slopes are given for this much more defect."""
 
+Used = list[tuple[Table, dict[Pair, Sample]]]
+"""Cells with what each pair of runs contributes."""
+
 
 @dataclass(frozen=True)
-class Claim:
-    """One test. `predicted` is the sign of the effect that the claim expects."""
+class Outcome:
+    """A claim and what the records say about it."""
 
-    name: str
-    test: str
-    predicted: int
-    effect: Interval | None = None
+    claim: Claim
+    effect: Effect | None = None
     cells: int = 0
-    seeds: int = 0
+    pairs: int = 0
     """Paired runs over all cells."""
+    policies: int = 0
+    """Base policies that they steer."""
     reason: str = ""
-    """Why the test cannot decide, whatever its interval says."""
-    beside: str = ""
-    """Further numbers on the same question, without a test."""
+    """Why it is not tested."""
+    counts: str = ""
+    """Of shares, the numbers behind them."""
+    p: float = 1.0
+    """Of no effect, corrected for the number of tested claims of the family (Holm)."""
+    p_equal: float = 1.0
+    """Of an effect at least as large as the smallest of interest, corrected in the same way."""
 
     @property
     def verdict(self) -> str:
-        if self.reason or self.effect is None or self.effect.sign == 0:
+        """`equivalent`, `supported`, `contradicted`, `undecided` or `not tested`."""
+        level = 1 - CONFIDENCE
+        if self.reason or self.effect is None:
+            return "not tested"
+        if self.p_equal < level:
+            return "equivalent"
+        if self.p >= level:
             return "undecided"
-        return "supported" if self.effect.sign == self.predicted else "contradicted"
+        sign = 1 if self.effect.value > 0 else -1
+        return "supported" if sign == self.claim.predicted else "contradicted"
 
 
-T = TypeVar("T")
-Cells = list[tuple[Table, dict[Pair, T]]]
-"""Tables with what each pair of runs contributes."""
+def claims(study: Study, summary: Summary, audit: Audit) -> list[Outcome]:
+    """All claims of a study, in its order.
+
+    Raises:
+        UserError: for an agent, task, embodiment or variant that neither the records nor the audit
+            nor SymSteer has.
+    """
+    _check_names(study, summary, audit)
+    found = [_outcome(claim, summary, audit) for claim in study.claims]
+    families: dict[str, list[int]] = defaultdict(list)
+    for index, outcome in enumerate(found):
+        if not outcome.reason:
+            families[outcome.claim.family].append(index)
+    for members in families.values():
+        effects = [(found[i].effect, found[i].claim.smallest) for i in members]
+        different = holm([p_difference(effect) for effect, _ in effects if effect])
+        equal = holm([p_equivalence(effect, margin) for effect, margin in effects if effect])
+        for index, p, p_equal in zip(members, different, equal, strict=True):
+            found[index] = replace(found[index], p=p, p_equal=p_equal)
+    return found
 
 
-def claims(summary: Summary, audit: Audit, found: DefectMap) -> list[Claim]:
-    """All tests, in the order of the paper's claims."""
-    symmetric = [t for t in summary.tables if _below(t, audit)]
-    return [
-        *(_sample_efficiency(symmetric, rival) for rival in WITHOUT_SYMMETRY),
-        *(_divergence(summary.tables, rival) for rival in WITHOUT_SYMMETRY),
-        *(_bias(summary.tables, rival) for rival in WITHOUT_SYMMETRY),
-        _fewest_demonstrations(symmetric),
-        _fewer_demonstrations(symmetric),
-        *(_falls(found.panels[EQUIVARIANT, measure]) for measure in ("auc", "success")),
-        _approximate_beyond(summary.tables, audit),
-    ]
+def _check_names(study: Study, summary: Summary, audit: Audit) -> None:
+    keys = [table.key for table in summary.tables]
+    places = [*((k.task, k.embodiment, k.variant) for k in keys), *(p[:3] for p in audit)]
+    variants = {name for place in places for name in (place[2], *_parts(place[2]))}
+    valid = {
+        "agent": [*ROW_ORDER, *(a for a in summary.agents if a not in ROW_ORDER)],
+        "task": sorted({place[0] for place in places}),
+        "embodiment": sorted({place[1] for place in places}),
+        "variant": sorted(variants),
+    }
+    for claim in study.claims:
+        named: list[tuple[str, tuple[str, ...]]] = [("agent", claim.agents)]
+        for cells in (claim.cells, claim.minus or Cells()):
+            named += [
+                ("task", cells.task or ()),
+                ("embodiment", cells.embodiment or ()),
+                ("variant", cells.variant or ()),
+            ]
+        for kind, names in named:
+            for name in names:
+                if name not in valid[kind]:
+                    raise unknown(kind, name, valid[kind], f"{study.source}, {claim.name!r}")
 
 
-def _below(table: Table, audit: Audit) -> bool:
-    defect = defect_of(table.key, audit)
-    return defect is not None and defect.value <= NEARLY_SYMMETRIC
+def _parts(variant: str) -> list[str]:
+    """The variants that a text joins, without their strengths."""
+    return [part.partition(":")[0] for part in variant.split("+")]
 
 
-def _enough(cells: Cells[T], wanted: str) -> tuple[Cells[T], str]:
-    """The cells with enough seeds; if there are none, all of them and why they cannot decide."""
-    cells = [(table, samples) for table, samples in cells if samples]
-    if not cells:
-        return [], f"no runs of {wanted} to pair"
-    enough = [(table, samples) for table, samples in cells if len(samples) >= MIN_SEEDS]
-    if enough:
-        return enough, ""
-    most = max(len(samples) for _, samples in cells)
-    return cells, f"at most {most} paired seeds in a cell, {MIN_SEEDS} are needed"
-
-
-def _averaged(
-    name: str, test: str, found: Cells[Sample], wanted: str
-) -> tuple[Claim, Cells[Sample]]:
-    """Mean over cells of paired differences, predicted to be positive, and the cells used."""
-    cells, reason = _enough(found, wanted)
-    if not cells:
-        return Claim(name, test, 1, reason=reason), cells
-    effect = stratified_bootstrap([list(samples.values()) for _, samples in cells])
-    seeds = sum(len(samples) for _, samples in cells)
-    return Claim(name, test, 1, effect, len(cells), seeds, reason), cells
-
-
-def _paired(
-    name: str, test: str, tables: Sequence[Table], first: str, second: str, measure: str, where: str
-) -> tuple[Claim, Cells[Sample]]:
-    """The same for the difference of two agents in a measure of the map."""
-    found = [(table, advantage(table, first, second, measure)) for table in tables]
-    return _averaged(name, test, found, f"`{first}` and `{second}`{where}")
-
-
-def _sample_efficiency(tables: Sequence[Table], rival: str) -> Claim:
-    claim, cells = _paired(
-        "Sample efficiency: symmetric agents learn faster",
-        f"area under the curve, `equivariant` minus `{rival}`, defect up to {NEARLY_SYMMETRIC:g}",
-        tables,
-        EQUIVARIANT,
-        rival,
-        "auc",
-        f" where the audited defect is at most {NEARLY_SYMMETRIC:g}",
+def _outcome(claim: Claim, summary: Summary, audit: Audit) -> Outcome:
+    sides = []
+    for cells in (claim.cells, claim.minus):
+        if cells is None:
+            continue
+        tables, reason = selected(cells, summary.tables, audit)
+        used = [(table, pairs) for table in tables if (pairs := paired(table, claim))]
+        reason = reason or ("" if used else _without_pairs(tables, claim, cells))
+        if reason:
+            return Outcome(claim, reason=reason)
+        sides.append(used)
+    reason = ""
+    if any(max(len(pairs) for _, pairs in side) < MIN_SEEDS for side in sides):
+        reason = f"fewer than {MIN_SEEDS} pairs of runs in every cell"
+    else:
+        sides = [[(t, pairs) for t, pairs in side if len(pairs) >= MIN_SEEDS] for side in sides]
+    weights = [sign / len(side) for sign, side in zip((1, -1), sides, strict=False) for _ in side]
+    everything = [cell for side in sides for cell in side]
+    if claim.effect == "slope":
+        points = [
+            Point(table, defect, pairs)
+            for table, pairs in everything
+            if (defect := defect_of(table.key, audit))
+        ]
+        found = fit(points)
+        if found is None:
+            return Outcome(claim, reason="no base policy was steered at two defects")
+        everything = [(p.table, dict(p.pairs)) for p in points if p.setting in found.settings]
+        drawn, reason = combined([found.slope], [SLOPE_UNIT]), reason or found.reason
+    else:
+        drawn = combined(cell_estimates([list(p.values()) for _, p in everything]), weights)
+    effect, counts = (
+        (drawn, "") if claim.measure != "diverged" else _shares(everything, claim, drawn)
     )
-    if not cells:
-        return claim
-    steps = [_threshold_steps([t for t, _ in cells], agent) for agent in (EQUIVARIANT, rival)]
-    return replace(claim, beside=f"steps: {steps[0]} against {steps[1]} of the budget")
-
-
-def _threshold_steps(tables: Sequence[Table], agent: str) -> str:
-    """Median share of the budget until the threshold over all runs, and how many got there."""
-    shares = [
-        None if steps is None else round(100 * steps / table.key.env_steps)
-        for table in tables
-        if (row := table.row_of(agent))
-        for steps in row.threshold_steps
-    ]
-    reached = sum(share is not None for share in shares)
-    median = censored_median(shares)
-    text = "> 100 %" if median is None else f"{median:.0f} %"
-    return f"{text} ({reached}/{len(shares)})"
-
-
-DIVERGENCE = "Value divergence: symmetry prevents it"
-
-
-def _divergence(tables: Sequence[Table], rival: str) -> Claim:
-    test = f"share of runs whose Q diverged, `{rival}` minus `equivariant`, all cells"
-
-    def verdicts(table: Table, agent: str) -> dict[Pair, bool]:
-        # A run that failed because its Q was not finite counts, so rows may have no finished run.
-        rows = [row for row in table.rows if row.agent == agent]
-        found = [{r.pair: r.diverged for r in row.runs if r.diverged is not None} for row in rows]
-        return max(found, key=len, default={})
-
-    found = [
-        (table, _joined(verdicts(table, rival), verdicts(table, EQUIVARIANT))) for table in tables
-    ]
-    cells, reason = _enough(found, f"`{rival}` and `equivariant` with a critic")
-    if not cells:
-        return Claim(DIVERGENCE, test, 1, reason=reason)
-    both = [pair for _, pairs in cells for pair in pairs.values()]
-    counts, runs = [sum(pair[i] for pair in both) for i in (0, 1)], len(both)
-    effect = newcombe((counts[0], runs), (counts[1], runs))
-    beside = f"{counts[0]}/{runs} against {counts[1]}/{runs} diverged"
-    return Claim(DIVERGENCE, test, 1, effect, len(cells), runs, reason, beside)
-
-
-def _bias(tables: Sequence[Table], rival: str) -> Claim:
-    """The milder form of divergence: how far Q is from the returns that it should predict."""
-    name = "Value error: symmetry makes Q less wrong"
-    test = f"absolute Q bias, `{rival}` minus `equivariant`, all cells"
-
-    def biases(table: Table, agent: str) -> dict[Pair, float]:
-        row = table.row_of(agent)
-        found = {run.pair: run.in_window("q_bias") for run in row.finished} if row else {}
-        return {pair: abs(float(np.mean(values))) for pair, values in found.items() if values}
-
-    found: Cells[Sample] = []
-    for table in tables:
-        both = _joined(biases(table, rival), biases(table, EQUIVARIANT))
-        found.append((table, {pair: Sample.constant(a - b) for pair, (a, b) in both.items()}))
-    claim, cells = _averaged(name, test, found, f"`{rival}` and `equivariant` with a critic")
-    return replace(claim, beside="in units of return") if cells else claim
-
-
-def _joined(first: Mapping[Pair, T], second: Mapping[Pair, T]) -> dict[Pair, tuple[T, T]]:
-    return {pair: (value, second[pair]) for pair, value in first.items() if pair in second}
-
-
-FEW = "Few demonstrations: symmetry helps most there"
-
-
-def _by_demonstrations(tables: Sequence[Table]) -> list[list[Table]]:
-    """Tables that differ in the number of demonstrations alone, fewest first; families of two."""
-    families: dict[tuple[object, ...], list[Table]] = defaultdict(list)
-    for table in sorted(tables, key=lambda table: table.key):
-        families[_family(table.key)].append(table)
-    return [
-        sorted(family, key=lambda table: table.key.demonstrations)
-        for family in families.values()
-        if len({table.key.demonstrations for table in family}) > 1
-    ]
-
-
-def _family(key: Key) -> tuple[object, ...]:
-    return (key.task, key.embodiment, key.breaking, key.base, key.group, key.mode, key.env_steps)
-
-
-def _one_number(tables: Sequence[Table]) -> str:
-    numbers = sorted({table.key.demonstrations for table in tables})
-    if not numbers:
-        return f"no cell has an audited defect of at most {NEARLY_SYMMETRIC:g}"
-    have = f"all have {numbers[0]}" if len(numbers) == 1 else f"there are {numbers}"
-    return f"no cell was run with more than one number of demonstrations ({have})"
-
-
-def _fewest_demonstrations(tables: Sequence[Table]) -> Claim:
-    test = (
-        "success, `equivariant` minus `standard`, at the smallest number of demonstrations, "
-        f"defect up to {NEARLY_SYMMETRIC:g}"
+    if effect is None:
+        reason = "nobody diverged"
+    runs = {pair for _, pairs in everything for pair in pairs}
+    return Outcome(
+        claim,
+        effect,
+        len(everything),
+        sum(len(pairs) for _, pairs in everything),
+        len({policy for policy, _ in runs}),
+        reason,
+        counts,
     )
-    families = _by_demonstrations(tables)
-    if not families:
-        return Claim(FEW, test, 1, reason=_one_number(tables))
-    fewest = [family[0] for family in families]
-    where = " at the smallest number of demonstrations"
-    return _paired(FEW, test, fewest, EQUIVARIANT, STANDARD, "success", where)[0]
 
 
-def _fewer_demonstrations(tables: Sequence[Table]) -> Claim:
-    test = "the same, at the smallest minus at the largest number of demonstrations"
-    families = _by_demonstrations(tables)
-    if not families:
-        return Claim(FEW, test, 1, reason=_one_number(tables))
-
-    def samples(table: Table) -> list[Sample]:
-        return list(advantage(table, EQUIVARIANT, STANDARD, "success").values())
-
-    ends = [(samples(family[0]), samples(family[-1])) for family in families]
-    ends = [(few, many) for few, many in ends if few and many]
-    if not ends:
-        return Claim(FEW, test, 1, reason="no runs of `equivariant` and `standard` at both ends")
-    enough = [(few, many) for few, many in ends if min(len(few), len(many)) >= MIN_SEEDS]
-    reason = "" if enough else f"fewer than {MIN_SEEDS} paired seeds at one of the ends"
-    # The cells of one family share their episodes, so their draws belong together.
-    cells = [side for end in enough or ends for side in end]
-    signs = np.tile([1.0, -1.0], len(enough or ends))
-    values = np.array([np.mean([sample.value for sample in cell]) for cell in cells])
-    draws = stratified_draws(cells, np.random.default_rng(0))
-    effect = percentile(
-        2 * float(np.mean(signs * values)), 2 * np.mean(signs[:, None] * draws, axis=0)
-    )
-    runs = sum(len(few) for few, _ in enough or ends)
-    return Claim(FEW, test, 1, effect, len(enough or ends), runs, reason)
+def selected(cells: Cells, tables: Sequence[Table], audit: Audit) -> tuple[list[Table], str]:
+    """The tables that a claim is about, and if there are none, why."""
+    tables = [table for table in tables if _selects(cells, table.key, audit)]
+    if not tables:
+        return [], f"there are no {where(cells)}"
+    if cells.demonstrations is None:
+        return tables, ""
+    families: dict[Key, list[Table]] = defaultdict(list)
+    for table in sorted(tables, key=lambda table: table.key.demonstrations):
+        families[replace(table.key, demonstrations=0)].append(table)
+    several = [family for family in families.values() if len(family) > 1]
+    end = 0 if cells.demonstrations == "fewest" else -1
+    reason = "" if several else "no cell was run with more than one number of demonstrations"
+    return [family[end] for family in several], reason
 
 
-LIMITS = "Limits under breaking: the advantage of strictness falls with the defect"
-
-
-def _falls(panel: Panel) -> Claim:
-    what = {"auc": "area under the curve", "success": "success"}[panel.measure]
-    test = f"slope of the advantage in {what} (the map's line), per {SLOPE_UNIT:g} of defect"
-    if panel.line is None:
-        found = len({p.defect.value for p in panel.points if p.counts})
-        reason = (
-            f"{found} audited cells with {MIN_SEEDS} paired seeds and a defect of their own, "
-            f"{MIN_CELLS} are needed"
+def _selects(cells: Cells, key: Key, audit: Audit) -> bool:
+    if cells.defect is not None:
+        defect = defect_of(key, audit)
+        if defect is None or not cells.defect[0] <= defect.value <= cells.defect[1]:
+            return False
+    return (
+        (cells.broken is None or cells.broken == bool(key.broken_by))
+        and (cells.task is None or key.task in cells.task)
+        and (cells.embodiment is None or key.embodiment in cells.embodiment)
+        and (
+            cells.variant is None
+            or not {key.variant, *_parts(key.variant)}.isdisjoint(cells.variant)
         )
-        return Claim(LIMITS, test, -1, reason=reason)
-    slope = panel.line.slope
-    scaled = Interval(*(SLOPE_UNIT * value for value in (slope.value, slope.low, slope.high)))
-    counted = [point for point in panel.points if point.counts]
-    seeds = sum(len(point.samples) for point in counted)
-    return Claim(LIMITS, test, -1, scaled, len(counted), seeds)
+    )
 
 
-def _approximate_beyond(tables: Sequence[Table], audit: Audit) -> Claim:
-    broken = [
-        table
-        for table in tables
-        if (defect := defect_of(table.key, audit)) and defect.value >= STRONGLY_BROKEN
+def where(cells: Cells) -> str:
+    """Which cells, in words."""
+    words = {None: "", True: "broken ", False: "unbroken "}[cells.broken] + "cells"
+    if cells.defect is not None:
+        words += f" with a defect of {cells.defect[0]:g} to {cells.defect[1]:g}"
+    for names in (cells.task, cells.embodiment, cells.variant):
+        if names is not None:
+            words += f" of {' or '.join(map(code, names))}"
+    if cells.demonstrations is not None:
+        words += f" with the {cells.demonstrations} demonstrations"
+    return words
+
+
+def _without_pairs(tables: Sequence[Table], claim: Claim, cells: Cells) -> str:
+    """Why no runs of the two agents can be compared."""
+    for agent in claim.agents:
+        if not any(row.agent == agent and row.runs for table in tables for row in table.rows):
+            return f"no runs of {code(agent)} in {where(cells)}"
+    if claim.measure == "bias":
+        return "not measured over all decisions"
+    return f"no runs of both agents with the same seed on the same base policy in {where(cells)}"
+
+
+def paired(table: Table, claim: Claim) -> dict[Pair, Sample]:
+    """The difference of the two agents' measure, by pair of runs."""
+    if claim.measure in ("auc", "success"):
+        return advantage(table, *claim.agents, claim.measure)
+    values = [_values(table, agent, claim.measure) for agent in claim.agents]
+    return {
+        pair: Sample.constant(value - values[1][pair], pair[0])
+        for pair, value in values[0].items()
+        if pair in values[1]
+    }
+
+
+def _values(table: Table, agent: str, measure: str) -> dict[Pair, float]:
+    """A number for each run of an agent that has it; of several recipes, of that with most runs."""
+
+    def of(run: Run) -> float | None:
+        if measure == "diverged":
+            # A run that failed because its Q was not finite counts.
+            return run.diverged
+        if not run.finished or (found := run.record.divergence) is None:
+            return None
+        if measure == "magnitude":
+            return found.magnitude
+        biases = run.in_window("q_bias")
+        return abs(float(np.mean(biases))) if biases else None
+
+    rows = [row for row in table.rows if row.agent == agent]
+    found = [{r.pair: float(v) for r in row.runs if (v := of(r)) is not None} for row in rows]
+    return max(found, key=len, default={})
+
+
+def _shares(cells: Used, claim: Claim, drawn: Estimate) -> tuple[Effect | None, str]:
+    """A difference of shares, and the numbers behind it; no effect where nobody diverged.
+
+    Where all units agree the draws have no width. Newcombe's interval takes their place, with the
+    units as trials: runs on one policy, in one world or in several, are no independent trials.
+    """
+    sides = [[_values(table, agent, claim.measure) for table, _ in cells] for agent in claim.agents]
+    counts = [
+        sum(values[pair] for values, (_, pairs) in zip(side, cells, strict=True) for pair in pairs)
+        for side in sides
     ]
-    return _paired(
-        "Limits under breaking: approximate equivariance holds up where strictness does not",
-        f"success, `approximate` minus `equivariant`, defect from {STRONGLY_BROKEN:g} on",
-        broken,
-        APPROXIMATE,
-        EQUIVARIANT,
-        "success",
-        f" where the audited defect is at least {STRONGLY_BROKEN:g}",
-    )[0]
+    number = sum(len(pairs) for _, pairs in cells)
+    text = " against ".join(f"{count:.0f}/{number}" for count in counts) + " diverged"
+    if not any(counts):
+        return None, text
+    if np.ptp(drawn.units) > 1e-9:
+        return drawn, text
+    named = [units_of(list(pairs.values()), index) for index, (_, pairs) in enumerate(cells)]
+    units = len({name for units in named for name in units})
+    first, second = ((units * count / number, units) for count in counts)
+    return ShareDifference(first, second), text

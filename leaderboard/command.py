@@ -11,7 +11,7 @@ from typing import TextIO
 import tyro
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.paths import PAGE_FOLDER, RECORDS
+from symsteer.leaderboard.paths import PAGE_FOLDER, RECORDS, STUDY
 from symsteer.leaderboard.verification import Verification, other_versions
 
 FEW = 10
@@ -22,6 +22,7 @@ def report(
     records: tyro.conf.Positional[tuple[Path, ...]] = (),
     out: Path | None = None,
     audit: Path | None = None,
+    study: str | None = None,
     verify: bool = False,
     check: bool = False,
 ) -> int:
@@ -32,6 +33,8 @@ def report(
         out: Where to write; default: RECORDS/leaderboard, in the first folder that is named; of
             the committed records: the committed leaderboard.
         audit: The summary.json of an audit, for the map; default: the committed one.
+        study: The claims to test: name of a study in leaderboard/studies or path of a .toml file;
+            default: those of the paper, for the committed records those of their study.
         verify: Write nothing; fail if OUT is not, byte for byte, what the records give.
         check: Write nothing; say of each record whether the leaderboard admits it, and why not.
 
@@ -58,11 +61,13 @@ def report(
         return _show_verdicts(paths)
     # Here, so that the help of all commands does not wait for matplotlib and scipy.
     from symsteer.leaderboard import report
+    from symsteer.leaderboard.study import PAPER
 
     out = out or _folder_for(records)
+    study = study or (PAPER if records else STUDY)
     if verify:
-        return _show_differences(report.verify(paths, out, audit))
-    files = report.generate(paths, out, audit)
+        return _show_differences(report.verify(paths, out, audit, study))
+    files = report.generate(paths, out, audit, study)
     page = next(file for file in files if file.name == "LEADERBOARD.md")
     _say(f"wrote {page} and {len(files) - 1} files beside it")
     return 0

@@ -20,7 +20,7 @@ from symsteer.leaderboard.statistics import (
     performance_profile,
     probability_of_improvement,
 )
-from symsteer.leaderboard.summary import Row, Run, Summary, Table, reference_success
+from symsteer.leaderboard.summary import Row, Summary, Table, reference_success
 
 GROUPS = ("unbroken", "broken")
 THRESHOLDS = np.linspace(-0.5, 1.0, 151)
@@ -42,7 +42,8 @@ class Profile:
 
 @dataclass(frozen=True)
 class Improvement:
-    """P(a run of `first` beats a run of `second`), mean over the tables that have both."""
+    """P(a run of `first` beats a run of `second` on one base policy), mean over the tables that
+    have both."""
 
     first: str
     second: str
@@ -78,8 +79,9 @@ def compare_agents(summary: Summary) -> Comparisons:
     return result
 
 
-def gap_closed(row: Row, base: Row) -> list[float]:
-    """(success - base) / (1 - base) of each finished run, final window, same episodes.
+def gap_closed(row: Row, base: Row) -> list[tuple[str, float]]:
+    """Base policy and (success - base) / (1 - base) of each finished run, final window, same
+    episodes.
 
     0 is the frozen base policy, 1 success in every episode, negative is worse than the base. Runs
     without common episodes, or whose base always succeeds, are left out.
@@ -92,7 +94,7 @@ def gap_closed(row: Row, base: Row) -> list[float]:
             continue
         success, of_base = np.mean(episodes, axis=0)
         if of_base < 1:
-            values.append(float((success - of_base) / (1 - of_base)))
+            values.append((run.policy, float((success - of_base) / (1 - of_base))))
     return values
 
 
@@ -114,33 +116,26 @@ def profiles(tables: Sequence[Table], roles: Mapping[str, Role]) -> list[Profile
     return found
 
 
-def _policy(run: Run) -> str:
-    return run.record.base_policy.content_hash
-
-
-def _policies(row: Row) -> set[str]:
-    return {_policy(run) for run in row.finished}
-
-
 def improvements(tables: Sequence[Table], roles: Mapping[str, Role]) -> list[Improvement]:
     """Every pair of agents that are no references, the later one of the page's order first.
 
-    In each table, over the runs on base policies that both agents steered.
+    In each table, over the base policies that both agents steered.
     """
     found = []
     learning = [agent for agent, role in roles.items() if role != "reference"]
     for second, first in combinations(learning, 2):
         cells = []
         for table in tables:
-            rows = table.row_of(first), table.row_of(second)
-            if rows[0] and rows[1] and (policies := _policies(rows[0]) & _policies(rows[1])):
-                mine, theirs = (
-                    [run.success for run in row.finished if _policy(run) in policies]
-                    for row in (rows[0], rows[1])
-                )
+            rows = [table.row_of(agent) for agent in (first, second)]
+            runs = [
+                [(run.policy, run.success) for run in row.finished] if row else [] for row in rows
+            ]
+            common = {policy for policy, _ in runs[0]} & {policy for policy, _ in runs[1]}
+            if common:
+                mine, theirs = ([run for run in of if run[0] in common] for of in runs)
                 cells.append((mine, theirs))
         if cells:
-            runs = sum(len(x) for x, _ in cells), sum(len(y) for _, y in cells)
+            sizes = sum(len(x) for x, _ in cells), sum(len(y) for _, y in cells)
             probability = probability_of_improvement(cells)
-            found.append(Improvement(first, second, len(cells), runs, probability))
+            found.append(Improvement(first, second, len(cells), sizes, probability))
     return found

@@ -7,12 +7,13 @@ committed summary is read as data; nothing is simulated here.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
@@ -23,11 +24,12 @@ from symsteer.leaderboard.records import canonical_json
 from symsteer.leaderboard.statistics import (
     RESAMPLES,
     Array,
+    Estimate,
     Interval,
     Sample,
+    cell_estimates,
+    combined,
     crossed_bootstrap,
-    percentile,
-    stratified_draws,
 )
 from symsteer.leaderboard.summary import (
     MIN_SEEDS,
@@ -38,19 +40,16 @@ from symsteer.leaderboard.summary import (
     area_pairs,
     success_pairs,
 )
-from symsteer.variant import parse_variant, variant_text
+from symsteer.variant import UNBROKEN, parse_variant, variant_text
 
 AUDIT = Path(__file__).resolve().parent / "results" / "audit" / "summary.json"
 """The audit of all tasks and variants that the repository and every wheel contain."""
 
-COMPONENTS = {"tool_step": "dynamics", "cost": "reward", "observation": "observation"}
-"""Columns of the audit, and what each is a defect of. The map's x is the largest of them."""
+SIGNIFICANT = 0.01
+"""Resets differ from their turned copies below this p-value."""
 
 MEASURES = ("auc", "success")
 """What the advantage is measured in: area under the curve, final-window success."""
-
-MIN_CELLS = 3
-"""A line through fewer points than this says nothing about its own error."""
 
 NORMAL = 1.96
 """Half the width of a 95 % interval in standard deviations."""
@@ -58,37 +57,50 @@ NORMAL = 1.96
 Place = tuple[str, str, str, str]
 """Task, embodiment, variant in canonical form, group of the base policy."""
 
+Part = Literal["tool", "object", "cost", "observation"]
+"""What the defect of a decision is a defect of."""
+
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class _AuditCell(BaseModel):
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
+    version: Literal[2]
     task: str
     embodiment: str
     variant: str
     group: str
-    tool_step: tuple[Number, Number, Number]
-    cost: tuple[Number, Number, Number]
-    observation: tuple[Number, Number, Number]
+    part: Part
+    decision: tuple[Number, Number, Number]
+    resets: tuple[Number, Number, Number]
+    resets_p: Number
 
     @model_validator(mode="after")
     def _ordered(self) -> _AuditCell:
-        for name in COMPONENTS:
-            value, low, high = getattr(self, name)
-            if not low <= value <= high:
-                raise ValueError(f"{name} lies outside of its interval")
+        value, low, high = self.decision
+        if not low <= value <= high:
+            raise ValueError("decision lies outside of its interval")
         return self
 
 
 _CELLS = TypeAdapter(list[_AuditCell])
 
+ALIKE = Interval(0.0, 0.0, 0.0)
+"""The distance of equal distributions."""
+
 
 @dataclass(frozen=True)
 class Defect:
-    """The largest audited defect of a cell, and which component it is (`COMPONENTS`)."""
+    """The audited defect of a decision in a cell, and of which part of the decision it is.
+
+    Beside it `resets`, the energy distance of initial states from their turned copies, and whether
+    these differ. They are no part of a decision.
+    """
 
     interval: Interval
-    component: str
+    part: Part
+    resets: Interval = ALIKE
+    resets_differ: bool = False
 
     @property
     def value(self) -> float:
@@ -112,20 +124,19 @@ def read_audit(path: Path | None = None) -> Audit:
     """
     path = path or AUDIT
     try:
-        data = json.loads(path.read_bytes())
-        if not isinstance(data, list):
-            raise TypeError("not a list")
-        # JSON has no tuples, so strictness about them starts inside.
-        cells = _CELLS.validate_python([_with_tuples(cell) for cell in data])
+        cells = _CELLS.validate_json(path.read_bytes())
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}.") from error
-    except (ValueError, TypeError, RecursionError) as error:
-        problem = "it is not such a list"
-        if isinstance(error, ValidationError):
-            first = error.errors(include_url=False, include_input=False)[0]
-            problem = f"{'.'.join(map(str, first['loc']))[:120]}: {first['msg']}"
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        if first["loc"][1:] == ("version",):
+            raise UserError(
+                f"{path} holds an audit of another version of SymSteer, without the defects of "
+                "decisions: measure it again with `symsteer audit`."
+            ) from error
+        where = ".".join(map(str, first["loc"]))[:120]
         raise UserError(
-            f"{path} is no summary of an audit ({problem}): "
+            f"{path} is no summary of an audit ({where}: {first['msg']}): "
             "name the summary.json that `symsteer audit --out` wrote."
         ) from error
     audit: dict[Place, Defect] = {}
@@ -135,26 +146,16 @@ def read_audit(path: Path | None = None) -> Audit:
             raise UserError(
                 f"{path} holds {' '.join(place)} twice: remove the older of the two cells."
             )
-        audit[place] = _largest(cell)
+        differ = cell.resets_p < SIGNIFICANT
+        audit[place] = Defect(Interval(*cell.decision), cell.part, Interval(*cell.resets), differ)
     return audit
 
 
 def fingerprint(audit: Audit) -> str:
     """How many cells an audit has, and a hash of their defects."""
-    defects = [[*place, d.component, *astuple(d.interval)] for place, d in sorted(audit.items())]
+    defects = [[*place, *astuple(defect)] for place, defect in sorted(audit.items())]
     digest = hashlib.sha256(canonical_json(defects).encode()).hexdigest()
     return f"{len(audit)} cells, {digest[:12]}"
-
-
-def _with_tuples(cell: Any) -> Any:
-    if not isinstance(cell, dict):
-        return cell
-    return {k: tuple(v) if k in COMPONENTS and isinstance(v, list) else v for k, v in cell.items()}
-
-
-def _largest(cell: _AuditCell) -> Defect:
-    name = max(COMPONENTS, key=lambda component: getattr(cell, component)[0])
-    return Defect(Interval(*getattr(cell, name)), name)
 
 
 def _in_order(variant: str) -> str:
@@ -193,83 +194,143 @@ def audit_commands(keys: Sequence[Key]) -> list[str]:
 
 @dataclass(frozen=True)
 class Point:
-    """One table in one panel of the map: the advantage over `STANDARD`, paired by run seed."""
+    """One table with its defect: the differences of two agents by pair of runs."""
 
     table: Table
     defect: Defect
-    samples: tuple[Sample, ...]
-    advantage: Interval
+    pairs: Mapping[Pair, Sample]
+
+    @cached_property
+    def advantage(self) -> Interval:
+        """Mean of the differences."""
+        return crossed_bootstrap(list(self.pairs.values()))
 
     @property
     def counts(self) -> bool:
-        """Whether it has the seeds that a fit needs."""
-        return len(self.samples) >= MIN_SEEDS
+        """Whether it has the runs that a verdict needs."""
+        return len(self.pairs) >= MIN_SEEDS
 
+    @property
+    def dial(self) -> str:
+        """The variant without its strength; `none` for the unbroken control."""
+        try:
+            names = sorted(spec.name for spec in parse_variant(self.table.key.variant))
+            return "+".join(names) or UNBROKEN
+        except UserError:
+            return self.table.key.variant
 
-@dataclass(frozen=True)
-class Crossing:
-    """Where the fitted line falls through zero: symmetry helps below and hurts above.
-
-    `value` is None where the fitted line does not fall through zero inside the audited range. An
-    end of the interval is infinite where 2.5 % of the resamples or more have no crossing on that
-    side of the range: the interval is open there.
-    """
-
-    value: float | None
-    low: float
-    high: float
+    @property
+    def setting(self) -> Key:
+        """What the points have in common between which base policies can be compared."""
+        return replace(self.table.key, breaking=(False, UNBROKEN))
 
 
 @dataclass(frozen=True)
 class Line:
-    """Least squares through the points: advantage = `intercept` + `slope` x defect."""
+    """The fit to one setting's points: through `centre` (defect, advantage), over `span`."""
 
-    intercept: float
-    slope: Interval
+    setting: Key
+    centre: tuple[float, float]
     span: tuple[float, float]
-    """Smallest and largest audited defect of the points."""
-    grid: Array
-    low: Array
-    high: Array
-    """The pointwise 95 % band of the line at the defects `grid`."""
-    crossing: Crossing
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Least squares with an intercept for each base policy, so that only the dials move it.
+
+    Attributes:
+        slope: change of the advantage per 1 of defect.
+        policies: base policies that were steered at two defects or more.
+        lines: the mean over the policies of each setting.
+    """
+
+    slope: Estimate
+    policies: int
+    lines: tuple[Line, ...]
+
+    @property
+    def settings(self) -> set[Key]:
+        """The settings whose points it is about."""
+        return {line.setting for line in self.lines}
+
+    @property
+    def reason(self) -> str:
+        """Why the slope decides nothing, whatever its interval; empty if it may."""
+        if self.policies >= MIN_SEEDS:
+            return ""
+        return f"base policies at several defects: {self.policies}, {MIN_SEEDS} are needed"
 
 
 @dataclass(frozen=True)
 class Panel:
-    """The advantage of one agent in one measure against the defect."""
+    """The advantage of one agent in one measure against the defect, in one embodiment.
 
+    Attributes:
+        fit: over all dials; None if no base policy was steered at two defects.
+        dials: fits to the unbroken control and one dial, by its name.
+    """
+
+    embodiment: str
     agent: str
     measure: str
-    points: tuple[Point, ...]
-    line: Line | None
+    points: tuple[Point, ...] = ()
+    fit: Fit | None = None
+    dials: Mapping[str, Fit] = field(default_factory=dict)
+
+    @property
+    def slope(self) -> Estimate | None:
+        """Change of the advantage per 1 of defect, within base policies."""
+        return self.fit.slope if self.fit else None
+
+    @property
+    def reason(self) -> str:
+        """Why the slope decides nothing, whatever its interval; empty if it may."""
+        return self.fit.reason if self.fit else "no base policy was steered at two audited defects"
 
 
 @dataclass(frozen=True)
 class DefectMap:
-    """All panels, by (agent, measure), and the tables that are not audited."""
+    """All panels, by (embodiment, agent, measure), and the tables that are not audited.
 
-    panels: Mapping[tuple[str, str], Panel]
+    Arm and gripper have panels of their own: a defect of 0.3 of the unbroken arm is its
+    kinematics, one of 0.3 of the gripper a dial.
+    """
+
+    panels: Mapping[tuple[str, str, str], Panel]
     unaudited: tuple[Key, ...]
 
     @property
-    def has_points(self) -> bool:
-        return any(panel.points for panel in self.panels.values())
+    def embodiments(self) -> list[str]:
+        """Those that have points."""
+        return sorted({e for (e, _, _), panel in self.panels.items() if panel.points})
+
+    def panel(self, embodiment: str, agent: str, measure: str) -> Panel:
+        """A panel, without points if there are none."""
+        empty = Panel(embodiment, agent, measure)
+        return self.panels.get((embodiment, agent, measure), empty)
 
 
 def defect_map(summary: Summary, audit: Audit) -> DefectMap:
-    """Advantage of `WITH_SYMMETRY` over `STANDARD` in audited tables, with lines and crossings."""
+    """Advantage of `WITH_SYMMETRY` over `STANDARD` in audited tables, with slopes."""
     panels = {}
-    for agent in WITH_SYMMETRY:
-        for measure in MEASURES:
-            points = []
-            for table in summary.tables:
-                defect = defect_of(table.key, audit)
-                samples = tuple(advantage(table, agent, STANDARD, measure).values())
-                if defect and samples:
-                    points.append(Point(table, defect, samples, crossed_bootstrap(samples)))
-            line = fit([point for point in points if point.counts])
-            panels[agent, measure] = Panel(agent, measure, tuple(points), line)
+    for embodiment in sorted({table.key.embodiment for table in summary.tables}):
+        for agent in WITH_SYMMETRY:
+            for measure in MEASURES:
+                points = []
+                for table in summary.tables:
+                    defect = defect_of(table.key, audit)
+                    if defect is None or table.key.embodiment != embodiment:
+                        continue
+                    if pairs := advantage(table, agent, STANDARD, measure):
+                        points.append(Point(table, defect, pairs))
+                fits = {
+                    dial: found
+                    for dial in sorted({point.dial for point in points} - {UNBROKEN})
+                    if (found := fit([p for p in points if p.dial in (dial, UNBROKEN)]))
+                }
+                panels[embodiment, agent, measure] = Panel(
+                    embodiment, agent, measure, tuple(points), fit(points), fits
+                )
     unaudited = [table.key for table in summary.tables if not defect_of(table.key, audit)]
     return DefectMap(panels, tuple(unaudited))
 
@@ -284,83 +345,73 @@ def advantage(table: Table, first: str, second: str, measure: str) -> dict[Pair,
     return success_pairs(rows[0], rows[1])
 
 
-def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> Line | None:
-    """A line through the points; None for fewer than `MIN_CELLS` different defects.
+def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> Fit | None:
+    """The slope within base policies; None where none was steered at two different defects.
 
-    Every point weighs the same. Each resample draws runs and episodes within each cell, each defect
-    within its interval, and what else makes cells differ (`_scatter`), and fits again.
+    Every base policy (where a setting has one only, every run) has an intercept of its own, so what
+    policies or tasks differ in by themselves does not enter. Resamples draw policies and episodes
+    (`cell_estimates`), and each defect within its interval. The points themselves are not drawn.
     """
     defects = np.array([point.defect.value for point in points])
-    if len(set(defects.tolist())) < MIN_CELLS:
+    settings: dict[Key, list[dict[int, Sample]]] = {}
+    for setting in sorted({point.setting for point in points}):
+        here = {i: point for i, point in enumerate(points) if point.setting == setting}
+        units = [unit for unit in _units(here) if len({defects[i] for i in unit}) > 1]
+        if units:
+            settings[setting] = units
+    every = [unit for units in settings.values() for unit in units]
+    if not every:
         return None
+    total = sum(float((_centred(defects[list(unit)]) ** 2).sum()) for unit in every)
+    cells = [
+        [_sum(unit, _centred(defects[list(unit)])) for unit in units] for units in settings.values()
+    ]
+    estimates = cell_estimates(cells, resamples=resamples)
+    slope = combined(estimates, [len(units) / total for units in settings.values()])
     generator = np.random.default_rng(seed)
-    x = np.stack([point.defect.draw(resamples, generator) for point in points], axis=1)
-    y = stratified_draws([point.samples for point in points], generator, resamples).T
-    values = np.array([point.advantage.value for point in points])
-    slope, intercept = _least_squares(defects, values)
-    expected = np.var(y - slope * x, axis=0).mean()
-    residuals = values - intercept - slope * defects
-    scatter = _scatter(residuals, float(expected), resamples, generator)
-    y += scatter * generator.standard_normal(y.shape)
-    slopes, intercepts = _least_squares(x, y)
-    span = float(defects.min()), float(defects.max())
-    grid = np.linspace(*span, 50)
-    band = np.quantile(intercepts[:, None] + slopes[:, None] * grid, (0.025, 0.975), axis=0)
-    return Line(
-        intercept=float(intercept),
-        slope=percentile(float(slope), slopes),
-        span=span,
-        grid=grid,
-        low=band[0],
-        high=band[1],
-        crossing=crossing(float(slope), float(intercept), slopes, intercepts, span),
+    drawn = np.stack([point.defect.draw(resamples, generator) for point in points])
+    rise, run = np.zeros(resamples), np.zeros(resamples)
+    for unit in every:
+        x = _centred(drawn[list(unit)])
+        rise += (x * np.array([[sample.value] for sample in unit.values()])).sum(axis=0)
+        run += (x**2).sum(axis=0)
+    moved = np.divide(rise, run, out=np.full(resamples, slope.value), where=run > 0)
+    lines = []
+    for setting, units in settings.items():
+        x = np.concatenate([defects[list(unit)] for unit in units])
+        y = [sample.value for unit in units for sample in unit.values()]
+        centre = float(x.mean()), float(np.mean(y))
+        lines.append(Line(setting, centre, (float(x.min()), float(x.max()))))
+    return Fit(
+        slope=replace(slope, episodes=slope.episodes + moved - slope.value),
+        policies=len({sample.policy for unit in every for sample in unit.values()}),
+        lines=tuple(lines),
     )
 
 
-def _scatter(
-    residuals: Array, expected: float, resamples: int, generator: np.random.Generator
-) -> Array:
-    """Draws of the standard deviation between cells: [resamples, 1].
-
-    Cells differ by more than seeds, episodes and audit explain (`expected`), because tasks differ.
-    With few residuals their variance is uncertain, so it is drawn from its distribution (sum of
-    squares over a chi-square draw); `expected` is subtracted. Without this the interval misses the
-    crossing half of the time when cells scatter three times as much as their seeds explain.
-    """
-    freedom = len(residuals) - 2
-    observed = (residuals**2).sum() / generator.chisquare(freedom, size=(resamples, 1))
-    return np.sqrt(np.maximum(0.0, observed - expected))
+def _units(points: Mapping[int, Point]) -> list[dict[int, Sample]]:
+    """What each base policy has at each point of a setting; each run if there is one policy."""
+    alone = len({policy for point in points.values() for policy, _ in point.pairs}) == 1
+    found: dict[Pair, dict[int, list[Sample]]] = defaultdict(lambda: defaultdict(list))
+    for index, point in points.items():
+        for (policy, seed), sample in point.pairs.items():
+            found[policy, seed if alone else 0][index].append(sample)
+    return [
+        {index: Sample.mean(samples) for index, samples in found[unit].items()}
+        for unit in sorted(found)
+    ]
 
 
-def _least_squares(x: Array, y: Array) -> tuple[Array, Array]:
-    """Slope and intercept along the last axis."""
-    centred = x - x.mean(axis=-1, keepdims=True)
-    slope = (centred * y).sum(axis=-1) / (centred**2).sum(axis=-1)
-    return slope, y.mean(axis=-1) - slope * x.mean(axis=-1)
+def _centred(values: Array) -> Array:
+    """Less the mean along the first axis."""
+    return values - values.mean(axis=0)
 
 
-def crossing(
-    slope: float, intercept: float, slopes: Array, intercepts: Array, span: tuple[float, float]
-) -> Crossing:
-    """Where the line falls through zero, with the interval of its resamples.
-
-    A resample that is positive over the whole `span` counts as a crossing beyond the upper end, a
-    negative one as a crossing beyond the lower end. One that rises through zero inside has no such
-    crossing; it counts against both ends, which can only widen the interval.
-    """
-    low, high = span
-    at_low, at_high = intercepts + slopes * low, intercepts + slopes * high
-    with np.errstate(divide="ignore", invalid="ignore"):
-        roots = -intercepts / slopes
-    roots = np.where((at_low > 0) & (at_high > 0), np.inf, roots)
-    roots = np.where((at_low <= 0) & (at_high <= 0), -np.inf, roots)
-    rising = (at_low <= 0) & (at_high > 0)
-    lowest = np.where(rising, -np.inf, roots)
-    highest = np.where(rising, np.inf, roots)
-    falls = intercept + slope * low > 0 >= intercept + slope * high
-    # Quantiles without interpolation: there is no number between a root and infinity.
-    return Crossing(
-        -intercept / slope if falls else None,
-        float(np.quantile(lowest, 0.025, method="lower")),
-        float(np.quantile(highest, 0.975, method="higher")),
+def _sum(unit: Mapping[int, Sample], factors: Array) -> Sample:
+    """The sum of samples of one base policy, each times its factor."""
+    samples = list(unit.values())
+    blocks = tuple(block for sample in samples for block in sample.blocks)
+    weights = tuple(
+        float(f) * w for f, sample in zip(factors, samples, strict=True) for w in sample.weights
     )
+    return Sample(blocks, weights, samples[0].policy)

@@ -21,7 +21,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
-from symsteer.leaderboard.defects import MEASURES, DefectMap, Line, Panel
+from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import BASE, STANDARD, WITH_SYMMETRY
 from symsteer.leaderboard.statistics import Interval, Sample, success_interval
@@ -44,13 +44,24 @@ STYLES: dict[str, Style] = {
     "golden-ticket": ("#A8860B", "", (0, (5, 1.5, 1, 1.5))),
     "standard": ("#D55E00", "s", "-"),
     "standard-matched": ("#E69F00", "D", "-"),
+    "augmented": ("#CC79A7", "v", "-"),
     "equivariant": ("#0072B2", "o", "-"),
     "approximate": ("#009E73", "^", "-"),
+    "wrong-group": ("#000000", "X", (0, (3, 1.5))),
 }
-OTHERS: tuple[Style, ...] = (("#CC79A7", "v", "-"), ("#56B4E9", "P", "-"), ("#000000", "X", "-"))
+OTHERS: tuple[Style, ...] = (("#56B4E9", "P", "-"), ("#882255", "<", "-"), ("#332288", "h", "-"))
 FEASIBLE, FEASIBLE_EDGE, FEASIBLE_TEXT = "#DDE7D0", "#7A9A50", "#4F6B2A"
 PLACE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*")
-"""Markers of the map, one for each task and embodiment."""
+"""Markers of the map, one for each task."""
+
+PARTS = {
+    "tool": "#0072B2",
+    "object": "#D55E00",
+    "cost": "#CC79A7",
+    "observation": "#009E73",
+}
+"""Colours of the map: which part of a decision the defect is of."""
+FIT = "#444444"
 
 COLUMNS = 3
 WIDEST = 125
@@ -81,7 +92,7 @@ SHEETS: Any = ["default", RC]
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure, what it shows, and where it belongs: (task, embodiment), or () for all of them."""
+    """A figure, what it shows, and where it belongs: (task, embodiment), (embodiment,) or ()."""
 
     kind: str
     place: tuple[str, ...]
@@ -97,9 +108,10 @@ def render_figures(summary: Summary, findings: Findings) -> list[Drawing]:
         if table.runs:
             places.setdefault((table.key.task, table.key.embodiment), []).append(table)
     with mpl_style.context(SHEETS):
-        if findings.map.has_points:
+        for embodiment in findings.map.embodiments:
             text = "Advantage of symmetry against the audited defect"
-            drawings.append(Drawing("map", (), text, advantage_map(findings.map)))
+            figure = advantage_map(findings.map, embodiment)
+            drawings.append(Drawing("map", (embodiment,), text, figure))
         if any(findings.comparisons.profiles.values()):
             figure = performance_profiles(findings.comparisons)
             drawings.append(Drawing("profiles", (), "Performance profiles", figure))
@@ -164,7 +176,7 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
     bands = [
         success_interval(
             [
-                Sample.pooled(episode_success(run.curve[step]).items())
+                Sample.pooled(episode_success(run.curve[step]).items(), run.policy)
                 for run, step in zip(row.finished, point, strict=True)
             ],
             BAND_RESAMPLES,
@@ -277,50 +289,49 @@ def _feasible_band(ax: Axes, low: float, high: float, values: Sequence[float]) -
     ax.set_ylim(bottom - margin, top + margin)
 
 
-def advantage_map(found: DefectMap) -> Figure:
+def advantage_map(found: DefectMap, embodiment: str) -> Figure:
     """Advantage over the standard agent against the audited defect: agents by measures.
 
-    Bars are 95 % intervals; hollow points have too few seeds for the line. The line is drawn with
-    its band over the audited range, the diamond is where it falls through zero, with its interval.
+    The colour says which part of a decision the defect is of, the marker the task; bars are 95 %
+    intervals, hollow points have few runs. A line per task has the slope within base policies and
+    goes through the task's mean; the fan around it has the slopes of the 95 % interval.
     """
     figure = Figure(figsize=(9.0, 6.9), layout="constrained")
     shape = len(WITH_SYMMETRY), len(MEASURES)
     grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
-    points = [point for panel in found.panels.values() for point in panel.points]
-    places = sorted({(p.table.key.task, p.table.key.embodiment) for p in points})
-    markers = {p: PLACE_MARKERS[i % len(PLACE_MARKERS)] for i, p in enumerate(places)}
+    panels = [[found.panel(embodiment, a, m) for m in MEASURES] for a in WITH_SYMMETRY]
+    points = [point for row in panels for panel in row for point in panel.points]
+    tasks = sorted({point.table.key.task for point in points})
+    markers = {task: PLACE_MARKERS[i % len(PLACE_MARKERS)] for i, task in enumerate(tasks)}
     right = 1.04 * max(point.defect.interval.high for point in points)
     names = {"auc": "area under the curve", "success": "final success"}
-    for row, agent in enumerate(WITH_SYMMETRY):
-        for column, measure in enumerate(MEASURES):
-            ax = grid[row, column]
-            _draw_panel(ax, found.panels[agent, measure], markers, right)
-            ax.set_title(f"{agent}, {names[measure]}")
-            if row == len(WITH_SYMMETRY) - 1:
-                ax.set_xlabel("audited defect")
-            if column == 0:
-                ax.set_ylabel(f"advantage over {STANDARD}")
+    for axes, row in zip(grid, panels, strict=True):
+        for ax, panel in zip(axes, row, strict=True):
+            ax.set_xlim(-0.02 * right, right)
+            _draw_panel(ax, panel, markers)
+            ax.set_title(f"{panel.agent}, {names[panel.measure]}")
+        axes[0].set_ylabel(f"advantage over {STANDARD}")
+    for ax in grid[-1]:
+        ax.set_xlabel(f"audited defect of a decision, {_ascii(embodiment, 26)}")
     handles: dict[str, Line2D | Patch] = {
-        _ascii(", ".join(place), 26): Line2D(
-            [], [], color="#555555", marker=marker, linestyle="none", markersize=5
-        )
-        for place, marker in markers.items()
+        _ascii(task, 26): Line2D([], [], color="#555555", marker=marker, linestyle="none")
+        for task, marker in markers.items()
     }
-    if any(panel.line and panel.line.crossing.value is not None for panel in found.panels.values()):
-        diamond: dict[str, Any] = {"marker": "d", "linestyle": "-", "markersize": 7}
-        handles["falls through 0, 95 %"] = Line2D([], [], color="black", **diamond)
+    parts = {point.defect.part for point in points}
+    handles |= {part: Patch(color=color) for part, color in PARTS.items() if part in parts}
+    if any(panel.fit for row in panels for panel in row):
+        handles["within base policies, 95 %"] = Line2D([], [], color=FIT)
     _legend(figure, handles, columns=4)
     return figure
 
 
-def _draw_panel(
-    ax: Axes, panel: Panel, markers: Mapping[tuple[str, str], str], right: float
-) -> None:
-    color = STYLES[panel.agent][0]
-    ax.set_xlim(-0.02 * right, right)
+def _draw_panel(ax: Axes, panel: Panel, markers: Mapping[str, str]) -> None:
     ax.axhline(0, color="#333333", linewidth=0.9, zorder=1)
+    if panel.fit:
+        _draw_fit(ax, panel.fit)
     for point in panel.points:
         defect, gain = point.defect.interval, point.advantage
+        color = PARTS[point.defect.part]
         ax.errorbar(
             defect.value,
             gain.value,
@@ -329,14 +340,12 @@ def _draw_panel(
             color=color,
             elinewidth=0.8,
             alpha=0.85,
-            marker=markers[point.table.key.task, point.table.key.embodiment],
+            marker=markers[point.table.key.task],
             markersize=6,
             markerfacecolor=color if point.counts else "white",
         )
     if not panel.points:
         ax.text(0.5, 0.5, "no paired runs", transform=ax.transAxes, ha="center", color="#777777")
-    if panel.line:
-        _draw_line(ax, panel.line, color, right)
 
 
 def _arms(interval: Interval) -> list[list[float]]:
@@ -345,19 +354,15 @@ def _arms(interval: Interval) -> list[list[float]]:
     return [[max(0.0, low)], [max(0.0, high)]]
 
 
-def _draw_line(ax: Axes, line: Line, color: str, right: float) -> None:
-    ax.fill_between(line.grid, line.low, line.high, color=color, alpha=0.13, linewidth=0)
-    heights = line.intercept + line.slope.value * line.grid
-    ax.plot(line.grid, heights, color=color, linewidth=1.8)
-    crossing = line.crossing
-    if crossing.value is None:
-        return
-    ends = max(crossing.low, 0.0), min(crossing.high, right)
-    ax.plot(ends, [0, 0], color="black", linewidth=2.2, solid_capstyle="butt", zorder=4)
-    for end, bound, marker in ((ends[0], crossing.low, "<"), (ends[1], crossing.high, ">")):
-        shape = "|" if np.isfinite(bound) else marker
-        ax.plot(end, 0, marker=shape, color="black", markersize=7, clip_on=False, zorder=4)
-    ax.plot(crossing.value, 0, marker="d", color="black", markersize=8, zorder=5)
+def _draw_fit(ax: Axes, fit: Fit) -> None:
+    slope = fit.slope.interval()
+    for line in fit.lines:
+        (x, y), ends = line.centre, np.array(line.span)
+        grid = np.array([ends[0], x, ends[1]])
+        heights = [y + s * (grid - x) for s in (slope.value, slope.low, slope.high)]
+        ax.plot(grid, heights[0], color=FIT, linewidth=1.4)
+        low, high = np.minimum(*heights[1:]), np.maximum(*heights[1:])
+        ax.fill_between(grid, low, high, color=FIT, alpha=0.1, linewidth=0)
 
 
 def performance_profiles(found: Comparisons) -> Figure:

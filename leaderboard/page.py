@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
-import numpy as np
-
-from symsteer.leaderboard.claims import NEARLY_SYMMETRIC, STRONGLY_BROKEN, Claim
+from symsteer.leaderboard.claims import SLOPE_UNIT, where
 from symsteer.leaderboard.comparisons import Comparisons
-from symsteer.leaderboard.defects import (
-    COMPONENTS,
-    MEASURES,
-    MIN_CELLS,
-    Crossing,
-    DefectMap,
-    Line,
-    Panel,
-    audit_commands,
-)
 from symsteer.leaderboard.findings import Findings
-from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.map_page import Figures, map_section
 from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
+from symsteer.leaderboard.statistics import Spread
+from symsteer.leaderboard.study import Claim
 from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
 from symsteer.leaderboard.tables import Links, cell_name, section, status
 from symsteer.leaderboard.text import (
@@ -28,16 +18,13 @@ from symsteer.leaderboard.text import (
     NOTHING,
     SPACE,
     code,
-    difference,
     grid,
     image,
     interval,
     number,
     stacked,
+    without_empty,
 )
-
-Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
-"""By place, (task, embodiment) or () for all of them, then by kind: description and address."""
 
 READING = f"""\
 Each agent steers a frozen diffusion policy by choosing the noise that it starts from. References
@@ -48,13 +35,12 @@ demonstrations, the budget and the held-out episodes.
 
 - **Success** is `success_once` in the final window: all held-out evaluations in the last fifth of
   the budget, their episodes pooled (a reference is evaluated once). Shown are the interquartile
-  mean (IQM) over seeds and its 95 % interval, from a bootstrap over seeds and over episodes: all
-  runs are scored on the same initial states, so an episode is drawn for all of them at once. With
-  fewer than 4 seeds the IQM is the plain mean; with one seed the interval covers its episodes
-  only. No interval covers the training of other base policies. **Last checkpoint** is the same for
-  the final evaluation alone. No number is the best of several evaluations. Below each table is the
-  change of success *from the fourth to the last fifth of the budget*: an agent with ▲ there was
-  still improving, and more steps may change its place.
+  mean (IQM) over base policies and its 95 % interval. The interval draws base policies, each with
+  all its runs, or the runs of a cell with one base policy; and it draws episodes, each for all runs
+  at once, because all are scored on the same initial states. Of fewer than 4 the IQM is the plain
+  mean. **Last checkpoint** is the same for the final evaluation alone. No number is the best of
+  several evaluations. Below each table is the change of success *from the fourth to the last fifth
+  of the budget*: an agent with ▲ there was still improving, and more steps may change its place.
 - **Against base** is the mean difference (not the IQM's) to the base policy on the same episodes
   and seeds, with its 95 % interval. ▲ or ▼ marks an interval that excludes 0; without a mark the
   data do not decide.
@@ -82,38 +68,21 @@ CURVES = (
 )
 
 CLAIMS = f"""\
-The paper is arXiv 2512.11345. A claim is *supported* where the 95 % interval of the effect lies on
-the side of 0 that the claim predicts, *contradicted* where it lies on the other side, and
-otherwise *undecided*. Differences are paired by seed (success and its area by episode, too) and
-averaged over cells; shares of diverged runs are pooled over cells, with Newcombe's interval. Only
-cells with {MIN_SEEDS} paired seeds count, and at least one is needed. There is no correction for
-the number of tests: where there is no effect, up to one interval in twenty still excludes 0.
-*Defect* is the audited defect (next section): cells up to {NEARLY_SYMMETRIC:g} count as symmetric,
-from {STRONGLY_BROKEN:g} on as strongly broken.
-"""
-
-MAP = f"""\
-Each point is a cell: the advantage over `{STANDARD}`, paired by seed, against the *audited
-defect*. The defect is measured in simulation: it is the largest of the defects of dynamics (as a
-share of a step's own displacement), reward and observation. Bars are 95 % intervals; hollow points
-have fewer than {MIN_SEEDS} paired seeds and are not used for the line, which needs {MIN_CELLS}
-cells. The intervals of line, slope and crossing come from drawing seeds and episodes within the
-cells, defects within their intervals, and the scatter of the cells about the line that these do
-not explain.
+Effects are differences of two agents, paired by base policy and seed (success and its area by
+episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNIT:g} of defect,
+within base policies. *Supported* and *contradicted* need p < 0.05 for "no effect", *equivalent*
+needs it for "an effect of at least the smallest one of interest"; otherwise a claim is *undecided*.
+Both p-values are corrected for the number of tests of a family (Holm), the intervals are not.
 """
 
 PROFILES = (
     "Performance profiles: the share of runs that close at least the given share of the gap "
     "between the frozen base (0, on the same episodes) and certain success (1), in the final "
-    "window. Higher is better; left of 0 steering does harm. Bands are 95 %, from drawing runs "
-    "within each cell."
+    "window. Higher is better; left of 0 steering does harm. Bands are 95 %."
 )
 IMPROVEMENT = (
-    "Probability of improvement: how likely a run of X beats a run of Y in the same cell (ties "
-    "count half), mean over cells, with 95 % intervals from drawing runs within each cell; runs on "
-    "base policies that only one of the two steered are left out. "
-    "Where every run of one beats every run of the other, the interval has no width, which is too "
-    "narrow for few runs."
+    "Probability of improvement: how likely a run of X beats a run of Y on the same base policy of "
+    "the same cell (ties count half), mean over cells, with 95 % intervals."
 )
 
 
@@ -123,16 +92,19 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     parts = [
         "# Leaderboard",
         "This page is generated from run records by `symsteer report`; do not edit it.",
-        "## How to read it",
-        READING.strip(),
     ]
+    parts += [findings.study.notice] if findings.study.notice else []
+    parts += ["## How to read it", READING.strip()]
     if notice := _seed_notice(summary):
         parts.append(notice)
     parts += ["## At a glance", _overview(summary)]
     if beaten := _beaten(summary):
         parts.append(beaten)
-    parts += ["## The paper's claims", CLAIMS.strip(), _claims(findings.claims)]
-    parts += ["## Where symmetry stops paying", *_map(summary, findings.map, overall)]
+    if findings.spreads:
+        parts += ["## How much is the base policy's", *_spreads(summary, findings.spreads)]
+    parts += ["## Claims", CLAIMS.strip(), *_claims(findings)]
+    heading = "## The advantage of symmetry against the defect"
+    parts += [heading, *map_section(summary, findings.map, figures)]
     if findings.comparisons.cells:
         parts += ["## All cells together", *_comparisons(findings.comparisons, overall)]
     place = None
@@ -198,132 +170,104 @@ def _beaten(summary: Summary) -> str:
     return f"Against the best reference of each cell, the frozen policy alone: {'; '.join(texts)}."
 
 
-def _claims(found: Sequence[Claim]) -> str:
-    rows = []
-    for claim in found:
-        effect = interval(claim.effect, sign=True, digits=3)
-        if claim.beside:
-            effect += f"<br>{claim.beside}"
-        verdict = f"**{claim.verdict}**"
-        if claim.reason:
-            verdict += f": {claim.reason}"
-        elif claim.verdict == "undecided":
-            verdict += ": the interval contains 0"
-        seeds = f"{claim.cells}, {claim.seeds}" if claim.cells else NOTHING
-        rows.append([claim.name, claim.test, effect, seeds, verdict])
-    header = ["Claim", "Test", "Effect, 95 % interval", "Cells, paired seeds", "Verdict"]
-    return grid(header, rows, left=5)
+def _spreads(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
+    parts = [
+        "Standard deviations of a run's success in the final window, pooled over cells: between "
+        "base policies, between runs on one policy, and because episodes are a sample."
+    ]
+    alone = sum(len({run.policy for run in table.runs}) == 1 for table in summary.tables)
+    if alone:
+        which = "Each cell steers" if alone == len(summary.tables) else f"{alone} cells steer"
+        parts[0] += (
+            f" {which} one base policy: the intervals there are about this policy alone, and no "
+            "spread of policies can be told."
+        )
+    if any(spread.together is not None for spread in found.values()):
+        parts[0] += " Where each policy has one run, only the sum of both can be told."
+    columns = {
+        "Base policies": [number(spread.policies, 3) for spread in found.values()],
+        "Runs on one": [number(spread.runs, 3) for spread in found.values()],
+        "Both together": [number(spread.together, 3) for spread in found.values()],
+        "Episodes": [number(spread.episodes, 3) for spread in found.values()],
+        "Base policies' share of the variance": [_share(spread) for spread in found.values()],
+    }
+    header, body = without_empty(columns)
+    rows = [[code(agent), *texts] for agent, texts in zip(found, body, strict=True)]
+    return [*parts, grid(["Agent", *header], rows, left=1)]
 
 
-def _map(summary: Summary, found: DefectMap, figures: Mapping[str, tuple[str, str]]) -> list[str]:
-    parts = [MAP.strip()]
-    if "map" in figures:
-        parts += [image(*figures["map"]), _lines(found), _map_numbers(summary, found)]
+def _share(spread: Spread) -> str:
+    """The base policies' share of the variance."""
+    if spread.policies is None or spread.runs is None:
+        return NOTHING
+    total = spread.policies**2 + spread.runs**2 + spread.episodes**2
+    return f"{100 * spread.policies**2 / total:.0f}{SPACE}%" if total else NOTHING
+
+
+MEASURE_WORDS = {
+    "auc": "area under the curve",
+    "success": "success",
+    "diverged": "share of diverged runs",
+    "magnitude": "largest \\|Q\\| over the largest feasible",
+    "bias": "\\|Q bias\\| (reward)",
+}
+
+
+def _claims(findings: Findings) -> list[str]:
+    study = findings.study
+    origin = f"They are declared in {code(study.source)} (sha256 {code(study.sha256[:12])}"
+    if study.declared:
+        origin += f", commit {code(study.declared)})."
     else:
-        parts.append("There is no map yet: no audited cell has paired runs of these agents.")
-    if found.unaudited:
-        names = {t.key: cell_name(t, summary) for t in summary.tables}
-        listed = ", ".join(dict.fromkeys(names[key] for key in found.unaudited))
-        text = f"Not audited, so not in the map: {listed}."
-        if commands := audit_commands(found.unaudited):
-            measured = ", ".join(code(command, 1000) for command in commands)
-            text += (
-                f" To measure them: {measured}; then "
-                "`python -m symsteer.bench.audit.page leaderboard/results/audit/summary.json "
-                "runs/audit/summary.json`."
-            )
-        parts.append(text)
+        origin += "). The study names no commit that declared them before its runs."
+    rows, untested = [], []
+    for outcome in findings.claims:
+        claim, effect = outcome.claim, outcome.effect
+        if effect is None:
+            untested.append(f"- {claim.name}: {outcome.reason}")
+            continue
+        rows.append(
+            [
+                claim.family,
+                claim.name,
+                _test(claim),
+                interval(effect.interval(), sign=True, digits=3)
+                + (f"<br>{outcome.counts}" if outcome.counts else ""),
+                f"{claim.smallest:g}",
+                *([NOTHING] * 2 if outcome.reason else map(_p, (outcome.p, outcome.p_equal))),
+                f"{outcome.cells}, {outcome.pairs}, {outcome.policies}",
+                f"**{outcome.verdict}**" + (f": {outcome.reason}" if outcome.reason else ""),
+            ]
+        )
+    parts = [origin]
+    if rows:
+        header = [
+            "Family",
+            "Claim",
+            "Effect",
+            "Size, 95 % interval",
+            "Smallest of interest",
+            "p (none)",
+            "p (at least the smallest)",
+            "Cells, pairs, policies",
+            "Verdict",
+        ]
+        parts.append(grid(header, rows, left=3))
+    if untested:
+        parts.append("Not tested:\n\n" + "\n".join(untested))
     return parts
 
 
-def _lines(found: DefectMap) -> str:
-    rows = []
-    for agent in WITH_SYMMETRY:
-        for measure in MEASURES:
-            panel = found.panels[agent, measure]
-            counted = sum(point.counts for point in panel.points)
-            slope = NOTHING
-            if panel.line:
-                s = panel.line.slope
-                slope = f"{number(s.value, sign=True)} [{number(s.low, sign=True)}, "
-                slope = f"{slope}{number(s.high, sign=True)}]".replace(" ", SPACE)
-            rows.append(
-                [
-                    code(agent),
-                    {"auc": "AUC", "success": "success"}[measure],
-                    f"{counted} of {len(panel.points)}",
-                    slope,
-                    crossing_text(panel),
-                ]
-            )
-    header = [
-        "Agent",
-        "Advantage in",
-        "Cells in the line",
-        "Slope (per 1 of defect)",
-        "The line falls through 0 at a defect of",
-    ]
-    return grid(header, rows, left=5)
+def _test(claim: Claim) -> str:
+    first, second = map(code, claim.agents)
+    text = f"{MEASURE_WORDS[claim.measure]}, {first} minus {second}, {where(claim.cells)}"
+    if claim.minus is not None:
+        text += f" minus the same in {where(claim.minus)}"
+    return f"slope of {text}" if claim.effect == "slope" else text
 
 
-def crossing_text(panel: Panel) -> str:
-    """Where the advantage ends, or in words why there is no such place."""
-    line = panel.line
-    if line is None:
-        return f"no line: fewer than {MIN_CELLS} different defects with {MIN_SEEDS} paired seeds"
-    crossing = line.crossing
-    if crossing.value is not None:
-        low = number(crossing.low) if np.isfinite(crossing.low) else "below all audited"
-        high = number(crossing.high) if np.isfinite(crossing.high) else "beyond all audited"
-        return f"{number(crossing.value)} [{low}, {high}]"
-    return f"none: {_no_crossing(line)}{_excluded(crossing)}"
-
-
-def _no_crossing(line: Line) -> str:
-    low, high = line.span
-    ends = [line.intercept + line.slope.value * x for x in line.span]
-    where = f"from {number(low)} to {number(high)}"
-    if min(ends) > 0:
-        return f"the line stays above 0 {where}"
-    return f"the line {'rises through' if max(ends) > 0 else 'stays below'} 0 {where}"
-
-
-def _excluded(crossing: Crossing) -> str:
-    """What the interval says about a crossing inside the audited range."""
-    if crossing.low == crossing.high:
-        return "; at 95 % there is none in this range"
-    if np.isfinite(crossing.low):
-        return f"; at 95 % it does not lie below {number(crossing.low)}"
-    if np.isfinite(crossing.high):
-        return f"; at 95 % it does not lie beyond {number(crossing.high)}"
-    return "; the data do not say where"
-
-
-def _map_numbers(summary: Summary, found: DefectMap) -> str:
-    cells: dict[int, dict[tuple[str, str], str]] = {}
-    tables, defects = {}, {}
-    for which, panel in found.panels.items():
-        for point in panel.points:
-            place = id(point.table)
-            tables[place], defects[place] = point.table, point.defect
-            cells.setdefault(place, {})[which] = (
-                f"{difference(point.advantage)} ({len(point.samples)})"
-            )
-    rows = []
-    for place in sorted(cells, key=lambda p: (defects[p].value, tables[p].key)):
-        defect = defects[place]
-        rows.append(
-            [
-                cell_name(tables[place], summary),
-                f"{interval(defect.interval, digits=3)} {COMPONENTS[defect.component]}",
-                *(cells[place].get(which, NOTHING) for which in found.panels),
-            ]
-        )
-    header = ["Cell", "Audited defect"]
-    for agent, measure in found.panels:
-        header.append(f"{code(agent)}, {'AUC' if measure == 'auc' else measure} (seeds)")
-    table = grid(header, rows, left=1)
-    return f"<details>\n<summary>The map's numbers</summary>\n\n{table}\n\n</details>"
+def _p(value: float) -> str:
+    return "< 0.001".replace(" ", SPACE) if value < 0.001 else number(value, 3)
 
 
 def _comparisons(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> list[str]:

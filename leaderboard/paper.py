@@ -1,4 +1,4 @@
-"""The agents that the paper's claims are about, by name, and the order of rows.
+"""The agents that the page knows by name, and the order of rows.
 
 Nothing here says what an agent is: its role is in its record.
 """
@@ -9,15 +9,13 @@ BASE = "base"
 STANDARD = "standard"
 """Without symmetry, with the channels of the equivariant agent."""
 
-STANDARD_MATCHED = "standard-matched"
-"""Without symmetry, with the parameters of the equivariant agent."""
+WITHOUT_SYMMETRY = (STANDARD, "standard-matched", "augmented")
+"""Rivals without symmetry in their networks: the plain agent, the same with the parameters of the
+equivariant agent, and the fair one, which learns from rotated data."""
 
-EQUIVARIANT = "equivariant"
-APPROXIMATE = "approximate"
-
-WITHOUT_SYMMETRY = (STANDARD, STANDARD_MATCHED)
-WITH_SYMMETRY = (EQUIVARIANT, APPROXIMATE)
+WITH_SYMMETRY = ("equivariant", "approximate")
 """The agents of the map, which shows their advantage over `STANDARD`."""
 
-ROW_ORDER = (BASE, "zero", "golden-ticket", *WITHOUT_SYMMETRY, *WITH_SYMMETRY)
-"""Other agents follow in alphabetical order; references come before learners, then controls."""
+ROW_ORDER = (BASE, "zero", "golden-ticket", *WITHOUT_SYMMETRY, *WITH_SYMMETRY, "wrong-group")
+"""Other agents follow in alphabetical order; references come before learners, then controls. The
+last one here is the control: equivariant under a group that is not the world's."""

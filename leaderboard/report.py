@@ -15,15 +15,18 @@ from symsteer.leaderboard.defects import Audit, read_audit
 from symsteer.leaderboard.figures import render_figures, to_svg
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.page import render_page
+from symsteer.leaderboard.study import PAPER, Study, read_study
 from symsteer.leaderboard.summary import Run, load_runs, summarize
 from symsteer.leaderboard.tables import render_csv
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
 
-FIGURE_NAME = re.compile(r"(map|profiles|improvement|(success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
+FIGURE_NAME = re.compile(r"(map|profiles|improvement|(map|success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
 
 
-def generate(records: Sequence[Path], out: Path, audit: Path | None = None) -> list[Path]:
+def generate(
+    records: Sequence[Path], out: Path, audit: Path | None = None, study: str = PAPER
+) -> list[Path]:
     """Write LEADERBOARD.md, leaderboard.csv and figures/ into `out`.
 
     Figures of an earlier call that no longer belong to a table are removed.
@@ -32,6 +35,7 @@ def generate(records: Sequence[Path], out: Path, audit: Path | None = None) -> l
         records: record files, run folders, or folders of these.
         out: the folder to write into.
         audit: summary of an audit, the committed one by default (`read_audit`).
+        study: name or file of the study that declares the claims (`read_study`).
 
     Returns:
         The files written.
@@ -41,32 +45,35 @@ def generate(records: Sequence[Path], out: Path, audit: Path | None = None) -> l
             as it was (`write_together`).
     """
     runs, out = load_runs(records), _folder(out)
-    files = render(runs, out, read_audit(audit))
+    files = render(runs, out, read_audit(audit), read_study(study))
     if (out / "figures").is_symlink():
-        raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it.")
+        raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it")
     stale = [out / name for name in _stale(out, files)]
     write_together({out / name: data for name, data in files.items()}, stale)
     return [out / name for name in files]
 
 
-def verify(records: Sequence[Path], out: Path, audit: Path | None = None) -> Verification:
+def verify(
+    records: Sequence[Path], out: Path, audit: Path | None = None, study: str = PAPER
+) -> Verification:
     """Compare the files in `out` with what `generate` would write; changes nothing.
 
     Arguments and errors are those of `generate`.
     """
     runs, out = load_runs(records), _folder(out)
-    files = render(runs, out, read_audit(audit))
+    files = render(runs, out, read_audit(audit), read_study(study))
     found = differences(files, _stale(out, files), out)
     return Verification(len(runs), len(files), found)
 
 
-def render(runs: Sequence[Run], out: Path, audit: Audit) -> dict[str, bytes]:
+def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[str, bytes]:
     """Every file of the leaderboard, by its path relative to `out` (with `/`); nothing is written.
 
-    Depends on the records, the audit, and where the records lie relative to `out`, nothing else.
+    Depends on the records, the audit, the study, and where the records lie relative to `out`,
+    nothing else.
     """
     summary = summarize(runs)
-    findings = analyse(summary, audit)
+    findings = analyse(summary, audit, study)
     files: dict[str, bytes] = {}
     shown: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
     for drawing in render_figures(summary, findings):
@@ -95,8 +102,8 @@ def _folder(out: Path) -> Path:
     except FileNotFoundError:
         return out
     except OSError as error:
-        raise UserError(f"{out} cannot be used: {error.strerror}; name another folder.") from error
-    raise UserError(f"{out} is a file: name a folder for the leaderboard.")
+        raise UserError(f"{out} cannot be used: {error.strerror}; name another folder") from error
+    raise UserError(f"{out} is a file: name a folder for the leaderboard")
 
 
 def _stale(out: Path, files: Mapping[str, bytes]) -> list[str]:

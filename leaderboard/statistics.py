@@ -6,21 +6,23 @@ All functions are pure and seeded: the same numbers give the same result. Succes
 
 from __future__ import annotations
 
+import hashlib
+import math
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Self, TypeVar
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special, stats
 from scipy.integrate import trapezoid
 
 CONFIDENCE = 0.95
 RESAMPLES = 5000
-_EPISODES = 1
-"""Separates the stream of episode weights from other generators with small seeds."""
+_EPISODES, _UNITS = 1, 2
+"""Separate the streams of weights from each other and from generators with small seeds."""
 
 Array = NDArray[np.float64]
 Key = TypeVar("Key", bound=Hashable)
@@ -72,21 +74,30 @@ class Sample:
 
     blocks: tuple[Block, ...]
     weights: tuple[float, ...] = (1.0,)
+    policy: str = ""
+    """Content hash of the base policy that the run steers."""
 
     @classmethod
-    def pooled(cls, values: Iterable[tuple[int, float]]) -> Self:
+    def pooled(cls, values: Iterable[tuple[int, float]], policy: str = "") -> Self:
         """One block of (episode seed, value) pairs; a seed may occur in several evaluations."""
         gathered: dict[int, list[float]] = defaultdict(list)
         for seed, value in values:
             gathered[seed].append(value)
         totals = np.array([sum(gathered[seed]) for seed in gathered], dtype=np.float64)
         counts = np.array([len(gathered[seed]) for seed in gathered], dtype=np.float64)
-        return cls((Block(tuple(gathered), totals, counts),))
+        return cls((Block(tuple(gathered), totals, counts),), policy=policy)
 
     @classmethod
-    def constant(cls, value: float) -> Self:
+    def constant(cls, value: float, policy: str = "") -> Self:
         """One number for the whole run, equal in every resample."""
-        return cls.pooled([(0, value)])
+        return cls.pooled([(0, value)], policy)
+
+    @classmethod
+    def mean(cls, runs: Sequence[Self]) -> Self:
+        """The mean over runs on one base policy."""
+        blocks = tuple(block for run in runs for block in run.blocks)
+        weights = tuple(weight / len(runs) for run in runs for weight in run.weights)
+        return cls(blocks, weights, runs[0].policy)
 
     @cached_property
     def value(self) -> float:
@@ -109,7 +120,22 @@ def episode_weights(seed: int, resamples: int) -> Array:
     and cells: agents are scored on the same initial states, and a hard one is hard for all of them.
     With weights instead of counts (the Bayesian bootstrap, Rubin 1981) no block is ever empty.
     """
-    weights = np.random.default_rng([_EPISODES, seed]).exponential(size=resamples)
+    return _exponential([_EPISODES, seed], resamples)
+
+
+@lru_cache(maxsize=512)
+def unit_weights(unit: str, resamples: int) -> Array:
+    """How much a base policy, or another unit with this name, weighs in each resample.
+
+    They depend on the name only, so that a base policy has the same weight in all cells: the policy
+    of a task is steered in several variants, and what it can do it can do in all of them.
+    """
+    digest = hashlib.sha256(unit.encode()).digest()
+    return _exponential([_UNITS, int.from_bytes(digest[:8])], resamples)
+
+
+def _exponential(seed: list[int], resamples: int) -> Array:
+    weights = np.random.default_rng(seed).exponential(size=resamples)
     weights.flags.writeable = False
     return weights
 
@@ -129,195 +155,428 @@ _weighted_counts = lru_cache(maxsize=64)(_weighted_sum)
 """The same, kept: most blocks of a leaderboard have equal episodes and counts."""
 
 
-def iqm(values: Sequence[float] | Array, axis: int = -1) -> Array:
+def iqm(values: Sequence[float] | Array, weights: Array | None = None) -> Array:
     """Interquartile mean: the mean without the lowest and highest quarter (Agarwal et al. 2021).
 
-    Below 4 values nothing is cut off, so it is the plain mean.
+    Along the last axis. Below 4 values nothing is cut off, so it is the plain mean. With weights of
+    the values, as many of n are cut off in weight as without them in number: floor(n / 4) / n of
+    all weight at each end.
     """
-    return np.asarray(stats.trim_mean(np.asarray(values, dtype=np.float64), 0.25, axis=axis))
+    values = np.asarray(values, dtype=np.float64)
+    if weights is None:
+        return np.asarray(stats.trim_mean(values, 0.25, axis=-1))
+    order = np.argsort(values, axis=-1)
+    upto = np.cumsum(np.take_along_axis(weights, order, axis=-1), axis=-1)
+    cut = values.shape[-1] // 4 / values.shape[-1]
+    upto = np.clip(upto / upto[..., -1:], cut, 1 - cut)
+    kept = np.diff(upto, axis=-1, prepend=cut) / (1 - 2 * cut)
+    return np.asarray((kept * np.take_along_axis(values, order, axis=-1)).sum(axis=-1))
 
 
-def mean(values: Sequence[float] | Array, axis: int = -1) -> Array:
-    """The plain mean, in the form that the bootstraps expect of a statistic."""
-    return np.asarray(np.mean(np.asarray(values, dtype=np.float64), axis=axis))
+def mean(values: Sequence[float] | Array, weights: Array | None = None) -> Array:
+    """The mean along the last axis, in the form that the bootstraps expect of a statistic."""
+    return np.asarray(np.average(np.asarray(values, dtype=np.float64), axis=-1, weights=weights))
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a success probability."""
-    interval = stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return float(interval.low), float(interval.high)
+def wilson(successes: float, trials: float, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Wilson's interval of a success probability; the numbers need not be whole."""
+    z, share = _normal(confidence), successes / trials
+    centre = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z * np.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2)) / (1 + z**2 / trials)
+    # At the ends the formula gives 0 and 1, up to rounding.
+    return (
+        0.0 if share == 0 else float(centre - half),
+        1.0 if share == 1 else float(centre + half),
+    )
 
 
-def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
-    """Difference of two proportions, each (successes, trials), with Newcombe's hybrid interval.
-
-    Combines the two Wilson intervals (Newcombe 1998, method 10); unlike a bootstrap it has a width
-    when nobody or everybody succeeds.
-    """
-    p, q = first[0] / first[1], second[0] / second[1]
-    (p_low, p_high), (q_low, q_high) = wilson(*first), wilson(*second)
-    low = p - q - float(np.hypot(p - p_low, q_high - q))
-    high = p - q + float(np.hypot(p_high - p, q - q_low))
-    return Interval(p - q, low, high)
-
-
-def percentile(value: float, draws: Array) -> Interval:
-    """`value` with the 95 % percentile interval of its bootstrap draws."""
-    tail = (1 - CONFIDENCE) / 2
+def percentile(value: float, draws: Array, confidence: float = CONFIDENCE) -> Interval:
+    """`value` with the percentile interval of its bootstrap draws."""
+    tail = (1 - confidence) / 2
     low, high = np.quantile(draws, (tail, 1 - tail))
     return Interval(float(value), float(low), float(high))
 
 
-def small_sample_factor(runs: int, freedom: int) -> float:
-    """By how much a percentile bootstrap over `runs` runs is too narrow.
+def _normal(confidence: float) -> float:
+    return float(special.ndtri((1 + confidence) / 2))
 
-    Its variance has the divisor n, not n - 1, and its tails are those of a normal distribution, not
-    of Student's with `freedom` degrees of freedom (Hesterberg 2015, The American Statistician 69).
-    1.58 for five runs of one cell.
+
+def tails(confidence: float, freedom: int) -> float:
+    """By how much Student's tails are longer than those of a normal distribution; 1.42 for five."""
+    if freedom == 0:
+        return 1.0
+    return float(special.stdtrit(freedom, (1 + confidence) / 2)) / _normal(confidence)
+
+
+class Effect(Protocol):
+    """An estimate whose interval can be asked for at every level of confidence."""
+
+    @property
+    def value(self) -> float: ...
+
+    def interval(self, confidence: float = CONFIDENCE) -> Interval: ...
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A bootstrapped estimate.
+
+    Attributes:
+        value: the estimate.
+        episodes: under each resample's weights of episodes, with every unit as it is [resamples].
+        units: what drawing units changes, with the variance of a mean over them [resamples].
+        freedom: degrees of freedom of the units.
     """
-    quantile = (1 + CONFIDENCE) / 2
-    tails = stats.t.ppf(quantile, freedom) / stats.norm.ppf(quantile)
-    return float(tails * np.sqrt(runs / (runs - 1)))
+
+    value: float
+    episodes: Array
+    units: Array
+    freedom: int
+
+    def draws(self, confidence: float = CONFIDENCE) -> Array:
+        """Draws whose quantiles are the ends of the interval: [resamples]."""
+        return self.episodes + tails(confidence, self.freedom) * self.units
+
+    def interval(self, confidence: float = CONFIDENCE) -> Interval:
+        return percentile(self.value, self.draws(confidence), confidence)
 
 
-def bootstrap_draws(
-    samples: Sequence[Sample],
-    generator: np.random.Generator,
+@dataclass(frozen=True)
+class ShareDifference:
+    """Difference of two shares, each (successes, trials), with Newcombe's hybrid interval.
+
+    It combines the two Wilson intervals (Newcombe 1998, method 10); unlike a bootstrap it has a
+    width when nobody or everybody succeeds. Where successes come in clusters, give the number of
+    clusters as trials and the sum of the clusters' shares as successes: a share of a cluster varies
+    at most as much as a single success.
+    """
+
+    first: tuple[float, float]
+    second: tuple[float, float]
+
+    @property
+    def value(self) -> float:
+        return self.first[0] / self.first[1] - self.second[0] / self.second[1]
+
+    def interval(self, confidence: float = CONFIDENCE) -> Interval:
+        p, q = self.first[0] / self.first[1], self.second[0] / self.second[1]
+        p_low, p_high = wilson(*self.first, confidence)
+        q_low, q_high = wilson(*self.second, confidence)
+        low = self.value - float(np.hypot(p - p_low, q_high - q))
+        high = self.value + float(np.hypot(p_high - p, q - q_low))
+        return Interval(self.value, low, high)
+
+
+def p_difference(effect: Effect) -> float:
+    """The p-value of "there is no effect", two-sided: 1 - the most confidence of an interval that
+    excludes 0.
+
+    It is below 0.05 where the 95 % interval excludes 0, and nowhere else.
+    """
+    return _smallest(lambda p: effect.interval(1 - p).sign != 0, 1.0)
+
+
+def p_equivalence(effect: Effect, margin: float) -> float:
+    """The p-value of "the effect is at least `margin`, up or down", by two one-sided tests.
+
+    That is the smallest p for which the interval of confidence 1 - 2 p lies between -`margin` and
+    `margin` (Schuirmann 1987; 1 if there is none below 0.5).
+    """
+
+    def inside(p: float) -> bool:
+        found = effect.interval(1 - 2 * p)
+        return -margin < found.low and found.high < margin
+
+    found = _smallest(inside, 0.5)
+    return found if found < 0.5 else 1.0
+
+
+def _smallest(holds: Callable[[float], bool], largest: float) -> float:
+    """The smallest p in (1e-6, `largest`) for which a test that only gets easier with p holds."""
+    low, high = np.log(1e-6), np.log(largest)
+    for _ in range(24):
+        middle = (low + high) / 2
+        low, high = (low, middle) if holds(float(np.exp(middle))) else (middle, high)
+    return float(np.exp(high))
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """p-values of a family, adjusted so that at most one family in twenty has a false result below
+    0.05 (Holm 1979)."""
+    adjusted, largest = [0.0] * len(values), 0.0
+    for rank, index in enumerate(sorted(range(len(values)), key=lambda i: values[i])):
+        largest = max(largest, min(1.0, (len(values) - rank) * values[index]))
+        adjusted[index] = largest
+    return adjusted
+
+
+def units_of(runs: Sequence[Sample], cell: object = "") -> dict[str, Sample]:
+    """What is drawn of a cell, by name: its base policies, or the runs if there is one policy.
+
+    A policy's runs are averaged and drawn together: their spread is a part of the spread of the
+    policies' means, and to draw them again would count it twice (Davison and Hinkley 1997, section
+    3.8).
+    """
+    policies: dict[str, list[Sample]] = defaultdict(list)
+    for run in runs:
+        policies[run.policy].append(run)
+    if len(policies) == 1:
+        return {f"{cell} {index}": run for index, run in enumerate(runs)}
+    return {policy: Sample.mean(policies[policy]) for policy in sorted(policies)}
+
+
+def cell_estimates(
+    cells: Sequence[Sequence[Sample]],
     statistic: Callable[..., Array] = mean,
     resamples: int = RESAMPLES,
-    freedom: int | None = None,
-) -> Array:
-    """Draws of `statistic` over runs whose quantiles are its interval: [resamples].
+) -> list[Estimate]:
+    """`statistic` over the units (`units_of`) of each cell, all drawn together.
 
-    Runs and episodes are crossed factors: every run is scored on the same initial states. Each
-    resample weighs the episodes (`episode_weights`, the same for all runs) and draws runs with
-    replacement (Owen and Eckles 2012); what the drawn runs change is widened by
-    `small_sample_factor`. With one run only episodes vary.
+    Units and episodes are crossed factors: every run is scored on the same initial states. Each
+    resample weighs the episodes (`episode_weights`) and the units (`unit_weights`), each the same
+    wherever it occurs (Owen and Eckles 2012). The weights of n units give a mean (n - 1) / (n + 1)
+    of the variance that it has; what they change is scaled by the root of that. With one unit only
+    episodes vary.
 
-    `freedom` is the number of degrees of freedom, runs - 1 if these are all there are.
-
-    Raises ValueError without samples.
+    Raises ValueError without cells, or for a run without episodes.
     """
-    if not samples or any(not block.seeds for run in samples for block in run.blocks):
+    if not cells or not all(cells):
+        raise ValueError("there is no cell, or one without runs")
+    if any(not block.seeds for runs in cells for run in runs for block in run.blocks):
         raise ValueError("every run needs at least one episode")
-    number = len(samples)
-    values = np.stack([sample.draw(resamples) for sample in samples], axis=1)
-    of_all = statistic(values, axis=1)
-    if number == 1:
-        return of_all
-    drawn = generator.integers(number, size=(resamples, number))
-    of_drawn = statistic(np.take_along_axis(values, drawn, axis=1), axis=1)
-    factor = small_sample_factor(number, number - 1 if freedom is None else freedom)
-    return of_all + factor * (of_drawn - of_all)
+    named = [units_of(runs, index) for index, runs in enumerate(cells)]
+    freedom = degrees_of_freedom(named)
+    found = []
+    for units in named:
+        number = len(units)
+        values = np.stack([unit.draw(resamples) for unit in units.values()], axis=1)
+        of_all, change = statistic(values), np.zeros(resamples)
+        if number > 1:
+            weights = np.stack([unit_weights(unit, resamples) for unit in units], axis=1)
+            change = statistic(values, weights) - of_all
+            change *= np.sqrt((number + 1) / (number - 1))
+        value = float(statistic([unit.value for unit in units.values()]))
+        found.append(Estimate(value, of_all, change, freedom))
+    return found
+
+
+def degrees_of_freedom(cells: Iterable[Iterable[str]]) -> int:
+    """Number of units less one for each group of cells that share any."""
+    groups: list[set[str]] = []
+    for units in map(set, cells):
+        joined = [group for group in groups if group & units]
+        groups = [group for group in groups if not group & units]
+        groups.append(units.union(*joined))
+    return sum(len(group) - 1 for group in groups)
+
+
+def combined(cells: Sequence[Estimate], weights: Sequence[float] | None = None) -> Estimate:
+    """A weighted sum of estimates that were drawn together; by default their mean.
+
+    The cells themselves are not drawn: the interval is about these cells.
+    """
+    factors = np.full(len(cells), 1 / len(cells)) if weights is None else np.asarray(weights)
+    return Estimate(
+        float(sum(f * cell.value for f, cell in zip(factors, cells, strict=True))),
+        np.sum([f * cell.episodes for f, cell in zip(factors, cells, strict=True)], axis=0),
+        np.sum([f * cell.units for f, cell in zip(factors, cells, strict=True)], axis=0),
+        cells[0].freedom,
+    )
 
 
 def crossed_bootstrap(
-    samples: Sequence[Sample],
+    runs: Sequence[Sample],
     statistic: Callable[..., Array] = mean,
     resamples: int = RESAMPLES,
-    seed: int = 0,
 ) -> Interval:
-    """`statistic` over runs with the 95 % interval of `bootstrap_draws`."""
-    draws = bootstrap_draws(samples, np.random.default_rng(seed), statistic, resamples)
-    return percentile(float(statistic([sample.value for sample in samples], axis=0)), draws)
+    """`statistic` over the units of one cell with its 95 % interval (`cell_estimates`)."""
+    return cell_estimates([runs], statistic, resamples)[0].interval()
 
 
-def stratified_draws(
-    cells: Sequence[Sequence[Sample]],
-    generator: np.random.Generator,
-    resamples: int = RESAMPLES,
-) -> Array:
-    """Draws of the mean over runs of every cell: [cells, resamples].
-
-    Runs are drawn within each cell, episodes for all cells at once. Raises ValueError without
-    cells.
-    """
-    if not cells:
-        raise ValueError("there is no cell")
-    freedom = sum(len(runs) - 1 for runs in cells)
-    return np.stack([bootstrap_draws(c, generator, mean, resamples, freedom) for c in cells])
+def stratified_bootstrap(cells: Sequence[Sequence[Sample]], resamples: int = RESAMPLES) -> Interval:
+    """Mean over cells of the mean over their units, with its 95 % interval (`combined`)."""
+    return combined(cell_estimates(cells, mean, resamples)).interval()
 
 
-def stratified_bootstrap(
-    cells: Sequence[Sequence[Sample]], resamples: int = RESAMPLES, seed: int = 0
-) -> Interval:
-    """Mean over cells of the mean over their runs, with the interval of `stratified_draws`.
-
-    The cells themselves are not drawn: the interval is about these cells. Raises ValueError
-    without cells.
-    """
-    draws = stratified_draws(cells, np.random.default_rng(seed), resamples).mean(axis=0)
-    value = np.mean([np.mean([run.value for run in runs]) for runs in cells])
-    return percentile(float(value), draws)
+def stratified_draws(cells: Sequence[Sequence[Sample]], resamples: int = RESAMPLES) -> Array:
+    """Draws of the mean over the units of every cell: [cells, resamples]."""
+    return np.stack([cell.draws() for cell in cell_estimates(cells, mean, resamples)])
 
 
-def success_interval(samples: Sequence[Sample], resamples: int = RESAMPLES) -> Interval:
-    """IQM over runs of the success rate with its interval, which stays within [0, 1].
+def success_interval(runs: Sequence[Sample], resamples: int = RESAMPLES) -> Interval:
+    """IQM over units of the success rate with its interval, which stays within [0, 1].
 
     Where all episodes agree (all failed or all succeeded) the bootstrap has no width; Wilson's
     interval of the distinct episodes takes its place.
     """
-    result = crossed_bootstrap(samples, iqm, resamples)
-    if len(set(values := [run.value for run in samples])) == 1 and values[0] in (0.0, 1.0):
-        episodes = len({seed for run in samples for block in run.blocks for seed in block.seeds})
-        return Interval(result.value, *wilson(round(values[0] * episodes), episodes))
+    result = crossed_bootstrap(runs, iqm, resamples)
+    if len(set(values := [run.value for run in runs])) == 1 and values[0] in (0.0, 1.0):
+        episodes = len({seed for run in runs for block in run.blocks for seed in block.seeds})
+        return Interval(result.value, *wilson(values[0] * episodes, episodes))
     return Interval(result.value, max(0.0, result.low), min(1.0, result.high))
 
 
-def probability_of_improvement(
-    cells: Sequence[tuple[Sequence[float], Sequence[float]]],
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> Interval:
-    """P(X > Y) + P(X = Y) / 2 for a run of either agent, mean over cells (Agarwal et al. 2021).
+@dataclass(frozen=True)
+class Spread:
+    """Standard deviations of a run's result: what base policy, run and episodes contribute.
 
-    `cells` holds (values of X's runs, values of Y's runs). Within a cell it is the Mann-Whitney
-    statistic over all pairs of runs. The interval draws the runs of both with replacement within
-    each cell. Raises ValueError without cells or for a cell without runs.
+    Attributes:
+        policies: between base policies; None where no cell has several.
+        runs: between runs on one policy; None where no policy has several.
+        together: of policies and runs, where only their sum can be estimated.
+        episodes: because a run is scored on a sample of episodes.
     """
-    if not cells or any(len(x) == 0 or len(y) == 0 for x, y in cells):
-        raise ValueError("every cell needs runs of both agents")
-    generator = np.random.default_rng(seed)
-    value, draws = 0.0, np.zeros(resamples)
-    for x, y in cells:
-        difference = np.subtract.outer(np.asarray(x, float), np.asarray(y, float))
-        wins = (np.sign(difference) + 1) / 2
-        drawn_x = _occurrences(len(x), resamples, generator) / len(x)
-        drawn_y = _occurrences(len(y), resamples, generator) / len(y)
-        value += float(wins.mean()) / len(cells)
-        draws += np.einsum("ri,ij,rj->r", drawn_x, wins, drawn_y) / len(cells)
-    return percentile(value, draws)
+
+    policies: float | None
+    runs: float | None
+    together: float | None
+    episodes: float
+
+
+def spread(cells: Sequence[Sequence[Sample]], resamples: int = 1000) -> Spread:
+    """Variance components by the method of moments, pooled over cells.
+
+    Sums of squares between runs of a policy, and between policies' means, less what the episodes
+    contribute to them: the covariance of the runs under weights of the episodes (`Sample.draw`).
+    Differences below 0 count as 0.
+    """
+    sums = np.sum([_sums_of_squares(runs, resamples) for runs in cells], axis=0)
+    within, of_runs, between, of_policies, shares, policies, noise, runs = sums.tolist()
+    per_run = max(0.0, within / of_runs) if of_runs else None
+    # Of a policy with n runs the mean varies by its own variance and by 1/n of the runs'.
+    means = max(0.0, between / of_policies) if of_policies else None
+    per_policy = None
+    if per_run is not None and means is not None:
+        per_policy = max(0.0, means - shares / policies * per_run)
+
+    def deviation(variance: float | None) -> float | None:
+        return None if variance is None else math.sqrt(variance)
+
+    return Spread(
+        deviation(per_policy),
+        deviation(per_run),
+        deviation(means) if per_policy is None else None,
+        math.sqrt(noise / runs),
+    )
+
+
+def _sums_of_squares(runs: Sequence[Sample], resamples: int) -> tuple[float, ...]:
+    """For `spread`: sums of squares between runs of a policy and between policies, each without
+    what episodes contribute and with its degrees of freedom; the sum over policies of 1 / its runs,
+    and their number; the sum over runs of the variance due to episodes, and their number."""
+    values = np.array([run.value for run in runs])
+    noise = np.atleast_2d(np.cov([run.draw(resamples) for run in runs]))
+    names = sorted({run.policy for run in runs})
+    member = np.array([[run.policy == name for run in runs] for name in names], dtype=np.float64)
+    average = member / member.sum(axis=1, keepdims=True)
+    means, of_means = average @ values, average @ noise @ average.T
+    within = ((values - means @ member) ** 2).sum() - noise.trace()
+    return (
+        within + (member @ noise @ average.T).trace(),
+        len(runs) - len(names),
+        ((means - means.mean()) ** 2).sum() - of_means.trace() + of_means.sum() / len(names),
+        len(names) - 1,
+        (1 / member.sum(axis=1)).sum(),
+        len(names),
+        noise.trace(),
+        len(runs),
+    )
+
+
+Values = Sequence[tuple[str, float]]
+"""(base policy, value) of each run of an agent in a cell."""
+
+
+def probability_of_improvement(
+    cells: Sequence[tuple[Values, Values]], resamples: int = RESAMPLES
+) -> Interval:
+    """P(X > Y) + P(X = Y) / 2 for runs of two agents on one base policy, mean over cells.
+
+    `cells` holds (X's runs, Y's runs); runs on policies that only one of the two steers are left
+    out. For each policy it is the Mann-Whitney statistic over all pairs of runs (Agarwal et al.
+    2021), averaged over policies. The interval draws policies, or the runs of both agents where a
+    cell has one policy. Where every pair has the same winner the draws do not vary; Wilson's
+    interval of the number of policies (or runs of the agent with fewer) takes its place. Raises
+    ValueError without cells, or for a cell without a common policy.
+    """
+    if not cells:
+        raise ValueError("there is no cell")
+    values, changes, names = [], [], []
+    for index, (first, second) in enumerate(cells):
+        units = sorted({policy for policy, _ in first} & {policy for policy, _ in second})
+        if not units:
+            raise ValueError("every cell needs runs of both agents on one base policy")
+        wins = [_wins(first, second, policy) for policy in units]
+        if len(units) > 1:
+            value, change = _drawn(units, np.array([won.mean() for won in wins]), resamples)
+        else:
+            rows, columns = (
+                [f"{index} {axis} {i}" for i in range(size)]
+                for axis, size in enumerate(wins[0].shape)
+            )
+            value, of_first = _drawn(rows, wins[0].mean(axis=1), resamples)
+            change = of_first + _drawn(columns, wins[0].mean(axis=0), resamples)[1]
+            units = min(rows, columns, key=len)
+        values.append(value)
+        changes.append(change)
+        names.append(units)
+    won = float(np.mean(values))
+    if won in (0.0, 1.0):
+        number = len({name for units in names for name in units})
+        return Interval(won, *wilson(won * number, number))
+    factor = tails(CONFIDENCE, degrees_of_freedom(names))
+    result = percentile(won, won + factor * np.mean(changes, axis=0))
+    return Interval(won, max(0.0, result.low), min(1.0, result.high))
+
+
+def _wins(first: Values, second: Values, policy: str) -> Array:
+    """Who wins each pair of runs on a base policy, 1 for the first, a half for both: [X, Y]."""
+    x, y = (np.array([value for on, value in runs if on == policy]) for runs in (first, second))
+    return (np.sign(np.subtract.outer(x, y)) + 1) / 2
 
 
 def performance_profile(
-    cells: Sequence[Sequence[float]],
-    thresholds: Sequence[float] | Array,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
+    cells: Sequence[Values], thresholds: Sequence[float] | Array, resamples: int = RESAMPLES
 ) -> tuple[Array, Array, Array]:
     """Share of runs with a value >= each threshold, mean over cells: (share, low, high).
 
-    The pointwise 95 % band draws runs with replacement within each cell. Raises ValueError without
-    cells or for a cell without runs.
+    The share of a cell is the mean over its base policies. The pointwise 95 % band draws these, or
+    the runs where a cell has one policy. Raises ValueError without cells or for a cell without
+    runs.
     """
-    if not cells or any(len(values) == 0 for values in cells):
+    if not cells or not all(cells):
         raise ValueError("every cell needs runs")
-    generator = np.random.default_rng(seed)
     levels = np.asarray(thresholds, dtype=np.float64)
-    share, draws = np.zeros(levels.size), np.zeros((resamples, levels.size))
-    for values in cells:
-        reached = (np.asarray(values, float)[:, None] >= levels).astype(np.float64)
-        drawn = _occurrences(len(values), resamples, generator) / len(values)
-        share += reached.mean(axis=0) / len(cells)
-        draws += np.einsum("ri,it->rt", drawn, reached) / len(cells)
+    names, shares, changes = [], [], []
+    for index, runs in enumerate(cells):
+        policies = np.array([policy for policy, _ in runs])
+        reached = (np.array([value for _, value in runs])[:, None] >= levels).astype(np.float64)
+        units = sorted(set(policies.tolist()))
+        if len(units) == 1:
+            units = [f"{index} {i}" for i in range(len(runs))]
+        else:
+            reached = np.stack([reached[policies == unit].mean(axis=0) for unit in units])
+        share, change = _drawn(units, reached, resamples)
+        names.append(units)
+        shares.append(share)
+        changes.append(change)
+    share = np.mean(shares, axis=0)
+    draws = share + tails(CONFIDENCE, degrees_of_freedom(names)) * np.mean(changes, axis=0)
     tail = (1 - CONFIDENCE) / 2
-    low, high = np.quantile(draws, (tail, 1 - tail), axis=0)
+    low, high = np.clip(np.quantile(draws, (tail, 1 - tail), axis=0), 0, 1)
     return share, low, high
 
 
-def _occurrences(number: int, resamples: int, generator: np.random.Generator) -> Array:
-    """How often each of `number` runs occurs in each resample: [resamples, number]."""
-    return generator.multinomial(number, np.full(number, 1 / number), size=resamples).astype(float)
+def _drawn(units: Sequence[str], values: Array, resamples: int) -> tuple[Array, Array]:
+    """Mean over units of their values [units, ...], and what drawing them changes
+    [resamples, ...] (`cell_estimates`)."""
+    average, number = values.mean(axis=0), len(units)
+    if number == 1:
+        return average, np.zeros((resamples, *average.shape))
+    weights = np.stack([unit_weights(unit, resamples) for unit in units], axis=1)
+    weights = weights / weights.sum(axis=1, keepdims=True)
+    change = np.einsum("ru,u...->r...", weights, values - average)
+    return average, np.sqrt((number + 1) / (number - 1)) * change
 
 
 def paired_differences(first: Mapping[Key, float], second: Mapping[Key, float]) -> dict[Key, float]:

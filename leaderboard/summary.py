@@ -16,6 +16,7 @@ from symsteer.leaderboard.paper import BASE, ROW_ORDER
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import (
     ROLES,
+    Divergence,
     Evaluation,
     Provenance,
     Role,
@@ -81,9 +82,14 @@ class Run:
         return self.record.settings.seed
 
     @property
+    def policy(self) -> str:
+        """Content hash of the base policy that it steers."""
+        return self.record.base_policy.content_hash
+
+    @property
     def pair(self) -> Pair:
         """What a run of another agent must share to be paired with this one."""
-        return self.record.base_policy.content_hash, self.seed
+        return self.policy, self.seed
 
     @property
     def agent(self) -> str:
@@ -279,9 +285,14 @@ class Row:
         return censored_median(self.threshold_steps) if self.threshold_steps else None
 
     @property
+    def divergences(self) -> list[Divergence]:
+        """How far Q left what is feasible, for every run with a critic, finished or not."""
+        return [found for run in self.runs if (found := run.record.divergence)]
+
+    @property
     def diverged(self) -> list[bool]:
-        """Whether Q diverged, for every run with a critic, finished or not."""
-        return [run.record.diverged for run in self.runs if run.record.diverged is not None]
+        """Whether Q diverged, for the same runs."""
+        return [found.diverged for found in self.divergences]
 
     def over_runs(self, *names: str) -> float | None:
         """Mean over finished runs of a diagnostic's final value."""
@@ -289,20 +300,9 @@ class Row:
         return float(np.mean(values)) if values else None
 
     def largest(self, name: str) -> float | None:
-        """Largest finite value of a diagnostic over all evaluations and runs."""
-        values = [value for run in self.runs for value in run.diagnostics(name)]
-        return max(values) if values else None
-
-    @property
-    def highest_q(self) -> float | None:
-        """Largest finite Q of the minimum over critics, since learning began."""
-        values = [
-            value
-            for run in self.runs
-            for evaluation in run.record.evaluations
-            if evaluation.updates and (value := evaluation.diagnostics.get("q_max")) is not None
-        ]
-        return max(values) if values else None
+        """Largest value of a part of `Divergence` over the runs that have it."""
+        values = [getattr(found, name) for found in self.divergences]
+        return max((value for value in values if value is not None), default=None)
 
 
 @dataclass
@@ -489,18 +489,29 @@ def _fill(row: Row, budget: int) -> None:
     """Compute the numbers of a row that need no other row."""
     if not row.finished:
         return
-    row.success = success_interval([_pooled(run.window) for run in row.finished])
-    row.last = success_interval([Sample.pooled(run.final_success.items()) for run in row.finished])
-    rises = [run.rise for run in row.finished if run.rise and not row.is_reference]
-    row.rise = crossed_bootstrap([Sample.pooled(r.items()) for r in rises]) if rises else None
+    row.success = success_interval([success_sample(run) for run in row.finished])
+    row.last = success_interval(
+        [Sample.pooled(run.final_success.items(), run.policy) for run in row.finished]
+    )
+    rises = [
+        Sample.pooled(run.rise.items(), run.policy)
+        for run in row.finished
+        if run.rise and not row.is_reference
+    ]
+    row.rise = crossed_bootstrap(rises) if rises else None
     if row.search_steps is None:
         areas = [area_under_curve(*_points(run), budget) for run in row.finished]
         row.area = float(np.mean(areas))
 
 
-def _pooled(window: Mapping[tuple[int, int], float]) -> Sample:
+def success_sample(run: Run) -> Sample:
+    """Success in the final window of a finished run."""
+    return _pooled(run.window, run)
+
+
+def _pooled(window: Mapping[tuple[int, int], float], run: Run) -> Sample:
     """Values by (env_steps, episode seed) as one block."""
-    return Sample.pooled((seed, value) for (_, seed), value in window.items())
+    return Sample.pooled(((seed, value) for (_, seed), value in window.items()), run.policy)
 
 
 def _threshold(rows: Sequence[Row]) -> float | None:
@@ -531,11 +542,7 @@ def reference_success(run: Run, references: Sequence[Run]) -> dict[int, float]:
     Taken from the reference's run with the same policy (content hash) and the same run seed, else
     from the mean of all its runs with that policy; empty if there is none.
     """
-    same = [
-        reference
-        for reference in references
-        if reference.record.base_policy.content_hash == run.record.base_policy.content_hash
-    ]
+    same = [reference for reference in references if reference.policy == run.policy]
     same = [reference for reference in same if reference.seed == run.seed] or same
     values: dict[int, list[float]] = defaultdict(list)
     for reference in same:
@@ -568,7 +575,7 @@ def success_pairs(first: Row, second: Row) -> dict[Pair, Sample]:
                 if partner and (points.get(step), seed) in partner.window
             }
         if differences := paired_differences(run.window, other):
-            pairs[run.pair] = _pooled(differences)
+            pairs[run.pair] = _pooled(differences, run)
     return pairs
 
 
@@ -589,7 +596,7 @@ def area_pairs(first: Row, second: Row, budget: int) -> dict[Pair, Sample]:
                 blocks[step] = Sample.pooled(found.items()).blocks[0]
         if blocks:
             weights = area_weights(list(blocks), budget)
-            pairs[run.pair] = Sample(tuple(blocks.values()), weights)
+            pairs[run.pair] = Sample(tuple(blocks.values()), weights, run.policy)
     return pairs
 
 

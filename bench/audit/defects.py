@@ -5,7 +5,6 @@ docs/audit.md defines every number.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 
@@ -21,6 +20,7 @@ from symsteer.bench.audit.estimates import (
     mean,
     ratio,
     root_excess,
+    root_share,
 )
 from symsteer.bench.audit.measure import Copies, Experiment, Resets
 from symsteer.bench.audit.result import (
@@ -34,6 +34,7 @@ from symsteer.bench.audit.result import (
     check_group,
 )
 from symsteer.bench.audit.states import Visited, join_trees, visit
+from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.policies.contract import ChunkPolicy
@@ -43,7 +44,7 @@ LEAST_DISPLACEMENT = 5e-4
 """A defect is not divided by a mean displacement (metres) below this."""
 
 LEAST_SPREAD = 1e-3
-"""A field whose spread over the states is smaller does not enter normalised distances."""
+"""A field whose spread over the resets is smaller does not enter their distance."""
 
 
 def visit_all(
@@ -101,14 +102,12 @@ def audit(
     try:
         copies = experiment.copies()
         resets = experiment.resets(settings.resets)
-        undistorted = experiment.undistorted().numpy()
-        centre = experiment.centre
+        centre, box = experiment.centre, experiment.corners
     finally:
         experiment.close()
     layout = reference.observation_layout
     seed = settings.seed
     energy, p_value = _reset_defect(resets, layout, seed)
-    observation, fields = _observation_defect(copies, undistorted, layout, seed)
     return AuditResult(
         settings=settings,
         base_policy=policy.content_hash()[:12] if policy is not None else None,
@@ -116,10 +115,9 @@ def audit(
         moving=int(visited.moving.sum()),
         unreachable=float((~copies.reached).double().mean()),
         origin_mm=(1e3 * float(centre[0]), 1e3 * float(centre[1])),
-        dynamics=tuple(_dynamics(copies, seed)),
+        dynamics=tuple(_dynamics(copies, box, seed)),
         reward=_reward_defect(copies, seed),
-        observation=observation,
-        fields=fields,
+        fields=_observation_defect(copies, box, layout, seed),
         random_observation=copies.observations.shape[2] > 1,
         resets=energy,
         resets_p=p_value,
@@ -152,7 +150,26 @@ def _angle(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return 4 * torch.asin((chord / 2).clamp(max=1.0))
 
 
-def _dynamics(copies: Copies, seed: int) -> list[Defect]:
+def _lengths(
+    copies: Copies, body: str, box: torch.Tensor
+) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """Distances of copies from the original, and how far each copy moves, ``[S, G + 1]`` both.
+
+    Horizontally and vertically: of the tool's centre point, or of the object's corners ``box``,
+    mean over these.
+    """
+    points = copies.positions[body][..., None, :]
+    if body == "object":
+        points = points + box @ quaternion_to_matrix(copies.quaternions[body]).mT
+    start, end = points.unbind(dim=2)
+    pair = end - end[:, :1], end - start
+    return {
+        "horizontal": tuple(d[..., :2].norm(dim=-1).mean(dim=-1) for d in pair),  # type: ignore
+        "vertical": tuple(d[..., 2].abs().mean(dim=-1) for d in pair),  # type: ignore
+    }
+
+
+def _dynamics(copies: Copies, box: torch.Tensor, seed: int) -> list[Defect]:
     moving, policy = copies.moving.numpy(), copies.policy.numpy()
     subsets = {
         "all": np.ones_like(moving),
@@ -165,37 +182,47 @@ def _dynamics(copies: Copies, seed: int) -> list[Defect]:
     for body in ("tool", "object"):
         position, orientation = copies.positions[body], copies.quaternions[body]
         order = position.shape[1] - 1
-        for index, window in ((1, "step"), (2, "chunk")):
-            end, start = position[:, :, index], position[:, :, 0]
-            apart = (end - end[:, :1]).norm(dim=-1)
-            angles = _angle(orientation[:, :, index], orientation[:, :1, index])
-            own = (end - start).norm(dim=-1)
-            defect = _over_copies(apart[:, :order], copies)
-            turn = np.degrees(_over_copies(angles[:, :order], copies))
-            travelled = _over_copies(own[:, :order], copies, first=0)
-            for subset, chosen in subsets.items():
-                keep = _valid(chosen, copies)
-                if keep.sum() < LEAST_STATES or (subset != "all" and chosen.all()):
-                    continue
-                picked = torch.as_tensor(keep)
-                mask = copies.reached[picked, 1:]
-                rows.append(
-                    Defect(
-                        body=body,  # type: ignore[arg-type]
-                        window=window,  # type: ignore[arg-type]
-                        subset=subset,  # type: ignore[arg-type]
-                        states=int(keep.sum()),
-                        relative=bootstrap(ratio, defect[keep], travelled[keep], seed=seed)
-                        if travelled[keep].mean() >= LEAST_DISPLACEMENT
-                        else None,
-                        mm=bootstrap(mean, 1e3 * defect[keep], seed=seed),
-                        degrees=bootstrap(mean, turn[keep], seed=seed),
-                        displacement_mm=1e3 * float(travelled[keep].mean()),
-                        floor_mm=1e3 * float(apart[picked, order].mean()),
-                        floor_degrees=math.degrees(float(angles[picked, order].mean())),
-                        p95_mm=1e3 * float(apart[picked, 1:order][mask].quantile(0.95)),
-                    )
+        angles = _angle(orientation[:, :, 1], orientation[:, :1, 1])
+        distance = (position[:, :, 1] - position[:, :1, 1]).norm(dim=-1)
+        travelled = _over_copies(
+            (position[:, :order, 1] - position[:, :order, 0]).norm(dim=-1), copies, first=0
+        )
+        directions = {
+            name: (
+                _over_copies(between[:, :order], copies),
+                _over_copies(moved[:, :order], copies, first=0),
+            )
+            for name, (between, moved) in _lengths(copies, body, box).items()
+        }
+        millimetres = 1e3 * _over_copies(distance[:, :order], copies)
+        turn = np.degrees(_over_copies(angles[:, :order], copies))
+        for subset, chosen in subsets.items():
+            keep = _valid(chosen, copies)
+            if keep.sum() < LEAST_STATES or (subset != "all" and chosen.all()):
+                continue
+            picked = torch.as_tensor(keep)
+            mask = copies.reached[picked, 1:]
+            relative = {
+                name: bootstrap(ratio, between[keep], moved[keep], seed=seed)
+                if moved[keep].mean() >= LEAST_DISPLACEMENT
+                else None
+                for name, (between, moved) in directions.items()
+            }
+            rows.append(
+                Defect(
+                    body=body,  # type: ignore[arg-type]
+                    subset=subset,  # type: ignore[arg-type]
+                    states=int(keep.sum()),
+                    horizontal=relative["horizontal"],
+                    vertical=relative["vertical"],
+                    mm=bootstrap(mean, millimetres[keep], seed=seed),
+                    degrees=bootstrap(mean, turn[keep], seed=seed),
+                    displacement_mm=1e3 * float(travelled[keep].mean()),
+                    floor_mm=1e3 * float(distance[picked, order].mean()),
+                    floor_degrees=math.degrees(float(angles[picked, order].mean())),
+                    p95_mm=1e3 * float(distance[picked, 1:order][mask].quantile(0.95)),
                 )
+            )
     return rows
 
 
@@ -204,10 +231,8 @@ def _reward_defect(copies: Copies, seed: int) -> dict[str, Estimate]:
     values = {
         "cost": copies.function_cost,
         "dense": copies.function_dense,
-        "outcome_cost_step": copies.cost[:, :, 0],
-        "outcome_cost_chunk": copies.cost[:, :, 1],
-        "outcome_dense_step": copies.dense[:, :, 0],
-        "outcome_dense_chunk": copies.dense[:, :, 1],
+        "outcome_cost": copies.cost,
+        "outcome_dense": copies.dense,
     }
     return {
         name: bootstrap(mean, _over_copies((value - value[:, :1]).abs(), copies)[keep], seed=seed)
@@ -221,11 +246,12 @@ def in_metres(field: Field) -> bool:
 
 
 def _observation_defect(
-    copies: Copies, undistorted: Array, layout: Layout, seed: int
-) -> tuple[Estimate, tuple[FieldDefect, ...]]:
+    copies: Copies, box: torch.Tensor, layout: Layout, seed: int
+) -> tuple[FieldDefect, ...]:
     keep = _valid(np.ones(len(copies.moving), dtype=bool), copies)
+    moved = _lengths(copies, "tool", box)["horizontal"][1][:, :-1]
+    travelled = _over_copies(moved, copies, first=0)[keep]
     seen, again = copies.observations.numpy(), copies.observations_again.numpy()
-    total, chance, used = np.zeros(keep.sum()), np.zeros(keep.sum()), 0
     fields = []
     for part in layout.fields:
         here = layout.slice(part.name)
@@ -233,27 +259,19 @@ def _observation_defect(
         squares = gaussian_distance_squared(seen[:, :, :, here], own)
         by_state = _over_copies(torch.as_tensor(squares), copies)[keep]
         # The distance between two sets of draws from the same distribution.
-        floor = gaussian_distance_squared(again[:, :, here], own[:, 0])[keep]
+        chance = gaussian_distance_squared(again[:, :, here], own[:, 0])[keep]
         if seen.shape[2] == 1:
-            floor = np.zeros_like(floor)
-        spread = _spread(undistorted[keep][:, here], part)
-        defect = bootstrap(root_excess, by_state, floor, seed=seed)
+            chance = np.zeros_like(chance)
         metres = in_metres(part)
-        scale = 1e3 if metres else 1.0
-        fields.append(
-            FieldDefect(
-                name=part.name,
-                unit="mm" if metres else "",
-                value=Estimate(*(scale * v for v in dataclasses.astuple(defect))),
-                relative=defect.value / spread if spread >= LEAST_SPREAD else None,
-            )
-        )
-        if spread >= LEAST_SPREAD:
-            total = total + by_state / spread**2
-            chance = chance + floor / spread**2
-            used += 1
-    overall = bootstrap(root_excess, total / max(used, 1), chance / max(used, 1), seed=seed)
-    return overall, tuple(fields)
+        scale = 1e6 if metres else 1.0
+        value = bootstrap(root_excess, scale * by_state, scale * chance, seed=seed)
+        relative: Estimate | None = value
+        if metres:
+            moving = travelled.mean() >= LEAST_DISPLACEMENT
+            shares = (by_state, chance, travelled)
+            relative = bootstrap(root_share, *shares, seed=seed) if moving else None
+        fields.append(FieldDefect(part.name, "mm" if metres else "", value, relative))
+    return tuple(fields)
 
 
 def _spread(values: Array, part: Field) -> float:
@@ -277,7 +295,7 @@ def _reset_defect(resets: Resets, layout: Layout, seed: int) -> tuple[Estimate, 
 def _map(copies: Copies) -> list[Bin]:
     bins = []
     for body in ("tool", "object"):
-        end = copies.positions[body][:, :-1, 2]
+        end = copies.positions[body][:, :-1, 1]
         apart = (end[:, :, None] - end[:, None]).norm(dim=-1)
         exists = copies.reached.double()
         # The medoid is the copy that is closest to all others, so it belongs to the majority.

@@ -47,6 +47,13 @@ def root_excess(squares: Array, chance: Array, axis: int = -1) -> Array:
     return np.sqrt(np.maximum(squares.mean(axis=axis) - chance.mean(axis=axis), 0.0))
 
 
+def root_share(squares: Array, chance: Array, whole: Array, axis: int = -1) -> Array:
+    """`root_excess` as a share of the mean ``whole``; nan if that is zero."""
+    below = whole.mean(axis=axis)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(below > 0, root_excess(squares, chance, axis) / below, np.nan)
+
+
 def bootstrap(statistic: Callable[..., Any], *columns: Any, seed: int) -> Estimate:
     """Compute ``statistic`` of ``columns``, each ``[S]``, with a percentile interval over states.
 

@@ -9,6 +9,7 @@ rounding only and shows how small a defect can be measured.
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,7 @@ from symsteer.bench.audit.states import (
     Turner,
     Visited,
     join_trees,
+    map_trees,
     rows_of,
     seen_from,
     task_state,
@@ -55,15 +57,14 @@ class Copies:
         reached: which copies exist, ``[S, G]`` bool (an arm cannot reach every turned state).
         place: initial position of each copy's tool and object, relative to the policy's origin,
             ``[S, G, 2]`` each.
-        positions, quaternions: turned-back positions ``[S, G + 1, W, 3]`` and quaternions
-            ``[S, G + 1, W, 4]`` of tool and object at the start, after one step and after all
-            steps (W = 3); the last of the G + 1 is the copy that differs by rounding.
-        cost: 1 plus the extra cost of the variants, summed over the steps before success, after
-            one step and after all steps, ``[S, G, 2]``.
-        dense: ManiSkill's normalised dense reward minus the extra cost of the variants, summed
-            over all steps, after one step and after all steps, ``[S, G, 2]``.
-        function_cost, function_dense: cost and dense reward of one step whose outcome is set to
-            the turned outcome of the unbroken task, ``[S, G]``.
+        positions, quaternions: turned-back positions ``[S, G + 1, 2, 3]`` and quaternions
+            ``[S, G + 1, 2, 4]`` of tool and object at the start and the end of the decision; the
+            last of the G + 1 is the copy that differs by rounding.
+        cost: cost of a step (1 plus the extra cost of the variants until success, then 0), mean
+            over the decision's steps, ``[S, G]``.
+        dense: ManiSkill's normalised dense reward minus the extra cost of the variants, likewise.
+        function_cost, function_dense: the same where every step starts and ends in the turned
+            states of the unbroken task, ``[S, G]``.
         observations: turned-back observations of the copies, K draws each,
             ``[S, G, K, obs_dim]``.
         observations_again: a second set of draws for the state itself, ``[S, K, obs_dim]``.
@@ -128,6 +129,9 @@ class Experiment:
         )
         self.fresh = True
         self.centre = self.env.policy_origin[0].cpu()
+        mesh = self.env.manipulated.get_first_collision_mesh(to_world_frame=False)
+        self.corners = torch.tensor(list(itertools.product(*mesh.bounds.T)), dtype=torch.float64)
+        """Corners of the manipulated object's bounding box in its own frame, ``[8, 3]``."""
 
     def close(self) -> None:
         """Free the scenes at once: the number that a process can hold is limited."""
@@ -151,7 +155,7 @@ class Experiment:
     def _batch(self, rows: torch.Tensor, random: bool) -> Copies:
         env, visited, elements = self.env, self.visited, self.elements
         order, count = len(elements), len(rows)
-        state, after = rows_of(visited.state, rows), rows_of(visited.after, rows)
+        state, path = rows_of(visited.state, rows), rows_of(visited.path, rows)
         turned = [self.turner.turn(state, g, self.centre) for g in elements]
         starts = [copy for copy, _ in turned]
         reached = torch.stack([mask for _, mask in turned], dim=1)
@@ -178,27 +182,19 @@ class Experiment:
             body: self._split(p[:, :2] - self.centre, count)[:, :order]
             for body, (p, _) in poses[0].items()
         }
-        costs, denses = [], []
+        cost, dense = torch.zeros(env.num_envs), torch.zeros(env.num_envs)
         alive = torch.ones(env.num_envs)
-        total_cost, total_dense = torch.zeros(env.num_envs), torch.zeros(env.num_envs)
         steps = plan.shape[1]
         for step in range(steps):
             before = env.agent.tcp_pose.p.clone()
             _, reward, _, _, info = env.step(plan[:, step].to(env.device))
             alive = alive * (~info["success"].cpu()).float()
-            total_cost = total_cost + alive * (1 + self._extra_cost(before, info)).cpu()
-            total_dense = total_dense + reward.cpu()
-            if step in (0, steps - 1):
-                poses.append(self._poses())
-                costs.append(total_cost)
-                denses.append(total_dense)
-        if steps == 1:
-            poses.append(poses[-1])
-            costs, denses = costs * 2, denses * 2
+            cost = cost + alive * (1 + self._extra_cost(before, info)).cpu() / steps
+            dense = dense + reward.cpu() / steps
+        poses.append(self._poses())
 
-        function_cost, function_dense, both = self._reward_function(starts, after, actions[:, 0])
+        function_cost, function_dense, both = self._reward_function(scenes, path, plan, count)
         positions, quaternions = self._turned_back(poses, count)
-        split = [self._split(torch.stack(v, dim=1), count)[:, :order] for v in (costs, denses)]
         return Copies(
             moving=visited.moving[rows],
             policy=visited.policy[rows],
@@ -206,8 +202,8 @@ class Experiment:
             place=place,
             positions=positions,
             quaternions=quaternions,
-            cost=split[0],
-            dense=split[1],
+            cost=self._split(cost, count)[:, :order],
+            dense=self._split(dense, count)[:, :order],
             function_cost=function_cost,
             function_dense=function_dense,
             observations=observations,
@@ -280,33 +276,41 @@ class Experiment:
         return torch.where(info["success"], torch.zeros_like(cost), cost)
 
     def _reward_function(
-        self, starts: list[dict[str, Any]], after: dict[str, Any], action: torch.Tensor
+        self, scenes: dict[str, Any], path: dict[str, Any], plan: torch.Tensor, count: int
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Cost and dense reward of turned transitions of the unbroken task, and which copies exist.
 
-        All are ``[S, G]``. The outcome is set, not simulated: neither the broken dynamics nor
+        All are ``[S, G]``. The outcomes are set, not simulated: neither the broken dynamics nor
         contact forces enter.
+
+        Args:
+            scenes: the states in which all scenes start.
+            path: the states after each step, ``[S, T, ...]``.
+            plan: the actions of all scenes, ``[(G + 1) * S, T, 7]``.
+            count: number S of states.
         """
-        env, count = self.env, len(action)
-        turned = [self.turner.turn(after, g, self.centre) for g in self.elements]
-        reached = torch.stack([mask for _, mask in turned], dim=1)
-        self._put(join_trees([*starts, starts[0]]))
+        env, steps = self.env, plan.shape[1]
+        self._put(scenes)
         before = env.agent.tcp_pose.p.clone()
-        self._put(join_trees([*[copy for copy, _ in turned], after]))
-        layout = env.action_layout
-        actions = torch.cat([layout.transform(action, *g) for g in self.elements] + [action])
-        info = env.get_info()
-        extra = self._extra_cost(before, info)
-        dense = env.compute_normalized_dense_reward(
-            env.get_obs(info), action=actions.to(env.device), info=info
-        )
-        cost = (~info["success"]).float() + extra
+        reached = torch.ones(count, len(self.elements), dtype=torch.bool)
+        cost, dense = torch.zeros(env.num_envs), torch.zeros(env.num_envs)
+        alive = torch.ones(env.num_envs)
+        for step in range(steps):
+            after = map_trees(lambda later, k=step: later[:, k], path)
+            turned = [self.turner.turn(after, g, self.centre) for g in self.elements]
+            reached &= torch.stack([mask for _, mask in turned], dim=1)
+            self._put(join_trees([*[copy for copy, _ in turned], after]))
+            info = env.get_info()
+            extra = self._extra_cost(before, info)
+            before = env.agent.tcp_pose.p.clone()
+            reward = env.compute_normalized_dense_reward(
+                env.get_obs(info), action=plan[:, step].to(env.device), info=info
+            )
+            alive = alive * (~info["success"].cpu()).float()
+            cost = cost + alive * (1 + extra).cpu() / steps
+            dense = dense + (reward - extra).cpu() / steps
         order = len(self.elements)
-        return (
-            self._split(cost.cpu(), count)[:, :order],
-            self._split((dense - extra).cpu(), count)[:, :order],
-            reached,
-        )
+        return self._split(cost, count)[:, :order], self._split(dense, count)[:, :order], reached
 
     # ------------------------------------------------------------- observation
 
@@ -371,10 +375,6 @@ class Experiment:
             state = {k: {n: state[k][n] for n in known[k]} for k in ("actors", "articulations")}
             found.append(self._observe_unbroken(seen_from(state, self.centre)))
         return torch.cat(found)[:count].double()
-
-    def undistorted(self) -> torch.Tensor:
-        """Observations of the states in the unbroken task, ``[S, obs_dim]``."""
-        return self._observe_unbroken(self.visited.state).double()
 
     def _observe_unbroken(self, state: dict[str, Any]) -> torch.Tensor:
         env = self.reference

@@ -23,6 +23,7 @@ from symsteer.bench.audit.report import (
     summary_json,
     to_markdown,
 )
+from symsteer.bench.audit.result import VERSION, old_version
 from symsteer.errors import UserError
 from symsteer.files import write_together
 
@@ -33,7 +34,7 @@ TASK_PAGES = CHECKOUT / "docs" / "tasks"
 MARK = "<!-- audit:{} -->\n"
 """Line of a task's page after which everything is generated."""
 GRADES = ((0.01, "near exact"), (0.05, "close"), (0.15, "rough"))
-"""Limits of the larger of two defects: of the tool in a step, of the object in a chunk."""
+"""Limits of the defect of a decision."""
 
 BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
 
@@ -55,7 +56,7 @@ def render(rows: Sequence[dict[str, Any]]) -> str:
 
 def _overview(rows: Sequence[dict[str, Any]]) -> str:
     """Range of each component over the tasks, one row for each embodiment and variant."""
-    head = ["variant", "tasks", "tool, step", "object, chunk", "cost", "observed", "resets"]
+    head = ["variant", "tasks", "decision", "tool", "object", "cost", "observed", "resets"]
     lines = ["| " + " | ".join(head) + " |", "|---|" + "--:|" * (len(head) - 1)]
     for embodiment, group, variant in dict.fromkeys(
         (r["embodiment"], r["group"], r["variant"]) for r in rows
@@ -69,7 +70,7 @@ def _overview(rows: Sequence[dict[str, Any]]) -> str:
         if (embodiment, group) != ("floating", "C8"):
             name = f"{embodiment}, {group}, {name}"
         cells = [name, str(len(own))]
-        cells += [percent_range([r[c] for r in own], 0) for c in ("tool_step", "object_chunk")]
+        cells += [percent_range([r[c] for r in own], 0) for c in ("decision", "tool", "object")]
         cells += [percent_range([r[c] for r in own], EXACT) for c in ("cost", "observation")]
         differ = sum(r["resets_p"] < SIGNIFICANT for r in own)
         cells += [f"{differ} of {len(own)} differ" if differ else "alike"]
@@ -94,8 +95,7 @@ def generate(page: str, rows: Sequence[dict[str, Any]]) -> str:
 
 def grade(row: dict[str, Any]) -> str:
     """How well the symmetry of a row holds, in words."""
-    defects = [row[name][0] for name in ("tool_step", "object_chunk") if row[name] is not None]
-    return next((word for limit, word in GRADES if max(defects) < limit), "broken")
+    return next((word for limit, word in GRADES if row["decision"][0] < limit), "broken")
 
 
 def generate_task(page: str, task: str, rows: Sequence[dict[str, Any]]) -> str:
@@ -111,17 +111,18 @@ def generate_task(page: str, task: str, rows: Sequence[dict[str, Any]]) -> str:
         )
     lines = [
         "",
-        "The [audit](../audit.md) of the unbroken task in states that expert and policy visit "
-        "(group C8):",
+        "The [audit](../audit.md) of the unbroken task: defect of a decision of "
+        "4 steps in states that expert and policy visit (group C8):",
         "",
-        "| embodiment | tool, one step | object, chunk of 4 steps | resets | symmetry |",
-        "|---|--:|--:|--:|---|",
+        "| embodiment | decision | part | tool | object | resets | symmetry |",
+        "|---|--:|---|--:|--:|--:|---|",
     ]
     for row in rows:
         if (row["task"], row["variant"], row["group"]) == (task, "none", "C8"):
-            tool, thing = (percent(row[name]) for name in ("tool_step", "object_chunk"))
+            whole, tool, thing = (percent(row[name]) for name in ("decision", "tool", "object"))
             resets = "differ" if row["resets_p"] < SIGNIFICANT else "alike"
-            lines.append(f"| {row['embodiment']} | {tool} | {thing} | {resets} | {grade(row)} |")
+            cells = [row["embodiment"], whole, row["part"], tool, thing, resets, grade(row)]
+            lines.append(f"| {' | '.join(cells)} |")
     return before + mark + "\n".join(lines) + "\n"
 
 
@@ -135,14 +136,18 @@ def read_summary(path: Path) -> list[dict[str, Any]]:
     """Read the rows of a ``summary.json``.
 
     Raises:
-        UserError: the file cannot be read.
+        UserError: the file cannot be read, or is of another version.
     """
     try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        rows = json.loads(path.read_text())
+        versions = {row.get("version", 1) for row in rows}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(
             f"cannot read the summary {path}: {error}; name the summary.json of an audit"
         ) from error
+    for version in versions - {VERSION}:
+        raise UserError(f"{path}: {old_version(version)}")
+    return rows
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -18,10 +18,16 @@ from symsteer.errors import UserError
 from symsteer.files import write_together
 
 EXACT = 1e-3
-"""Reward and observation defects below this are rounding errors."""
+"""Reward and observation defects below this are rounding errors, also of inverse kinematics."""
 
 SIGNIFICANT = 0.01
 """Resets differ from their turned copies below this p-value."""
+
+MEANING = {
+    "tool": "turned copies of a decision move the tool to places that differ by",
+    "object": "the object to places that differ by",
+}
+"""Defects of motion in words, before their share of the motion."""
 
 MIN_COPIES = 3
 """Squares of the map with fewer copies are not drawn."""
@@ -32,38 +38,39 @@ def text(result: AuditResult) -> str:
     s = result.settings
     visitors = " and ".join(f"{s.count} of the {v}" for v in s.visitors)
     lines = [
-        f"{s.task}, {s.embodiment}, {_variant(result)}: group {s.group}, {result.states} states "
+        f"{s.task}, {s.embodiment}, {_variant(result)}: group {s.group}, decisions of {s.chunk} "
+        f"steps from {result.states} states",
         f"({visitors}; the object moves in {result.moving})",
         "",
-        f"{'dynamics':26s} {'one step':>28s}   {f'chunk of {s.chunk} steps':>28s}",
+        f"{'defect of a decision':26s} {_percent(result.decision)}, of the {result.part}",
     ]
     for body in ("tool", "object"):
         for subset in ("all", "moving") if body == "object" else ("all",):
-            found = [result.defect(body, w, subset) for w in ("step", "chunk")]  # type: ignore
-            pair = [defect for defect in found if defect is not None]
-            if len(pair) < 2:
+            defect = result.defect(body, subset)  # type: ignore[arg-type]
+            if defect is None:
                 continue
             name = body if subset == "all" else f"{body}, where it moves"
-            lines.append(f"  {name:24s} " + "   ".join(f"{_relative(d):>28s}" for d in pair))
-            lines.append(f"  {'':24s} " + "   ".join(f"{_millimetres(d):>28s}" for d in pair))
-            lines.append(f"  {'':24s} " + "   ".join(f"{_degrees(d):>28s}" for d in pair))
-    floors = [result.defect(b, "chunk") for b in ("tool", "object")]  # type: ignore[arg-type]
+            lines.append(f"{name:26s} {_relative(defect)}")
+            lines.append(f"{'':26s} {_millimetres(defect)}, {_number(defect.degrees, 2)} degrees")
+    floors = [result.defect(b) for b in ("tool", "object")]  # type: ignore[arg-type]
     lines.append(
-        f"  {'floor (rounding alone)':24s} "
+        f"{'floor (rounding alone)':26s} "
         + ", ".join(f"{d.body} {d.floor_mm:.2g} mm" for d in floors if d)
-        + " after the chunk"
     )
     r = result.reward
     lines += [
-        f"{'reward, a step':26s} cost {_number(r['cost'], 3)}, dense {_number(r['dense'], 4)}",
-        f"{'  by way of the dynamics':26s} cost {_number(r['outcome_cost_chunk'], 3)}, dense "
-        f"{_number(r['outcome_dense_chunk'], 4)} a chunk",
-        f"{'observation':26s} {_percent(result.observation)} of its spread"
-        + (" (random: Gaussians compared)" if result.random_observation else ""),
+        f"{'reward, mean of a step':26s} cost {_number(r['cost'], 3)}, "
+        f"dense {_number(r['dense'], 4)}",
+        f"{'  by way of the dynamics':26s} cost {_number(r['outcome_cost'], 3)}, "
+        f"dense {_number(r['outcome_dense'], 4)}",
     ]
     worst = result.worst_field
-    if worst is not None and worst.value.value > EXACT:
-        lines.append(f"{'  most in ' + worst.name:26s} {_number(worst.value, 1)} mm")
+    noise = " (random: Gaussians compared)" if result.random_observation else ""
+    observed = _percent(worst.relative) if worst.relative else "no"
+    lines.append(f"{'observation':26s} {observed} of the tool's displacement{noise}")
+    if breaks_observation(result):
+        unit = f", {_number(worst.value, 1)} mm" if worst.unit else ""
+        lines.append(f"{'  most in':26s} {worst.name}{unit}")
     lines.append(
         f"{'resets':26s} energy distance {_number(result.resets, 3)}, p = {result.resets_p:.3g}"
     )
@@ -80,27 +87,25 @@ def text(result: AuditResult) -> str:
     return "\n".join([*lines, "", meaning(result), f"({result.seconds:.1f} s)"])
 
 
+def breaks_observation(result: AuditResult) -> bool:
+    """Whether the observation is broken, beyond rounding."""
+    relative = result.worst_field.relative
+    return relative is not None and relative.value > EXACT
+
+
 def meaning(result: AuditResult) -> str:
     """A result in one sentence."""
-    tool, thing = result.defect("tool", "step"), result.defect("object", "chunk")
-    parts = []
-    if tool is not None and tool.relative is not None:
-        parts.append(
-            "turned copies of a step move the tool to places that differ by "
-            + (
-                f"{tool.relative.value:.2g} of its length"
-                if tool.relative.value >= 1
-                else f"{100 * tool.relative.value:.2g} % of its length"
-            )
-        )
-    if thing is not None and thing.relative is not None:
-        parts.append(f"copies of a chunk move the object by {100 * thing.relative.value:.2g} %")
+    parts = [
+        f"{MEANING[name]} {_short_percent(estimate.value)}"
+        for name, estimate in result.parts.items()
+        if name in MEANING
+    ]
     broken: list[str] = []
     kept: list[str] = []
     reward = max(result.reward["cost"].value, result.reward["dense"].value)
     for name, is_broken in (
         ("reward", reward > EXACT),
-        ("observation", result.observation.value > EXACT),
+        ("observation", breaks_observation(result)),
         ("resets", result.resets_p < SIGNIFICANT),
     ):
         (broken if is_broken else kept).append(name)
@@ -138,15 +143,16 @@ def _largest(result: AuditResult) -> str | None:
 
 
 def _relative(defect: Defect) -> str:
-    return _percent(defect.relative) if defect.relative else "at rest"
+    directions = {"horizontal": defect.horizontal, "vertical": defect.vertical}
+    return ", ".join(f"{k} {_percent(v) if v else 'at rest'}" for k, v in directions.items())
 
 
 def _millimetres(defect: Defect) -> str:
     return f"{_number(defect.mm, 2)} of {defect.displacement_mm:.1f} mm"
 
 
-def _degrees(defect: Defect) -> str:
-    return f"{_number(defect.degrees, 2)} degrees"
+def _short_percent(value: float) -> str:
+    return f"{100 * value:.2g} % of their length" if value < 1 else f"{value:.2g} of their length"
 
 
 def _percent(estimate: Estimate) -> str:
@@ -168,35 +174,37 @@ def _plain(value: float, digits: int) -> str:
 # ------------------------------------------------------------------------- tables
 
 ESTIMATES = {
-    "tool_step": lambda c: _of(c.defect("tool", "step"), "relative"),
-    "tool_step_mm": lambda c: _of(c.defect("tool", "step"), "mm"),
-    "tool_step_deg": lambda c: _of(c.defect("tool", "step"), "degrees"),
-    "tool_chunk": lambda c: _of(c.defect("tool", "chunk"), "relative"),
-    "tool_chunk_mm": lambda c: _of(c.defect("tool", "chunk"), "mm"),
-    "object_step": lambda c: _of(c.defect("object", "step"), "relative"),
-    "object_chunk": lambda c: _of(c.defect("object", "chunk"), "relative"),
-    "object_chunk_mm": lambda c: _of(c.defect("object", "chunk"), "mm"),
-    "object_chunk_deg": lambda c: _of(c.defect("object", "chunk"), "degrees"),
+    "decision": lambda c: c.decision,
+    "tool": lambda c: _of(c.defect("tool"), "horizontal"),
+    "tool_vertical": lambda c: _of(c.defect("tool"), "vertical"),
+    "tool_mm": lambda c: _of(c.defect("tool"), "mm"),
+    "tool_deg": lambda c: _of(c.defect("tool"), "degrees"),
+    "object": lambda c: _of(c.defect("object"), "horizontal"),
+    "object_vertical": lambda c: _of(c.defect("object"), "vertical"),
+    "object_mm": lambda c: _of(c.defect("object"), "mm"),
+    "object_deg": lambda c: _of(c.defect("object"), "degrees"),
     "cost": lambda c: c.reward["cost"],
     "dense": lambda c: c.reward["dense"],
-    "observation": lambda c: c.observation,
-    "field_mm": lambda c: c.worst_field.value if c.worst_field else None,
+    "observation": lambda c: c.worst_field.relative,
     "resets": lambda c: c.resets,
 }
 """Columns of the table that are numbers with an interval."""
 
 PLAIN = {
+    "version": lambda c: c.version,
     "task": lambda c: c.settings.task,
     "embodiment": lambda c: c.settings.embodiment,
     "variant": lambda c: c.settings.variant,
     "group": lambda c: c.settings.group,
+    "chunk": lambda c: c.settings.chunk,
     "states": lambda c: c.states,
     "moving": lambda c: c.moving,
     "unreachable": lambda c: _short(c.unreachable),
+    "part": lambda c: c.part,
     "resets_p": lambda c: _short(c.resets_p),
-    "field": lambda c: c.worst_field.name if c.worst_field else None,
-    "tool_floor_mm": lambda c: _short(_of(c.defect("tool", "chunk"), "floor_mm")),
-    "object_floor_mm": lambda c: _short(_of(c.defect("object", "chunk"), "floor_mm")),
+    "field": lambda c: c.worst_field.name if breaks_observation(c) else None,
+    "tool_floor_mm": lambda c: _short(_of(c.defect("tool"), "floor_mm")),
+    "object_floor_mm": lambda c: _short(_of(c.defect("object"), "floor_mm")),
 }
 
 
@@ -240,21 +248,18 @@ def to_csv(rows: Sequence[dict[str, Any]]) -> str:
 def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
     """Rows of :func:`summary` as a markdown table."""
     several = len({(r["task"], r["embodiment"], r["group"]) for r in rows}) > 1
-    head = ["variant", "tool, step", "tool, chunk", "object, chunk", "object, mm", "cost", "dense"]
-    head += ["observed", "field, mm", "resets", "p"]
+    head = ["variant", "decision", "part", "tool", "tool, vertical", "object", "object, mm"]
+    head += ["cost", "dense", "observed", "most in", "resets", "p"]
     lines = []
     for row in rows:
         name = "unbroken" if row["variant"] == "none" else f"`{row['variant']}`"
         if several:
             name = f"{row['task'].removesuffix('-v1')}, {row['embodiment']}, {name}"
-        cells = [name]
-        cells += [_interval(row[c], 100, "%") for c in ("tool_step", "tool_chunk", "object_chunk")]
-        cells += [_interval(row["object_chunk_mm"], 1)]
-        cells += [_interval(row[c], 1, exact=EXACT) for c in ("cost", "dense")]
-        cells += [
-            _interval(row["observation"], 100, "%", EXACT),
-            _interval(row["field_mm"], 1, "", 1e-2),
-        ]
+        cells = [name, percent(row["decision"]), row["part"]]
+        cells += [percent(row[c]) for c in ("tool", "tool_vertical", "object")]
+        cells += [_interval(row["object_mm"], 1)]
+        cells += [_interval(row[c], 100, "%", EXACT) for c in ("cost", "dense", "observation")]
+        cells += [f"`{row['field']}`" if row["field"] else "-"]
         differ = row["resets_p"] < SIGNIFICANT
         cells += [_interval(row["resets"], 1) if differ else "alike", f"{row['resets_p']:.3f}"]
         lines.append("| " + " | ".join(cells) + " |")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from pydantic import TypeAdapter, ValidationError
@@ -18,7 +18,12 @@ from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 from symsteer.variant import file_name
 
-VERSION = 1
+VERSION = 2
+"""2: decisions (chunks) in place of single steps, horizontal motion by itself."""
+
+Part = Literal["tool", "object", "cost", "observation"]
+PARTS: tuple[Part, ...] = get_args(Part)
+"""The parts of a decision whose largest defect is its defect."""
 
 Visitors = Literal["both", "expert", "policy"]
 
@@ -44,6 +49,14 @@ def check_group(name: str) -> Group:
     return group
 
 
+def old_version(version: Any) -> str:
+    """What to say about results of another version."""
+    return (
+        f"the audit has version {version}, but this SymSteer reads version {VERSION}; run the "
+        "audit again"
+    )
+
+
 @dataclass(frozen=True)
 class AuditSettings:
     """What an audit measures, and how finely."""
@@ -56,7 +69,7 @@ class AuditSettings:
     count: int = 32
     """States of each visitor."""
     chunk: int = 4
-    """Steps of an action chunk."""
+    """Control steps of a decision: those that are executed of an action chunk."""
     resets: int = 256
     """Resets that are compared with as many turned ones."""
     seed: int = 0
@@ -99,13 +112,22 @@ class AuditSettings:
 
 @dataclass(frozen=True)
 class Defect:
-    """Dynamics defect of one body over one window, for one subset of the states."""
+    """Dynamics defect of one body over a decision, for one subset of the states.
+
+    Attributes:
+        horizontal, vertical: of the tool's centre point, or of the object's corners (so of its
+            pose), relative to their own displacement in this direction; None at rest.
+        mm, degrees: distance of positions, angle between orientations.
+        displacement_mm: mean distance that it moves.
+        floor_mm, floor_degrees: what rounding alone does.
+        p95_mm: 95th percentile of the distances over states and copies.
+    """
 
     body: Literal["tool", "object"]
-    window: Literal["step", "chunk"]
     subset: Literal["all", "expert", "policy", "still", "moving"]
     states: int
-    relative: Estimate | None
+    horizontal: Estimate | None
+    vertical: Estimate | None
     mm: Estimate
     degrees: Estimate
     displacement_mm: float
@@ -116,17 +138,21 @@ class Defect:
 
 @dataclass(frozen=True)
 class FieldDefect:
-    """Observation defect of one field; ``value`` is in mm if ``unit`` is."""
+    """Observation defect of one field; ``value`` is in mm if ``unit`` is.
+
+    ``relative`` is the share of the tool's horizontal displacement if the field is a length (None
+    if the tool is at rest), and ``value`` else: such fields are of the order of 1.
+    """
 
     name: str
     unit: Literal["mm", ""]
     value: Estimate
-    relative: float | None
+    relative: Estimate | None
 
 
 @dataclass(frozen=True)
 class Bin:
-    """A square of the map: mean distance of its copies to their orbit's medoid after a chunk."""
+    """A square of the map: mean distance of its copies to their orbit's medoid at the end."""
 
     body: Literal["tool", "object"]
     x_mm: float
@@ -148,7 +174,6 @@ class AuditResult:
     origin_mm: tuple[float, float]
     dynamics: tuple[Defect, ...]
     reward: dict[str, Estimate]
-    observation: Estimate
     fields: tuple[FieldDefect, ...]
     random_observation: bool
     resets: Estimate
@@ -160,18 +185,39 @@ class AuditResult:
     def defect(
         self,
         body: Literal["tool", "object"],
-        window: Literal["step", "chunk"] = "step",
         subset: str = "all",
     ) -> Defect | None:
         """An entry of ``dynamics``, or None if the subset has too few states."""
-        rows = (d for d in self.dynamics if (d.body, d.window, d.subset) == (body, window, subset))
+        rows = (d for d in self.dynamics if (d.body, d.subset) == (body, subset))
         return next(rows, None)
 
     @property
-    def worst_field(self) -> FieldDefect | None:
-        """The position field with the largest defect."""
-        positions = [f for f in self.fields if f.unit == "mm"]
-        return max(positions, key=lambda f: f.value.value, default=None)
+    def worst_field(self) -> FieldDefect:
+        """The field of the observation with the largest relative defect."""
+        # Rounded, so that fields that differ by rounding are a tie, and the first is named.
+        return max(self.fields, key=lambda f: round(f.relative.value, 4) if f.relative else -1.0)
+
+    @property
+    def parts(self) -> dict[Part, Estimate]:
+        """Defects of the parts of a decision, without those of bodies at rest."""
+        tool, thing = self.defect("tool"), self.defect("object")
+        found: dict[Part, Estimate | None] = {
+            "tool": tool.horizontal if tool else None,
+            "object": thing.horizontal if thing else None,
+            "cost": self.reward["cost"],
+            "observation": self.worst_field.relative,
+        }
+        return {name: estimate for name, estimate in found.items() if estimate is not None}
+
+    @property
+    def part(self) -> Part:
+        """The part with the largest defect, which is the defect of a decision."""
+        return max(self.parts, key=lambda name: self.parts[name].value)
+
+    @property
+    def decision(self) -> Estimate:
+        """The defect of a decision: the largest of its parts."""
+        return self.parts[self.part]
 
     def to_json(self) -> dict[str, Any]:
         """Nested plain data, numbers to six significant digits."""
@@ -186,10 +232,7 @@ class AuditResult:
         """
         version = data.get("version") if isinstance(data, dict) else None
         if version not in (None, VERSION):
-            raise UserError(
-                f"the audit has version {version}, but this SymSteer reads version {VERSION}; run "
-                "the audit again"
-            )
+            raise UserError(old_version(version))
         try:
             return TypeAdapter(cls).validate_python(data)
         except ValidationError as error:

@@ -35,7 +35,7 @@ class Visited:
     Attributes:
         state: simulation states, a tree of ``[S, ...]``.
         actions: the next T actions of the visitor, ``[S, T, 7]``.
-        after: the states one control step later.
+        path: the states after each of these actions, a tree of ``[S, T, ...]``.
         moving: whether the manipulated object moves during these T steps of the unbroken task
             (pushed, carried or falling), ``[S]`` bool.
         policy: whether the visitor was the base policy, not the expert, ``[S]`` bool.
@@ -43,7 +43,7 @@ class Visited:
 
     state: dict[str, Any]
     actions: torch.Tensor
-    after: dict[str, Any]
+    path: dict[str, Any]
     moving: torch.Tensor
     policy: torch.Tensor
 
@@ -121,7 +121,10 @@ def _visit_batch(
     return Visited(
         state=_pick(trail, time),
         actions=torch.stack([torch.stack(actions)[time + k, every] for k in range(steps)], dim=1),
-        after=_pick(trail, time + 1),
+        path=map_trees(
+            lambda *later: torch.stack(later, dim=1),
+            *(_pick(trail, time + k) for k in range(1, steps + 1)),
+        ),
         moving=((window - window[0]).norm(dim=-1) > MOVED).any(dim=0),
         policy=torch.full((env.num_envs,), policy is not None),
     )

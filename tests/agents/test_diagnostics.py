@@ -49,16 +49,20 @@ def test_returns_by_hand():
 
 
 def test_agreement_by_hand():
-    q = torch.tensor([1.0, 2.0, 3.0, 9.0], dtype=torch.float64)
-    found = diagnostics.agreement(q, torch.tensor([2.0, 1.0, 4.0, 5.0], dtype=torch.float64))
+    q = torch.tensor([1.0, 2.0, 3.0, 9.0] * 2, dtype=torch.float64)
+    returns = torch.tensor([2.0, 1.0, 4.0, 5.0] * 2, dtype=torch.float64)
+    found = diagnostics.agreement(q, returns)
     assert found["bias"] == 0.75
     assert found["bias_std"] == pytest.approx(
-        torch.tensor([-1.75, 0.25, -1.75, 3.25]).std(0, False)
+        torch.tensor([-1.75, 0.25, -1.75, 3.25]).std(unbiased=False)
     )
     assert found["correlation"] == pytest.approx(16 / (38.75 * 10) ** 0.5)
     assert found["rank_correlation"] == pytest.approx(0.8)
     assert found["overestimated"] == 0.5
-    assert found["decisions"] == 4
+    assert found["decisions"] == 8
+    few = diagnostics.agreement(q[:7], returns[:7])
+    assert few["correlation"] is few["rank_correlation"] is None
+    assert few["bias"] is not None
     nothing = diagnostics.agreement(q[:0], q[:0])
     assert nothing.pop("decisions") == 0
     assert set(nothing.values()) == {None}

@@ -1,230 +1,368 @@
-"""The paper's claims: each test on records whose answer is known, and every way to be undecided."""
+"""Declared claims: each verdict on records whose answer is known, and every way to be untested."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from symsteer.leaderboard.claims import Claim, claims
-from symsteer.leaderboard.defects import Audit, Defect, defect_map
+from symsteer.errors import UserError
+from symsteer.leaderboard.claims import Outcome, claims
+from symsteer.leaderboard.defects import Audit, Defect
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.statistics import Interval
+from symsteer.leaderboard.study import Claim, Study, read_study
 from symsteer.leaderboard.summary import Run, summarize
 from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 
-NAMES = (
-    "faster than standard",
-    "faster than standard-matched",
-    "divergence",
-    "divergence, matched",
-    "bias",
-    "bias, matched",
-    "fewest demonstrations",
-    "fewer demonstrations",
-    "slope, area",
-    "slope, success",
-    "approximate beyond",
-)
 DEFECTS = {"none": 0.01, "wind:0.1": 0.04, "wind:0.5": 0.1, "wind:0.8": 0.26, "wind:1": 0.4}
 
 
-def audit_of(defects: dict[str, float]) -> Audit:
+def audit_of(defects: dict[str, float], embodiment: str = "floating") -> Audit:
     return {
-        ("PickCube-v1", "floating", variant, "C8"): Defect(Interval(d, d, d), "tool_step")
+        ("PickCube-v1", embodiment, variant, "C8"): Defect(Interval(d, d, d), "tool")
         for variant, d in defects.items()
     }
 
 
-def found(records: Sequence[RunRecord], audit: Audit | None = None) -> dict[str, Claim]:
-    audit = audit_of(DEFECTS) if audit is None else audit
+def claim_of(measure: str = "success", **changes: Any) -> Claim:
+    plain = {
+        "name": "a claim",
+        "family": "one",
+        "measure": measure,
+        "agents": ["equivariant", "standard"],
+        "predicted": 1,
+        "smallest": 0.05,
+    }
+    return Claim.model_validate(plain | changes)
+
+
+def outcomes(
+    records: Sequence[RunRecord], *claimed: Claim, audit: Audit | None = None
+) -> list[Outcome]:
     summary = summarize([Run(Path(f"{i}.json"), r) for i, r in enumerate(records)])
-    tests = claims(summary, audit, defect_map(summary, audit))
-    return dict(zip(NAMES, tests, strict=True))
+    study = Study("", "", claimed, "study.toml", "")
+    return claims(study, summary, audit_of(DEFECTS) if audit is None else audit)
 
 
 def cells(rates: dict[str, dict[str, float]], seeds: int = 5) -> list[RunRecord]:
     return [r for variant, cell in rates.items() for r in make_cell(cell, seeds, variant=variant)]
 
 
-def value(claim: Claim) -> float:
-    assert claim.effect is not None
-    return claim.effect.value
+def value(found: Outcome) -> float:
+    assert found.effect is not None
+    return found.effect.value
 
 
-def test_sample_efficiency_is_tested_where_symmetry_holds() -> None:
+def policies(records: Sequence[RunRecord], of: Callable[[RunRecord], str]) -> list[RunRecord]:
+    """The same records, with a base policy named by a function of each."""
+    for record in records:
+        record.base_policy.content_hash = of(record).encode().hex().ljust(64, "0")
+    return list(records)
+
+
+def test_differences_are_means_over_the_selected_cells() -> None:
     rates = {
         "none": {"standard": 0.5, "standard-matched": 0.9, "equivariant": 0.75},
         "wind:0.1": {"standard": 0.5, "standard-matched": 0.9, "equivariant": 0.85},
-        # Broken beyond the limit, so these must not count.
-        "wind:0.5": {"standard": 0.9, "standard-matched": 0.1, "equivariant": 0.1},
         "wind:1": {"standard": 0.9, "standard-matched": 0.1, "equivariant": 0.1},
     }
-    tests = found(cells(rates))
-    standard, matched = tests[NAMES[0]], tests[NAMES[1]]
-    assert value(standard) == pytest.approx(0.3)
-    assert (standard.verdict, standard.cells, standard.seeds) == ("supported", 2, 10)
-    assert value(matched) == pytest.approx(-0.1)
-    assert matched.verdict == "contradicted"
-    # 80 % of the best is 0.72 in both cells.
-    assert standard.beside == "steps: 0 % (10/10) against > 100 % (0/10) of the budget"
+    near = {"cells": {"defect": [0, 0.05]}}
+    matched = {"agents": ["equivariant", "standard-matched"]}
+    up, down = outcomes(
+        cells(rates), claim_of("auc", **near), claim_of("auc", family="two", **near, **matched)
+    )
+    assert value(up) == pytest.approx(0.3)
+    assert (up.verdict, up.cells, up.pairs, up.policies) == ("supported", 2, 10, 1)
+    assert value(down) == pytest.approx(-0.1)
+    assert down.verdict == "contradicted"
+    selections = {
+        -0.8: {"variant": ["wind:1"]},
+        -0.225: {"variant": ["wind"]},
+        0.25: {"broken": False},
+        -0.2: {"defect": [0.04, 0.4], "task": ["PickCube-v1"], "broken": True},
+    }
+    found = outcomes(cells(rates), *(claim_of(cells=chosen) for chosen in selections.values()))
+    for expected, one in zip((-0.8, -0.225, 0.25, -0.225), found, strict=True):
+        assert value(one) == pytest.approx(expected)
 
 
-def test_no_difference_is_undecided() -> None:
-    rates = {"none": {"standard": 0.6, "equivariant": 0.6}}
-    claim = found(cells(rates))[NAMES[0]]
-    assert value(claim) == pytest.approx(0)
-    assert (claim.verdict, claim.reason) == ("undecided", "")
+def test_no_difference_is_undecided_until_it_is_shown_to_be_small() -> None:
+    records = cells({"none": {"standard": 0.6, "equivariant": 0.6}})
+    (found,) = outcomes(records, claim_of())
+    assert value(found) == pytest.approx(0)
+    assert (found.verdict, found.reason) == ("undecided", "")
+    (found,) = outcomes(records, claim_of(smallest=0.3, predicted=0))
+    assert found.verdict == "equivalent"
+    # A difference that is there, and smaller than what is of interest.
+    small = cells({"none": {"standard": 0.6, "equivariant": 0.625}})
+    for record in small:
+        for evaluation in record.evaluations:
+            evaluation.episodes.success_once.sort()
+    assert [
+        t.verdict for t in outcomes(small, claim_of(smallest=0.01), claim_of(smallest=0.3))
+    ] == [
+        "supported",
+        "equivalent",
+    ]
+    # One that claims to be equal is contradicted by a difference.
+    large = cells({"none": {"standard": 0.1, "equivariant": 0.9}})
+    assert outcomes(large, claim_of(predicted=0))[0].verdict == "contradicted"
 
 
-def test_without_enough_seeds_the_effect_is_shown_and_nothing_decided() -> None:
-    rates = {"none": {"standard": 0.1, "equivariant": 0.9, "approximate": 0.9}}
-    tests = found(cells(rates, seeds=4))
-    for name in NAMES[0], "divergence":
-        assert tests[name].effect is not None
-        assert tests[name].verdict == "undecided"
-        assert tests[name].reason == "at most 4 paired seeds in a cell, 5 are needed"
+def test_verdicts_are_corrected_within_a_family() -> None:
+    """A p-value that is just below 0.05 alone is not among others."""
+    records = cells({"none": {"standard": 0.5, "equivariant": 0.7, "approximate": 0.5}})
+    first = claim_of(name="first")
+    other = claim_of(name="other", agents=["approximate", "standard"])
+    alone = outcomes(records, first)[0]
+    found = outcomes(records, first, *[other] * 3)
+    assert 0.0125 < alone.p < 0.05
+    assert found[0].p == pytest.approx(4 * alone.p)
+    assert (alone.verdict, found[0].verdict) == ("supported", "undecided")
+    apart = [other.model_copy(update={"family": "two"})] * 3
+    assert outcomes(records, first, *apart)[0].p == alone.p
+    # Claims that cannot be tested are no tests.
+    untested = [other.model_copy(update={"agents": ("augmented", "standard")})] * 3
+    assert outcomes(records, first, *untested)[0].p == alone.p
 
 
-def test_cells_with_few_seeds_do_not_count_beside_full_ones() -> None:
-    rates = {"none": {"standard": 0.4, "equivariant": 0.6}}
+def test_an_interaction_is_tested_as_one() -> None:
+    """A gain that is there in all cells alike is none."""
+    gain = {"standard": 0.4, "equivariant": 0.8}
+    broken = {"cells": {"broken": True}, "minus": {"broken": False}}
+    alike, alone = outcomes(
+        cells({"none": gain, "wind:1": gain}), claim_of(**broken), claim_of(cells=broken["cells"])
+    )
+    assert (value(alike), alike.verdict) == (pytest.approx(0), "undecided")
+    assert (value(alone), alone.verdict) == (pytest.approx(0.4), "supported")
+    rates = {"none": {"standard": 0.6, "equivariant": 0.6}, "wind:1": gain}
+    (found,) = outcomes(cells(rates), claim_of(**broken))
+    assert value(found) == pytest.approx(0.4)
+    assert (found.verdict, found.cells, found.pairs) == ("supported", 2, 10)
+    (found,) = outcomes(cells({"wind:1": gain}), claim_of(**broken))
+    assert found.reason == "there are no unbroken cells"
+
+
+def test_policies_that_both_sides_steer_cancel_in_an_interaction() -> None:
+    """Each policy has an advantage of its own, and the same one in both worlds."""
+
+    def world(variant: str) -> list[RunRecord]:
+        made = []
+        for seed, rate in enumerate((0.1, 0.3, 0.5, 0.7, 0.9)):
+            cell = make_cell({"standard": 0.0, "equivariant": rate}, 1, 10, variant=variant)
+            made += [make_record(r.evaluations, **(r.config | {"seed": seed})) for r in cell]
+        return made
+
+    records = policies(world("none") + world("wind:1"), lambda r: str(r.settings.seed))
+    inside, across = outcomes(
+        records,
+        claim_of(cells={"broken": False}),
+        claim_of(cells={"broken": True}, minus={"broken": False}),
+    )
+    assert (inside.policies, across.policies) == (5, 5)
+    widths = [t.effect.interval().high - t.effect.interval().low for t in (inside, across)]
+    # What is left are the episodes that differ: 10 in each run.
+    assert widths[1] < 0.6 * widths[0]
+
+
+def test_without_enough_pairs_the_effect_is_shown_and_nothing_decided() -> None:
+    rates = {"none": {"standard": 0.1, "equivariant": 0.9}}
+    (found,) = outcomes(cells(rates, seeds=4), claim_of())
+    assert value(found) == pytest.approx(0.8)
+    assert found.verdict == "not tested"
+    assert found.reason == "fewer than 5 pairs of runs in every cell"
     few = {"wind:0.1": {"standard": 0.9, "equivariant": 0.1}}
-    claim = found(cells(rates) + cells(few, seeds=3))[NAMES[0]]
-    assert value(claim) == pytest.approx(0.2)
-    assert (claim.cells, claim.seeds) == (1, 5)
+    (found,) = outcomes(cells(rates) + cells(few, seeds=3), claim_of())
+    assert value(found) == pytest.approx(0.8)
+    assert (found.cells, found.pairs) == (1, 5)
 
 
-def test_without_an_audit_or_an_agent_there_is_a_reason() -> None:
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"cells": {"broken": True}}, "there are no broken cells"),
+        ({"cells": {"defect": [0.2, 0.3]}}, "there are no cells with a defect of 0.2 to 0.3"),
+        ({"agents": ["augmented", "standard"]}, "no runs of `augmented` in cells"),
+        ({"measure": "bias"}, "not measured over all decisions"),
+        ({"measure": "diverged"}, "nobody diverged"),
+        ({"effect": "slope"}, "no base policy was steered at two defects"),
+        ({"cells": {"demonstrations": "most"}}, "no cell was run with more than one number"),
+    ],
+)
+def test_what_is_not_tested_says_why(changes: dict[str, Any], reason: str) -> None:
     records = cells({"none": {"standard": 0.4, "equivariant": 0.6}})
-    tests = found(records, {})
-    assert "where the audited defect is at most 0.05" in tests[NAMES[0]].reason
-    assert "no cell has an audited defect" in tests["fewest demonstrations"].reason
-    assert "0 audited cells" in tests["slope, area"].reason
-    tests = found(records)
-    assert "`standard-matched`" in tests[NAMES[1]].reason
-    assert "`approximate`" in tests["approximate beyond"].reason
-    assert all(t.verdict == "undecided" and t.effect is None for t in tests.values() if t.reason)
+    (found,) = outcomes(records, claim_of(**changes))
+    assert (found.verdict, found.effect) == ("not tested", None)
+    assert found.reason.startswith(reason)
 
 
-def diverging(agent: str, seeds: Sequence[int], status: str = "finished") -> list[RunRecord]:
+def diverging(
+    agent: str, seeds: Sequence[int], status: str = "finished", **config: Any
+) -> list[RunRecord]:
     """Five runs of which `seeds` diverge."""
     records = []
     for seed in range(5):
-        q = {"q_mean": -5.0, "q_violation": 0.5 if seed in seeds else 0.0}
+        q = {"q_mean": -5.0, "q_magnitude": 1.5 if seed in seeds else 0.5}
         curve = [make_evaluation([1, 0], 10_000 * (i + 1), i == 4, **q) for i in range(5)]
         broke = seed in seeds and status != "finished"
         run_status = status if broke else "finished"
-        records.append(make_record(curve, run_status, agent=agent, seed=seed))
+        records.append(make_record(curve, run_status, agent=agent, seed=seed, **config))
     return records
 
 
-def test_divergence_counts_seeds() -> None:
-    claim = found(diverging("standard", range(5)) + diverging("equivariant", []))["divergence"]
-    assert claim.verdict == "supported"
-    assert claim.effect is not None
-    assert (claim.effect.value, claim.effect.high) == (1.0, 1.0)
-    assert 0.3 < claim.effect.low < 0.6
-    assert claim.beside == "5/5 against 0/5 diverged"
-    claim = found(diverging("standard", [0]) + diverging("equivariant", [1]))["divergence"]
-    assert (value(claim), claim.verdict) == (0.0, "undecided")
-    claim = found(diverging("standard", []) + diverging("equivariant", range(5)))["divergence"]
-    assert claim.verdict == "contradicted"
-    matched = diverging("standard-matched", range(5)) + diverging("equivariant", [])
-    assert found(matched)["divergence, matched"].verdict == "supported"
+DIVERGED = claim_of("diverged", agents=["standard", "equivariant"])
 
 
-def test_the_bias_of_q_counts_by_its_size_in_the_final_window() -> None:
+def test_divergence_counts_runs() -> None:
+    (found,) = outcomes(diverging("standard", range(5)) + diverging("equivariant", []), DIVERGED)
+    assert found.verdict == "supported"
+    assert found.effect is not None
+    interval = found.effect.interval()
+    assert (interval.value, interval.high) == (1.0, 1.0)
+    assert 0.3 < interval.low < 0.6
+    assert found.counts == "5/5 against 0/5 diverged"
+    (found,) = outcomes(diverging("standard", [0]) + diverging("equivariant", [1]), DIVERGED)
+    assert (value(found), found.verdict) == (0.0, "undecided")
+    (found,) = outcomes(diverging("standard", []) + diverging("equivariant", range(5)), DIVERGED)
+    assert found.verdict == "contradicted"
+
+
+def test_a_policy_in_four_worlds_is_one_trial() -> None:
+    """A policy that makes both agents diverge, or none, does so in every world."""
+    worlds = ("none", "wind:0.1", "wind:0.5", "wind:1")
+    records = [
+        record
+        for variant in worlds
+        for agent, seeds in (("standard", range(3)), ("equivariant", []))
+        for record in diverging(agent, seeds, variant=variant)
+    ]
+    (runs,) = outcomes(records, DIVERGED)
+    assert (runs.counts, runs.verdict) == ("12/20 against 0/20 diverged", "supported")
+    (drawn,) = outcomes(policies(records, lambda r: str(r.settings.seed)), DIVERGED)
+    assert drawn.counts == runs.counts
+    assert (drawn.policies, drawn.verdict) == (5, "undecided")
+    assert value(drawn) == pytest.approx(0.6)
+
+
+def test_runs_that_broke_off_after_diverging_count() -> None:
+    standard = diverging("standard", range(5), status="failed")
+    (found,) = outcomes(standard + diverging("equivariant", []), DIVERGED)
+    assert (found.pairs, found.verdict) == (5, "supported")
+    # A run that has not finished can still diverge.
+    running = [make_record(r.evaluations, "running", seed=r.settings.seed) for r in standard]
+    for record in running:
+        for evaluation in record.evaluations:
+            evaluation.diagnostics["q_magnitude"] = 0.5
+    (found,) = outcomes(running + diverging("equivariant", []), DIVERGED)
+    assert found.effect is None
+
+
+def test_the_size_of_q_and_of_its_bias() -> None:
     def biased(agent: str, biases: Sequence[float]) -> list[RunRecord]:
         records = []
         for seed, bias in enumerate(biases):
             curve = [
-                make_evaluation([1, 0], steps, steps == 50_000, q_mean=0.0, q_bias=value)
-                for steps, value in ((0, 99.0), (45_000, bias - 1), (50_000, bias + 1))
+                make_evaluation(
+                    [1, 0], steps, steps == 50_000, q_mean=0.0, q_bias=b, q_magnitude=abs(bias) / 10
+                )
+                for steps, b in ((0, 99.0), (45_000, bias - 1), (50_000, bias + 1))
             ]
             records.append(make_record(curve, agent=agent, seed=seed))
         return records
 
     far, near = [-6.0, 6.0, 7.0, -7.0, 6.0], [2.0, -2.0, 3.0, -3.0, 2.0]
-    claim = found(biased("standard", far) + biased("equivariant", near))["bias"]
-    assert value(claim) == pytest.approx(4.0)
-    assert (claim.verdict, claim.seeds) == ("supported", 5)
-    claim = found(biased("standard", near) + biased("equivariant", far))["bias"]
-    assert claim.verdict == "contradicted"
-    claim = found(biased("standard-matched", far) + biased("equivariant", near))["bias, matched"]
-    assert value(claim) == pytest.approx(4.0)
-
-
-def test_q_is_compared_on_the_same_base_policy() -> None:
-    others = diverging("equivariant", [])
-    for record in others:
-        record.base_policy.content_hash = "f" * 64
-    tests = found(diverging("standard", range(5)) + others)
-    assert tests["divergence"].effect is tests["bias"].effect is None
-
-
-def test_runs_that_broke_off_after_diverging_count() -> None:
-    standard = diverging("standard", range(5), status="failed")
-    claim = found(standard + diverging("equivariant", []))["divergence"]
-    assert (claim.seeds, claim.verdict) == (5, "supported")
-    # A run that has not finished can still diverge.
-    running = [make_record(r.evaluations, "running", seed=r.settings.seed) for r in standard]
-    for record in running:
-        for evaluation in record.evaluations:
-            evaluation.diagnostics["q_violation"] = 0.0
-    claim = found(running + diverging("equivariant", []))["divergence"]
-    assert claim.effect is None
-
-
-def demonstrations(advantages: dict[int, float], seeds: int = 5) -> list[RunRecord]:
-    return [
-        record
-        for count, advantage in advantages.items()
-        for record in make_cell(
-            {"standard": 0.4, "equivariant": 0.4 + advantage},
-            seeds,
-            demonstrations={"mode": "diverse", "count": count, "seed": 0},
-        )
+    claimed = [
+        claim_of(measure, agents=["standard", "equivariant"], family=measure)
+        for measure in ("bias", "magnitude")
     ]
+    bias, magnitude = outcomes(biased("standard", far) + biased("equivariant", near), *claimed)
+    assert value(bias) == pytest.approx(4.0)
+    assert (bias.verdict, bias.pairs) == ("supported", 5)
+    assert value(magnitude) == pytest.approx(0.4)
+    (found,) = outcomes(biased("standard", near) + biased("equivariant", far), claimed[0])
+    assert found.verdict == "contradicted"
+
+
+def test_runs_are_compared_on_the_same_base_policy() -> None:
+    others = policies(diverging("equivariant", []), lambda r: "other")
+    found = outcomes(diverging("standard", range(5)) + others, DIVERGED, claim_of())
+    assert all(t.reason.startswith("no runs of both agents with the same seed") for t in found)
 
 
 def test_few_demonstrations_compare_the_ends() -> None:
-    tests = found(demonstrations({10: 0.4, 50: 0.2, 100: 0.1}))
-    fewest, fewer = tests["fewest demonstrations"], tests["fewer demonstrations"]
+    def demonstrations(advantages: dict[int, float], seeds: int = 5) -> list[RunRecord]:
+        return [
+            record
+            for count, advantage in advantages.items()
+            for record in make_cell(
+                {"standard": 0.4, "equivariant": 0.4 + advantage},
+                seeds,
+                demonstrations={"mode": "diverse", "count": count, "seed": 0},
+            )
+        ]
+
+    claimed = [
+        claim_of(cells={"demonstrations": "fewest"}),
+        claim_of(cells={"demonstrations": "fewest"}, minus={"demonstrations": "most"}),
+    ]
+    fewest, fewer = outcomes(demonstrations({10: 0.4, 50: 0.2, 100: 0.1}), *claimed)
     assert value(fewest) == pytest.approx(0.4)
     assert value(fewer) == pytest.approx(0.3)
     assert (fewest.verdict, fewer.verdict) == ("supported", "supported")
-    assert (fewest.cells, fewest.seeds, fewer.cells, fewer.seeds) == (1, 5, 1, 5)
-    tests = found(demonstrations({10: 0.2, 50: 0.5}))
-    assert tests["fewest demonstrations"].verdict == "supported"
-    assert tests["fewer demonstrations"].verdict == "contradicted"
+    assert (fewest.cells, fewest.pairs, fewer.cells, fewer.pairs) == (1, 5, 2, 10)
+    fewest, fewer = outcomes(demonstrations({10: 0.2, 50: 0.5}), *claimed)
+    assert (fewest.verdict, fewer.verdict) == ("supported", "contradicted")
 
 
-def test_one_number_of_demonstrations_decides_nothing() -> None:
-    for name in ("fewest demonstrations", "fewer demonstrations"):
-        claim = found(demonstrations({50: 0.3}))[name]
-        assert claim.verdict == "undecided"
-        assert claim.reason.endswith("(all have 50)")
-        few = found(demonstrations({10: 0.4, 50: 0.2}, seeds=3))[name]
-        assert few.verdict == "undecided"
-        assert "5" in few.reason
-        assert few.effect is not None
-
-
-def test_limits_follow_the_line_and_the_largest_defects() -> None:
-    rates = {
-        variant: {"standard": 0.5, "equivariant": 0.75 - 1.2 * d, "approximate": 0.7}
-        for variant, d in DEFECTS.items()
-    }
-    tests = found(cells(rates))
-    for name in ("slope, area", "slope, success"):
-        assert value(tests[name]) == pytest.approx(-0.12, abs=0.01)
-        assert (tests[name].verdict, tests[name].cells) == ("supported", 5)
-    beyond = tests["approximate beyond"]
-    assert value(beyond) == pytest.approx(
-        np.mean([0.7 - 0.75 + 1.2 * d for d in (0.26, 0.4)]), abs=0.02
+def test_the_slope_is_that_within_base_policies() -> None:
+    """Between two bodies the advantage rises with the defect, within each it falls."""
+    records, audit = [], {}
+    for embodiment, level in (("floating", 0.0), ("panda", 0.3)):
+        defects = {v: d + level for v, d in DEFECTS.items()}
+        audit |= audit_of(defects, embodiment)
+        for variant, defect in DEFECTS.items():
+            rates = {"standard": 0.3, "equivariant": 0.5 - 0.5 * defect + level}
+            cell = make_cell(rates, 5, 200, variant=variant, embodiment=embodiment)
+            records += policies(cell, lambda r, e=embodiment: f"{e} {r.settings.seed}")
+    slope = claim_of(effect="slope", predicted=-1, smallest=0.01)
+    (found,) = outcomes(records, slope, audit=audit)
+    assert value(found) == pytest.approx(-0.05, abs=0.003)
+    assert (found.verdict, found.cells, found.policies) == ("supported", 10, 10)
+    (floating,) = outcomes(
+        records,
+        slope.model_copy(update={"cells": claim_of(cells={"embodiment": ["floating"]}).cells}),
+        audit=audit,
     )
-    assert (beyond.verdict, beyond.cells) == ("supported", 2)
-    rising = {v: {"standard": 0.5, "equivariant": 0.3 + 1.2 * d} for v, d in DEFECTS.items()}
-    assert found(cells(rising))["slope, success"].verdict == "contradicted"
+    assert (floating.cells, floating.policies) == (5, 5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"agents": ["equivarant", "standard"]}, "no agent 'equivarant'; did you mean 'equivaria"),
+        ({"cells": {"task": ["PikCube-v1"]}}, "no task 'PikCube-v1'; did you mean 'PickCube-v1'"),
+        ({"cells": {"embodiment": ["float"]}}, "did you mean 'floating'"),
+        ({"minus": {"variant": ["win"]}}, "no variant 'win'; did you mean 'wind'"),
+    ],
+)
+def test_unknown_names_are_refused_with_the_nearest(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(UserError, match=words) as refused:
+        outcomes(cells({"none": {"standard": 0.5}}), claim_of(**changes))
+    assert str(refused.value).startswith("study.toml, 'a claim': there is no ")
+
+
+def test_the_committed_studies_can_be_tested() -> None:
+    """Every agent that they name has a row, and the claims of the paper are all there."""
+    study = read_study("first")
+    assert study.source == "paper.toml"
+    assert "withdrawn" in study.notice
+    assert study.claims == read_study("paper").claims
+    records = cells({"none": {"standard": 0.5, "equivariant": 0.7}})
+    found = outcomes(records, *study.claims)
+    assert {claim.measure for claim in study.claims} == {"auc", "success", "diverged", "bias"}
+    assert found[0].verdict == "supported"
+    assert np.mean([t.verdict == "not tested" for t in found]) > 0.5

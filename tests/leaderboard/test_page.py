@@ -15,6 +15,7 @@ from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.page import render_page
 from symsteer.leaderboard.records import RunRecord, write_record
 from symsteer.leaderboard.report import generate
+from symsteer.leaderboard.study import FOLDER, PAPER, read_study
 from symsteer.leaderboard.summary import Run, summarize
 from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 
@@ -30,9 +31,11 @@ def audit(folder: Path, group: str = "C8", variants: dict[str, float] = DEFECTS)
             "embodiment": "floating",
             "variant": variant,
             "group": group,
-            "tool_step": [defect, 0.9 * defect, 1.1 * defect],
-            "cost": [0.0, 0.0, 0.0],
-            "observation": [0.0, 0.0, 0.0],
+            "version": 2,
+            "part": "object" if variant == "none" else "tool",
+            "decision": [defect, 0.9 * defect, 1.1 * defect],
+            "resets": [0.0, -0.001, 0.001],
+            "resets_p": 0.5,
         }
         for variant, defect in variants.items()
     ]
@@ -71,7 +74,9 @@ def page_of(records: list[RunRecord]) -> str:
     """The page without figures and links."""
     runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(records)]
     summary = summarize(runs)
-    return render_page(summary, analyse(summary, {}), {}, {run.path: None for run in runs})
+    return render_page(
+        summary, analyse(summary, {}, read_study(PAPER)), {}, {run.path: None for run in runs}
+    )
 
 
 def text_of(board: Path) -> str:
@@ -144,34 +149,103 @@ def test_the_best_reference_counts_where_five_runs_steer_its_policy() -> None:
 def test_the_second_table_shows_q_cost_and_device(board: Path) -> None:
     text = text_of(board)
     header, _, *rows = table_after(text, "Q-values, symmetry and cost")
-    assert "Largest \\|Q\\|, highest Q (feasible Q: \u221220 to 0)" in header
+    bounds = "(feasible Q: \u221220 to 0)"
+    assert header[:3] == [
+        "Agent",
+        "Q diverged",
+        f"\\|Q\\| over the largest feasible, overshoot {bounds}",
+    ]
     assert [row[-1] for row in rows] == ["`cpu`"] * 4
-    assert [row[1] for row in rows] == ["0/5"] * 4
+    assert [row[1:3] for row in rows] == [["0/5", "0.5, \u2013"]] * 4
+    # Nobody measured it.
+    assert "TD error" not in header
 
 
 def test_every_claim_has_a_verdict(board: Path) -> None:
-    _, _, *rows = table_after(text_of(board), "## The paper's claims")
-    assert len(rows) == 11
-    verdicts = [re.match(r"\*\*(\w+)\*\*", row[-1]) for row in rows]
-    assert [verdict and verdict[1] for verdict in verdicts] == [
-        "supported",
-        "supported",
-        *["undecided"] * 6,
-        "supported",
-        "supported",
-        "supported",
-    ]
-    assert all(":" in row[-1] for row in rows if "undecided" in row[-1])
-
-
-def test_the_map_names_the_crossing_and_what_is_missing(board: Path) -> None:
     text = text_of(board)
-    _, _, *rows = table_after(text, "## Where symmetry stops paying")
+    header, _, *rows = table_after(text, "## Claims")
+    assert [row[0] for row in rows] == ["efficiency"] * 2 + ["limits"] * 3
+    assert [row[-1] for row in rows] == ["**supported**"] * 5
+    shown = dict(zip(header, rows[-1], strict=True))
+    assert shown["Effect"] == (
+        "success, `approximate` minus `equivariant`, broken cells of `floating` minus the same in "
+        "unbroken cells"
+    )
+    # -0.1 in the unbroken cell; -0.1 + the defect in the broken ones, 0.25 on average.
+    assert shown["Size, 95 % interval"].startswith("+0.250 [+0.")
+    assert shown["Cells, pairs, policies"] == "5, 25, 1"
+    assert (shown["Smallest of interest"], shown["p (at least the smallest)"]) == ("0.05", "1.000")
+    assert "declared in `paper.toml` (sha256 `" in text
+    _, untested = text.split("\nNot tested:\n\n", 1)
+    reasons = dict(line[2:].split(": ")[-2:] for line in untested.split("\n\n")[0].splitlines())
+    assert reasons["Symmetry prevents value divergence"] == "nobody diverged"
+    assert reasons["Symmetry makes Q less wrong"] == "not measured over all decisions"
+    assert reasons["a wrong group does not help"].startswith("no runs of `wrong-group`")
+    assert len(rows) + len(reasons) == len(read_study(PAPER).claims)
+
+
+def test_a_study_can_say_what_a_reader_must_know(board: Path, tmp_path: Path) -> None:
+    study = tmp_path / "mine.toml"
+    study.write_text('notice = "> **Mind this.**"\ndeclared = "abcdef0"\nclaims = "other.toml"')
+    (tmp_path / "other.toml").write_text((FOLDER / "paper.toml").read_text())
+    generate([board / "results"], tmp_path, study=str(study))
+    text = text_of(tmp_path)
+    assert text.index("> **Mind this.**") < text.index("## How to read it")
+    assert re.search(r"declared in `other.toml` \(sha256 `[0-9a-f]{12}`, commit `abcdef0`\)", text)
+    assert "Mind this" not in text_of(board)
+
+
+def spreads(records: list[RunRecord]) -> tuple[str, dict[str, list[str]]]:
+    """The text and the table on the spread of runs, rows by agent."""
+    text = page_of(records).replace("\u00a0", " ")
+    section = text[text.index("## How much is the base policy's") :]
+    header, _, *rows = table_after(f"\n{section}", "Standard deviations")
+    return section[: section.index("|")], {row[0]: row for row in [header, *rows]}
+
+
+def test_the_page_says_how_much_of_the_spread_is_the_policys() -> None:
+    rates = (0.1, 0.4, 0.5, 0.6, 0.9)
+
+    def runs(of_policy: int, policies: int = 5) -> list[RunRecord]:
+        records = []
+        for policy, rate in enumerate(rates[:policies]):
+            made = make_cell({"standard": rate}, seeds=of_policy, episodes=100, policy_seed=policy)
+            for record in made:
+                record.base_policy.content_hash = f"{policy}" * 64
+            records += made
+        return records
+
+    text, found = spreads(runs(3))
+    assert found["Agent"][1:] == [
+        "Base policies",
+        "Runs on one",
+        "Episodes",
+        "Base policies' share of the variance",
+    ]
+    policies, of_runs, episodes = map(float, found["`standard`"][1:4])
+    # The episodes that succeed are others in every run, their number is not.
+    assert (policies, of_runs) == (pytest.approx(np.std(rates, ddof=1), abs=0.01), 0)
+    assert episodes == pytest.approx(0.04, abs=0.01)
+    assert found["`standard`"][4] == "98 %"
+    assert "one base policy" not in text
+    text, found = spreads(runs(5, policies=1))
+    assert found["Agent"][1:] == ["Runs on one", "Episodes"]
+    assert "Each cell steers one base policy: the intervals there are about this policy" in text
+    text, found = spreads(runs(1))
+    assert found["Agent"][1:] == ["Both together", "Episodes"]
+    assert "only the sum of both can be told" in text
+
+
+def test_the_map_names_slopes_parts_and_what_is_missing(board: Path) -> None:
+    text = text_of(board)
+    _, _, *rows = table_after(text, "## The advantage of symmetry against the defect")
     by_agent = {(row[0], row[1]): row for row in rows}
     strict = by_agent["`equivariant`", "success"]
-    assert strict[2] == "4 of 4"
-    assert strict[4].startswith("0.30 [0.2")
-    assert "stays above 0" in by_agent["`approximate`", "success"][4]
+    assert strict[2:4] == ["`wind`", "1"]
+    assert strict[4].startswith("\u22121.00 [\u22121.")
+    # With one base policy no slope is marked as a finding.
+    assert not strict[4].endswith("\u25bc")
+    assert strict[5] == "base policies at several defects: 1, 5 are needed"
     assert "Not audited, so not in the map: `PickCube-v1` `floating` `wind:0.75`." in text
     assert (
         "`symsteer audit --task PickCube-v1 --embodiment floating --group C8 "
@@ -179,6 +253,7 @@ def test_the_map_names_the_crossing_and_what_is_missing(board: Path) -> None:
     )
     _, _, *cells = table_after(text, "<summary>The map's numbers")
     assert [cell[1].split(" ")[0] for cell in cells] == ["0.002", "0.100", "0.200", "0.400"]
+    assert [cell[2] for cell in cells] == ["object", "tool", "tool", "tool"]
 
 
 def test_provenance_names_every_session(board: Path) -> None:
@@ -191,7 +266,8 @@ def test_provenance_names_every_session(board: Path) -> None:
 
 def test_all_figures_are_there(board: Path) -> None:
     names = sorted(path.name for path in (board / "figures").iterdir())
-    assert names[:2] == ["improvement.svg", "map.svg"]
+    assert names[0] == "improvement.svg"
+    assert re.fullmatch(r"map-floating-[0-9a-f]{6}\.svg", names[1])
     assert "profiles.svg" in names
     for name in names:
         root = ElementTree.fromstring((board / "figures" / name).read_bytes())
@@ -231,11 +307,11 @@ def test_the_audit_changes_the_page_and_the_order_of_records_does_not(
     generate(few[::-1], other, audit(tmp_path, variants={"none": 0.1}))
     for path in files:
         assert path.read_bytes() == (other / path.relative_to(again)).read_bytes()
-    assert "no cell has an audited defect" in text_of(again)
-    assert (again / "figures" / "map.svg").exists()
+    assert "no base policy was steered at two defects" in text_of(again)
+    assert len(list((again / "figures").glob("map-*.svg"))) == 1
     generate(few, again, audit(tmp_path, group="D4"))
     assert "There is no map yet" in text_of(again)
-    assert not (again / "figures" / "map.svg").exists()
+    assert not list((again / "figures").glob("map*"))
 
 
 def test_hostile_names_stay_text_in_every_section(tmp_path: Path) -> None:
@@ -264,7 +340,7 @@ def test_hostile_names_stay_text_in_every_section(tmp_path: Path) -> None:
     plain = " ".join(t.content for t in tokens if t.type == "text")
     assert "alert" not in plain
     assert "symsteer audit --task" not in page
-    assert (tmp_path / "figures" / "map.svg").exists()
+    assert len(list((tmp_path / "figures").glob("map-*.svg"))) == 1
     for path in (tmp_path / "figures").iterdir():
         assert re.fullmatch(r"[a-z0-9-]+\.svg", path.name)
         ElementTree.fromstring(path.read_bytes())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -11,24 +10,32 @@ from scipy import stats
 
 from symsteer.leaderboard.statistics import (
     Array,
+    Effect,
     Interval,
     Sample,
+    ShareDifference,
     area_under_curve,
     area_weights,
+    cell_estimates,
     censored_median,
+    combined,
     crossed_bootstrap,
     deepest_dip,
+    degrees_of_freedom,
     episode_weights,
+    holm,
     iqm,
     mean,
-    newcombe,
+    p_difference,
+    p_equivalence,
     paired_differences,
     performance_profile,
     probability_of_improvement,
-    small_sample_factor,
+    spread,
     steps_to_threshold,
     stratified_bootstrap,
     success_interval,
+    tails,
     wilson,
 )
 
@@ -37,9 +44,18 @@ def test_iqm_drops_a_quarter_on_either_side() -> None:
     assert iqm([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 100.0]) == 3.5
     assert iqm([0.0, 0.2, 0.4, 0.6, 10.0]) == pytest.approx(0.4)
     assert iqm([0.0, 1.0, 5.0]) == 2.0
-    values = np.random.default_rng(0).random((40, 7))
-    by_hand = np.sort(values, axis=0)[10:30].mean(axis=0)
-    np.testing.assert_allclose(iqm(values, axis=0), by_hand)
+    values = np.random.default_rng(0).random((7, 40))
+    by_hand = np.sort(values, axis=1)[:, 10:30].mean(axis=1)
+    np.testing.assert_allclose(iqm(values), by_hand)
+
+
+@pytest.mark.parametrize("number", [1, 3, 4, 5, 11])
+def test_weights_of_the_iqm_are_like_copies(number: int) -> None:
+    values = np.random.default_rng(number).random((6, number))
+    np.testing.assert_allclose(iqm(values, np.full(values.shape, 0.3)), iqm(values))
+    # Four values, twice of one and none of another: its copy takes its place.
+    copied = iqm([0.0, 1.0, 1.0, 8.0])
+    assert iqm([0.0, 1.0, 5.0, 8.0], np.array([1.0, 2.0, 0.0, 1.0])) == pytest.approx(copied)
 
 
 def test_wilson_has_its_textbook_values() -> None:
@@ -67,27 +83,69 @@ def test_one_seed_gives_the_interval_of_its_episodes() -> None:
     )
 
 
-def test_drawing_runs_equals_its_enumeration() -> None:
-    """Numbers without episodes: 3^3 resamples of three runs can be listed."""
-    values = np.array([0.0, 1.0, 5.0])
-    drawn = np.array([np.mean(draw) for draw in itertools.product(values, repeat=3)])
-    widened = 2 + small_sample_factor(3, 2) * (drawn - 2)
-    expected = np.quantile(widened, (0.025, 0.975), method="inverted_cdf")
-    interval = crossed_bootstrap([Sample.constant(v) for v in values], mean, resamples=200_000)
-    assert interval.value == 2.0
-    assert (interval.low, interval.high) == pytest.approx(tuple(expected))
+def test_drawing_runs_has_the_variance_of_their_mean() -> None:
+    values = np.array([0.0, 1.0, 5.0, 7.0])
+    found = cell_estimates([[Sample.constant(v) for v in values]], mean, resamples=200_000)[0]
+    assert (found.value, found.freedom) == (3.25, 3)
+    assert found.units.std() == pytest.approx(stats.sem(values), rel=0.01)
+    assert np.ptp(found.episodes) == pytest.approx(0)
 
 
-def test_five_runs_without_episodes_get_students_interval() -> None:
-    """The mean of normal numbers is where the exact interval is known."""
+def test_five_runs_without_episodes_get_students_interval_and_p_value() -> None:
+    """The mean of normal numbers is where both are known exactly."""
     generator = np.random.default_rng(0)
-    ratios = []
-    for seed in range(40):
-        values = generator.standard_normal(5)
+    ratios, p_values = [], []
+    for _ in range(40):
+        values = generator.standard_normal(5) + 0.5
         exact = stats.t(4, values.mean(), stats.sem(values)).interval(0.95)
-        found = crossed_bootstrap([Sample.constant(v) for v in values], mean, seed=seed)
-        ratios.append(width(found) / (exact[1] - exact[0]))
+        found = cell_estimates([[Sample.constant(v) for v in values]])[0]
+        ratios.append(width(found.interval()) / (exact[1] - exact[0]))
+        p_values.append((p_difference(found), stats.ttest_1samp(values, 0).pvalue))
     assert np.mean(ratios) == pytest.approx(1, abs=0.03)
+    p_values = np.log(p_values)
+    assert np.abs(p_values[:, 0] - p_values[:, 1]).mean() < 0.2
+
+
+def by_policy(table: Array, shared: bool = True) -> list[Sample]:
+    """Runs [policies, runs, episodes] of as many policies, on one list of episodes."""
+    policies, runs, episodes = table.shape
+    return [
+        Sample.pooled(
+            enumerate(table[p, r], 0 if shared else episodes * (p * runs + r)), policy=f"policy {p}"
+        )
+        for p in range(policies)
+        for r in range(runs)
+    ]
+
+
+def test_policies_are_drawn_with_all_their_runs() -> None:
+    """More runs of five policies narrow the interval little where the policies differ."""
+    generator = np.random.default_rng(2)
+    policies = generator.standard_normal((5, 1, 1))
+    one = crossed_bootstrap(by_policy(policies))
+    many = by_policy(np.repeat(policies, 8, axis=1))
+    assert crossed_bootstrap(many) == one
+    # Runs of one policy are not copies of it: as many, seen as runs alone, would look precise.
+    alone = [Sample(run.blocks) for run in many]
+    assert width(crossed_bootstrap(alone)) < 0.4 * width(one)
+    # Policies count alike, however many runs each has.
+    uneven = [Sample.constant(v, p) for v, p in ((0.0, "a"), (1.0, "b"), (1.0, "b"), (1.0, "b"))]
+    assert crossed_bootstrap(uneven).value == 0.5
+
+
+def test_a_policy_is_drawn_once_for_all_cells_that_steer_it() -> None:
+    """Four variants of one world: the mean over them is as uncertain as the policies are."""
+    generator = np.random.default_rng(3)
+    policies = generator.standard_normal((5, 1, 1))
+    cells = [by_policy(policies + 0.01 * generator.standard_normal((5, 1, 1))) for _ in range(4)]
+    assert degrees_of_freedom([["a", "b"], ["b", "c"], ["d", "e", "f"]]) == 4
+    together, alone = stratified_bootstrap(cells), crossed_bootstrap(cells[0])
+    assert width(together) == pytest.approx(width(alone), rel=0.05)
+    # In the difference of two of them the policies cancel.
+    estimates = cell_estimates(cells)
+    assert width(combined(estimates[:2], [1, -1]).interval()) < 0.05 * width(alone)
+    apart = [[Sample(s.blocks, policy=f"{i} {s.policy}") for s in c] for i, c in enumerate(cells)]
+    assert width(stratified_bootstrap(apart)) < 0.5 * width(alone)
 
 
 def test_an_episode_weighs_the_same_for_all_runs() -> None:
@@ -113,28 +171,133 @@ def test_a_shared_difficulty_cancels_in_differences() -> None:
     assert width(crossed_bootstrap(differences)) < 0.001
 
 
+TRIALS = 300
+MOST = stats.binom(TRIALS, 0.05).ppf(0.999)
+"""0.05 and three standard errors of such a share."""
+
+
 @pytest.mark.parametrize("statistic", [mean, iqm])
-@pytest.mark.parametrize("seeds", [0.0, 0.06, 0.2])
+@pytest.mark.parametrize(
+    ("policies", "runs", "of_policies", "of_runs"),
+    [(1, 5, 0.3, 0.0), (1, 5, 0.3, 0.2), (5, 1, 0.1, 0.1), (5, 3, 0.0, 0.2), (5, 3, 0.2, 0.1)],
+)
 @pytest.mark.parametrize("episodes", [0.0, 0.3])
 def test_the_interval_misses_the_truth_in_at_most_one_of_twenty(
-    statistic: Callable[..., Array], seeds: float, episodes: float
+    statistic: Callable[..., Array],
+    policies: int,
+    runs: int,
+    of_policies: float,
+    of_runs: float,
+    episodes: float,
 ) -> None:
-    """Differences of two agents over 5 seeds and 100 shared episodes, with no true effect.
+    """Differences of two agents over policies, runs of each, and 100 shared episodes.
 
-    The standard deviations span those of the committed runs: over seeds, over episodes (initial
-    states that suit one of the agents), and what is left.
+    The standard deviations span those of the committed runs: between runs, between episodes
+    (initial states that suit one of the agents), and what is left. With one policy the truth is its
+    own effect, with several it is the mean over all policies, 0.
     """
     generator = np.random.default_rng(1)
-    trials, missed = 300, 0
-    for trial in range(trials):
-        table = seeds * generator.standard_normal((5, 1)) + 0.4 * generator.standard_normal(
-            (5, 100)
-        )
-        table += episodes * generator.standard_normal(100)
-        samples = [of(row) for row in table]
-        missed += crossed_bootstrap(samples, statistic, resamples=400, seed=trial).sign != 0
-    # Up to 0.05 + three standard errors of such a share.
-    assert missed <= stats.binom(trials, 0.05).ppf(0.999)
+    missed = 0
+    for _ in range(TRIALS):
+        effect = of_policies * generator.standard_normal((policies, 1, 1))
+        table = effect + of_runs * generator.standard_normal((policies, runs, 1))
+        table = table + 0.4 * generator.standard_normal((policies, runs, 100))
+        table = table + episodes * generator.standard_normal(100)
+        truth = float(effect[0, 0, 0]) if policies == 1 else 0.0
+        found = crossed_bootstrap(by_policy(table), statistic, resamples=400)
+        missed += not found.low <= truth <= found.high
+    assert missed <= MOST
+
+
+def test_the_mean_over_cells_misses_the_truth_in_at_most_one_of_twenty() -> None:
+    """Six variants with the same five policies: drawing the policies anew in each misses more."""
+    generator = np.random.default_rng(1)
+    missed = apart = 0
+    for _ in range(TRIALS):
+        policies = 0.2 * generator.standard_normal((5, 1, 1))
+        tables = [policies + 0.1 * generator.standard_normal((5, 1, 1)) for _ in range(6)]
+        cells = [by_policy(table) for table in tables]
+        missed += stratified_bootstrap(cells, resamples=400).sign != 0
+        cells = [[Sample(run.blocks) for run in cell] for cell in cells]
+        apart += stratified_bootstrap(cells, resamples=400).sign != 0
+    assert missed <= MOST < 4 * MOST < apart
+
+
+def families(generator: np.random.Generator, effect: float) -> list[Effect]:
+    """Five comparisons of five policies each, independent, with this true effect."""
+    draws = effect + 0.1 * generator.standard_normal((5, 5, 1, 1))
+    return [cell_estimates([by_policy(d)], resamples=400)[0] for d in draws]
+
+
+def test_holm_keeps_the_share_of_families_with_a_false_result() -> None:
+    generator = np.random.default_rng(1)
+    false = uncorrected = 0
+    for _ in range(TRIALS // 2):
+        p_values = [p_difference(effect) for effect in families(generator, 0.0)]
+        false += min(holm(p_values)) < 0.05
+        uncorrected += min(p_values) < 0.05
+    assert false <= stats.binom(TRIALS // 2, 0.05).ppf(0.999) < uncorrected
+
+
+def test_equivalence_needs_an_effect_inside_the_margin() -> None:
+    """At the margin one test in twenty passes; with no effect at all nearly every one does."""
+    generator = np.random.default_rng(1)
+
+    def passed(effect: float) -> int:
+        found = [e for _ in range(40) for e in families(generator, effect)]
+        return sum(p_equivalence(e, 0.3) < 0.05 for e in found)
+
+    assert passed(0.3) <= stats.binom(200, 0.05).ppf(0.999) < 190 < passed(0.0)
+
+
+def test_p_values_belong_to_the_intervals() -> None:
+    generator = np.random.default_rng(5)
+    effects = [e for _ in range(8) for e in families(generator, 0.1)]
+    effects += [ShareDifference((k, 12.0), (2.0, 12.0)) for k in range(13)]
+    signs = [effect.interval().sign != 0 for effect in effects]
+    assert [p_difference(effect) < 0.05 for effect in effects] == signs
+    assert 5 < sum(signs) < len(signs) - 5
+    inside = [max(map(abs, (i.low, i.high))) < 0.25 for i in (e.interval(0.9) for e in effects)]
+    assert [p_equivalence(effect, 0.25) < 0.05 for effect in effects] == inside
+    assert 5 < sum(inside) < len(inside) - 5
+    assert p_equivalence(effects[0], 1e-9) == 1.0
+
+
+def test_holm_by_hand() -> None:
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert holm([0.5, 0.9]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_variance_components_of_a_nested_design() -> None:
+    """Each is found where it is there, and not where only their sum is known."""
+    generator = np.random.default_rng(7)
+
+    def cells(policies: int, runs: int) -> list[list[Sample]]:
+        made = []
+        for _ in range(60):
+            table = 0.3 * generator.standard_normal((policies, 1, 1))
+            table = table + 0.2 * generator.standard_normal((policies, runs, 1))
+            table = table + 1.0 * generator.standard_normal(50)
+            made.append(by_policy(table + 1.0 * generator.standard_normal((policies, runs, 50))))
+        return made
+
+    full = spread(cells(5, 3))
+    assert (full.policies, full.runs) == (
+        pytest.approx(0.3, abs=0.05),
+        pytest.approx(0.2, abs=0.02),
+    )
+    assert full.episodes == pytest.approx(np.sqrt(2 / 50), rel=0.1)
+    assert full.together is None
+    one_run = spread(cells(5, 1))
+    assert one_run.together == pytest.approx(np.hypot(0.3, 0.2), abs=0.04)
+    assert one_run.policies is one_run.runs is None
+    one_policy = spread(cells(1, 5))
+    assert one_policy.runs == pytest.approx(0.2, abs=0.03)
+    assert one_policy.policies is one_policy.together is None
+    # Copies of one evaluation differ in nothing.
+    assert spread([by_policy(np.ones((3, 2, 4)))]) == spread([by_policy(np.ones((3, 2, 4)))] * 2)
+    assert spread([by_policy(np.ones((3, 2, 4)))]).policies == 0
 
 
 def test_spread_over_seeds_widens_the_interval() -> None:
@@ -145,12 +308,11 @@ def test_spread_over_seeds_widens_the_interval() -> None:
     assert width(wide) > 2 * width(narrow)
 
 
-def test_the_bootstrap_is_seeded_and_needs_samples() -> None:
+def test_the_bootstrap_repeats_and_needs_samples() -> None:
     samples = [of(np.random.default_rng(i).random(30)) for i in range(3)]
     assert crossed_bootstrap(samples) == crossed_bootstrap(samples)
-    assert crossed_bootstrap(samples) != crossed_bootstrap(samples, seed=1)
     for bad in ([], [of([])], [of([1.0]), of([])]):
-        with pytest.raises(ValueError, match="episode"):
+        with pytest.raises(ValueError, match=r"episode|without runs"):
             crossed_bootstrap(bad)
 
 
@@ -225,7 +387,7 @@ def test_newcombe_has_its_textbook_values() -> None:
         ((10, 10), (0, 10)): (1.0, 0.6075, 1.0),
     }
     for (first, second), (value, low, high) in textbook.items():
-        found = newcombe(first, second)
+        found = ShareDifference(first, second).interval()
         assert (found.value, found.low, found.high) == pytest.approx((value, low, high), abs=5e-5)
 
 
@@ -275,7 +437,7 @@ def test_cells_are_averaged_and_not_drawn() -> None:
     ones = [width(stratified_bootstrap([c])) for c in cells]
     four = stratified_bootstrap(cells)
     # Half as wide, and even less, because twenty runs estimate their spread better than five.
-    factors = small_sample_factor(5, 16) / small_sample_factor(5, 4)
+    factors = tails(0.95, 16) / tails(0.95, 4)
     assert factors / 2 * np.mean(ones) * 0.8 < width(four) < np.mean(ones) / 2 * 1.15
     assert four.value == pytest.approx(np.mean([sample.value for c in cells for sample in c]))
     # The same episodes in every cell are drawn once: they do not average out.
@@ -285,47 +447,57 @@ def test_cells_are_averaged_and_not_drawn() -> None:
         stratified_bootstrap([])
 
 
+def on(policy: str, values: Iterable[float]) -> list[tuple[str, float]]:
+    return [(policy, value) for value in values]
+
+
 def test_probability_of_improvement_by_hand() -> None:
     # 3 beats 1, 2; ties with 3: 2.5 of 3. 1 ties with 1: 0.5 of 3. Together 3 of 6.
-    assert probability_of_improvement([([3, 1], [1, 2, 3])]).value == pytest.approx(0.5)
-    sure = probability_of_improvement([([2, 3], [0, 1])])
-    assert (sure.value, sure.low, sure.high) == (1.0, 1.0, 1.0)
+    cell = (on("a", [3, 1]), on("a", [1, 2, 3]))
+    assert probability_of_improvement([cell]).value == pytest.approx(0.5)
     # The mean over cells, however many runs each has.
-    mixed = probability_of_improvement([([1], [0]), ([0, 0, 0], [1, 1, 1])])
-    assert mixed.value == pytest.approx(0.5)
-    for bad in ([], [([], [1])], [([1], [])]):
-        with pytest.raises(ValueError, match="runs"):
+    mixed = (on("a", [1]), on("a", [0])), (on("a", [0, 0, 0]), on("a", [1, 1, 1]))
+    assert probability_of_improvement(mixed).value == pytest.approx(0.5)
+    # Only runs on one policy are compared; policies count alike.
+    policies = (on("a", [2]) + on("b", [5, 5]), on("a", [1]) + on("b", [9, 9]) + on("c", [0]))
+    assert probability_of_improvement([policies]).value == pytest.approx(0.5)
+    for bad in ([], [([], on("a", [1]))], [(on("a", [1]), on("b", [1]))]):
+        with pytest.raises(ValueError, match=r"no cell|runs of both"):
             probability_of_improvement(bad)
+
+
+def test_where_one_side_always_wins_the_interval_is_wilsons() -> None:
+    sure = probability_of_improvement([(on("a", [2, 3]), on("a", [0, 1, 1]))])
+    assert (sure.value, sure.low, sure.high) == (1.0, *wilson(2, 2))
+    runs = [(f"policy {i}", 1.0) for i in range(5)]
+    never = probability_of_improvement([([(p, 0.0) for p, _ in runs], runs)] * 3)
+    # Three cells, the same five policies.
+    assert (never.value, never.low, never.high) == (0.0, *wilson(0, 5))
 
 
 def test_probability_of_improvement_is_mann_whitneys() -> None:
     generator = np.random.default_rng(2)
     x, y = generator.integers(0, 5, 9).tolist(), generator.integers(0, 5, 6).tolist()
     expected = stats.mannwhitneyu(x, y).statistic / 54
-    here, there = probability_of_improvement([(x, y)]), probability_of_improvement([(y, x)])
+    here, there = (
+        probability_of_improvement([(on("a", one), on("a", other))])
+        for one, other in ((x, y), (y, x))
+    )
     assert here.value == pytest.approx(expected)
     assert here.value + there.value == pytest.approx(1)
     assert here.low < expected < here.high
 
 
-def test_the_interval_of_the_probability_equals_its_enumeration() -> None:
-    x, y = [0.2, 0.6], [0.1, 0.6]
-    draws = [
-        np.mean([(a > b) + 0.5 * (a == b) for a in first for b in second])
-        for first in itertools.product(x, repeat=2)
-        for second in itertools.product(y, repeat=2)
-    ]
-    found = probability_of_improvement([(x, y)], resamples=100_000)
-    expected = np.quantile(draws, (0.025, 0.975), method="inverted_cdf")
-    assert (found.low, found.high) == tuple(expected)
-
-
 def test_performance_profiles_by_hand() -> None:
-    cells = [[0.1, 0.5], [0.5, 0.5, 0.9, 0.9]]
+    cells = [on("a", [0.1, 0.5]), on("a", [0.5, 0.5, 0.9, 0.9])]
     share, low, high = performance_profile(cells, [0.0, 0.5, 0.6, 1.0])
     assert share == pytest.approx([1.0, 0.75, 0.25, 0.0])
     assert low[[0, 3]].tolist() == high[[0, 3]].tolist() == [1.0, 0.0]
-    assert (low[1], high[1]) == (0.5, 1.0)
+    assert low[1] < 0.75 < high[1] == 1.0
+    # Policies count alike, and a policy's runs are drawn together.
+    uneven = [on("a", [1.0] * 9) + on("b", [0.0])]
+    share, low, high = performance_profile(uneven, [0.5])
+    assert (share, low, high) == ([0.5], [0.0], [1.0])
     with pytest.raises(ValueError, match="runs"):
         performance_profile([[]], [0.5])
 
@@ -350,18 +522,23 @@ def test_statistics_agree_with_rliable() -> None:
     value, ends = intervals(column, lambda x: np.array([metrics.aggregate_iqm(x)]))
     ours = crossed_bootstrap([Sample.constant(run) for run in column[:, 0]], iqm, resamples=10_000)
     assert ours.value == pytest.approx(value)
+
     # Theirs without the widening for five runs.
-    narrow = [value + (end - value) / small_sample_factor(5, 4) for end in (ours.low, ours.high)]
-    assert narrow == pytest.approx(ends, abs=0.015)
+    def narrow(cells: int, centre: object, *ours: object) -> list[object]:
+        factor = tails(0.95, 4 * cells) * np.sqrt(5 / 4)
+        return [centre + (end - centre) / factor for end in ours]
+
+    assert narrow(1, value, ours.low, ours.high) == pytest.approx(ends, abs=0.02)
 
     value, ends = intervals((first, second), metrics.probability_of_improvement)
-    ours = probability_of_improvement(list(zip(first.T, second.T, strict=True)))
+    cells = [(on("a", x), on("a", y)) for x, y in zip(first.T, second.T, strict=True)]
+    ours = probability_of_improvement(cells)
     assert ours.value == pytest.approx(value)
-    assert (ours.low, ours.high) == pytest.approx(ends, abs=0.015)
+    assert narrow(12, value, ours.low, ours.high) == pytest.approx(ends, abs=0.015)
 
     levels = np.linspace(0.41, 0.89, 7)
-    share, low, high = performance_profile(list(first.T), levels)
+    share, *band = performance_profile([on("a", x) for x in first.T], levels)
     shares, bands = library.create_performance_profile({"x": first}, levels, reps=1000)
     assert share == pytest.approx(shares["x"])
-    assert low == pytest.approx(bands["x"][0], abs=0.025)
-    assert high == pytest.approx(bands["x"][1], abs=0.025)
+    for mine, theirs in zip(narrow(12, share, *band), bands["x"], strict=True):
+        assert mine == pytest.approx(theirs, abs=0.025)

@@ -15,6 +15,7 @@ from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.page import render_page
 from symsteer.leaderboard.records import Evaluation, RunRecord, config_hash, write_record
 from symsteer.leaderboard.statistics import Sample
+from symsteer.leaderboard.study import PAPER, read_study
 from symsteer.leaderboard.summary import (
     Pair,
     Row,
@@ -99,7 +100,9 @@ def test_an_arm_breaks_the_symmetry_by_itself() -> None:
         ("arm kinematics", "action_gain:0.5"),
     ]
     summary = summarize(runs)
-    page = render_page(summary, analyse(summary, {}), {}, {run.path: None for run in runs})
+    page = render_page(
+        summary, analyse(summary, {}, read_study(PAPER)), {}, {run.path: None for run in runs}
+    )
     assert "### Broken by arm kinematics and `action_gain:0.5`" in page
     assert page.count("### Unbroken symmetry") == 1
 

@@ -99,6 +99,9 @@ def test_a_table_of_audits(monkeypatch, capsys, tmp_path):
     assert symsteer(monkeypatch, *arguments, "--resume") == 0
     assert capsys.readouterr().out == out
     assert cell.stat().st_mtime_ns == before
+    cell.write_text('{"version": 1}')
+    assert symsteer(monkeypatch, *arguments, "--resume") == 2
+    assert "version 1" in capsys.readouterr().err
     cell.write_text("{}")
     assert symsteer(monkeypatch, *arguments, "--resume") == 2
     assert "damaged" in capsys.readouterr().err
@@ -138,6 +141,20 @@ def test_the_page_is_written_in_a_checkout_only(monkeypatch, capsys, tmp_path):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert "in a checkout" in lines[0]
+
+
+@pytest.mark.parametrize("row", [{}, {"version": 1}, {"version": 99}])
+def test_a_summary_of_another_version(row, capsys, tmp_path):
+    path = tmp_path / "summary.json"
+    path.write_text(json.dumps([row]))
+    assert page.main([str(path)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert f"version {row.get('version', 1)}" in lines[0]
+    for text in ("[3]", "{", "3"):
+        path.write_text(text)
+        assert page.main([str(path)]) == 2
+        assert "cannot read the summary" in capsys.readouterr().err
 
 
 def test_a_page_without_marks():

@@ -10,6 +10,7 @@ from symsteer.bench.audit.estimates import (
     mean,
     ratio,
     root_excess,
+    root_share,
 )
 
 
@@ -30,6 +31,14 @@ def test_resampling_is_over_states_and_seeded():
     assert first.low < first.value == values.mean() < first.high
     constant = bootstrap(mean, np.full(5, 2.0), seed=0)
     assert (constant.low, constant.value, constant.high) == (2.0, 2.0, 2.0)
+
+
+def test_a_share_of_a_length():
+    """The root mean square of 3 and 1, of a mean of 2; what is due to chance is taken off."""
+    whole = np.array([1.0, 3.0])
+    assert root_share(np.array([9.0, 1.0]), np.zeros(2), whole) == pytest.approx(5**0.5 / 2)
+    assert root_share(np.array([9.0, 1.0]), np.ones(2), whole) == pytest.approx(1.0)
+    assert np.isnan(root_share(np.ones(2), np.zeros(2), np.zeros(2)))
 
 
 def test_states_at_rest_do_not_blow_up_a_ratio():

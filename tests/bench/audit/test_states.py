@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from symsteer.bench.audit.result import check_group
-from symsteer.bench.audit.states import Turner, visit
+from symsteer.bench.audit.states import Turner, map_trees, visit
 from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
@@ -21,17 +21,22 @@ def visited(request):
 
 
 def test_visited_states_replay(visited):
-    """The stored state and action lead to the stored next state."""
+    """The stored states and actions lead to the stored next states."""
     env, states = visited
     env.reset(seed=0, options={"reconfigure": True})
     env.set_state_dict(states.state)
     before = env.agent.tcp_pose.p.clone()
-    env.step(states.actions[:, 0])
-    tool = env.agent.tcp_pose.p.clone()
-    assert (tool - before).norm(dim=1).mean() > 5e-3
-    env.set_state_dict(states.after)
-    # Up to the forces of contacts that an episode remembers and a fresh scene does not.
-    assert (env.agent.tcp_pose.p - tool).norm(dim=1).median() < 1e-4
+    for step in range(4):
+        env.step(states.actions[:, step])
+        tool = env.agent.tcp_pose.p.clone()
+        assert (tool - before).norm(dim=1).mean() > 5e-3
+        present = env.get_state_dict()
+        after = map_trees(lambda later, k=step: later[:, k], states.path)
+        env.set_state_dict(after)
+        # Up to the forces of contacts that an episode remembers and a fresh scene does not.
+        assert (env.agent.tcp_pose.p - tool).norm(dim=1).median() < 1e-4
+        before = tool
+        env.set_state_dict(present)
 
 
 def test_visited_states_differ(visited):

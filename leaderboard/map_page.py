@@ -1,0 +1,107 @@
+"""The page's section on the map: advantage of symmetry against the audited defect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel, audit_commands
+from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.summary import MIN_SEEDS, Summary
+from symsteer.leaderboard.tables import cell_name
+from symsteer.leaderboard.text import NOTHING, code, difference, grid, image, interval
+
+Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
+"""By place, (task, embodiment), (embodiment,) or (), then by kind: description and address."""
+
+MAP = f"""\
+Each point is a cell: the advantage over `{STANDARD}`, paired by base policy and seed, against the
+*audited defect* of a decision. The defect is measured in simulation, over the steps of an action
+chunk that are executed between two decisions: how differently the world answers to turned copies of
+the same decision. It is the largest of four parts: horizontal motion of the tool and of the object
+(each as a share of its own), cost (as a share of a step's usual cost) and observation (as a share
+of the tool's motion). The colour says which. Broken initial states are no part of a decision; they
+are in the table below. Bars are 95 % intervals, hollow points have fewer than {MIN_SEEDS} paired
+runs.
+
+The *slope* is that of least squares with an intercept for each base policy: it comes from the dials
+alone, never from a comparison of policies, tasks or embodiments. Its interval draws base policies
+(runs, where a task has one policy) and episodes, and the defects within their intervals; it is
+about these cells. With fewer than {MIN_SEEDS} base policies it decides nothing. Lines in the figure
+have this slope and go through the mean of their task; the fan has the slopes of the interval.
+"""
+
+
+def map_section(summary: Summary, found: DefectMap, figures: Figures) -> list[str]:
+    """Paragraphs of the section, without its heading."""
+    parts = [MAP.strip()]
+    for embodiment in found.embodiments:
+        panels = [found.panel(embodiment, a, m) for a in WITH_SYMMETRY for m in MEASURES]
+        parts.append(f"### {code(embodiment)}")
+        if drawn := figures.get((embodiment,)):
+            parts += [image(*figure) for figure in drawn.values()]
+        parts += [_slopes(panels), _numbers(summary, panels)]
+    if not found.embodiments:
+        parts.append("There is no map yet: no audited cell has paired runs of these agents.")
+    if found.unaudited:
+        names = {t.key: cell_name(t, summary) for t in summary.tables}
+        listed = ", ".join(dict.fromkeys(names[key] for key in found.unaudited))
+        text = f"Not audited, so not in the map: {listed}."
+        if commands := audit_commands(found.unaudited):
+            measured = ", ".join(code(command, 1000) for command in commands)
+            text += (
+                f" To measure them: {measured}; then "
+                "`python -m symsteer.bench.audit.page leaderboard/results/audit/summary.json "
+                "runs/audit/summary.json`."
+            )
+        parts.append(text)
+    return parts
+
+
+def _name(panel: Panel) -> list[str]:
+    return [code(panel.agent), "AUC" if panel.measure == "auc" else panel.measure]
+
+
+def _slopes(panels: Sequence[Panel]) -> str:
+    rows = []
+    for panel in panels:
+        fits = {code(dial): fit for dial, fit in panel.dials.items()}
+        if len(fits) > 1 and panel.fit:
+            fits = {"all": panel.fit} | fits
+        rows += [[*_name(panel), dial, *_fit(fit)] for dial, fit in fits.items()]
+        if not fits:
+            rows.append([*_name(panel), NOTHING, NOTHING, NOTHING, panel.reason])
+    header = [
+        "Agent",
+        "Advantage in",
+        "Dial",
+        "Base policies",
+        "Slope per 1 of defect",
+        "Undecided because",
+    ]
+    return grid(header, rows, left=3)
+
+
+def _fit(fit: Fit) -> list[str]:
+    slope = fit.slope.interval()
+    # A mark would be read as a decision.
+    text = interval(slope, sign=True) if fit.reason else difference(slope)
+    reason = fit.reason or ("" if slope.sign else "the interval contains 0")
+    return [str(fit.policies), text, reason]
+
+
+def _numbers(summary: Summary, panels: Sequence[Panel]) -> str:
+    points = {(p.table.key, index): p for index, panel in enumerate(panels) for p in panel.points}
+    cells = {key: point for (key, _), point in points.items()}
+    rows = []
+    for key, cell in sorted(cells.items(), key=lambda item: (item[1].defect.value, item[0])):
+        defect, row = cell.defect, []
+        for index in range(len(panels)):
+            point = points.get((key, index))
+            row.append(f"{difference(point.advantage)} ({len(point.pairs)})" if point else NOTHING)
+        resets = interval(defect.resets, digits=3) if defect.resets_differ else "alike"
+        size = interval(defect.interval, digits=3)
+        rows.append([cell_name(cell.table, summary), size, defect.part, resets, *row])
+    header = ["Cell", "Audited defect", "Of", "Resets"]
+    header += [f"{agent}, {measure} (runs)" for agent, measure in map(_name, panels)]
+    table = grid(header, rows, left=1)
+    return f"<details>\n<summary>The map's numbers</summary>\n\n{table}\n\n</details>"

@@ -1,0 +1,165 @@
+"""Studies: the claims that are declared before runs are made, and what a reader must know of them.
+
+A study is a TOML file of `leaderboard/studies`, or any other one. docs/metrics.md describes its
+keys.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from symsteer.errors import UserError
+from symsteer.names import unknown
+
+PAPER = "paper"
+"""The study with the claims of the paper: for runs that belong to no other one."""
+
+FOLDER = Path(__file__).resolve().parent / "studies"
+
+Measure = Literal["auc", "success", "diverged", "magnitude", "bias"]
+MEASURES: tuple[Measure, ...] = get_args(Measure)
+
+Words = Annotated[str, Field(pattern=r"^[\w ,;:.()'=%-]{1,120}$")]
+"""Text that the page shows as it is."""
+
+Names = Annotated[tuple[str, ...], Field(min_length=1)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Cells(_Table):
+    """Which cells a claim is about; a key that is left out selects all."""
+
+    broken: bool | None = None
+    """Whether anything breaks the symmetry, the arm included."""
+    defect: tuple[float, float] | None = None
+    """Smallest and largest audited defect."""
+    task: Names | None = None
+    embodiment: Names | None = None
+    variant: Names | None = None
+    """Variants with or without strength; a cell is selected if it has one of them."""
+    demonstrations: Literal["fewest", "most"] | None = None
+    """Of cells that differ in the number of demonstrations alone, those at this end."""
+
+
+class Claim(_Table):
+    """One declared claim: an effect, the cells it is about, and what counts as an effect."""
+
+    name: Words
+    family: Words
+    """Claims of a family are corrected together for their number."""
+    measure: Measure
+    agents: tuple[str, str]
+    """The effect is the first one's measure minus the second one's."""
+    effect: Literal["difference", "slope"] = "difference"
+    """`slope`: change of the difference with the defect, per 0.1, within each base policy."""
+    cells: Cells = Cells()
+    minus: Cells | None = None
+    """Of an interaction: the effect in `cells` minus that in these cells."""
+    predicted: Literal[-1, 0, 1]
+    """Sign of the effect that the claim expects; 0: no effect of interest."""
+    smallest: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    """The smallest effect of interest: the margin of the test for equivalence."""
+
+    @model_validator(mode="after")
+    def _can_be_tested(self) -> Claim:
+        if self.minus is not None and (self.effect == "slope" or self.measure == "diverged"):
+            raise ValueError("minus belongs to differences of a measure other than diverged")
+        if self.effect == "slope" and self.measure == "diverged":
+            raise ValueError("there is no slope of diverged")
+        return self
+
+
+class _File(_Table):
+    description: str = ""
+    notice: str = ""
+    declared: Annotated[str, Field(pattern=r"^([0-9a-f]{7,40})?$")] = ""
+    claims: str = ""
+    """Another file of the same folder, which holds the claims."""
+    claim: tuple[Claim, ...] = ()
+
+
+@dataclass(frozen=True)
+class Study:
+    """Declared claims, and what a reader must know of the runs.
+
+    Attributes:
+        notice: markdown that the page shows above all results.
+        declared: the commit that declared the claims, if the study names one.
+        claims: in the order of the file.
+        source: name of the file that declares the claims.
+        sha256: of its content.
+    """
+
+    notice: str
+    declared: str
+    claims: tuple[Claim, ...]
+    source: str
+    sha256: str
+
+
+def study_names() -> list[str]:
+    """The studies that come with SymSteer."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def read_study(name_or_path: str) -> Study:
+    """Read a study by name or from a TOML file.
+
+    Raises:
+        UserError: if there is no such study, or the file is not one; for an unknown key or
+            measure, the message has the nearest valid one.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        path = FOLDER / f"{name_or_path}.toml"
+    file, source = _read(path), path
+    if file.claims:
+        source = path.parent / file.claims
+        if file.claim or (declaring := _read(source)).claims:
+            raise UserError(
+                f"{path.name}: claims must name a file that declares claims itself, in place of own"
+            )
+        file = declaring.model_copy(update={"notice": file.notice, "declared": file.declared})
+    digest = hashlib.sha256(source.read_bytes()).hexdigest()
+    return Study(file.notice.strip(), file.declared, file.claim, source.name, digest)
+
+
+def _read(path: Path) -> _File:
+    try:
+        data = tomllib.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise unknown("study", path.stem, study_names()) from error
+    except OSError as error:
+        raise UserError(
+            f"the study {path} cannot be read: {error.strerror}; name another"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"the study {path} cannot be read as TOML: {error}; correct it") from error
+    try:
+        return _File.model_validate(data)
+    except ValidationError as error:
+        raise UserError(f"{path.name}: {_problem(error)}") from error
+
+
+def _problem(error: ValidationError) -> str:
+    """The first thing that is wrong with a study's file, in words."""
+    found = error.errors(include_url=False)
+    # A key that is misspelt is missing, too.
+    first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])
+    words = [str(part + 1) if isinstance(part, int) else part for part in first["loc"]]
+    where, last = " ".join(words[:-1]), words[-1] if words else ""
+    if first["type"] == "extra_forbidden":
+        tables: dict[int, type[_Table]] = {1: _File, 3: Claim}
+        return str(unknown("key", last, tables.get(len(words), Cells).model_fields, where))
+    if last == "measure" and isinstance(first["input"], str):
+        return str(unknown("measure", first["input"], MEASURES, where))
+    return f"{' '.join(words)}: {first['msg'].removeprefix('Value error, ')}"

@@ -1,0 +1,79 @@
+"""Studies as files: what is read, and each mistake in one sentence."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from symsteer.errors import UserError
+from symsteer.leaderboard.study import read_study, study_names
+
+CLAIM = """
+[[claim]]
+name = "faster"
+family = "speed"
+measure = "auc"
+agents = ["equivariant", "standard"]
+cells = { broken = false, defect = [0, 0.1] }
+predicted = 1
+smallest = 0.05
+"""
+
+
+def write(folder: Path, text: str, name: str = "mine.toml") -> str:
+    (folder / name).write_text(text)
+    return str(folder / name)
+
+
+def test_a_study_declares_claims_or_names_a_file_that_does(tmp_path: Path) -> None:
+    assert {"first", "paper"} <= set(study_names())
+    study = read_study(write(tmp_path, f'notice = "mind this"\n{CLAIM}'))
+    (claim,) = study.claims
+    assert (claim.agents, claim.cells.broken, claim.minus) == (
+        ("equivariant", "standard"),
+        False,
+        None,
+    )
+    other = read_study(write(tmp_path, 'claims = "mine.toml"\ndeclared = "abcdef0"', "other.toml"))
+    assert (other.claims, other.source) == (study.claims, "mine.toml")
+    assert (other.notice, other.declared) == ("", "abcdef0")
+    content = (tmp_path / "mine.toml").read_bytes()
+    assert other.sha256 == study.sha256 == hashlib.sha256(content).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (CLAIM.replace("measure", "mesure"), "claim 1: there is no key 'mesure'; did you mean 'me"),
+        (CLAIM.replace('"auc"', '"acu"'), "claim 1: there is no measure 'acu'; did you mean 'auc'"),
+        (CLAIM.replace("broken", "brokn"), "claim 1 cells: there is no key 'brokn'; did you mean"),
+        ("notce = 'x'", "there is no key 'notce'; did you mean 'notice'"),
+        (CLAIM.replace("smallest = 0.05", "smallest = 0"), "claim 1 smallest: .*greater than 0"),
+        (CLAIM.replace("smallest = 0.05", "smallest = nan"), "claim 1 smallest: "),
+        (CLAIM.replace("predicted = 1", "predicted = 2"), "claim 1 predicted: "),
+        (CLAIM.replace("predicted = 1", ""), "claim 1 predicted: Field required"),
+        (CLAIM.replace(', "standard"', ""), "claim 1 agents 2: Field required"),
+        (CLAIM.replace('"faster"', '"<b>"'), "claim 1 name: "),
+        (CLAIM + "minus = { broken = true }\neffect = 'slope'", "claim 1: minus belongs to"),
+        (CLAIM.replace('"auc"', '"diverged"') + "effect = 'slope'", "no slope of diverged"),
+        ("declared = 'yesterday'", "declared: "),
+        ("claim = 3", "claim: "),
+        ("claims = 'none.toml'", "there is no study 'none'"),
+        ("claims = 'mine.toml'", "must name a file that declares claims itself"),
+        ("not toml", "cannot be read as TOML"),
+    ],
+)
+def test_mistakes_in_a_study(text: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=words) as refused:
+        read_study(write(tmp_path, text))
+    assert "\n" not in str(refused.value)
+
+
+def test_an_unknown_study_names_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="there is no study 'papr'; did you mean 'paper'"):
+        read_study("papr")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(UserError, match="cannot be read: Is a directory"):
+        read_study(str(tmp_path / "folder.toml"))
