@@ -114,9 +114,10 @@ def test_critic_preference_grows_as_the_actor_follows_the_critic(problem, critic
 
 def test_policy_statistics(problem):
     obs = problem.batch(256).obs
-    quiet = diagnostics.policy_statistics(problem.agent("equivariant", initial_scale=0.01), obs)
+    agent = problem.agent("equivariant", initial_scale=0.01, initial_alpha=0.2)
+    quiet = diagnostics.policy_statistics(agent, obs)
     loud = diagnostics.policy_statistics(problem.agent("equivariant", initial_scale=2.5), obs)
-    assert quiet["alpha"] == pytest.approx(0.1, rel=1e-5)
+    assert quiet["alpha"] == pytest.approx(0.2, rel=1e-5)
     assert quiet["saturated_share"] == 0.0
     assert loud["saturated_share"] > 0.2
     assert quiet["entropy"] < loud["entropy"]

@@ -143,21 +143,24 @@ def test_one_step_is_what_was_stored():
 
 
 def test_decisions_of_two_environments_are_joined_up_to_their_ends():
-    """Environment 0 succeeds after three decisions, environment 1 reaches the time limit."""
+    """Environment 0 succeeds after three decisions, environment 1 reaches the time limit.
+
+    Both begin anew; as it happens, in the state in which they ended.
+    """
     buffer = ReplayBuffer(100, JOINED)
     buffer.add(decisions([0, 10], [1, 11], [-1, -16]))
     buffer.add(decisions([1, 11], [2, 12], [-2, -32], truncated=[1]))
-    buffer.add(decisions([2, 20], [3, 21], [-4, -64], terminal=[0]))  # environment 1 begins anew
-    buffer.add(decisions([30, 21], [31, 22], [-8, -128]))
+    buffer.add(decisions([2, 12], [3, 13], [-4, -64], terminal=[0]))
+    buffer.add(decisions([3, 13], [4, 14], [-8, -128]))
     two = {
         0: (-1 - 1, 0.25, 2, 0, 0),
         1: (-2 - 2, 0.25, 3, 1, 0),
         2: (-4, 0.5, 3, 1, 0),
+        3: (-8, 0.5, 4, 0, 0),
         10: (-16 - 16, 0.25, 12, 0, 1),
         11: (-32, 0.5, 12, 0, 1),
-        20: (-64 - 64, 0.25, 22, 0, 0),
-        21: (-128, 0.5, 22, 0, 0),  # the newest decision of its environment
-        30: (-8, 0.5, 31, 0, 0),
+        12: (-64 - 64, 0.25, 14, 0, 0),
+        13: (-128, 0.5, 14, 0, 0),  # the newest decision of its environment
     }
     assert joined(buffer, 2) == two
     assert joined(buffer, 5) == {**two, 0: (-1 - 1 - 1, 0.125, 3, 1, 0)}

@@ -160,9 +160,10 @@ def test_hyperparameters_can_be_compared_across_runs(broken):
             if key in own:
                 assert values[f"agent_options.{key}"].number_value == own[key]
         assert values["demonstrations.count"].number_value == 3
-        if record.role == "learner":
+        if record.role != "reference":
             assert values["agent_options.layer_norm"].bool_value is True
-            assert values["agent_options.target_entropy"].string_value == "none"
+            assert values["agent_options.target_entropy"].number_value == 0
+            assert values["agent_options.learning_starts"].string_value == "none"
         assert folder.name.endswith(start.group_name)
         experiment = metadata.parse_experiment_plugin_data(content(metadata.EXPERIMENT_TAG))
         assert set(values) <= {info.name for info in experiment.hparam_infos}
@@ -188,7 +189,7 @@ def test_the_text_says_what_was_run(broken):
         assert f"{record.base_policy.base_success:.0%} of 32 episodes" in rows["its success"]
         assert f"{record.base_policy.action_std:.2f}" in rows["its steerability"]
         assert rows["its warning"] == record.base_policy.warning
-        assert rows.get("agent_options.lr") == ("0.0006" if record.role == "learner" else None)
+        assert rows.get("agent_options.lr") == ("0.0006" if record.role != "reference" else None)
         assert rows["evaluation.final_episodes"] == "5"
 
 

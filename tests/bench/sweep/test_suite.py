@@ -78,10 +78,13 @@ def test_the_suite_first_describes_the_committed_records():
         for mine, theirs in (
             (plain, config),
             (plain["policy"], config["policy"]),
-            (plain["agent_options"], config["sac"]),
+            (plain["evaluation"], config["evaluation"]),
+            (plain["agent_options"], {**config["sac"], "target_entropy": -0.5}),
         ):
-            shared = mine.keys() & theirs.keys() - {"policy"}
+            shared = mine.keys() & theirs.keys() - {"policy", "evaluation"}
             assert {key: mine[key] for key in shared} == {key: theirs[key] for key in shared}
+        # None was minus half a nat for each number of the noise; now it is given per number.
+        assert config["sac"]["target_entropy"] is None
         assert config["policy_seed"] == config["demonstrations"]["seed"] == 0
     assert not recorded
 
