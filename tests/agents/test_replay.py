@@ -68,7 +68,9 @@ def test_holds_the_fields_that_were_asked_for():
     assert set(batch) == {"actions", "reward", "truncated", "discount"}
     assert torch.equal(batch.actions.unique(), torch.arange(16.0))
     assert batch.truncated.eq(1).all()
-    with pytest.raises(AttributeError, match="holds no 'noise'; it holds actions, reward, truncated"):
+    with pytest.raises(
+        AttributeError, match="holds no 'noise'; it holds actions, reward, truncated"
+    ):
         _ = batch.noise
 
 
@@ -118,7 +120,10 @@ GAMMA = 0.5
 def decisions(obs, next_obs, reward, terminal=(), truncated=()):
     """One decision of each environment; the last two name environments."""
     obs, next_obs, reward = (torch.tensor(x, dtype=torch.float32) for x in (obs, next_obs, reward))
-    ends = [torch.tensor([float(i in which) for i in range(len(obs))]) for which in (terminal, truncated)]
+    ends = [
+        torch.tensor([float(i in which) for i in range(len(obs))])
+        for which in (terminal, truncated)
+    ]
     columns = {"obs": obs[:, None], "noise": 100 + obs[:, None], "next_obs": next_obs[:, None]}
     return {**columns, "reward": reward, "terminal": ends[0], "truncated": ends[1]}
 
@@ -128,7 +133,9 @@ def joined(buffer, n_step):
     batch = buffer.sample(2000, n_step, GAMMA)
     assert torch.equal(batch.noise, 100 + batch.obs)  # the noise is that of the first decision
     names = ("reward", "discount", "next_obs", "terminal", "truncated")
-    rows = zip(batch.obs.flatten().tolist(), *(batch[n].flatten().tolist() for n in names), strict=True)
+    rows = zip(
+        batch.obs.flatten().tolist(), *(batch[n].flatten().tolist() for n in names), strict=True
+    )
     found = {}
     for obs, *row in rows:
         assert found.setdefault(obs, tuple(row)) == tuple(row)

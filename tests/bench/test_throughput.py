@@ -8,7 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from symsteer.bench import throughput
+from symsteer.agents import AGENTS
+from symsteer.agents.sac import SacAgent
+from symsteer.bench import learner_throughput, throughput
 from symsteer.bench.throughput import Replay, Row, Turn, _Stopwatch
 from symsteer.errors import UserError
 
@@ -149,3 +151,17 @@ def test_the_whole_measurement():
     assert one["times_stock_cpu"] > 2
     assert 0.1 < one["share_of_limit_cpu"] < 1
     throughput.table(data)
+
+
+def test_every_learner_is_timed_with_every_kind_of_critic():
+    rows = learner_throughput.measure(TASK, updates=1, repeats=2, report=lambda text: None)
+    kinds = {row["agent"]: set() for row in rows}
+    for row in rows:
+        kinds[row["agent"]].add(row["critic"])
+        assert 0 < row["min"] <= row["median"] <= row["max"]
+    assert kinds.pop("decoder") == {None}
+    learners = {n for n in AGENTS.builtin if issubclass(AGENTS.get(n), SacAgent)}
+    assert kinds == {name: {"noise", "aliased", "sampler"} for name in learners}
+    text = learner_throughput.table(rows)
+    (line,) = (row for row in text.splitlines() if row.split()[:2] == ["standard", "noise"])
+    assert line.endswith("1.00")
