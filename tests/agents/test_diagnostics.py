@@ -1,6 +1,7 @@
 """Every diagnostic against a case whose answer is known."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -94,6 +95,23 @@ def test_orbit_variance_is_the_variance_over_the_orbit(problem):
     report = diagnostics.orbit_variance(Linear(), batch.obs, batch.noise, C8)
     radius2 = batch.obs[:, problem.obs_layout.slice("tcp_xy")].square().sum(1)
     assert report["orbit_variance"] == pytest.approx(radius2.mean().item() / 2, rel=1e-5)
+
+
+def test_alias_gap_is_the_mean_error_of_the_distilled_critics(problem):
+    class Known:
+        options = SimpleNamespace(critic="aliased")
+
+        def q_values(self, obs, noise):
+            return obs[:, 0].expand(2, -1)
+
+        def noise_q_values(self, obs, noise):
+            return self.q_values(obs, noise) + torch.tensor([[1.0], [-3.0]])
+
+    batch = problem.batch()
+    assert diagnostics.alias_gap(Known(), batch.obs, batch.noise) == pytest.approx(2.0)
+    for critic in ("noise", "sampler"):
+        agent = problem.agent("standard", critic=critic)
+        assert diagnostics.alias_gap(agent, batch.obs, batch.noise) is None
 
 
 @pytest.mark.parametrize("critic", ["noise", "aliased", "sampler"])

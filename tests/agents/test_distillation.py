@@ -1,5 +1,7 @@
 """Noise critics learn what the action critics say of the actions that noise is decoded to."""
 
+import copy
+
 import pytest
 import torch
 
@@ -12,7 +14,7 @@ def filled(problem, name="standard", **options):
     agent = problem.agent(name, lr=3e-3, gamma=0.0, **options)
     # The critics stay as they are; large enough for differences between actions.
     agent.optimizers["critic"].param_groups[0]["lr"] = 0.0
-    agent.observe(problem.transition(256))
+    agent.observe(problem.transition(256))  # reward scale 1: values in units of rewards
     return agent
 
 
@@ -38,8 +40,7 @@ def where_it_distils(agent):
     return points
 
 
-@pytest.mark.parametrize("bank", [0, 4])
-@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize(("source", "bank"), [*((source, 4) for source in SOURCES), ("mixture", 0)])
 def test_noise_critics_approach_the_action_critics(problem, source, bank):
     agent = filled(problem, distill=source, noise_bank=bank)
     before = {key: gap(agent, *point) for key, point in where_it_distils(agent).items()}
@@ -56,6 +57,30 @@ def test_without_distillation_they_stay_apart(problem):
     for _ in range(300):
         assert "losses/distillation" not in agent.update(agent.replay.sample(64))
     assert gap(agent, *where_it_distils(agent)["random"]) == before > 1
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_the_loss_is_the_hand_computed_one(problem, source):
+    """Head by head, at the noise that the option names and nowhere else."""
+    agent = filled(problem, distill=source, dtype=torch.float64)
+    batch = agent.replay.sample(32)
+    generator = copy.deepcopy(agent.generator)
+    with torch.no_grad():
+        mean, log_scale = agent.moments(batch.next_obs)
+        eps = torch.randn(mean.shape, generator=generator, dtype=mean.dtype)
+        drawn = agent.chunk(agent.distribution.sample(mean, log_scale, eps)[0])
+        points = [(batch.next_obs, drawn)]
+        if source != "actor":
+            rows = torch.arange(32)
+            picked = torch.randint(4, (32,), generator=generator)
+            points.append((batch.obs, batch.bank_noise[rows, picked]))
+        if source in ("gaussian", "squashed"):
+            del points[0]
+        obs, noise = (torch.cat(parts) for parts in zip(*points, strict=True))
+        gap = agent.noise_q_values(obs, noise) - agent.q_values(obs, noise)
+        expected = gap.square().mean(1).sum()
+    scalars = agent.update(batch)
+    assert scalars["losses/distillation"].item() == pytest.approx(expected.item(), rel=1e-12)
 
 
 @pytest.mark.parametrize(("steps", "made"), [(2.0, [2, 2, 2, 2]), (0.5, [0, 1, 0, 1])])

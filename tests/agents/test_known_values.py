@@ -1,13 +1,14 @@
 """Problems whose Q-values are known: every learner must find them, and must not drift from them.
 
-The null problem: successors are random, every decision costs the same, no episode ends. All noise is
-equally good, Q is r / (1 - gamma) everywhere. An actor that climbs errors of its critics leaves
+The null problem: successors are random, every decision costs the same, no episode ends. All noise
+is equally good, Q is r / (1 - gamma) everywhere. An actor that climbs errors of its critics leaves
 w = 0 all the same; with the settings of the first leaderboard it does.
 
 The reach problem: a point steps towards the origin, each decision costs 1 until it is close. With
 the fewest decisions left N, V* = -(1 - gamma^N) / (1 - gamma).
 """
 
+import itertools
 import math
 
 import pytest
@@ -20,7 +21,9 @@ from symsteer.agents.replay import Transition
 from symsteer.policies.geometry import Field, Layout
 from symsteer.policies.normalizer import clip_blocks
 
-LEARNERS = [name for name in AGENTS.builtin if AGENTS.get(name).role != "reference"]
+LEARNERS = [name for name in AGENTS.builtin if AGENTS.get(name).role == "learner"]
+KINDS = [(name, "aliased") for name in LEARNERS]
+KINDS += itertools.product(("standard", "equivariant"), ("noise", "sampler"))
 # The critics of size-matched agents are narrow; they need larger steps.
 OWN = {"standard-matched": {"lr": 5e-3}}
 
@@ -44,7 +47,7 @@ NULL_ACT = Layout(
     [Field("xy", 1), Field("z", 0), Field("tilt", 1), Field("yaw", 0), Field("gripper", 0)]
 )
 COST, DECISIONS = -4.0, 1024
-DRIFT = 2.0
+DRIFT = 1.5
 """Largest mean norm of the deterministic noise; that of N(0, I) is 7.5, the bound's 9.5."""
 
 
@@ -82,13 +85,7 @@ def null_problem(name, **options):
     return norms, shares
 
 
-@pytest.mark.parametrize(
-    ("name", "critic"),
-    [
-        *((name, "aliased") for name in LEARNERS),
-        *((name, critic) for name in ("standard", "equivariant") for critic in ("noise", "sampler")),
-    ],
-)
+@pytest.mark.parametrize(("name", "critic"), [("wrong-group", "aliased"), *KINDS])
 def test_nothing_to_gain(name, critic):
     norms, shares = null_problem(name, critic=critic)
     assert max(norms) < DRIFT, norms
@@ -100,7 +97,7 @@ def test_nothing_to_gain(name, critic):
 @pytest.mark.parametrize("name", ["standard", "equivariant"])
 def test_the_first_leaderboards_settings_drift_and_misjudge(name):
     norms, shares = null_problem(name, **preset_options("first", name, AGENTS.get(name).Options))
-    assert min(norms) > 1.5 * DRIFT, norms
+    assert max(norms) > 3 * DRIFT, norms
     assert shares["actor", "q"].mean() < 0.8
 
 
@@ -173,13 +170,7 @@ def reach(name, **options):
     return agent
 
 
-@pytest.mark.parametrize(
-    ("name", "critic"),
-    [
-        *((name, "aliased") for name in LEARNERS if name != "wrong-group"),
-        *((name, critic) for name in ("standard", "equivariant") for critic in ("noise", "sampler")),
-    ],
-)
+@pytest.mark.parametrize(("name", "critic"), KINDS)
 def test_values_and_steps_are_almost_the_best(name, critic):
     agent = reach(name, critic=critic)
     generator = torch.Generator().manual_seed(2)
@@ -188,7 +179,7 @@ def test_values_and_steps_are_almost_the_best(name, critic):
     assert truth.std() > 0.3
     for values in (agent.q_values, agent.noise_q_values):
         q = values(obs, noise).mean(0)
-        assert abs((q - truth).mean()) < 0.35
+        assert abs((q - truth).mean()) < 0.3
         assert torch.corrcoef(torch.stack([q, truth]))[0, 1] > 0.8
     most = best(obs).mean()
     assert play(obs, lambda obs: agent.act(obs, deterministic=True)).mean() > most - 0.05
@@ -196,9 +187,8 @@ def test_values_and_steps_are_almost_the_best(name, critic):
     assert play(obs, lambda obs: torch.zeros(len(obs), 2, ACT.dim)).mean() < most - 1.5
 
 
-@pytest.mark.slow
 def test_with_the_wrong_symmetry_it_cannot_be_solved():
-    """The negative control: a step towards the origin does not turn as its noise does."""
+    """The control: a step towards the origin does not turn as its noise does."""
     agent = reach("wrong-group")
     obs = states(1024, torch.Generator().manual_seed(2))
     assert play(obs, lambda obs: agent.act(obs, deterministic=True)).mean() < best(obs).mean() - 0.5

@@ -1,6 +1,8 @@
 """Options of the learners: when they learn, how far noise may go, and the presets."""
 
+import dataclasses
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from symsteer.agents.presets import preset_names, preset_options
 from symsteer.agents.sac import SacAgent
 from symsteer.errors import UserError
 
+PAGE = (Path(__file__).parents[2] / "docs" / "agents.md").read_text()
 TRAINED = [name for name in AGENTS.builtin if AGENTS.get(name).role != "reference"]
 
 
@@ -138,7 +141,9 @@ def test_noise_may_exceed_a_soft_bound_and_comes_back(problem):
         return norms(problem, agent.act(problem.batch().obs, deterministic=True))
 
     soft, softer, hard = size(bound_penalty=1.0), size(bound_penalty=0.1), size()
-    scalars = [i for i, block in enumerate(problem.act_layout.blocks) if block.stop - block.start == 1]
+    scalars = [
+        i for i, block in enumerate(problem.act_layout.blocks) if block.stop == block.start + 1
+    ]
     # Where 1 = 2 * penalty * excess: half a unit beyond the bound, and five.
     assert (soft[..., scalars] - 1.5).abs().max() < 0.25
     assert softer[..., scalars].min() > 2
@@ -227,3 +232,9 @@ def test_presets_are_the_published_settings(name, preset, own):
     assert found == DSRL | own
     assert options.first_update == options.warmup
     assert math.isclose(options.utd * 4, 20)
+
+
+def test_the_page_names_every_agent_option_and_preset():
+    options = [field.name for n in TRAINED for field in dataclasses.fields(AGENTS.get(n).Options)]
+    for name in {*AGENTS.builtin, *preset_names(), *options}:
+        assert f"`{name}`" in PAGE, name

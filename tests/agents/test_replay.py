@@ -104,7 +104,7 @@ def test_mistakes_are_named():
         other.load_state_dict(ReplayBuffer(4, SHAPES).state_dict())
 
 
-# Joined decisions. A row's observation is its number; its next observation that of the next decision.
+# Joined decisions: the next observation of one is the observation of the next.
 
 JOINED = {
     "obs": (1,),

@@ -1,4 +1,4 @@
-"""The control with the wrong symmetry: exact under its own action of the group, wrong under ours."""
+"""The control with the wrong symmetry: exact under its own turns, wrong under the true ones."""
 
 import pytest
 import torch
