@@ -208,7 +208,6 @@ def _diagnostics(table: Table) -> list[str]:
         ],
         "Parameters: actor, critic (width)": [_parameters(row) for row in rows],
         "Minutes a run": [_minutes(row) for row in rows],
-        "Device": [_devices(row) for row in rows],
     }
     header, body = without_empty(columns)
     body = [[code(row.label), *texts] for row, texts in zip(rows, body, strict=True)]
@@ -234,10 +233,6 @@ def _magnitude_header(table: Table) -> str:
 def _minutes(row: Row) -> str:
     minutes = [run.record.wall_clock.total / 60 for run in row.finished]
     return number(sum(minutes) / len(minutes), 1) if minutes else NOTHING
-
-
-def _devices(row: Row) -> str:
-    return ", ".join(map(code, sorted({p.device for run in row.runs for p in run.provenances})))
 
 
 def _parameters(row: Row) -> str:
