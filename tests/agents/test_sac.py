@@ -277,6 +277,8 @@ def test_acting_uses_the_newest_weights(problem):
         ({"name": "standard"}, "agent"),
         ({"width": 64}, "width"),
         ({"group": "C4"}, "group"),
+        ({"critic": "noise"}, "critic"),
+        ({"noise_bound": 2.0}, "noise_bound"),
         ({"problem": {"horizon": 4}}, "horizon"),
         ({"problem": {"obs_layout": Layout([Field("xy", 1)])}}, "obs_layout"),
     ],
