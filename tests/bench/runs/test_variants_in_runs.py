@@ -23,7 +23,9 @@ def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, mon
     variant = "spawn_sector:1+directional_reward:0.5"
     config = tiny_config(variant=variant, env_steps=160)
     record = read_record(execute(config, folder.parent, progress=False) / "record.json")
-    assert sorted(made) == ["directional_reward:0.5", variant]
+    # Held-out episodes and those that Q is compared with have environments of their own.
+    assert made.count(variant) == 1
+    assert set(made) == {"directional_reward:0.5", variant}
     assert record.config["variant"] == variant
     assert record.config["evaluation_variant"] == "directional_reward:0.5"
     low, _ = task_class(config.task).feasible_return(
