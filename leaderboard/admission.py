@@ -93,7 +93,7 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
 def named_after_its_run(file: Path, record: RunRecord) -> Iterator[str]:
     """The file is called RUN_ID.json."""
     if file.name != f"{record.run_id}.json":
-        yield f"the file must be named after its run: rename it to {record.run_id}.json."
+        yield f"the file must be named after its run: rename it to {record.run_id}.json"
 
 
 def finished(file: Path, record: RunRecord) -> Iterator[str]:
@@ -101,7 +101,7 @@ def finished(file: Path, record: RunRecord) -> Iterator[str]:
     if record.status != "finished":
         yield (
             f"the run is {record.status}, not finished: continue it with `symsteer resume "
-            "RUN_FOLDER` and take the record from there."
+            "RUN_FOLDER` and take the record from there"
         )
 
 
@@ -118,19 +118,19 @@ def reproducible(file: Path, record: RunRecord) -> Iterator[str]:
             if not _is_released(provenance):
                 yield (
                     f"{part}the run names neither a commit nor a released version, so nobody knows "
-                    "its code: run it again in a git clone of the repository."
+                    "its code: run it again in a git clone of the repository"
                 )
         elif provenance.dirty is not False:
             yield (
                 f"{part}the run used code that is not in commit {provenance.commit[:12]}: "
-                "commit all changes and new files, then run it again."
+                "commit all changes and new files, then run it again"
             )
         for extension in provenance.extensions:
             if extension.distribution is None or extension.version is None:
                 yield (
                     f"{part}the run used the {extension.kind} {extension.target}, which belongs to "
                     "no installed distribution: install it as a package with an entry point, or "
-                    "add it to the repository, then run it again."
+                    "add it to the repository, then run it again"
                 )
 
 
@@ -141,13 +141,13 @@ def scored_on_held_out_episodes(file: Path, record: RunRecord) -> Iterator[str]:
         if seeds != list(range(HELD_OUT_SEED, HELD_OUT_SEED + len(seeds))):
             yield (
                 f"the evaluation at step {evaluation.env_steps} is not on the held-out seeds "
-                f"{HELD_OUT_SEED}, {HELD_OUT_SEED + 1}, ... in order: evaluate with `symsteer run`."
+                f"{HELD_OUT_SEED}, {HELD_OUT_SEED + 1}, ... in order: evaluate with `symsteer run`"
             )
             break
     if record.final and len(record.final.episodes.seed) < MIN_EPISODES:
         yield (
             f"the final evaluation has {len(record.final.episodes.seed)} episodes, fewer than "
-            f"{MIN_EPISODES}: run it again with --evaluation.final-episodes {MIN_EPISODES}."
+            f"{MIN_EPISODES}: run it again with --evaluation.final-episodes {MIN_EPISODES}"
         )
 
 
@@ -159,12 +159,12 @@ def consistent(file: Path, record: RunRecord) -> Iterator[str]:
     if not file_name(record.run_id).startswith(f"{named}-"):
         yield (
             f"the run is named {record.run_id}, but its configuration is that of {named}: take the "
-            "record as `symsteer run` wrote it."
+            "record as `symsteer run` wrote it"
         )
     elif record.seeds.get("run") != seed:
         yield (
             f"the run drew from seed {record.seeds.get('run')}, but its configuration says "
-            f"{seed}: take the record as `symsteer run` wrote it."
+            f"{seed}: take the record as `symsteer run` wrote it"
         )
 
 
@@ -176,17 +176,17 @@ def budget_used_up(file: Path, record: RunRecord) -> Iterator[str]:
     if final.env_steps != record.budget.env_steps:
         yield (
             f"the final evaluation stands at step {final.env_steps}, but the run used "
-            f"{record.budget.env_steps}: run it again."
+            f"{record.budget.env_steps}: run it again"
         )
     elif final.env_steps >= budget + _steps_of_a_decision(record):
         yield (
             f"the run used {final.env_steps} environment steps, more than the {budget} of its "
-            "budget: run it again."
+            "budget: run it again"
         )
     elif _learns(record) and final.env_steps < budget:
         yield (
             f"the run ended after {final.env_steps} of the {budget} environment steps of its "
-            "budget: run it again to the end, or with --env-steps as large as what it uses."
+            "budget: run it again to the end, or with --env-steps as large as what it uses"
         )
 
 
@@ -196,7 +196,7 @@ def names_no_machine(file: Path, record: RunRecord) -> Iterator[str]:
         if portable(text) != text:
             yield (
                 f"the text {text[:60]!r} holds a path of the machine: leave it out where the run "
-                "is configured, and run it again."
+                "is configured, and run it again"
             )
             return
 
@@ -243,16 +243,16 @@ class _Known:
         twin = self._runs.get((_row(record), seeds_of(record.config)))
         outcome = _outcome(record)
         if twin and twin[1] == record:
-            yield f"it is a copy of {twin[0]}: remove one of the two."
+            yield f"it is a copy of {twin[0]}: remove one of the two"
         elif twin:
             yield (
                 f"{twin[0]} holds the same configuration and seeds already: remove one of the two "
-                "(to replace a committed record, say why in the pull request)."
+                "(to replace a committed record, say why in the pull request)"
             )
         elif outcome in self._outcomes:
             yield (
                 f"its evaluations equal those of {self._outcomes[outcome]} to the last digit: a "
-                "copy, or a setting that changes nothing; keep one of the two."
+                "copy, or a setting that changes nothing; keep one of the two"
             )
 
     def notes(self, record: RunRecord) -> Iterator[str]:
@@ -261,13 +261,13 @@ class _Known:
         if record.role == "learner" and number < MIN_SEEDS:
             yield (
                 f"shown, not ranked: its row has {number} of the {MIN_SEEDS} finished seeds that a "
-                "ranking needs."
+                "ranking needs"
             )
         usual, seed = self._committed_seeds[row[0]], record.settings.seed
         if usual and seed not in usual:
             yield (
                 f"its seed {seed} is none of those of the committed runs of its table "
-                f"({', '.join(map(str, sorted(usual)))}): agents are compared on equal seeds."
+                f"({', '.join(map(str, sorted(usual)))}): agents are compared on equal seeds"
             )
         policy, committed = record.base_policy.content_hash, self._committed[row[0]]
         if committed and policy not in committed:
@@ -276,13 +276,13 @@ class _Known:
             wanted = f"; submit {', '.join(names)} on it as well" if names else ""
             yield (
                 f"its base policy {policy[:12]} is not that of the committed runs of its table: it "
-                f"is compared only with runs on the same policy{wanted}."
+                f"is compared only with runs on the same policy{wanted}"
             )
         commit = record.provenance.commit
         if commit is not None and _is_missing(commit):
             yield (
                 f"its commit {commit[:12]} is not in this clone: push it with the pull request, so "
-                "that others can run the same code."
+                "that others can run the same code"
             )
 
 
@@ -295,11 +295,11 @@ def _code_from_elsewhere(record: RunRecord) -> Iterator[str]:
     parts = [record.provenance, *record.continued]
     for version, sha256 in dict.fromkeys((p.version, p.sha256) for p in parts if not p.commit):
         if sha256:
-            yield f"it ran symsteer {version} as installed, not a checkout; sha256 {sha256[:12]}."
+            yield f"it ran symsteer {version} as installed, not a checkout; sha256 {sha256[:12]}"
     extensions = [e for p in parts for e in p.extensions if e.distribution]
     used = {(e.kind, e.name, e.distribution, e.version, e.sha256[:12]) for e in extensions}
     for kind, name, distribution, version, sha256 in sorted(used, key=str):
-        yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}."
+        yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}"
 
 
 def _is_released(provenance: Provenance) -> bool:

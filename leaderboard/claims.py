@@ -202,6 +202,8 @@ def _selects(cells: Cells, key: Key, audit: Audit) -> bool:
 
 def where(cells: Cells) -> str:
     """Which cells, in words."""
+    if cells == Cells():
+        return "all cells"
     words = {None: "", True: "broken ", False: "unbroken "}[cells.broken] + "cells"
     if cells.defect is not None:
         words += f" with a defect of {cells.defect[0]:g} to {cells.defect[1]:g}"
@@ -215,12 +217,13 @@ def where(cells: Cells) -> str:
 
 def _without_pairs(tables: Sequence[Table], claim: Claim, cells: Cells) -> str:
     """Why no runs of the two agents can be compared."""
+    place = "" if cells == Cells() else f" in {where(cells)}"
     for agent in claim.agents:
         if not any(row.agent == agent and row.runs for table in tables for row in table.rows):
-            return f"no runs of {code(agent)} in {where(cells)}"
+            return f"no runs of {code(agent)}" + place
     if claim.measure == "bias":
         return "not measured over all decisions"
-    return f"no runs of both agents with the same seed on the same base policy in {where(cells)}"
+    return f"no runs of both agents with the same seed on the same base policy{place}"
 
 
 def paired(table: Table, claim: Claim) -> dict[Pair, Sample]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from symsteer.leaderboard.claims import SLOPE_UNIT, where
+from symsteer.leaderboard.claims import SLOPE_UNIT, Outcome, where
 from symsteer.leaderboard.comparisons import Comparisons
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.map_page import Figures, map_section
@@ -23,6 +23,7 @@ from symsteer.leaderboard.text import (
     interval,
     number,
     stacked,
+    without_empty,
 )
 
 READING = f"""\
@@ -55,16 +56,13 @@ demonstrations, the budget and the held-out episodes.
   one after learning had begun, whose Q-values grew out of the feasible interval (|Q| {MAX_GROWTH:g}
   times as large at the end as in the middle, and {MAX_OVERSHOOT:g} of the interval outside), or
   were not finite.
+- In **learning curves**, thick lines are the IQM (success) or the mean (Q), bands the 95 % interval
+  of the IQM, thin lines single runs, dotted lines with a cross unfinished runs. References are
+  horizontal lines that start where their search ended. The green area shows the returns that the
+  reward allows; a cross there ends a run whose Q was not finite.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
   **Status**. The seeds below the number of seeds and episodes are links to the records.
 """
-
-CURVES = (
-    "Thick lines are the IQM (success) or the mean (Q) over seeds, bands the 95 % interval of the "
-    "IQM, thin lines single seeds, dotted lines with a cross unfinished runs. References are "
-    "horizontal lines that start where their search ended. The green area shows the returns that "
-    "the reward allows; a cross there ends a run whose Q was not finite."
-)
 
 CLAIMS = f"""\
 Effects are differences of two agents, paired by base policy and seed (success and its area by
@@ -114,7 +112,6 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
             parts.append(f"## {code(key.task)}, {code(key.embodiment)}")
             if drawn := figures.get(place):
                 parts += [image(*figure) for figure in drawn.values()]
-                parts.append(CURVES)
         parts += section(table, links)
     parts += ["## Provenance", *_provenance(summary, findings.audit, links)]
     return "\n\n".join(parts) + "\n"
@@ -171,18 +168,18 @@ def _beaten(summary: Summary) -> str:
 
 def _spreads(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
     parts = [
-        "Standard deviations of a run's success in the final window, pooled over cells: between "
-        "base policies, between runs on one policy, and because episodes are a sample."
+        "Standard deviations of a run's success in the final window, pooled over cells, due to "
+        "base policy, run, and the sample of episodes."
     ]
     alone = sum(len({run.policy for run in table.runs}) == 1 for table in summary.tables)
     if alone:
         which = "Each cell steers" if alone == len(summary.tables) else f"{alone} cells steer"
         parts[0] += (
-            f" {which} one base policy: the intervals there are about this policy alone, and no "
-            "spread of policies can be told."
+            f" {which} one base policy: intervals are about this policy alone, and how much others "
+            "differ is unknown."
         )
     if any(spread.together is not None for spread in found.values()):
-        parts[0] += " Where each policy has one run, only the sum of both can be told."
+        parts[0] += " Where each policy has one run, only the sum of both is known."
     columns = {
         "Base policies": [number(spread.policies, 3) for spread in found.values()],
         "Runs on one": [number(spread.runs, 3) for spread in found.values()],
@@ -190,9 +187,9 @@ def _spreads(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
         "Episodes": [number(spread.episodes, 3) for spread in found.values()],
         "Base policies' share of the variance": [_share(spread) for spread in found.values()],
     }
-    shown = {name: texts for name, texts in columns.items() if set(texts) != {NOTHING}}
-    rows = [[code(agent), *texts] for agent, *texts in zip(found, *shown.values(), strict=True)]
-    return [*parts, grid(["Agent", *shown], rows, left=1)]
+    header, body = without_empty(columns)
+    rows = [[code(agent), *texts] for agent, texts in zip(found, body, strict=True)]
+    return [*parts, grid(["Agent", *header], rows, left=1)]
 
 
 def _share(spread: Spread) -> str:
@@ -219,11 +216,12 @@ def _claims(findings: Findings) -> list[str]:
         origin += f", commit {code(study.declared)})."
     else:
         origin += "). The study names no commit that declared them before its runs."
-    rows, untested = [], []
+    rows: list[list[str]] = []
+    untested: dict[str, list[str]] = {}
     for outcome in findings.claims:
         claim, effect = outcome.claim, outcome.effect
         if effect is None:
-            untested.append(f"- {claim.name}: {outcome.reason}")
+            untested.setdefault(outcome.reason, []).append(claim.name)
             continue
         rows.append(
             [
@@ -235,7 +233,7 @@ def _claims(findings: Findings) -> list[str]:
                 f"{claim.smallest:g}",
                 *([NOTHING] * 2 if outcome.reason else map(_p, (outcome.p, outcome.p_equal))),
                 f"{outcome.cells}, {outcome.pairs}, {outcome.policies}",
-                f"**{outcome.verdict}**" + (f": {outcome.reason}" if outcome.reason else ""),
+                _verdict(outcome),
             ]
         )
     parts = [origin]
@@ -253,8 +251,19 @@ def _claims(findings: Findings) -> list[str]:
         ]
         parts.append(grid(header, rows, left=3))
     if untested:
-        parts.append("Not tested:\n\n" + "\n".join(untested))
+        lines = [f"- {reason}: {'; '.join(names)}" for reason, names in untested.items()]
+        parts.append("Not tested:\n\n" + "\n".join(lines))
     return parts
+
+
+def _verdict(outcome: Outcome) -> str:
+    text = f"**{outcome.verdict}**"
+    if outcome.reason:
+        return f"{text}: {outcome.reason}"
+    if outcome.policies >= MIN_SEEDS or outcome.verdict == "undecided":
+        return text
+    policies = "one base policy" if outcome.policies == 1 else f"{outcome.policies} base policies"
+    return f"{text}, for {policies} alone"
 
 
 def _test(claim: Claim) -> str:

@@ -41,17 +41,17 @@ def record_files(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         for file in _in_folder(path) if stat.S_ISDIR(_mode(path)) else [path]:
             if not stat.S_ISREG(_mode(file)):
-                raise UserError(f"{file} is no ordinary file: name a record or a folder.")
+                raise UserError(f"{file} is no ordinary file: name a record or a folder")
             resolved = file.resolve()
             try:
                 os.fspath(resolved).encode()
             except UnicodeEncodeError as error:
                 name = ascii(os.fspath(resolved))
-                raise UserError(f"{name} has a name that is not UTF-8: rename it.") from error
+                raise UserError(f"{name} has a name that is not UTF-8: rename it") from error
             found[resolved] = None
     if not found:
         names = ", ".join(str(path) for path in paths)
-        raise UserError(f"{names} holds no record: run `symsteer run` first or name its folder.")
+        raise UserError(f"{names} holds no record: run `symsteer run` first or name its folder")
     return list(found)
 
 
@@ -59,17 +59,15 @@ def _mode(path: Path) -> int:
     try:
         return path.stat().st_mode
     except FileNotFoundError as error:
-        raise UserError(
-            f"{path} does not exist: name a record or a folder with records."
-        ) from error
+        raise UserError(f"{path} does not exist: name a record or a folder with records") from error
     except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}; name another path.") from error
+        raise UserError(f"{path} cannot be read: {error.strerror}; name another path") from error
 
 
 def _in_folder(folder: Path) -> list[Path]:
     def refuse(error: OSError) -> None:
         raise UserError(
-            f"{error.filename} cannot be read: {error.strerror}; make it readable or leave it out."
+            f"{error.filename} cannot be read: {error.strerror}; make it readable or leave it out"
         ) from error
 
     files = sorted(
@@ -93,5 +91,5 @@ def _begins_like_a_record(file: Path) -> bool:
             return _BEGINNING.match(opened.read(128)) is not None
     except OSError as error:
         raise UserError(
-            f"{file} cannot be read: {error.strerror}; make it readable or leave it out."
+            f"{file} cannot be read: {error.strerror}; make it readable or leave it out"
         ) from error

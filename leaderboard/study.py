@@ -15,6 +15,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.records.provenance import git
 from symsteer.names import unknown
 
 PAPER = "paper"
@@ -116,7 +117,8 @@ def read_study(name_or_path: str) -> Study:
 
     Raises:
         UserError: if there is no such study, or the file is not one; for an unknown key or
-            measure, the message has the nearest valid one.
+            measure, the message has the nearest valid one. Where git is there, also if the commit
+            that the study names does not hold the claims as they are.
     """
     path = Path(name_or_path)
     if path.suffix != ".toml":
@@ -129,6 +131,8 @@ def read_study(name_or_path: str) -> Study:
                 f"{path.name}: claims must name a file that declares claims itself, in place of own"
             )
         file = declaring.model_copy(update={"notice": file.notice, "declared": file.declared})
+    if file.declared:
+        _check_commit(source, file.declared)
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
     return Study(file.notice.strip(), file.declared, file.claim, source.name, digest)
 
@@ -148,6 +152,19 @@ def _read(path: Path) -> _File:
         return _File.model_validate(data)
     except ValidationError as error:
         raise UserError(f"{path.name}: {_problem(error)}") from error
+
+
+def _check_commit(source: Path, commit: str) -> None:
+    """Compare a file that declares claims with what a commit has in its place."""
+    folder = source.resolve().parent
+    if git(folder, "rev-parse", "--is-shallow-repository") != "false":
+        return  # no git, or not all commits
+    then = git(folder, "rev-parse", "--verify", "--quiet", f"{commit}:./{source.name}")
+    if then is None or then != git(folder, "hash-object", "--", source.name):
+        raise UserError(
+            f"{source} is not as the commit {commit} has it, so this commit has not declared these "
+            "claims; name the one that has, or restore the file"
+        )
 
 
 def _problem(error: ValidationError) -> str:

@@ -16,6 +16,7 @@ from symsteer.leaderboard.paper import BASE, ROW_ORDER
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import (
     ROLES,
+    Divergence,
     Evaluation,
     Provenance,
     Role,
@@ -284,9 +285,14 @@ class Row:
         return censored_median(self.threshold_steps) if self.threshold_steps else None
 
     @property
+    def divergences(self) -> list[Divergence]:
+        """How far Q left what is feasible, for every run with a critic, finished or not."""
+        return [found for run in self.runs if (found := run.record.divergence)]
+
+    @property
     def diverged(self) -> list[bool]:
-        """Whether Q diverged, for every run with a critic, finished or not."""
-        return [run.record.diverged for run in self.runs if run.record.diverged is not None]
+        """Whether Q diverged, for the same runs."""
+        return [found.diverged for found in self.divergences]
 
     def over_runs(self, *names: str) -> float | None:
         """Mean over finished runs of a diagnostic's final value."""
@@ -294,20 +300,9 @@ class Row:
         return float(np.mean(values)) if values else None
 
     def largest(self, name: str) -> float | None:
-        """Largest finite value of a diagnostic over all evaluations and runs."""
-        values = [value for run in self.runs for value in run.diagnostics(name)]
-        return max(values) if values else None
-
-    @property
-    def highest_q(self) -> float | None:
-        """Largest finite Q of the minimum over critics, since learning began."""
-        values = [
-            value
-            for run in self.runs
-            for evaluation in run.record.evaluations
-            if evaluation.updates and (value := evaluation.diagnostics.get("q_max")) is not None
-        ]
-        return max(values) if values else None
+        """Largest value of a part of `Divergence` over the runs that have it."""
+        values = [getattr(found, name) for found in self.divergences]
+        return max((value for value in values if value is not None), default=None)
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from symsteer.leaderboard.paper import BASE
@@ -21,6 +21,7 @@ from symsteer.leaderboard.text import (
     grid,
     number,
     stacked,
+    without_empty,
 )
 
 Links = Mapping[Path, str | None]
@@ -190,45 +191,48 @@ def _diagnostics(table: Table) -> list[str]:
     rows = [row for row in table.rows if row.runs and not row.is_reference]
     if not rows:
         return []
-    header = [
-        "Agent",
-        "Q diverged",
-        "Q bias",
-        _largest_header(table),
-        "Orbit variance",
-        "Equivariance error: actor, critic",
-        "Parameters: actor, critic (width)",
-        "Minutes a run",
-        "Device",
-    ]
-    body = []
-    for row in sorted(rows, key=_place):
-        diverged = row.diverged
-        errors = [row.over_runs("equivariance_actor"), row.over_runs("equivariance_critic")]
-        minutes = [run.record.wall_clock.total / 60 for run in row.finished]
-        devices = sorted({p.device for run in row.runs for p in run.provenances})
-        body.append(
-            [
-                code(row.label),
-                f"{sum(diverged)}/{len(diverged)}" if diverged else NOTHING,
-                compact(row.over_runs("q_bias")),
-                f"{compact(row.largest('q_abs_max'))}, {compact(row.highest_q)}",
-                compact(row.over_runs("orbit_variance")),
-                ", ".join(map(compact, errors)) if any(e is not None for e in errors) else NOTHING,
-                _parameters(row),
-                number(sum(minutes) / len(minutes), 1) if minutes else NOTHING,
-                ", ".join(map(code, devices)),
-            ]
-        )
-    return ["Q-values, symmetry and cost:", grid(header, body, left=1)]
+    rows.sort(key=_place)
+    columns = {
+        "Q diverged": [_share(row.diverged) for row in rows],
+        _magnitude_header(table): [
+            _pair(row.largest("magnitude"), row.largest("overshoot")) for row in rows
+        ],
+        "Q bias, rank correlation": [
+            _pair(row.over_runs("q_bias"), row.over_runs("q_rank_correlation")) for row in rows
+        ],
+        "TD error": [compact(row.over_runs("td_error")) for row in rows],
+        "Orbit variance": [compact(row.over_runs("orbit_variance")) for row in rows],
+        "Equivariance error: actor, critic": [
+            _pair(row.over_runs("equivariance_actor"), row.over_runs("equivariance_critic"))
+            for row in rows
+        ],
+        "Parameters: actor, critic (width)": [_parameters(row) for row in rows],
+        "Minutes a run": [_minutes(row) for row in rows],
+    }
+    header, body = without_empty(columns)
+    body = [[code(row.label), *texts] for row, texts in zip(rows, body, strict=True)]
+    return ["Q-values, symmetry and cost:", grid(["Agent", *header], body, left=1)]
 
 
-def _largest_header(table: Table) -> str:
-    """The header holds the feasible bounds, so that every row can be compared with them."""
-    text = "Largest \\|Q\\|, highest Q"
+def _share(flags: Sequence[bool]) -> str:
+    return f"{sum(flags)}/{len(flags)}" if flags else NOTHING
+
+
+def _pair(first: float | None, second: float | None) -> str:
+    return NOTHING if first is None and second is None else f"{compact(first)}, {compact(second)}"
+
+
+def _magnitude_header(table: Table) -> str:
+    """The header holds the feasible bounds, so that both numbers can be understood."""
+    text = "\\|Q\\| over the largest feasible, overshoot"
     if table.feasible:
         text += f" (feasible Q: {compact(table.feasible[0])} to {compact(table.feasible[1])})"
     return text
+
+
+def _minutes(row: Row) -> str:
+    minutes = [run.record.wall_clock.total / 60 for run in row.finished]
+    return number(sum(minutes) / len(minutes), 1) if minutes else NOTHING
 
 
 def _parameters(row: Row) -> str:
@@ -269,9 +273,14 @@ def _notes(table: Table) -> list[str]:
 
 CSV_DIAGNOSTICS = (
     "q_mean",
-    "q_violation",
     "q_bias",
     "q_bias_std",
+    "q_correlation",
+    "q_rank_correlation",
+    "q_overestimated",
+    "q_off_bias",
+    "q_off_rank_correlation",
+    "td_error",
     "orbit_variance",
     "alpha",
     "entropy",
@@ -328,8 +337,7 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
         "dip": row.dip,
         "diverged": sum(row.diverged),
         "with_critic": len(row.diverged),
-        "q_abs_max": row.largest("q_abs_max"),
-        "q_highest": row.highest_q,
+        **{f"largest_{part}": row.largest(part) for part in ("magnitude", "overshoot", "growth")},
         "feasible_low": feasible and feasible[0],
         "feasible_high": feasible and feasible[1],
         **{name: row.over_runs(name) for name in CSV_DIAGNOSTICS},

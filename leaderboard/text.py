@@ -7,7 +7,7 @@ Text from a record is shown only inside code spans, without the characters that 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -99,6 +99,12 @@ def relative_link(path: Path, folder: Path) -> str | None:
 def image(text: str, path: str) -> str:
     """A figure of the page; `text` and `path` are our own."""
     return f"![{text}]({quote(path)})"
+
+
+def without_empty(columns: Mapping[str, Sequence[str]]) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the columns in which any row has something."""
+    shown = {name: texts for name, texts in columns.items() if set(texts) != {NOTHING}}
+    return list(shown), [list(row) for row in zip(*shown.values(), strict=True)]
 
 
 def grid(header: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:

@@ -42,14 +42,14 @@ def write_record(record: RunRecord, path: Path | str) -> None:
     try:
         text = dump_record(_validated(record.model_dump(by_alias=True)))
     except (ValidationError, ValueError) as error:
-        raise UserError(f"{path}: the record is not written: {first_problem(error)}.") from error
+        raise UserError(f"{path}: the record is not written: {first_problem(error)}") from error
     if path.exists():
         old = read_record(path)
         if old.status == "finished":
-            raise UserError(f"{path} holds a finished run: choose another folder or delete it.")
+            raise UserError(f"{path} holds a finished run: choose another folder or delete it")
         if old.run_id != record.run_id:
             raise UserError(
-                f"{path} holds another run ({old.run_id}): choose another folder or delete it."
+                f"{path} holds another run ({old.run_id}): choose another folder or delete it"
             )
     write_atomically(path, text.encode())
 
@@ -59,13 +59,13 @@ def read_record(path: Path | str) -> RunRecord:
     path = Path(path)
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise UserError(f"{path} is larger than {MAX_BYTES >> 20} MiB: not a run record.")
+            raise UserError(f"{path} is larger than {MAX_BYTES >> 20} MiB: not a run record")
         text = path.read_bytes().decode("utf-8")
     except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}.") from error
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise UserError(
-            f"{path} is not UTF-8 text: not a run record; name records or run folders only."
+            f"{path} is not UTF-8 text: not a run record; name records or run folders only"
         ) from error
     try:
         data = json.loads(
@@ -78,22 +78,22 @@ def read_record(path: Path | str) -> RunRecord:
         problem = error.msg if isinstance(error, json.JSONDecodeError) else str(error)
         raise UserError(
             f"{path} is not strict JSON ({problem[:120]}): truncated or edited; "
-            "restore it or run the cell again."
+            "restore it or run the cell again"
         ) from error
     if not isinstance(data, dict) or "schema_version" not in data:
         raise UserError(
             f"{path} is JSON but has no schema_version: not a run record; "
-            "name records or run folders only."
+            "name records or run folders only"
         )
     version = data["schema_version"]
     if type(version) is not int or not 1 <= version <= SCHEMA_VERSION:
         raise UserError(
             f"{path} has schema_version {str(version)[:20]!r}, "
             f"this program reads 1 to {SCHEMA_VERSION}: "
-            "use the version of symsteer that wrote it or run the cell again."
+            "use the version of symsteer that wrote it or run the cell again"
         )
     if "config_hash" not in data:
-        raise UserError(f"{path} is not a valid record: config_hash is missing; run it again.")
+        raise UserError(f"{path} is not a valid record: config_hash is missing; run it again")
     try:
         for old in range(version, SCHEMA_VERSION):
             data = MIGRATIONS[old](data)
@@ -101,7 +101,7 @@ def read_record(path: Path | str) -> RunRecord:
     except (ValidationError, ValueError) as error:
         raise UserError(
             f"{path} is not a valid record: {first_problem(error)}; "
-            "restore it or run the cell again."
+            "restore it or run the cell again"
         ) from error
 
 

@@ -195,7 +195,9 @@ def make_cell(
             steps = np.linspace(0, config.get("env_steps", 50_000), len(curve)).astype(int)
             if agent not in REFERENCES:
                 evaluations = [
-                    make_evaluation(outcomes(share), int(step), step == steps[-1], q_mean=-5.0)
+                    make_evaluation(
+                        outcomes(share), int(step), step == steps[-1], q_mean=-5.0, q_magnitude=0.5
+                    )
                     for share, step in zip(curve, steps, strict=True)
                 ]
             else:

@@ -209,9 +209,9 @@ def test_what_others_can_install_is_admitted_with_a_note(tmp_path: Path) -> None
     verdict = judge(store(record, tmp_path))[0]
     assert verdict.is_admissible
     assert verdict.notes == [
-        "it ran symsteer 0.1.0 as installed, not a checkout; sha256 cdcdcdcdcdcd.",
-        "it uses the agent mine of my-agents 1.2; sha256 abababababab.",
-        "it uses the variant fog of fogs 3.0; sha256 abababababab.",
+        "it ran symsteer 0.1.0 as installed, not a checkout; sha256 cdcdcdcdcdcd",
+        "it uses the agent mine of my-agents 1.2; sha256 abababababab",
+        "it uses the variant fog of fogs 3.0; sha256 abababababab",
     ]
 
 
@@ -225,7 +225,7 @@ def test_a_file_under_another_name(tmp_path: Path) -> None:
     verdict = judge(moved, *paths[1:])[0]
     assert verdict.problems == [
         "the file must be named after its run: rename it to "
-        "PickCube-v1-floating-none-standard-s0-0123456789ab.json."
+        "PickCube-v1-floating-none-standard-s0-0123456789ab.json"
     ]
 
 
@@ -242,7 +242,7 @@ def test_damaged_files(tmp_path: Path) -> None:
         assert sentence in verdict.problems[0]
     assert verdicts[4].is_admissible
     assert verdicts[4].notes == [
-        "shown, not ranked: its row has 1 of the 5 finished seeds that a ranking needs."
+        "shown, not ranked: its row has 1 of the 5 finished seeds that a ranking needs"
     ]
 
 
@@ -268,25 +268,25 @@ def test_duplicates(tmp_path: Path) -> None:
     fresh = store(admissible(seed=9), new)
     verdicts = judge(copy, store(again, new), store(renamed, new), fresh, committed=committed)
     assert [verdict.problems for verdict in verdicts] == [
-        [f"it is a copy of {old[1]}: remove one of the two."],
+        [f"it is a copy of {old[1]}: remove one of the two"],
         [
             f"{old[2]} holds the same configuration and seeds already: remove one of the two "
-            "(to replace a committed record, say why in the pull request)."
+            "(to replace a committed record, say why in the pull request)"
         ],
         [
             f"its evaluations equal those of {old[3]} to the last digit: a copy, or a setting that "
-            "changes nothing; keep one of the two."
+            "changes nothing; keep one of the two"
         ],
         [],
     ]
     assert verdicts[3].notes[-1] == (
         "its seed 9 is none of those of the committed runs of its table (0, 1, 2, 3, 4): agents "
-        "are compared on equal seeds."
+        "are compared on equal seeds"
     )
     assert all(verdict.is_admissible for verdict in judge(*old, committed=committed))
     twice = judge(fresh, store(admissible(seed=9), new, "other.json"))
     assert [verdict.is_admissible for verdict in twice] == [True, False]
-    assert twice[1].problems[1] == f"it is a copy of {fresh}: remove one of the two."
+    assert twice[1].problems[1] == f"it is a copy of {fresh}: remove one of the two"
 
 
 def test_two_learners_that_always_fail_are_no_copies(tmp_path: Path) -> None:
@@ -337,7 +337,7 @@ def test_a_commit_that_nobody_has_is_said(tmp_path: Path) -> None:
     assert verdict.is_admissible
     assert verdict.notes == [
         "its commit 012345678901 is not in this clone: push it with the pull request, so that "
-        "others can run the same code."
+        "others can run the same code"
     ]
 
 

@@ -13,7 +13,7 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.claims import Outcome, claims
 from symsteer.leaderboard.defects import Audit, Defect
 from symsteer.leaderboard.records import RunRecord
-from symsteer.leaderboard.statistics import Interval
+from symsteer.leaderboard.statistics import Interval, ShareDifference
 from symsteer.leaderboard.study import Claim, Study, read_study
 from symsteer.leaderboard.summary import Run, summarize
 from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
@@ -186,10 +186,9 @@ def test_without_enough_pairs_the_effect_is_shown_and_nothing_decided() -> None:
     [
         ({"cells": {"broken": True}}, "there are no broken cells"),
         ({"cells": {"defect": [0.2, 0.3]}}, "there are no cells with a defect of 0.2 to 0.3"),
-        ({"agents": ["augmented", "standard"]}, "no runs of `augmented` in cells"),
+        ({"agents": ["augmented", "standard"]}, "no runs of `augmented`"),
         ({"measure": "bias"}, "not measured over all decisions"),
         ({"measure": "diverged"}, "nobody diverged"),
-        ({"measure": "magnitude"}, "no runs of both agents"),
         ({"effect": "slope"}, "no base policy was steered at two defects"),
         ({"cells": {"demonstrations": "most"}}, "no cell was run with more than one number"),
     ],
@@ -247,6 +246,12 @@ def test_a_policy_in_four_worlds_is_one_trial() -> None:
     assert drawn.counts == runs.counts
     assert (drawn.policies, drawn.verdict) == (5, "undecided")
     assert value(drawn) == pytest.approx(0.6)
+    # Where all agree, too.
+    everywhere = [r for v in worlds for r in diverging("standard", range(5), variant=v)]
+    nowhere = [r for v in worlds for r in diverging("equivariant", [], variant=v)]
+    records = policies(everywhere + nowhere, lambda r: str(r.settings.seed))
+    (drawn,) = outcomes(records, DIVERGED)
+    assert drawn.effect == ShareDifference((5, 5), (0, 5))
 
 
 def test_runs_that_broke_off_after_diverging_count() -> None:
@@ -258,8 +263,8 @@ def test_runs_that_broke_off_after_diverging_count() -> None:
     for record in running:
         for evaluation in record.evaluations:
             evaluation.diagnostics["q_magnitude"] = 0.5
-    (found,) = outcomes(running + diverging("equivariant", []), DIVERGED)
-    assert found.effect is None
+    (found,) = outcomes(running + diverging("equivariant", range(5)), DIVERGED)
+    assert found.reason.startswith("no runs of both agents")
 
 
 def test_the_size_of_q_and_of_its_bias() -> None:

@@ -273,11 +273,13 @@ def test_variance_components_of_a_nested_design() -> None:
     """Each is found where it is there, and not where only their sum is known."""
     generator = np.random.default_rng(7)
 
-    def cells(policies: int, runs: int) -> list[list[Sample]]:
+    def cells(
+        policies: int, runs: int, of_policies: float = 0.3, of_runs: float = 0.2
+    ) -> list[list[Sample]]:
         made = []
         for _ in range(60):
-            table = 0.3 * generator.standard_normal((policies, 1, 1))
-            table = table + 0.2 * generator.standard_normal((policies, runs, 1))
+            table = of_policies * generator.standard_normal((policies, 1, 1))
+            table = table + of_runs * generator.standard_normal((policies, runs, 1))
             table = table + 1.0 * generator.standard_normal(50)
             made.append(by_policy(table + 1.0 * generator.standard_normal((policies, runs, 50))))
         return made
@@ -289,6 +291,8 @@ def test_variance_components_of_a_nested_design() -> None:
     )
     assert full.episodes == pytest.approx(np.sqrt(2 / 50), rel=0.1)
     assert full.together is None
+    # Runs make the policies' means differ, too.
+    assert spread(cells(5, 3, 0.1, 0.4)).policies == pytest.approx(0.1, abs=0.06)
     one_run = spread(cells(5, 1))
     assert one_run.together == pytest.approx(np.hypot(0.3, 0.2), abs=0.04)
     assert one_run.policies is one_run.runs is None

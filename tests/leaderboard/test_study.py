@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,35 @@ def test_mistakes_in_a_study(text: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=words) as refused:
         read_study(write(tmp_path, text))
     assert "\n" not in str(refused.value)
+
+
+def test_a_commit_that_has_not_declared_the_claims_is_refused(tmp_path: Path) -> None:
+    def git(*arguments: str) -> str:
+        settings = ["-c", "user.name=x", "-c", "user.email=x@x", "-c", "init.defaultBranch=main"]
+        command = ["git", *settings, *arguments]
+        return subprocess.run(
+            command, cwd=tmp_path, check=True, capture_output=True, text=True
+        ).stdout
+
+    write(tmp_path, CLAIM)
+    study = write(tmp_path, 'claims = "mine.toml"\ndeclared = "0123456"', "study.toml")
+    assert read_study(study).declared == "0123456"  # nothing to compare with
+    git("init")
+    git("add", "study.toml")
+    git("commit", "-m", "no claims yet")
+    before = git("rev-parse", "HEAD").strip()
+    git("add", "mine.toml")
+    git("commit", "-m", "claims")
+    commit = git("rev-parse", "--short", "HEAD").strip()
+    for wrong in ("0123456", before):
+        write(tmp_path, f'claims = "mine.toml"\ndeclared = "{wrong}"', "study.toml")
+        with pytest.raises(UserError, match=f"mine.toml is not as the commit {wrong} has it"):
+            read_study(study)
+    write(tmp_path, f'claims = "mine.toml"\ndeclared = "{commit}"', "study.toml")
+    assert read_study(study).declared == commit
+    write(tmp_path, CLAIM.replace("smallest = 0.05", "smallest = 0.01"))
+    with pytest.raises(UserError, match="has not declared these claims"):
+        read_study(study)
 
 
 def test_an_unknown_study_names_the_nearest(tmp_path: Path) -> None:
