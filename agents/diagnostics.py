@@ -6,6 +6,7 @@ All values are in the environment's reward units, per decision. ``q`` arrays hol
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Protocol
 
 import scipy.stats
@@ -171,12 +172,13 @@ def value_errors(agent: HasValues, played: LongEpisodes, alpha: float = 0.0) -> 
 
     ``td_error`` = root mean square over the on-policy decisions of
 
-        r + gamma (1 - d) (min_j Q_j(s', w') - alpha log pi(w'|s')) - mean_j Q_j(s, w),
+        r + gamma (1 - d) (R Q(s', w') - alpha log pi(w'|s')) - mean_j Q_j(s, w),
 
-    w' being the noise of the next decision.
+    w' being the noise of the next decision, and R the reduction of the targets; of random subsets,
+    the mean over them. It is the error over one decision, for any ``n_step``.
 
     Args:
-        agent: has ``q_values`` and ``options.gamma``.
+        agent: has ``q_values``, and of the options ``gamma``, ``reduce`` and ``subset``.
         alpha: entropy weight in reward units; 0 with a hard backup.
     """
     gamma = agent.options.gamma
@@ -189,9 +191,9 @@ def value_errors(agent: HasValues, played: LongEpisodes, alpha: float = 0.0) -> 
     follows[1:] = (counts & ~ends)[:-1]
     needed = played.on_policy | played.off_policy | follows
     values = agent.q_values(played.obs[needed], played.noise[needed]).double()
-    mean, smallest = (torch.zeros_like(returns) for _ in range(2))
-    mean[needed], smallest[needed] = values.mean(0), values.amin(0)
-    after = (smallest + bonus).roll(-1, 0).where(~ends, 0)
+    mean, reduced = (torch.zeros_like(returns) for _ in range(2))
+    mean[needed], reduced[needed] = values.mean(0), _expected_reduction(values, agent.options)
+    after = (reduced + bonus).roll(-1, 0).where(~ends, 0)
     gap = (played.reward + gamma * after - mean)[counts]
     result: Measures = {"td_error": gap.square().mean().sqrt().item() if len(gap) else None}
     for kind, chosen in (("", played.on_policy), ("off_", played.off_policy)):
@@ -257,6 +259,18 @@ def agreement(q: torch.Tensor, returns: torch.Tensor) -> Measures:
         "overestimated": _mean_and_std(over)[0],
         "decisions": float(len(q)),
     }
+
+
+def _expected_reduction(q: torch.Tensor, options: Any) -> torch.Tensor:
+    """What a target takes of the critics' values ``[critics, B]``, in the mean over subsets."""
+    if options.reduce == "mean":
+        return q.mean(0)
+    if options.reduce == "min":
+        return q.amin(0)
+    size = options.subset
+    # The i-th smallest value is the smallest of a subset if all others of it are larger.
+    chances = [math.comb(len(q) - 1 - i, size - 1) / math.comb(len(q), size) for i in range(len(q))]
+    return q.new_tensor(chances) @ q.sort(0).values
 
 
 def _mean_and_std(x: torch.Tensor) -> tuple[float, float] | tuple[None, None]:

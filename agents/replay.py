@@ -117,7 +117,7 @@ class ReplayBuffer:
         self.stride = count
         self.size = min(self.size + count, self.capacity)
 
-    def sample(self, batch_size: int, n_step: int = 1, gamma: float = 1.0) -> Batch:
+    def sample(self, batch_size: int, gamma: float, n_step: int = 1) -> Batch:
         """Draw ``batch_size`` transitions uniformly, with replacement.
 
         With ``n_step`` above 1, a transition is joined with those that follow it in its episode, up
@@ -126,8 +126,8 @@ class ReplayBuffer:
 
         Args:
             batch_size: number of rows.
-            n_step: decisions in a row.
             gamma: discount per decision.
+            n_step: decisions in a row.
 
         Returns:
             The fields, and ``discount [B]``: gamma to the power of the decisions that were joined.

@@ -334,9 +334,9 @@ class SacAgent(Agent):
         while self.owed >= 1:
             self.owed -= 1
             count = options.batch_size - shown
-            batch = self.replay.sample(count, options.n_step, options.gamma)
+            batch = self.replay.sample(count, options.gamma, options.n_step)
             if shown:
-                more = self.demonstrations.sample(shown, options.n_step, options.gamma)
+                more = self.demonstrations.sample(shown, options.gamma, options.n_step)
                 batch = Batch({name: torch.cat([x, more[name]]) for name, x in batch.items()})
             yield batch
 

@@ -131,4 +131,4 @@ def _decisions(context: AgentContext) -> Transition:
 
 def _update(agent: SacAgent) -> None:
     options = agent.options
-    agent.update(agent.replay.sample(options.batch_size, options.n_step, options.gamma))
+    agent.update(agent.replay.sample(options.batch_size, options.gamma, options.n_step))

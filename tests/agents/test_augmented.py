@@ -33,7 +33,7 @@ def test_turned_batches_teach_the_critics_the_symmetry():
         agent = kind(context, kind.Options(width=32, batch_size=64, lr=3e-3, gamma=0.0, warmup=0))
         agent.observe(Transition(obs, noise, noise, reward, obs, **ends))
         for _ in range(300):
-            agent.update(agent.replay.sample(64))
+            agent.update(agent.replay.sample(64, agent.options.gamma))
         of_actions = orbit_variance(agent, obs, noise, Group.parse("C8"))["orbit_share"]
         agent.q_values = agent.noise_q_values
         of_noise = orbit_variance(agent, obs, noise, Group.parse("C8"))["orbit_share"]

@@ -45,7 +45,7 @@ def test_noise_critics_approach_the_action_critics(problem, source, bank):
     agent = filled(problem, distill=source, noise_bank=bank)
     before = {key: gap(agent, *point) for key, point in where_it_distils(agent).items()}
     for _ in range(300):
-        assert "losses/distillation" in agent.update(agent.replay.sample(64))
+        assert "losses/distillation" in agent.update(agent.replay.sample(64, agent.options.gamma))
     after = {key: gap(agent, *point) for key, point in where_it_distils(agent).items()}
     for key, value in after.items():
         assert value < min(0.6, 0.5 * before[key]), (before, after)
@@ -55,7 +55,9 @@ def test_without_distillation_they_stay_apart(problem):
     agent = filled(problem, distill_steps=1e-9)
     before = gap(agent, *where_it_distils(agent)["random"])
     for _ in range(300):
-        assert "losses/distillation" not in agent.update(agent.replay.sample(64))
+        assert "losses/distillation" not in agent.update(
+            agent.replay.sample(64, agent.options.gamma)
+        )
     assert gap(agent, *where_it_distils(agent)["random"]) == before > 1
 
 
@@ -63,7 +65,7 @@ def test_without_distillation_they_stay_apart(problem):
 def test_the_loss_is_the_hand_computed_one(problem, source):
     """Head by head, at the noise that the option names and nowhere else."""
     agent = filled(problem, distill=source, dtype=torch.float64)
-    batch = agent.replay.sample(32)
+    batch = agent.replay.sample(32, agent.options.gamma)
     generator = copy.deepcopy(agent.generator)
     with torch.no_grad():
         mean, log_scale = agent.moments(batch.next_obs)
@@ -92,7 +94,7 @@ def test_distillation_steps_per_update(problem, monkeypatch, steps, made):
     )
     found = []
     for _ in range(4):
-        agent.update(agent.replay.sample(32))
+        agent.update(agent.replay.sample(32, agent.options.gamma))
         found.append(count.count("noise_critic"))
         count.clear()
     assert found == made
@@ -121,5 +123,5 @@ def test_the_bank_is_decoded_when_a_decision_is_stored(problem):
     assert len(kept["bank_noise"].flatten(0, 1).unique(dim=0)) == 32
     # In an update, only the actor's noise at the next states is decoded.
     decoded.clear()
-    agent.update(agent.replay.sample(32))
+    agent.update(agent.replay.sample(32, agent.options.gamma))
     assert decoded == [32]

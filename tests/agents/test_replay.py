@@ -22,7 +22,7 @@ def numbered(start, count):
 
 
 def held(buffer):
-    return sorted(buffer.sample(2000).reward.unique().int().tolist())
+    return sorted(buffer.sample(2000, GAMMA).reward.unique().int().tolist())
 
 
 @pytest.mark.parametrize("first_rows", [1, 3, 4096])
@@ -42,7 +42,7 @@ def test_rows_stay_together():
     buffer = ReplayBuffer(7, SHAPES)
     for start in range(0, 20, 4):
         buffer.add(numbered(start, 4))
-    batch = buffer.sample(100)
+    batch = buffer.sample(100, GAMMA)
     assert set(batch) == {*SHAPES, "discount"}
     for name in SHAPES:
         tensor = batch[name]
@@ -55,7 +55,7 @@ def test_keeps_copies():
     rows = numbered(1, 2)
     buffer.add(rows)
     rows["obs"].zero_()
-    assert buffer.sample(50).obs.min() >= 1
+    assert buffer.sample(50, GAMMA).obs.min() >= 1
 
 
 def test_holds_the_fields_that_were_asked_for():
@@ -64,7 +64,7 @@ def test_holds_the_fields_that_were_asked_for():
     step = Transition(**rows, actions=actions, truncated=torch.ones(4, dtype=torch.bool))
     buffer = ReplayBuffer(8, {"actions": (2, 2), "reward": (), "truncated": ()})
     buffer.add(step)
-    batch = buffer.sample(64)
+    batch = buffer.sample(64, GAMMA)
     assert set(batch) == {"actions", "reward", "truncated", "discount"}
     assert torch.equal(batch.actions.unique(), torch.arange(16.0))
     assert batch.truncated.eq(1).all()
@@ -81,11 +81,11 @@ def test_sampling_is_seeded_and_continues_after_loading():
         return buffer
 
     first, second, third = filled(3), filled(3), filled(4)
-    draws = first.sample(64).reward
-    assert torch.equal(draws, second.sample(64).reward)
-    assert not torch.equal(draws, third.sample(64).reward)
+    draws = first.sample(64, GAMMA).reward
+    assert torch.equal(draws, second.sample(64, GAMMA).reward)
+    assert not torch.equal(draws, third.sample(64, GAMMA).reward)
     third.load_state_dict(first.state_dict())
-    assert torch.equal(first.sample(64).reward, third.sample(64).reward)
+    assert torch.equal(first.sample(64, GAMMA).reward, third.sample(64, GAMMA).reward)
     for buffer in (first, third):
         buffer.add(numbered(8, 5))
     assert held(first) == held(third) == list(range(3, 13))
@@ -94,7 +94,7 @@ def test_sampling_is_seeded_and_continues_after_loading():
 
 def test_mistakes_are_named():
     with pytest.raises(UserError, match="empty"):
-        ReplayBuffer(4, SHAPES).sample(1)
+        ReplayBuffer(4, SHAPES).sample(1, GAMMA)
     with pytest.raises(UserError, match="replay_capacity"):
         ReplayBuffer(4, SHAPES).add(numbered(0, 5))
     with pytest.raises(UserError, match="capacity"):
@@ -130,7 +130,7 @@ def decisions(obs, next_obs, reward, terminal=(), truncated=()):
 
 def joined(buffer, n_step):
     """What each stored decision becomes: (reward, discount, next_obs, terminal, truncated)."""
-    batch = buffer.sample(2000, n_step, GAMMA)
+    batch = buffer.sample(2000, GAMMA, n_step)
     assert torch.equal(batch.noise, 100 + batch.obs)  # the noise is that of the first decision
     names = ("reward", "discount", "next_obs", "terminal", "truncated")
     rows = zip(

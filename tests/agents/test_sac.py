@@ -197,7 +197,7 @@ def test_same_seed_same_agent(problem, name):
         torch.randn(seed + 3)  # the global generator must not matter
         agent, replay = problem.agent(name, seed=seed), problem.replay()
         for _ in range(5):
-            agent.update(replay.sample(32))
+            agent.update(replay.sample(32, agent.options.gamma))
         return agent, agent.act(problem.batch().obs)
 
     (first, noise), (second, again), (other, _) = run(0), run(0), run(1)
@@ -538,7 +538,7 @@ def solve(problem, name, broken, rounds=400, **options):
                 truncated=torch.zeros(len(obs)),
             )
         )
-        agent.update(agent.replay.sample(128))
+        agent.update(agent.replay.sample(128, agent.options.gamma))
     obs = torch.randn(512, BANDIT_OBS.dim, generator=g)
     reward = bandit_reward(obs, agent.act(obs, deterministic=True), broken).mean().item()
     error = actor_equivariance_error(agent, obs, Group.parse("C8"))

@@ -42,7 +42,7 @@ def test_the_smooth_agent_learns_noise_that_decodes_to_smooth_chunks():
         agent = kind(context, kind.Options(width=32, lr=3e-3, smoothness=weight))
         agent.observe(step)
         for _ in range(100):
-            scalars = agent.update(agent.replay.sample(32))
+            scalars = agent.update(agent.replay.sample(32, agent.options.gamma))
         assert scalars["train/executed_roughness"] > 0
         return float(scalars["train/roughness"])
 

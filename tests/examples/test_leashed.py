@@ -60,7 +60,7 @@ def test_a_short_leash_keeps_the_noise_near_zero_and_the_agent_equivariant():
         agent = built(leash=leash)
         agent.observe(Transition(obs, noise, noise[:, :1].tanh(), reward, obs, **ends))
         for _ in range(150):
-            agent.update(agent.replay.sample(64))
+            agent.update(agent.replay.sample(64, agent.options.gamma))
         assert actor_equivariance_error(agent, obs, Group.parse("C8")) < 1e-5
         return agent.act(obs, deterministic=True)[:, 0, :2].norm(dim=1).mean().item()
 

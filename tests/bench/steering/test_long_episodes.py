@@ -73,8 +73,9 @@ def play(seeds, num_envs=4, sample=forward, **kwargs):
     return long_episodes(env, sample, seeds, GAMMA, generator), env
 
 
-def errors(played, q_values, alpha=0.0):
-    agent = SimpleNamespace(options=SimpleNamespace(gamma=GAMMA), q_values=q_values)
+def errors(played, q_values, alpha=0.0, reduce="min", subset=2):
+    options = SimpleNamespace(gamma=GAMMA, reduce=reduce, subset=subset)
+    agent = SimpleNamespace(options=options, q_values=q_values)
     return value_errors(agent, played, alpha)
 
 
@@ -134,13 +135,16 @@ def test_a_constant_critic_has_a_bias_and_no_correlation():
     assert found["q_off_rank_correlation"] is None
 
 
-def test_the_smallest_critic_is_the_target_and_the_mean_has_the_bias():
+# Of the pairs of three critics, two hold the smallest one and the third one the middle one.
+@pytest.mark.parametrize(("reduce", "taken"), [("min", -1), ("mean", 0), ("subset", -2 / 3)])
+def test_the_target_takes_what_the_options_say_and_the_mean_has_the_bias(reduce, taken):
     played, _ = play([3])
-    offsets = torch.tensor([[1.0], [-1.0]])
-    found = errors(played, lambda *x: true_values(*x) + offsets)
+    offsets = torch.tensor([[1.0], [-1.0], [0.0]])
+    found = errors(played, lambda *x: true_values(*x)[:1] + offsets, reduce=reduce)
     assert found["q_bias"] == pytest.approx(0, abs=1e-6)
-    gaps = torch.tensor([GAMMA, GAMMA, 0.0])
-    assert found["td_error"] == pytest.approx(gaps.square().mean().sqrt().item(), rel=1e-5)
+    gaps = taken * torch.tensor([GAMMA, GAMMA, 0.0])
+    expected = gaps.square().mean().sqrt().item()
+    assert found["td_error"] == pytest.approx(expected, rel=1e-5, abs=1e-6)
     # One episode has no off-policy decision.
     assert found["q_off_decisions"] == 0
     assert found["q_off_bias"] is found["return_off_mean"] is None
