@@ -9,6 +9,7 @@ from symsteer.leaderboard.comparisons import Comparisons
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.map_page import Figures, map_section
 from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
+from symsteer.leaderboard.soundness import MAX_BIAS, MAX_FALL, MIN_CORRELATION, soundness
 from symsteer.leaderboard.statistics import Spread
 from symsteer.leaderboard.study import Claim
 from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
@@ -18,6 +19,7 @@ from symsteer.leaderboard.text import (
     NOTHING,
     SPACE,
     code,
+    compact,
     grid,
     image,
     interval,
@@ -72,6 +74,15 @@ needs it for "an effect of at least the smallest one of interest"; otherwise a c
 Both p-values are corrected for the number of tests of a family (Holm), the intervals are not.
 """
 
+SOUND = f"""\
+A comparison of agents needs learners that work: success must not collapse on the way, and Q must
+agree with the returns of the same decisions. *Fall* is how far success falls below the better of
+the untrained agent and the base policy, at most, on the same episodes; *correlation* and *bias* are
+those of Q and the return at the end, over all decisions. Medians over runs; sound means a fall of
+at most {MAX_FALL:g}, a correlation of at least {MIN_CORRELATION:g}, and a bias of at most
+{100 * MAX_BIAS:g} % of the feasible interval.
+"""
+
 PROFILES = (
     "Performance profiles: the share of runs that close at least the given share of the gap "
     "between the frozen base (0, on the same episodes) and certain success (1), in the final "
@@ -99,6 +110,8 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
         parts.append(beaten)
     if findings.spreads:
         parts += ["## How much is the base policy's", *_spreads(summary, findings.spreads)]
+    if sound := _soundness(summary):
+        parts += ["## Are the learners sound", SOUND.strip(), sound]
     parts += ["## Claims", CLAIMS.strip(), *_claims(findings)]
     heading = "## The advantage of symmetry against the defect"
     parts += [heading, *map_section(summary, findings.map, figures)]
@@ -198,6 +211,29 @@ def _share(spread: Spread) -> str:
         return NOTHING
     total = spread.policies**2 + spread.runs**2 + spread.episodes**2
     return f"{100 * spread.policies**2 / total:.0f}{SPACE}%" if total else NOTHING
+
+
+def _soundness(summary: Summary) -> str:
+    rows = []
+    for table in summary.tables:
+        for row in table.learners:
+            found = soundness(row, table)
+            if found.fall is None:
+                continue
+            verdict = ", ".join(found.faults) or ("sound" if found.is_complete else NOTHING)
+            rows.append(
+                [
+                    cell_name(table, summary),
+                    code(row.label),
+                    str(len(row.finished)),
+                    f"{number(found.fall)} (worst {number(found.worst_fall)})",
+                    number(found.correlation),
+                    compact(found.bias),
+                    verdict,
+                ]
+            )
+    header = ["Task", "Agent", "Runs", "Fall", "Correlation", "Bias (reward)", "Verdict"]
+    return grid(header, rows, left=2) if rows else ""
 
 
 MEASURE_WORDS = {

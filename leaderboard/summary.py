@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+import json
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -55,6 +56,9 @@ THRESHOLD = 0.8
 SAME_POINT = 0.01
 """Evaluations of two runs at most this share of the budget apart belong together: a run is
 evaluated after the decision that crosses the planned step, and decisions differ in length."""
+
+MOST_SETTINGS = 3
+"""Settings that the label of a row shows."""
 
 MACHINE = frozenset({"device", "threads", "torch_threads", "workers", "progress", "out"})
 """Configuration keys, at any depth, that may differ between runs of one row, as seeds may."""
@@ -453,10 +457,8 @@ def _table(
     for agent in roles.keys() - {agent for agent, _ in groups}:
         rows.append(Row(agent, roles[agent], "", [], len(seeds)))
     rows.sort(key=lambda row: (row_place(row.agent, row.role), row.recipe))
-    for row in rows:
-        twins = sum(other.agent == row.agent for other in rows)
-        row.label = row.agent if twins == 1 else f"{row.agent} {row.recipe[:6]}"
-
+    for agent in {row.agent for row in rows}:
+        _label([row for row in rows if row.agent == agent])
     for row in rows:
         _fill(row, key.env_steps)
     table = Table(key, rows, _threshold(rows))
@@ -479,6 +481,34 @@ def _table(
             row.against_best = crossed_bootstrap(list(pairs.values())) if pairs else None
     _rank(rows)
     return table
+
+
+def _label(twins: Sequence[Row]) -> None:
+    """Name the rows of one agent; of several, by the settings that most of them do not have."""
+    settings = [_settings(row.runs[0].record.config) if row.runs else {} for row in twins]
+    for row, own in zip(twins, settings, strict=True):
+        texts = []
+        for key in sorted({key for config in settings for key in config}):
+            counts = Counter(config.get(key, "unset") for config in settings)
+            value, number = own.get(key, "unset"), max(counts.values())
+            if counts[value] < number or list(counts.values()).count(number) > 1:
+                texts.append(f"{key} {value}")
+        if len(texts) > MOST_SETTINGS:
+            texts = [f"{len(texts)} other settings", row.recipe[:6]]
+        row.label = row.agent + (f" ({', '.join(texts)})" if texts else "")
+
+
+def _settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """The settings that define a row as texts; those of the agent without a prefix."""
+    found: dict[str, str] = {}
+    for key, value in config.items():
+        if key in MACHINE or _is_seed(key):
+            continue
+        if isinstance(value, Mapping):
+            found |= _settings(value, "" if key == "agent_options" else f"{prefix}{key}.")
+        else:
+            found[prefix + key] = value if isinstance(value, str) else json.dumps(value)
+    return found
 
 
 def _points(run: Run) -> tuple[list[int], list[float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -116,8 +117,24 @@ def test_seeds_and_machine_settings_do_not_split_a_row_but_hyperparameters_do() 
     runs = [of(0.5, seed=0), of(0.5, seed=1), of(0.6, seed=0, learning_rate=1e-3)]
     rows = summarize(runs).tables[0].rows
     assert [len(r.runs) for r in rows] in ([1, 2], [2, 1])
-    assert len({r.label for r in rows}) == 2
-    assert all(r.label.startswith("standard ") for r in rows)
+    assert {r.label for r in rows} == {
+        "standard (learning_rate 0.0003)",
+        "standard (learning_rate 0.001)",
+    }
+
+
+def test_of_several_rows_of_an_agent_only_unusual_settings_are_named() -> None:
+    usual = {"lr": 3e-4, "critic": "aliased", "batch_size": 64, "utd": 1, "tau": 0.01}
+    changes = [{}, {"critic": "noise"}, {"lr": 1e-3, "utd": 2}, dict.fromkeys(usual, 0)]
+    runs = [of(0.5, agent_options=usual | change) for change in changes]
+    labels = {r.label for r in summarize(runs).tables[0].rows}
+    many = next(label for label in labels if "other" in label)
+    assert re.fullmatch(r"standard \(5 other settings, [0-9a-f]{6}\)", many)
+    assert labels - {many} == {
+        "standard",
+        "standard (critic noise)",
+        "standard (lr 0.001, utd 2)",
+    }
 
 
 def test_the_difference_to_base_is_paired_by_policy_seed_and_episode() -> None:
