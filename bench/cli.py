@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from symsteer.errors import UserError
 from symsteer.terminal import complain, printable
 
 if TYPE_CHECKING:
@@ -176,6 +177,52 @@ def sweep(
     return 1 if failed or elsewhere else 0
 
 
+def tune(
+    plan: Annotated[str, tyro.conf.arg(metavar="PLAN")],
+    /,
+    out: Path = Path("runs"),
+    workers: int = 0,
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> int:
+    """Search for the best settings of agents, with the same number of trials for each.
+
+    The same command continues a search that was stopped, with the same trials.
+
+    Args:
+        plan: Name of a tuning plan (see `symsteer list`) or path of a .toml file.
+        out: Folder of the runs; trials and chosen settings are written to OUT/tuning.
+        workers: Number of runs at the same time; 0: one per core, or as many as fit on the cluster.
+        ray: Address of a Ray cluster to run on: auto, or host:port of its head.
+        dry_run: Only show what would be tried.
+    """
+    from symsteer.bench.tuning.plan import read_plan
+
+    found = read_plan(plan)
+    try:
+        from symsteer.bench.tuning.command import Tuner, preview
+    except ModuleNotFoundError as error:
+        if error.name != "optuna":
+            raise
+        raise UserError(
+            'tuning needs Optuna; install it with: pip install "symsteer[tune]"'
+        ) from error
+    if dry_run:
+        print(preview(found))
+        return 0
+    from symsteer.bench.tuning.trials import to_text
+
+    tuner = Tuner(found, out, workers, ray)
+    trials, chosen = tuner.play()
+    print(f"\n{to_text(trials, chosen)}\n")
+    for kind, path in tuner.places.items():
+        print(f"{kind + ':':9s} {path}")
+    missing = [agent for agent in found.agents if agent not in {choice.agent for choice in chosen}]
+    for agent in missing:
+        print(f"no setting of {agent} was chosen: its first trial failed", file=sys.stderr)
+    return 1 if missing else 0
+
+
 def status(
     folder: Annotated[Path, tyro.conf.arg(metavar="[FOLDER]")] = Path("runs"),
     /,
@@ -198,10 +245,11 @@ def status(
 
 
 def list_names() -> int:
-    """Name the tasks, embodiments, variants, agents, policies and suites."""
+    """Name the tasks, embodiments, variants, agents, policies, suites and tuning plans."""
     from symsteer.agents import AGENTS
     from symsteer.bench.sweep.grid import read_suite, suite_names
     from symsteer.bench.tasks import EMBODIMENTS, TASKS
+    from symsteer.bench.tuning import plan_summaries
     from symsteer.bench.variants import VARIANTS
     from symsteer.policies import POLICIES
 
@@ -218,6 +266,7 @@ def list_names() -> int:
         "suites (symsteer sweep SUITE)",
         ((suite.name, f"{suite.description} ({len(suite.runs)} runs)") for suite in suites),
     )
+    _print_names("tuning plans (symsteer tune PLAN)", plan_summaries().items())
     return 0
 
 

@@ -17,7 +17,8 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special, stats
-from scipy.integrate import trapezoid
+
+from symsteer.leaderboard.records.curves import area_under_curve
 
 CONFIDENCE = 0.95
 RESAMPLES = 5000
@@ -582,18 +583,6 @@ def _drawn(units: Sequence[str], values: Array, resamples: int) -> tuple[Array, 
 def paired_differences(first: Mapping[Key, float], second: Mapping[Key, float]) -> dict[Key, float]:
     """`first - second` for the keys (episodes) that both have."""
     return {key: value - second[key] for key, value in first.items() if key in second}
-
-
-def area_under_curve(steps: Sequence[int], values: Sequence[float], budget: int) -> float:
-    """Area under a learning curve by the trapezoidal rule, as a share of `budget` x 1.
-
-    The first value is held back to step 0 and the last one on to the budget; what lies beyond the
-    budget is left out. One evaluation gives its own value.
-    """
-    knots = np.array([0, *steps, max(budget, steps[-1])], dtype=np.float64)
-    heights = np.array([values[0], *values, values[-1]], dtype=np.float64)
-    inside = np.unique(np.concatenate([knots[knots <= budget], [float(budget)]]))
-    return float(trapezoid(np.interp(inside, knots, heights), inside) / budget)
 
 
 def area_weights(steps: Sequence[int], budget: int) -> tuple[float, ...]:

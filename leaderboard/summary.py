@@ -25,11 +25,11 @@ from symsteer.leaderboard.records import (
     config_hash,
     read_record,
 )
+from symsteer.leaderboard.records.curves import area_under_curve
 from symsteer.leaderboard.statistics import (
     Block,
     Interval,
     Sample,
-    area_under_curve,
     area_weights,
     censored_median,
     crossed_bootstrap,

@@ -56,6 +56,7 @@ VERBS = {
     "evaluate": Verb(f"{BENCH}:evaluate", "Play held-out episodes with the checkpoint of a run."),
     "film": Verb(f"{BENCH}:film", "Film episodes with the checkpoint of a run."),
     "sweep": Verb(f"{BENCH}:sweep", "Run all runs of a suite that are not finished."),
+    "tune": Verb(f"{BENCH}:tune", "Search for settings, with equal trials for every agent."),
     "status": Verb(f"{BENCH}:status", "Show how far the runs of a folder are.", computes=False),
     "demo": Verb("symsteer.cli:demo", "Run a small suite and write its leaderboard, in minutes."),
     "report": Verb(
@@ -65,7 +66,7 @@ VERBS = {
     ),
     "list": Verb(
         f"{BENCH}:list_names",
-        "Name the tasks, embodiments, variants, agents, policies and suites.",
+        "Name the tasks, embodiments, variants, agents, policies, suites and tuning plans.",
         computes=False,
     ),
     "demos": Verb(f"{BENCH}:demos", "Write demonstrations of the scripted expert."),

@@ -78,26 +78,53 @@ def read_suite(name_or_path: str) -> SuiteData:
     Raises:
         UserError: if there is no such suite, or the file is not a suite.
     """
+    return suite_data(*read_toml(name_or_path, "suite", SUITES))
+
+
+def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any], Path]:
+    """The content of a TOML file, and its path.
+
+    Args:
+        name_or_path: name of a file in ``folder``, or the path of a ``.toml`` file.
+        kind: what the file is, for messages.
+        folder: of the files that come with SymSteer.
+
+    Raises:
+        UserError: if there is no such file, or it cannot be read.
+    """
     path = Path(name_or_path)
     if path.suffix != ".toml":
-        path = SUITES / f"{name_or_path}.toml"
+        path = folder / f"{name_or_path}.toml"
     try:
-        data = tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text()), path
     except FileNotFoundError as error:
-        close = nearest(name_or_path, suite_names())
+        names = sorted(path.stem for path in folder.glob("*.toml"))
+        close = nearest(name_or_path, names)
         hint = f"did you mean {close!r}? " if close else ""
         raise UserError(
-            f"there is no suite {name_or_path!r}; {hint}use one of {', '.join(suite_names())} or "
+            f"there is no {kind} {name_or_path!r}; {hint}use one of {', '.join(names)} or "
             "the path of a .toml file"
         ) from error
     except OSError as error:
         raise UserError(
-            f"the suite {path} cannot be read: {error.strerror}; name another file"
+            f"the {kind} {path} cannot be read: {error.strerror}; name another file"
         ) from error
     except (ValueError, RecursionError) as error:
         raise UserError(
-            f"the suite {path.name} cannot be read as TOML: {error}; correct it there"
+            f"the {kind} {path.name} cannot be read as TOML: {error}; correct it there"
         ) from error
+
+
+def suite_data(data: dict[str, Any], path: Path) -> SuiteData:
+    """A suite from the content of its file.
+
+    Args:
+        data: the tables of the file.
+        path: of the file, which gives the suite its name; messages begin with the file's name.
+
+    Raises:
+        UserError: if the content is not a suite.
+    """
     source = path.name
     valid = ("description", "grid", "run")
     for key in data:

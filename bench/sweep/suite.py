@@ -38,7 +38,15 @@ def load_suite(name_or_path: str) -> Suite:
         UserError: if there is no such suite, or a run in it has a value or option that does not
             exist.
     """
-    data = read_suite(name_or_path)
+    return suite_of(read_suite(name_or_path))
+
+
+def suite_of(data: SuiteData) -> Suite:
+    """The runs of a suite.
+
+    Raises:
+        UserError: if it has no runs, or a run in it has a value or option that does not exist.
+    """
     defaults = RunConfig().to_json()
     agents = _Options("agent", AGENTS, defaults["agent"], data)
     policies = _Options("policy", POLICIES, defaults["policy"]["name"], data)

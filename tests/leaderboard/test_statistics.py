@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from symsteer.leaderboard.records.curves import area_under_curve
 from symsteer.leaderboard.statistics import (
     Array,
     Effect,
     Interval,
     Sample,
     ShareDifference,
-    area_under_curve,
     area_weights,
     cell_estimates,
     censored_median,

@@ -1,0 +1,183 @@
+"""``symsteer tune``: rounds of trials for all agents, then the chosen settings on fresh cells."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from optuna.trial import FrozenTrial, Trial, TrialState
+
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.folder import write_json
+from symsteer.bench.sweep.command import run_plan
+from symsteer.bench.sweep.plan import make_plan
+from symsteer.bench.sweep.suite import Suite
+from symsteer.bench.tuning.plan import TuningPlan
+from symsteer.bench.tuning.search import Search, open_storage, storage_path
+from symsteer.bench.tuning.trials import (
+    Chosen,
+    Score,
+    State,
+    TrialResult,
+    choose,
+    mean_auc,
+    score_of,
+    to_json,
+    to_preset,
+)
+from symsteer.files import write_atomically
+
+STATES: Mapping[TrialState, State] = {
+    TrialState.COMPLETE: "complete",
+    TrialState.PRUNED: "pruned",
+    TrialState.FAIL: "failed",
+}
+
+
+class Tuner:
+    """Executes a tuning plan, and continues it where it was stopped.
+
+    Args:
+        plan: what to tune.
+        out: folder of the runs; the trials are in ``out/tuning``.
+        workers: number of runs at the same time; 0: one per core, or as many as fit on the cluster.
+        ray: address of a Ray cluster to use instead of this machine.
+
+    Raises:
+        UserError: if ``out`` holds trials of a plan that differs.
+    """
+
+    def __init__(self, plan: TuningPlan, out: Path, workers: int = 0, ray: str | None = None):
+        self.plan, self.out, self.workers, self.ray = plan, out, workers, ray
+        storage = open_storage(storage_path(out, plan.name))
+        self.searches = {agent: Search(plan, agent, storage) for agent in plan.agents}
+
+    def play(self) -> tuple[list[TrialResult], list[Chosen]]:
+        """Execute all trials that are left and compare what is chosen with the defaults."""
+        while batch := [(a, trial) for a, s in self.searches.items() for trial in s.batch()]:
+            self._round(batch)
+            self._write([])
+        chosen = self._confirm([found for a in self.plan.agents if (found := self._best(a))])
+        self._write(chosen)
+        return self.results, chosen
+
+    @property
+    def results(self) -> list[TrialResult]:
+        """All trials that have ended, by agent and number."""
+        return [
+            _result(agent, trial)
+            for agent, search in self.searches.items()
+            for trial in search.ended
+        ]
+
+    @property
+    def places(self) -> dict[str, Path]:
+        """The files that tuning writes."""
+        folder, name = self.out / "tuning", self.plan.name
+        return {
+            "trials": folder / f"{name}.json",
+            "preset": folder / f"{name}-preset.toml",
+            "journal": storage_path(self.out, name),
+        }
+
+    def _round(self, batch: Sequence[tuple[str, Trial]]) -> None:
+        """Execute trials: first a few cells of each, then the others of those that are good."""
+        cells = [self.plan.cells(agent, trial.params) for agent, trial in batch]
+        probe = self.plan.probe
+        self._run([config for configs in cells for config in configs[:probe]])
+        kept = []
+        for (agent, trial), configs in zip(batch, cells, strict=True):
+            scores = self._scores(configs[:probe])
+            if len(scores) < probe:
+                self._end(agent, trial, TrialState.FAIL, scores)
+                continue
+            if not self.searches[agent].study.trials[trial.number].intermediate_values:
+                trial.report(mean_auc(scores), probe)
+            if trial.should_prune():
+                self._end(agent, trial, TrialState.PRUNED, scores)
+            else:
+                kept.append((agent, trial, configs))
+        self._run([config for _, _, configs in kept for config in configs[probe:]])
+        for agent, trial, configs in kept:
+            scores = self._scores(configs)
+            done = len(scores) == len(configs)
+            self._end(agent, trial, TrialState.COMPLETE if done else TrialState.FAIL, scores)
+
+    def _run(self, configs: Sequence[RunConfig]) -> None:
+        """Execute runs; a run that fails is the fault of its options, and only shown."""
+        if not configs:
+            return
+        suite = Suite(
+            f"tune-{self.plan.name}", self.plan.description, tuple(dict.fromkeys(configs))
+        )
+        outcomes = run_plan(
+            make_plan(suite, self.out, self.ray is not None), self.workers, self.ray
+        )
+        for outcome in outcomes:
+            if outcome.status == "failed":
+                print(f"failed: {outcome.run.label}: {outcome.reason}", file=sys.stderr)
+
+    def _scores(self, configs: Sequence[RunConfig]) -> list[Score]:
+        return [score for config in configs if (score := score_of(config, self.out))]
+
+    def _end(self, agent: str, trial: Trial, state: TrialState, scores: list[Score]) -> None:
+        trial.set_user_attr("scores", [vars(score) for score in scores])
+        value = mean_auc(scores) if state == TrialState.COMPLETE else None
+        self.searches[agent].study.tell(trial, value, state)
+        area = f"AUC {mean_auc(scores):.3f} over {len(scores)} cells" if scores else "no cell"
+        of = f"{trial.number + 1} of {self.plan.trials}"
+        print(f"trial     {agent} {of}: {STATES[state]}, {area}", flush=True)
+
+    def _best(self, agent: str) -> Chosen | None:
+        return choose([trial for trial in self.results if trial.agent == agent])
+
+    def _confirm(self, chosen: Sequence[Chosen]) -> list[Chosen]:
+        """The same choices with scores on the fresh cells."""
+
+        def cells(choice: Chosen, options: Mapping[str, Any]) -> list[RunConfig]:
+            return self.plan.cells(choice.agent, options, "confirm")
+
+        pairs = [(cells(c, c.options), cells(c, self.plan.defaults(c.agent))) for c in chosen]
+        self._run([config for pair in pairs for configs in pair for config in configs])
+        return [
+            Chosen(
+                **{**vars(c), "confirmed": self._scores(a), "default_confirmed": self._scores(b)}
+            )
+            for c, (a, b) in zip(chosen, pairs, strict=True)
+        ]
+
+    def _write(self, chosen: Sequence[Chosen]) -> None:
+        places = self.places
+        about = {"plan": self.plan.name, "digest": self.plan.digest, "data": dict(self.plan.data)}
+        write_json(places["trials"], {**about, **to_json(self.results, chosen)})
+        if chosen:
+            words = (
+                f"Chosen by `symsteer tune {self.plan.name}`, {self.plan.trials} trials an agent."
+            )
+            write_atomically(places["preset"], to_preset(chosen, words).encode())
+
+
+def preview(plan: TuningPlan) -> str:
+    """What a plan asks for."""
+    first = plan.agents[0]
+    cells = len(plan.cells(first, plan.defaults(first)))
+    fresh = len(plan.cells(first, plan.defaults(first), "confirm"))
+    lines = [f"{plan.name}: {plan.description}" if plan.description else plan.name, ""]
+    lines += [
+        f"{agent}: {plan.trials} trials of {len(space)} options: {', '.join(space)}"
+        for agent, space in plan.spaces.items()
+    ]
+    lines += [
+        "",
+        f"{cells} runs a trial, {plan.probe} of a trial that is given up; then {fresh} runs each "
+        "with the chosen settings and with the defaults",
+        f"at most {len(plan.agents) * (plan.trials * cells + 2 * fresh):,} runs",
+    ]
+    return "\n".join(lines)
+
+
+def _result(agent: str, trial: FrozenTrial) -> TrialResult:
+    scores = [Score(**score) for score in trial.user_attrs.get("scores", [])]
+    return TrialResult(agent, trial.number, STATES[trial.state], trial.params, scores)

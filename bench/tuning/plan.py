@@ -1,0 +1,191 @@
+"""What is tuned: agents, cells, numbers of trials and search spaces, as a TOML file.
+
+``[grid]`` and ``[run]`` describe the cells as in a suite, one run per trial each. ``[confirm]`` is
+the grid of fresh cells on which the chosen settings are compared with the defaults. ``[space]`` has
+the options that all agents share, ``[space.AGENT]`` those of one agent. An option has a list of
+choices, or ``{ low = 1e-4, high = 1e-2, log = true }``.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from symsteer.agents import AGENTS
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.sweep.grid import read_toml, suite_data
+from symsteer.bench.sweep.suite import suite_of
+from symsteer.bench.tuning import FOLDER
+from symsteer.errors import UserError
+from symsteer.names import unknown
+
+NUMBERS = {"trials": 20, "batch": 4, "probe": 2, "seed": 0}
+"""Whole numbers of a plan and their defaults."""
+
+KEYS = ("description", "agents", *NUMBERS, "grid", "run", "confirm", "space")
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers from ``low`` to ``high``, whole ones if both are; ``log``: even in the logarithm."""
+
+    low: float
+    high: float
+    log: bool = False
+
+
+@dataclass(frozen=True)
+class Choices:
+    """A list of values."""
+
+    values: tuple[Any, ...]
+
+
+Space = Mapping[str, Range | Choices]
+"""By option."""
+
+
+@dataclass(frozen=True)
+class TuningPlan:
+    """A tuning plan.
+
+    Attributes:
+        name: of the file, without its ending.
+        source: file name; messages begin with it.
+        description: what is tuned, and where.
+        trials: of each agent.
+        batch: trials of an agent in one round; later rounds learn from earlier ones.
+        probe: cells after which a trial may be given up.
+        seed: of the search.
+        spaces: search space of each agent.
+        data: the tables of the file.
+    """
+
+    name: str
+    source: str
+    description: str
+    trials: int
+    batch: int
+    probe: int
+    seed: int
+    spaces: Mapping[str, Space]
+    data: Mapping[str, Any]
+
+    @property
+    def agents(self) -> list[str]:
+        """In the order of the file."""
+        return list(self.spaces)
+
+    @property
+    def digest(self) -> str:
+        """Hash of all that decides what a trial is; more trials may be added later."""
+        kept = {key: value for key, value in self.data.items() if key not in ("trials", "batch")}
+        return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+    def defaults(self, agent: str) -> dict[str, Any]:
+        """The agent's own values of the options that are tuned."""
+        options = AGENTS.get(agent).Options()
+        return {name: getattr(options, name) for name in self.spaces[agent]}
+
+    def cells(self, agent: str, options: Mapping[str, Any], grid: str = "grid") -> list[RunConfig]:
+        """One run per cell with these options, in the order of the file.
+
+        Args:
+            agent: its name.
+            options: of the agent.
+            grid: ``grid`` for the cells of trials, ``confirm`` for the fresh ones.
+        """
+        run = copy.deepcopy(self.data.get("run", {}))
+        table = {"grid": self.data[grid], "run": run}
+        shared = run.get("agent", {})
+        own = {key: value for key, value in shared.items() if key not in self.spaces}
+        run["agent"] = {**own, "name": agent, agent: {**shared.get(agent, {}), **options}}
+        return list(suite_of(suite_data(table, Path(self.source))).runs)
+
+
+def read_plan(name_or_path: str) -> TuningPlan:
+    """Read a tuning plan by name or from a TOML file.
+
+    Raises:
+        UserError: if there is no such plan, it is not complete, a search space does not fit its
+            agent, or it leaves out the agent's default.
+    """
+    data, path = read_toml(name_or_path, "tuning plan", FOLDER)
+    source = path.name
+    for key in data:
+        if key not in KEYS:
+            raise unknown("key", key, KEYS, source)
+    for key in ("agents", "grid", "confirm", "space"):
+        if not data.get(key):
+            raise UserError(f"{source}: {key} is missing; every tuning plan has it")
+    numbers = {
+        key: _number(data.get(key, default), key, source) for key, default in NUMBERS.items()
+    }
+    plan = TuningPlan(
+        name=path.stem,
+        source=source,
+        description=str(data.get("description", "")),
+        spaces={
+            agent: _space(agent, data["space"], data["agents"], source) for agent in data["agents"]
+        },
+        data=data,
+        **numbers,
+    )
+    for agent in plan.agents:
+        plan.cells(agent, plan.defaults(agent), "confirm")
+        if plan.probe > (count := len(plan.cells(agent, plan.defaults(agent)))):
+            raise UserError(f"{source}: probe is {plan.probe}, but there are only {count} cells")
+    return plan
+
+
+def _number(value: Any, key: str, source: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < (key != "seed"):
+        raise UserError(f"{source}: {key} must be a positive whole number, not {value!r}")
+    return value
+
+
+def _space(agent: str, tables: Mapping[str, Any], agents: Sequence[str], source: str) -> Space:
+    options = AGENTS.get(agent).Options
+    fields = [field.name for field in dataclasses.fields(options)]
+    shared = {key: value for key, value in tables.items() if key not in agents}
+    space: dict[str, Range | Choices] = {}
+    for name, value in {**shared, **tables.get(agent, {})}.items():
+        if name not in fields:
+            raise unknown(f"option of {agent}", name, fields, f"{source}, space")
+        space[name] = found = _values(name, value, source)
+        ends = found.values if isinstance(found, Choices) else (found.low, found.high)
+        for end in ends:
+            options(**{name: end})
+        if not _contains(found, default := getattr(options(), name)):
+            raise UserError(
+                f"{source}: space.{name} does not contain the default of {agent}, {default!r}; "
+                "the first trial has the defaults, so widen it"
+            )
+    return space
+
+
+def _values(name: str, value: Any, source: str) -> Range | Choices:
+    if isinstance(value, list) and value:
+        return Choices(tuple(value))
+    try:
+        found = Range(**value)
+        if found.low < found.high and (found.low > 0 or not found.log):
+            return found
+    except TypeError:
+        pass
+    raise UserError(
+        f"{source}: space.{name} must be a list of choices, or {{ low = 1e-4, high = 1e-2, "
+        f"log = true }} with low below high (and above 0 with log), not {value!r}"
+    )
+
+
+def _contains(values: Range | Choices, value: Any) -> bool:
+    if isinstance(values, Choices):
+        return value in values.values
+    return values.low <= value <= values.high

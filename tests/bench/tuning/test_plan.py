@@ -1,0 +1,85 @@
+"""Reading tuning plans: what they mean, and mistakes."""
+
+from __future__ import annotations
+
+import pytest
+
+from symsteer.bench.tuning import plan_summaries
+from symsteer.bench.tuning.plan import Choices, Range, read_plan
+from symsteer.errors import UserError
+from tests.bench.tuning.tiny_plan import TEXT, write_plan
+
+
+def test_every_plan_of_symsteer_can_be_read():
+    for name in plan_summaries():
+        plan = read_plan(name)
+        assert plan.trials >= plan.batch
+        assert plan.description
+
+
+def test_agents_share_a_space_and_have_their_own_options(tmp_path):
+    plan = read_plan(write_plan(tmp_path))
+    shared = {"lr": Range(1e-4, 1e-1, log=True), "batch_size": Choices((32, 64))}
+    assert plan.spaces["standard"] == shared
+    assert plan.spaces["equivariant"] == {**shared, "critics": Range(2, 6)}
+    assert plan.defaults("equivariant") == {"lr": 6e-4, "batch_size": 64, "critics": 2}
+
+
+def test_cells_are_runs_with_the_options(tmp_path):
+    plan = read_plan(write_plan(tmp_path, TEXT + "[run.agent]\ntau = 0.1\n"))
+    cells = plan.cells("equivariant", {"lr": 0.01, "critics": 3})
+    assert [cell.variant for cell in cells] == ["none", "action_gain:1"]
+    assert {cell.agent for cell in cells} == {"equivariant"}
+    options = cells[0].agent_options
+    assert (options.lr, options.critics, options.tau) == (0.01, 3, 0.1)
+    assert [cell.seed for cell in plan.cells("standard", {}, "confirm")] == [2, 3]
+
+
+def test_no_cell_of_a_plan_is_on_a_leaderboard():
+    """Tuned settings would have an advantage there."""
+    from symsteer.bench.sweep.grid import suite_names
+    from symsteer.bench.sweep.suite import load_suite
+
+    def policies(configs):
+        return {(c.task, c.embodiment, c.policy_seed) for c in configs}
+
+    shown = set()
+    for suite in suite_names():
+        if suite not in ("full", "smoke"):
+            shown |= policies(load_suite(suite).runs)
+    for name in plan_summaries():
+        plan = read_plan(name)
+        for agent in plan.agents:
+            for grid in ("grid", "confirm"):
+                assert not shown & policies(plan.cells(agent, plan.defaults(agent), grid))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("trials = 12", "trails = 12", "'trails'.*did you mean 'trials'"),
+        ("trials = 12", "trials = 0", "trials must be a positive whole number, not 0"),
+        ("trials = 12", "trials = true", "trials must be a positive whole number, not True"),
+        ("[confirm]\nseed = [2, 3]", "", "confirm is missing"),
+        ('"standard", ', '"standrad", ', "did you mean 'standard'"),
+        ("batch_size =", "batchsize =", "did you mean 'batch_size'"),
+        ("[32, 64]", "64", "space.batch_size must be a list of choices, or { low"),
+        ("[32, 64]", "[16, 32]", "space.batch_size does not contain the default of standard, 64"),
+        ("low = 1e-4, high = 1e-1", "low = 1e-1, high = 1e-4", "with low below high"),
+        ("low = 1e-4", "low = 0.0", "above 0 with log"),
+        ("low = 1e-4", "lowest = 1e-4", "space.lr must be a list of choices"),
+        ("[32, 64]", "[-1, 64]", "batch_size"),
+        ("probe = 1", "probe = 3", "probe is 3, but there are only 2 cells"),
+        ('"none", ', '"noone", ', "noone"),
+    ],
+)
+def test_mistakes(tmp_path, old, new, message):
+    assert old in TEXT
+    path = write_plan(tmp_path, TEXT.replace(old, new))
+    with pytest.raises(UserError, match=message):
+        read_plan(path)
+
+
+def test_an_unknown_plan_has_the_nearest_name():
+    with pytest.raises(UserError, match="no tuning plan 'cor'; did you mean 'core'"):
+        read_plan("cor")

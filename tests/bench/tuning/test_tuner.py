@@ -1,0 +1,193 @@
+"""The search, on runs whose success is a known function of the options; and one real one."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from symsteer.agents.equivariant import EquivariantAgent
+from symsteer.agents.presets import preset_options
+from symsteer.bench.tuning import command
+from symsteer.bench.tuning.command import Tuner, preview
+from symsteer.bench.tuning.plan import read_plan
+from symsteer.bench.tuning.trials import Score, TrialResult, choose, mean_ranks, to_text
+from symsteer.cli import main
+from symsteer.errors import UserError
+from tests.bench.tuning.tiny_plan import BEST, TEXT, KnownRuns, write_plan
+
+
+@pytest.fixture
+def play(tmp_path, monkeypatch):
+    """Plays a plan in ``out`` with known runs; returns trials, choices and the runs."""
+
+    def run(out="runs", text=TEXT, **kwargs):
+        runs = KnownRuns(**kwargs)
+        monkeypatch.setattr(command, "run_plan", runs)
+        tuner = Tuner(read_plan(write_plan(tmp_path, text)), tmp_path / out)
+        return *tuner.play(), runs
+
+    return run
+
+
+def trial(number, *areas, state="complete"):
+    scores = [Score(f"cell {i}", area, area, 60.0) for i, area in enumerate(areas)]
+    return TrialResult("standard", number, state, {"lr": number}, scores)
+
+
+def test_ranks_are_means_over_cells_and_ties_share_them():
+    assert mean_ranks([trial(0, 0.5, 0.9), trial(1, 0.7, 0.9), trial(2, 0.1, 0.2)]) == [
+        pytest.approx(x) for x in ((2 + 1.5) / 2, (1 + 1.5) / 2, 3.0)
+    ]
+
+
+def test_the_best_mean_rank_is_chosen_not_the_best_mean():
+    """One cell in which areas vary much does not decide alone."""
+    trials = [trial(0, 0.1, 0.50, 0.50), trial(1, 0.9, 0.48, 0.48), trial(2, 0.2, 0.51, 0.51)]
+    found = choose(trials)
+    assert np.argmax([t.auc for t in trials]) == 1
+    assert (found.trial, found.rank) == (2, pytest.approx(4 / 3))
+    assert found.default_rank == pytest.approx((3 + 2 + 2) / 3)
+
+
+def test_trials_that_were_given_up_are_not_chosen():
+    found = choose([trial(0, 0.5, 0.5), trial(1, 0.9, state="pruned"), trial(2, 0.4, 0.4)])
+    assert found.trial == 0
+    assert choose([trial(0, 0.5, state="failed"), trial(1, 0.4, 0.4)]) is None
+
+
+def test_every_agent_has_the_same_number_of_trials_and_begins_with_its_defaults(play):
+    trials, chosen, _ = play()
+    for agent in ("standard", "equivariant"):
+        own = [t for t in trials if t.agent == agent]
+        assert [t.number for t in own] == list(range(12))
+        assert own[0].options["lr"] == 6e-4
+        assert own[0].state == "complete"
+    assert [choice.agent for choice in chosen] == ["standard", "equivariant"]
+
+
+def test_the_search_comes_closer_to_the_known_optimum_than_the_defaults(play):
+    _, chosen, _ = play()
+    for choice in chosen:
+        best = BEST[choice.agent]
+        assert abs(math.log(choice.options["lr"] / best)) < abs(math.log(6e-4 / best))
+        fresh, default = ([s.auc for s in x] for x in (choice.confirmed, choice.default_confirmed))
+        assert len(fresh) == len(default) == 2
+        assert min(fresh) > max(default)
+
+
+def test_bad_trials_are_given_up_after_the_probe(play):
+    trials, _, runs = play()
+    states = {t.state for t in trials}
+    assert states == {"complete", "pruned"}
+    for t in trials:
+        assert len(t.scores) == (1 if t.state == "pruned" else 2)
+    # Chosen settings and defaults on two fresh cells each, for two agents.
+    assert len(runs.played) == sum(len(t.scores) for t in trials) + 8
+
+
+def test_a_search_that_was_killed_continues_with_the_same_trials(play):
+    whole, chosen, runs = play("undisturbed")
+    for stop in (1, 8, 25, len(runs.played) - 1):
+        out = f"stopped-{stop}"
+        with pytest.raises(KeyboardInterrupt):
+            play(out, stop_after=stop)
+        again, same, rest = play(out)
+        assert again == whole
+        assert same == chosen
+        assert len(rest.played) == len(runs.played) - stop
+
+
+def test_more_trials_can_be_added_later(play):
+    first, _, _ = play()
+    more, _, runs = play(text=TEXT.replace("trials = 12", "trials = 14"))
+    assert [t for t in more if t.number < 12] == first
+    assert max(t.number for t in more) == 13
+    assert 4 <= len(runs.played) <= 16
+
+
+def test_trials_of_another_plan_are_refused(play):
+    play()
+    with pytest.raises(UserError, match=r"tiny.toml is not as it was .*only trials and batch"):
+        play(text=TEXT.replace("high = 1e-1", "high = 1e-2"))
+
+
+def test_options_with_which_runs_fail_cost_their_trial(play, capsys):
+    trials, chosen, _ = play(failing=0.02)
+    failed = [t for t in trials if t.state == "failed"]
+    assert failed
+    assert all(t.options["lr"] > 0.02 and not t.scores for t in failed)
+    assert len(trials) == 24
+    assert all(choice.options["lr"] <= 0.02 for choice in chosen)
+    assert "Q is not finite" in capsys.readouterr().err
+
+
+def test_what_is_written_can_be_read_again(play, tmp_path):
+    trials, chosen, _ = play()
+    folder = tmp_path / "runs" / "tuning"
+    data = json.loads((folder / "tiny.json").read_text())
+    assert [t["options"] for t in data["trials"]] == [dict(t.options) for t in trials]
+    assert data["chosen"][1]["confirmed"][0]["auc"] == chosen[1].confirmed[0].auc
+    path = str(folder / "tiny-preset.toml")
+    found = preset_options(path, "equivariant", EquivariantAgent.Options)
+    assert found == {k: pytest.approx(v, rel=1e-3) for k, v in chosen[1].options.items()}
+
+
+def test_the_table_has_a_row_for_each_agent(play):
+    trials, chosen, _ = play()
+    header, *rows = to_text(trials, chosen).splitlines()
+    assert header.split()[:4] == ["agent", "trials", "pruned", "failed"]
+    assert [row.split()[:2] for row in rows] == [["standard", "12"], ["equivariant", "12"]]
+
+
+def test_the_preview_counts_the_runs(tmp_path):
+    text = preview(read_plan(write_plan(tmp_path)))
+    assert "standard: 12 trials of 2 options: lr, batch_size" in text
+    assert "at most 56 runs" in text
+
+
+REAL = """
+description = "one agent, one cell"
+agents = ["standard"]
+trials = 2
+batch = 2
+probe = 1
+[grid]
+seed = [1]
+[confirm]
+seed = [1]
+task = ["PushCube-v1"]
+[run]
+task = "PushCube-v1"
+env_steps = 160
+num_envs = 4
+demonstrations.count = 3
+agent = { width = 16, warmup = 16, gamma = 0.5 }
+policy = { channels = 8, width = 16, depth = 1, steps = 20, batch_size = 32 }
+[run.evaluation]
+every = 80
+episodes = 2
+final_episodes = 2
+diagnostic_episodes = 2
+final_diagnostic_episodes = 2
+steerability_states = 2
+[space]
+lr = { low = 1e-4, high = 1e-2, log = true }
+"""
+
+
+def test_the_command_tunes_with_real_runs(tmp_path, monkeypatch, capsys):
+    path, out = write_plan(tmp_path, REAL), str(tmp_path / "runs")
+    arguments = ["symsteer", "tune", path, "--out", out, "--workers", "1"]
+    monkeypatch.setattr("sys.argv", arguments)
+    assert main() == 0
+    first = capsys.readouterr().out
+    assert "trial     standard 2 of 2: complete" in first
+    assert "standard-preset" not in first
+    assert str(tmp_path / "runs" / "tuning" / "tiny-preset.toml") in first
+    # Again: all is done, and the same table is printed.
+    assert main() == 0
+    again = capsys.readouterr().out
+    assert again.splitlines()[-7:] == first.splitlines()[-7:]
