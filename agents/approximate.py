@@ -7,16 +7,17 @@ agent is exactly equivariant. If the world breaks the symmetry, the free path ca
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import nn
 
+from symsteer.agents.episodes import Played
 from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.agents.networks import Dense, dense, shrink_
 from symsteer.agents.options import SacOptions
-from symsteer.agents.replay import Batch
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Layout
 
@@ -63,6 +64,7 @@ class ApproximateAgent(EquivariantAgent):
     """The equivariant agent with a penalised free path beside every layer."""
 
     name = "approximate"
+    in_teams = True
     Options = ApproximateOptions
     options: ApproximateOptions
 
@@ -81,16 +83,15 @@ class ApproximateAgent(EquivariantAgent):
             {"params": equivariant, "weight_decay": 2 * self.options.equivariant_penalty},
         ]
 
-    def after_update(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """For each network: norm of the free path / norm of the equivariant path."""
-        scalars = {}
+    def diagnostics(self, played: Played) -> Mapping[str, float | None]:
+        """Also, for each network, norm of the free path / norm of the equivariant path."""
+        shares = {}
         for name, network in self.networks.items():
             free, equivariant = (
-                torch.stack(torch._foreach_norm([p.detach() for p in path])).norm()
-                for path in paths(network)
+                torch.stack([p.detach().norm() for p in path]).norm() for path in paths(network)
             )
-            scalars[f"train/free_path_{name}"] = free / equivariant
-        return scalars
+            shares[f"free_path_{name}"] = (free / equivariant).item()
+        return {**super().diagnostics(played), **shares}
 
 
 def paths(network: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:

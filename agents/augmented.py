@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-
 from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent
@@ -35,11 +33,12 @@ class AugmentedAgent(StandardAgent):
     """Plain actor, plain critics, every transition of a batch rotated at random."""
 
     name = "augmented"
+    in_teams = True
     Options = AugmentedOptions
     options: AugmentedOptions
 
-    def update(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """One step on a batch in which each row is rotated by a symmetry of its own."""
+    def augment(self, batch: Batch) -> Batch:
+        """Each row is rotated by a symmetry of its own."""
         augmentation = Augmentation(Group.parse(self.options.augmentation))
         # The agent's own generator: its state is in the checkpoint, so a resumed run repeats.
         drawn = augmentation.draw(len(batch.obs), self.generator)
@@ -48,4 +47,4 @@ class AugmentedAgent(StandardAgent):
             for name, layout in self.vector_fields.items()
             if name in batch
         }
-        return super().update(batch.replace(**turned))
+        return batch.replace(**turned)

@@ -46,6 +46,7 @@ class EquivariantAgent(SacAgent):
     """Equivariant actor and invariant critics, exact for every element of ``group``."""
 
     name = "equivariant"
+    in_teams = True
 
     def actor_layers(self) -> list[nn.Module]:
         return equivariant_actor_layers(self)

@@ -86,7 +86,10 @@ class Ensemble(nn.Module):
 
     def apply_weights(self, weights: Weights, x: torch.Tensor) -> torch.Tensor:
         """Evaluate with the given matrices: ``[B, in] -> [members, B, out]``."""
-        out = x.expand(len(weights[0][0]), *x.shape)
+        return self.propagate(weights, x.expand(len(weights[0][0]), *x.shape))
+
+    def propagate(self, weights: Weights, out: torch.Tensor) -> torch.Tensor:
+        """The same with an input for each member: ``[members, B, in] -> [members, B, out]``."""
         for index, (matrix, bias) in enumerate(weights):
             if index > 0:
                 if self.layer_norm:

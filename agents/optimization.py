@@ -26,7 +26,7 @@ class Multiplier:
         return self.log.detach().exp()
 
     def step(self, gap: torch.Tensor) -> torch.Tensor:
-        """One gradient step; returns the loss."""
+        """One gradient step; returns the loss. In a team there is one number for each member."""
         loss = self.log * gap
         descend(loss, self.optimizer)
         return loss.detach()
@@ -50,7 +50,7 @@ def adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
 def descend(
     loss: torch.Tensor, optimizer: torch.optim.Optimizer, penalty: torch.Tensor | None = None
 ) -> None:
-    """One gradient step on a loss plus its regulariser."""
+    """One gradient step on a loss plus its regulariser; in a team on the sum over members."""
     optimizer.zero_grad()
-    (loss if penalty is None else loss + penalty).backward()
+    (loss if penalty is None else loss + penalty).sum().backward()
     optimizer.step()

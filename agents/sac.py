@@ -36,9 +36,8 @@ Deviations from the papers, numbered as in ``docs/agents.md``:
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -84,6 +83,10 @@ class SacAgent(Agent):
     Options = SacOptions
     options: SacOptions
 
+    in_teams: ClassVar[bool] = False
+    """Whether the hooks of this very class work on the stacked tensors of a team, which have one
+    more dimension in front; subclasses say it anew."""
+
     replay: ReplayBuffer
 
     def __init__(self, context: AgentContext, options: SacOptions | None = None):
@@ -125,6 +128,8 @@ class SacAgent(Agent):
         self.decisions = 0
         self.owed = self.distillation_owed = 0.0
         self.updates = 0
+        self.synchronize: Callable[[], None] = lambda: None
+        """Called before the state is read; a team writes there what it keeps for its members."""
 
     @classmethod
     def check(cls, options: SacOptions, budget: Budget) -> None:
@@ -173,7 +178,7 @@ class SacAgent(Agent):
         """
         next_q = self.reduced(self._q(self.target, following.obs, following.judged))
         if self.options.soft_backup:
-            next_q = next_q - self.alpha * following.log_prob
+            next_q = next_q - self.alpha.unsqueeze(-1) * following.log_prob
         ends = batch.terminal
         if self.options.timeouts_terminal:
             ends = ends.maximum(batch.truncated)
@@ -181,7 +186,7 @@ class SacAgent(Agent):
 
     def critic_loss(self, q: torch.Tensor, target: torch.Tensor, batch: Batch) -> torch.Tensor:
         """Squared error, mean over the batch, summed over critics; ``q [critics, B]``."""
-        return (q - target).square().mean(1).sum()
+        return (q - target.unsqueeze(-2)).square().mean(-1).sum(-1)
 
     def actor_loss(
         self, q: torch.Tensor, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
@@ -195,11 +200,15 @@ class SacAgent(Agent):
             batch: transitions.
         """
         # A random subset makes targets pessimistic; the actor follows the mean (REDQ).
-        value = q.mean(0) if self.options.reduce == "subset" else self.reduced(q)
-        loss = (self.alpha * log_prob - value).mean()
+        value = q.mean(-2) if self.options.reduce == "subset" else self.reduced(q)
+        cost = self.alpha.unsqueeze(-1) * log_prob - value
         if not self.distribution.hard:
-            loss = loss + self.options.bound_penalty * self.distribution.excess(noise).mean()
-        return loss
+            cost = cost + self.options.bound_penalty * self.distribution.excess(noise)
+        return cost.mean(-1)
+
+    def augment(self, batch: Batch) -> Batch:
+        """Change a batch before the update."""
+        return batch
 
     def critic_penalty(self, batch: Batch) -> torch.Tensor | None:
         """A regulariser, added to the critics' loss; None: no regulariser."""
@@ -213,7 +222,7 @@ class SacAgent(Agent):
         self, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
     ) -> dict[str, torch.Tensor]:
         """Gap of each constraint in ``multipliers``, a scalar; negative: the multiplier grows."""
-        return {"alpha": -log_prob.mean() - self.target_entropy}
+        return {"alpha": -log_prob.mean(-1) - self.target_entropy}
 
     def after_update(self, batch: Batch) -> dict[str, torch.Tensor]:
         """Called after each update; returns more scalars."""
@@ -264,20 +273,28 @@ class SacAgent(Agent):
         """
         if self.options.critic == "noise":
             return noise
-        return self.executed(obs, self.chunk(noise)).flatten(1)
+        return self.executed(obs, self.chunk(noise)).flatten(-2)
 
     def executed(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """The actions ``[B, Ta, Da]`` that noise ``[B, Tp, Da]`` is decoded to."""
-        return self.context.decode(obs, noise)[:, : self.context.execute]
+        return self.context.decode(obs, noise)[..., : self.context.execute, :]
 
     def reduced(self, q: torch.Tensor) -> torch.Tensor:
         """One value per state, ``[B]``, of all critics' values ``[critics, B]``."""
         if self.options.reduce == "mean":
-            return q.mean(0)
+            return q.mean(-2)
         if self.options.reduce == "subset":
-            order = torch.randperm(len(q), generator=self.generator, device=self.device)
-            q = q[order[: self.options.subset]]
-        return q.amin(0)
+            order = self.random(
+                lambda generator: torch.randperm(
+                    q.shape[-2], generator=generator, device=self.device
+                )
+            )
+            q = q.take_along_dim(order[..., : self.options.subset, None], -2)
+        return q.amin(-2)
+
+    def random(self, draw: Callable[[torch.Generator], torch.Tensor]) -> torch.Tensor:
+        """A draw by the agent's generator; in a team a draw by each member's, stacked."""
+        return draw(self.generator)
 
     def random_noise(
         self, source: NoiseSource, count: int, generator: torch.Generator | None = None
@@ -346,12 +363,16 @@ class SacAgent(Agent):
         Returns:
             Scalars as tensors on the device; reading them waits for the device.
         """
+        return self.learn(self.augment(batch))
+
+    def learn(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """The same, with the batch as it is; in a team the batches of all members, stacked."""
         obs, alpha = self._features(batch.obs), self.alpha
         with torch.no_grad():
             following = self.drawn(batch.next_obs)
             target = self.critic_target(batch, following)
         stored = batch.noise if self.options.critic == "noise" else batch.actions
-        q = self._q(self.critic.weights(), obs, stored.flatten(1))
+        q = self._q(self.critic.weights(), obs, stored.flatten(-2))
         critic_loss = self.critic_loss(q, target, batch)
         self._descend("critic", critic_loss, self.critic_penalty(batch))
         scalars = {"losses/critic": critic_loss.detach()}
@@ -372,9 +393,9 @@ class SacAgent(Agent):
         q = q.detach() / self.reward_scale
         return {
             **scalars,
-            "train/q_mean": q.mean(),
-            "train/q_max_abs": q.abs().max(),
-            "train/target_mean": target.mean() / self.reward_scale,
+            "train/q_mean": q.mean((-2, -1)),
+            "train/q_max_abs": q.abs().amax((-2, -1)),
+            "train/target_mean": target.mean(-1) / self.reward_scale,
             "train/alpha": alpha,
             **self.after_update(batch),
         }
@@ -393,7 +414,7 @@ class SacAgent(Agent):
         return {
             "losses/actor": actor_loss.detach(),
             **{f"losses/{name}": self.multipliers[name].step(gap) for name, gap in gaps.items()},
-            "train/entropy": -log_prob.mean(),
+            "train/entropy": -log_prob.mean(-1),
         }
 
     def drawn(self, obs: torch.Tensor) -> Drawn:
@@ -414,24 +435,28 @@ class SacAgent(Agent):
             pairs.append((obs, *self._random_pairs(batch)))
         if source in ("actor", "mixture"):
             pairs.append((following.obs, following.noise, following.judged))
-        features, noise, actions = (torch.cat(parts) for parts in zip(*pairs, strict=True))
+        features, noise, actions = (torch.cat(parts, -2) for parts in zip(*pairs, strict=True))
         with torch.no_grad():
             wanted = self._q(judge, features, actions)
         found = self._q(self.noise_critic.weights(), features, noise)
-        loss = (found - wanted).square().mean(1).sum()
+        loss = (found - wanted).square().mean(-1).sum(-1)
         self._descend("noise_critic", loss, None)
         return loss.detach()
 
     def _random_pairs(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
         """Random noise for each row and the actions that it is decoded to, both flat."""
-        if not self.options.noise_bank:
-            noise = self.random_noise(self._bank_source, len(batch.obs))
-            return noise.flatten(1), self.executed(batch.obs, noise).flatten(1)
-        rows = torch.arange(len(batch.obs), device=self.device)
-        picked = torch.randint(
-            self.options.noise_bank, rows.shape, generator=self.generator, device=self.device
+        count, bank = batch.obs.shape[-2], self.options.noise_bank
+        if not bank:
+            noise = self.random(
+                lambda generator: self.random_noise(self._bank_source, count, generator)
+            )
+            return noise.flatten(-2), self.executed(batch.obs, noise).flatten(-2)
+        picked = self.random(
+            lambda generator: torch.randint(bank, (count,), generator=generator, device=self.device)
         )
-        return tuple(batch[name][rows, picked].flatten(1) for name in BANK)  # type: ignore[return-value]
+        banks = (batch[name].flatten(-2) for name in BANK)
+        noise, actions = (x.take_along_dim(picked[..., None, None], -2).squeeze(-2) for x in banks)
+        return noise, actions
 
     @torch.no_grad()
     def _banked(self, obs: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
@@ -464,7 +489,8 @@ class SacAgent(Agent):
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimisers, multipliers, generators; loads with ``weights_only=True``."""
-        return copy.deepcopy(
+        self.synchronize()
+        return _copied(
             {
                 **super().state_dict(),
                 "networks": {k: network.state_dict() for k, network in self.networks.items()},
@@ -556,7 +582,7 @@ class SacAgent(Agent):
             return self.context.normalize_obs(obs).to(self.dtype)
 
     def _heads(self, policy: Weights, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        out = self.actor.apply_weights(policy, obs)[0]
+        out = self.actor.apply_weights(policy, obs).select(-3, 0)
         mean, raw = out.split([self.distribution.dim, self.distribution.blocks], dim=-1)
         share = (math.log(self.options.initial_scale) - LOG_SCALE_MIN) / (
             LOG_SCALE_MAX - LOG_SCALE_MIN
@@ -571,10 +597,22 @@ class SacAgent(Agent):
     def _sample(
         self, mean: torch.Tensor, log_scale: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        eps = torch.randn(
-            mean.shape, generator=self.generator, device=self.device, dtype=self.dtype
+        shape = mean.shape[-2:]
+        eps = self.random(
+            lambda generator: torch.randn(
+                shape, generator=generator, device=self.device, dtype=self.dtype
+            )
         )
         return self.distribution.sample(mean, log_scale, eps)
+
+
+def _copied(tree: Any) -> Any:
+    """A copy with tensors in memory of their own: those of a team's member are views."""
+    if isinstance(tree, torch.Tensor):
+        return tree.detach().clone()
+    if isinstance(tree, Mapping):
+        return {key: _copied(value) for key, value in tree.items()}
+    return [_copied(value) for value in tree] if isinstance(tree, list) else tree
 
 
 def _flat(weights: Weights) -> list[torch.Tensor]:

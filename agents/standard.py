@@ -16,6 +16,7 @@ class StandardAgent(SacAgent):
     """SAC with a plain actor and plain critics."""
 
     name = "standard"
+    in_teams = True
 
     def actor_layers(self) -> list[nn.Module]:
         layers = plain_layers(
@@ -45,6 +46,7 @@ class MatchedStandardAgent(StandardAgent):
     """
 
     name = "standard-matched"
+    in_teams = True
 
     def actor_width(self) -> int:
         rival = nn.ModuleList(equivariant_actor_layers(self))

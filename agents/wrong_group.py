@@ -20,6 +20,7 @@ class WrongGroupAgent(EquivariantAgent):
     """Equivariant under rotations that turn observations and noise in opposite directions."""
 
     name = "wrong-group"
+    in_teams = True
     role = "control"
 
     def actor_layers(self) -> list[nn.Module]:

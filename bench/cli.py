@@ -138,6 +138,7 @@ def sweep(
     out: Path = Path("runs"),
     workers: int = 0,
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
+    together: int = 1,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> int:
     """Run all runs of a suite; the same command continues a sweep that was stopped.
@@ -150,6 +151,8 @@ def sweep(
         out: Folder of the runs; a sweep on a cluster needs one that all its machines share.
         workers: Number of runs at the same time; 0: one per core, or as many as fit on the cluster.
         ray: Address of a Ray cluster to run on: auto, or host:port of its head.
+        together: Learners that share a process and are trained as one, which is faster, if they
+            differ in seeds and variants alone.
         dry_run: Only show which runs are left and how long they may take.
     """
     from symsteer.bench.sweep.command import preview, run_plan
@@ -160,7 +163,7 @@ def sweep(
     if dry_run:
         print(preview(plan, workers, ray))
         return 0
-    outcomes = run_plan(plan, workers, ray)
+    outcomes = run_plan(plan, workers, ray, together)
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     for outcome in failed:
         print(f"failed: {outcome.run.label}: {outcome.reason}", file=sys.stderr)

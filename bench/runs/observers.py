@@ -64,6 +64,7 @@ class RecordWriter(Observer):
             device=_device_name(run.agent.device),
             torch_threads=torch.get_num_threads(),
             extensions=extensions_of(run.config),
+            together=run.together,
         )
         if checkpoint:
             self._continue(run, checkpoint, provenance)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,33 @@ def execute(
         return demonstrated_decisions(config, out, demonstrations, progress)
 
     folder = out / run_id(config, files)
-    return _play(config, folder, files, prepare, demonstrated, progress, workers)
+    with _opened(config, folder, files, prepare, demonstrated, progress, workers) as trainer:
+        trainer.play()
+    return folder
+
+
+@contextlib.contextmanager
+def opened(config: RunConfig, out: Path, together: int) -> Iterator[Trainer]:
+    """The trainer of a run that shares this process with others; see :func:`execute`.
+
+    Args:
+        config: what to run.
+        out: folder of the runs.
+        together: number of runs in this process.
+    """
+    _check_all(config, workers=1)
+
+    def prepare() -> ChunkPolicy:
+        return prepare_base(config, out, progress=False)
+
+    def demonstrated() -> Transition:
+        return demonstrated_decisions(config, out, None, progress=False)
+
+    folder = out / run_id(config, {})
+    with _opened(
+        config, folder, {}, prepare, demonstrated, progress=False, together=together
+    ) as trainer:
+        yield trainer
 
 
 def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
@@ -153,7 +180,9 @@ def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
         check_own()
         return demonstrated_decisions(config, folder.parent, None, progress)
 
-    return _play(config, folder, files, prepare, demonstrated, progress, workers)
+    with _opened(config, folder, files, prepare, demonstrated, progress, workers) as trainer:
+        trainer.play()
+    return folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,15 +269,18 @@ def _check_all(config: RunConfig, workers: int) -> None:
         raise UserError("--workers needs --sim cpu: on CUDA one process simulates all environments")
 
 
-def _play(
+@contextlib.contextmanager
+def _opened(
     config: RunConfig,
     folder: Path,
     files: dict[str, Any],
     prepare: Callable[[], ChunkPolicy],
     demonstrated: Callable[[], Transition],
     progress: bool,
-    workers: int,
-) -> Path:
+    workers: int = 1,
+    together: int = 1,
+) -> Iterator[Trainer]:
+    """The trainer of a run that this process alone works on; it is told of errors."""
     resolved = {
         **config.to_json(),
         "evaluation_variant": variant_text(evaluation_variants(config.variants)),
@@ -272,13 +304,13 @@ def _play(
             discard_empty(folder)
             raise
         observers = observers_of(config, resolved, progress)
-        trainer = Trainer(config, folder, base, load_checkpoint(folder), observers, workers)
+        checkpoint = load_checkpoint(folder)
+        trainer = Trainer(config, folder, base, checkpoint, observers, workers, together)
         if decisions is not None:
             trainer.agent.observe_demonstrations(decisions)
         try:
-            trainer.play()
+            yield trainer
         except BaseException as error:
             trainer.stop(error)
             error.add_note(f"continue the run with: symsteer resume {folder}")
             raise
-    return folder

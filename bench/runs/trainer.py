@@ -10,14 +10,15 @@ Observers (:mod:`symsteer.bench.runs.observers`) write the results.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import Agent, AgentContext, Budget, HasCritic
+from symsteer.agents.replay import Batch
 from symsteer.bench.runs.checkpoint import save_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.evaluator import Evaluator, discount, make_env, timeouts_end
@@ -28,6 +29,9 @@ from symsteer.bench.variants import build, evaluation_variants, highest_cost
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation
 from symsteer.policies.contract import ChunkPolicy
+
+Updates: TypeAlias = Generator[Batch, Mapping[str, torch.Tensor], None]
+"""A run that hands out every batch that is due, and is sent the scalars of the update."""
 
 
 def budget_of(config: RunConfig) -> Budget:
@@ -107,6 +111,7 @@ class Trainer:
         checkpoint: a state to continue from.
         observers: called in this order.
         workers: processes that share the environments.
+        together: number of runs in this process.
 
     Raises:
         UserError: if the checkpoint was made with another base policy or agent.
@@ -120,9 +125,10 @@ class Trainer:
         checkpoint: Mapping[str, Any] | None,
         observers: Sequence[Observer],
         workers: int = 1,
+        together: int = 1,
     ):
         self.config, self.folder, self.base = config, folder, base
-        self.observers, self.workers = observers, workers
+        self.observers, self.workers, self.together = observers, workers, together
         self.agent = new_agent(config, base)
         self.feasible = feasible_return(config, self.agent, base)
         self.env_steps = self.decisions = self.updates = 0
@@ -132,6 +138,7 @@ class Trainer:
         self.final = False
         self.clock = Clock()
         self.update_seconds = self.evaluate_seconds = self.diagnose_seconds = 0.0
+        self.waited = 0.0  # seconds in which other runs of this process went on
         earlier = self._restore(checkpoint) if checkpoint else 0.0
         self.start = time.perf_counter() - earlier
         for observer in observers:
@@ -163,15 +170,33 @@ class Trainer:
             "update": self.update_seconds,
             "evaluate": self.evaluate_seconds,
             "diagnose": self.diagnose_seconds,
-            "total": time.perf_counter() - self.start,
+            "total": time.perf_counter() - self.start - self.waited,
         }
 
     def play(self) -> None:
-        """Train to the end of the budget, evaluate the last checkpoint, close."""
+        """Execute the rest of the run."""
+        updates = self.updates_due()
+        batch = next(updates, None)
+        while batch is not None:
+            begin = time.perf_counter()
+            scalars = self.agent.update(batch)
+            self.add_update(time.perf_counter() - begin)
+            batch = following(updates, scalars)
+
+    def add_update(self, seconds: float) -> None:
+        """Count the time of an update that somebody else has made."""
+        self.update_seconds += seconds
+        self.waited -= seconds
+
+    def updates_due(self) -> Updates:
+        """Train to the end of the budget, evaluate the last checkpoint, close.
+
+        Whoever executes it makes the updates: it gives a batch, and takes the scalars.
+        """
         if not self.final:
             if self.train_until is None:
                 self._prepare()
-            self._train()
+            yield from self._train()
             self.evaluate(final=True)
             self.final = True
             self._checkpoint()
@@ -201,7 +226,7 @@ class Trainer:
             env_steps=self.env_steps,
             decisions=self.decisions,
             updates=self.updates,
-            wall_clock=time.perf_counter() - self.start,
+            wall_clock=self.seconds["total"],
             final=final,
             episodes=Episodes.model_validate(columns),
             diagnostics=dict(diagnostics),
@@ -225,7 +250,7 @@ class Trainer:
             self.decisions += env.decisions
             env.close()
 
-    def _train(self) -> None:
+    def _train(self) -> Updates:
         assert self.train_until is not None
         end = min(self.train_until, self.config.env_steps)
         if self.env_steps >= end:
@@ -233,10 +258,10 @@ class Trainer:
         env = self._make_env(ignore_terminations=False)
         env.control_steps, env.decisions = self.env_steps, self.decisions
         while self.env_steps < end:
-            self._train_until_checkpoint(env, end)
+            yield from self._train_until_checkpoint(env, end)
         env.close()
 
-    def _train_until_checkpoint(self, env: LatentNoiseEnv, end: int) -> None:
+    def _train_until_checkpoint(self, env: LatentNoiseEnv, end: int) -> Updates:
         """Train from one fresh start of all environments to the next, or to the end."""
         config, agent = self.config, self.agent
         if self.next_evaluation == 0:
@@ -254,7 +279,11 @@ class Trainer:
             begin = time.perf_counter()
             agent.observe(step)
             for batch in agent.batches():
-                scalars.append(agent.update(batch))
+                given = time.perf_counter()
+                self.update_seconds += given - begin
+                scalars.append((yield batch))
+                begin = time.perf_counter()
+                self.waited += begin - given
                 self.updates += 1
             self.update_seconds += time.perf_counter() - begin
             for observer in self.observers:
@@ -316,3 +345,11 @@ class Trainer:
         self.update_seconds, self.evaluate_seconds = seconds["update"], seconds["evaluate"]
         self.diagnose_seconds = seconds["diagnose"]
         return seconds["total"]
+
+
+def following(updates: Updates, scalars: Mapping[str, torch.Tensor]) -> Batch | None:
+    """Send the scalars of an update; the next batch that is due, or None at the end of the run."""
+    try:
+        return updates.send(scalars)
+    except StopIteration:
+        return None

@@ -53,7 +53,8 @@ class RayCluster:
 
     def submit(self, function: Callable[..., Result], *args: Any) -> Future:
         """Start a task."""
-        cuda = any(isinstance(a, RunConfig) and "cuda" in (a.sim, a.device) for a in args)
+        flat = [part for a in args for part in (a if isinstance(a, tuple) else (a,))]
+        cuda = any(isinstance(a, RunConfig) and "cuda" in (a.sim, a.device) for a in flat)
         # Other machines need the full path of the folder.
         args = tuple(self._out if isinstance(a, Path) else a for a in args)
         if (function, cuda) not in self._functions:

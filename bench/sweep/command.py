@@ -40,21 +40,26 @@ def number_of_workers(asked: int, configs: list[RunConfig]) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_plan(plan: Plan, workers: int = 0, ray: str | None = None) -> list[Outcome]:
+def run_plan(
+    plan: Plan, workers: int = 0, ray: str | None = None, together: int = 1
+) -> list[Outcome]:
     """Execute every run of a plan that is not finished, and report on stdout.
 
     Args:
         plan: the runs.
         workers: number of runs at the same time; 0: one per core, or as many as fit on the cluster.
         ray: address of a Ray cluster to use instead of this machine.
+        together: learners that share a process, if they differ in seeds and variants alone.
 
     Returns:
         The outcome of each run, in the order in which they ended; skipped ones first.
 
     Raises:
-        UserError: if ``workers`` or ``ray`` is wrong.
+        UserError: if ``workers``, ``ray`` or ``together`` is wrong.
         OSError: if the folder of the runs cannot be created.
     """
+    if together < 1:
+        raise UserError(f"--together is {together}; it must be at least 1")
     number = number_of_workers(workers, list(plan.configs.values()))
     estimate = Estimate()
     outcomes, todo = [], []
@@ -91,7 +96,7 @@ def run_plan(plan: Plan, workers: int = 0, ray: str | None = None) -> list[Outco
         display = stack.enter_context(kind(plan, todo, estimate, pool.capacity, console))
         failures = {}
         try:
-            for outcome in execute_plan(plan, todo, pool, display):
+            for outcome in execute_plan(plan, todo, pool, display, together):
                 outcomes.append(outcome)
                 display.ended(outcome)
                 if outcome.status == "failed":

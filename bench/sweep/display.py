@@ -120,8 +120,7 @@ class LiveDisplay(Display):
 
     def retried(self, task: Task, result: Result) -> None:
         """A task failed and will be tried again."""
-        label = self.labels[task.run] if task.run else f"{task.kind} {task.label}"
-        self.write("again", f"{label}: {result.reason}")
+        self.write("again", f"{self._label(task, *task.team)}: {result.reason}")
 
     def write(self, status: str, text: str) -> None:
         """Print one line above the live ones."""
@@ -133,9 +132,10 @@ class LiveDisplay(Display):
 
     def refresh(self, running: list[Task]) -> None:
         """Draw the live lines again."""
-        progress = {task: self._progress(task) for task in running}
+        lines_of = [(task, run) for task in running for run in task.team or (None,)]
+        progress = {line: self._progress(*line) for line in lines_of}
         # On a cluster, tasks without progress wait for a processor.
-        shown = [task for task in running if self.workers or progress[task]]
+        shown = [line for line in lines_of if self.workers or progress[line]]
         bars = self.longest + BAR + GAP <= self.room
         table = Table.grid(padding=(0, GAP, 0, 0), expand=True)
         table.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
@@ -144,18 +144,22 @@ class LiveDisplay(Display):
         for width in NUMBERS:
             table.add_column(no_wrap=True, justify="right", min_width=width)
         height = max(1, self.console.height - 3)
-        for task in shown[:height]:
-            label = self.labels[task.run] if task.run else f"{task.kind} {task.label}"
-            table.add_row(label, *self._row(task, progress[task], bars))
+        for task, run in shown[:height]:
+            label = self._label(task, *([run] if run else []))
+            table.add_row(label, *self._row(task, progress[task, run], bars))
         lines: list[Any] = [table]
         if len(shown) > height:
             lines.append(Text(f"and {len(shown) - height} more", style="dim"))
-        going = {task.run: progress[task] for task in shown if task.run}
+        going = {run: progress[task, run] for task, run in shown if run}
         self.live.update(Group(*lines, self._whole(going)))
 
-    def _progress(self, task: Task) -> Mapping[str, Any] | None:
+    def _label(self, task: Task, *runs: PlannedRun) -> str:
+        """The label of a run, or of a task without runs."""
+        return self.labels[runs[0]] if runs else f"{task.kind} {task.label}"
+
+    def _progress(self, task: Task, run: PlannedRun | None) -> Mapping[str, Any] | None:
         """The progress of a run, unless an earlier process wrote it."""
-        found = read_progress(self.out / task.run.run_id) if task.run else None
+        found = read_progress(self.out / run.run_id) if run else None
         if found:
             with contextlib.suppress(KeyError, TypeError, ValueError):
                 if datetime.fromisoformat(found["updated"]) >= self.begun[task][1] - SKEW:
@@ -164,7 +168,7 @@ class LiveDisplay(Display):
 
     def _row(self, task: Task, progress: Mapping[str, Any] | None, bars: bool) -> list[Any]:
         """The cells of a live line after its label."""
-        if not task.run:
+        if not task.team:
             elapsed = duration(time.monotonic() - self.begun[task][0])
             return [*([""] if bars else []), "", "", "for", elapsed]
         share = share_done(progress)

@@ -9,10 +9,13 @@ import heapq
 import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
+from symsteer.agents import AGENTS
+from symsteer.agents.team import can_join
 from symsteer.bench.runs.base_policy import demonstration_path, find_base
+from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.sweep.plan import Plan, PlannedRun
 from symsteer.bench.sweep.work import Result, build_base, build_demonstrations, play
 
@@ -69,38 +72,41 @@ class Watcher(Protocol):
 
 @dataclass(eq=False)
 class Task:
-    """Something to do: collect demonstrations, train a base policy, or execute a run."""
+    """Something to do: collect demonstrations, train a base policy, or execute runs."""
 
     kind: Literal["demonstrations", "base policy", "run"]
     label: str
     function: Callable[..., Result]
     args: tuple
-    run: PlannedRun | None = None
+    team: tuple[PlannedRun, ...] = ()
+    """The runs that it executes; several are trained together."""
     then: list[Task] = field(default_factory=list)
     """Tasks that need the result of this one."""
-    waits: bool = False
-    """Whether it needs the result of another one."""
+    waits: int = 0
+    """Number of tasks whose results it still needs."""
     tries: int = 0
     losses: int = 0
 
     @property
     def runs(self) -> list[PlannedRun]:
         """The runs that cannot be executed if this task fails."""
-        own = [self.run] if self.run else []
-        return own + [run for task in self.then for run in task.runs]
+        return [*self.team, *(run for task in self.then for run in task.runs)]
 
 
-def tasks_of(plan: Plan, todo: list[PlannedRun], patience: float = 0.0) -> list[Task]:
+def tasks_of(
+    plan: Plan, todo: list[PlannedRun], patience: float = 0.0, together: int = 1
+) -> list[Task]:
     """The tasks of a sweep: shared data that do not exist yet, each once, then the runs.
 
     Args:
         plan: of the sweep.
         todo: the runs to execute.
         patience: seconds to wait for a run that another process seems to hold.
+        together: number of runs that one task may execute, if they can be trained together.
     """
     demonstrations: dict[tuple, Task | None] = {}
     bases: dict[tuple, Task | None] = {}
-    runs = []
+    needs: dict[PlannedRun, Task | None] = {}
     for run in todo:
         config = plan.configs[run]
         wanted = config.demonstrations
@@ -117,18 +123,45 @@ def tasks_of(plan: Plan, todo: list[PlannedRun], patience: float = 0.0) -> list[
             words = f"{config.policy_name} for {words} demonstrations"
             bases[base_key] = Task("base policy", words, build_base, args)
             _join(demonstrations[demos_key], bases[base_key])
-        runs.append(Task("run", run.label, play, (*args, patience), run))
-        _join(bases[base_key], runs[-1])
+        needs[run] = bases[base_key]
+    runs = []
+    for team in _teams(plan, todo, together):
+        runs.append(_run_task(plan, team, patience))
+        for base in {id(needs[run]): needs[run] for run in team}.values():
+            _join(base, runs[-1])
     return [task for task in (*demonstrations.values(), *bases.values(), *runs) if task]
 
 
+def _run_task(plan: Plan, team: tuple[PlannedRun, ...], patience: float) -> Task:
+    configs = tuple(plan.configs[run] for run in team)
+    return Task("run", team[0].label, play, (configs, plan.out, patience), team)
+
+
+def _teams(plan: Plan, todo: list[PlannedRun], together: int) -> list[tuple[PlannedRun, ...]]:
+    """Runs that differ in seeds and variants alone, up to ``together`` of them; others alone."""
+    teams: list[list[PlannedRun]] = []
+    open_teams: dict[RunConfig, list[PlannedRun]] = {}
+    for run in todo:
+        config = plan.configs[run]
+        demonstrations = replace(config.demonstrations, seed=0)
+        key = replace(config, seed=0, policy_seed=0, variant="none", demonstrations=demonstrations)
+        team = open_teams.get(key)
+        if team is None or len(team) == together:
+            team = open_teams[key] = []
+            teams.append(team)
+        team.append(run)
+        if not can_join(AGENTS.get(config.agent)):
+            del open_teams[key]
+    return [tuple(team) for team in teams]
+
+
 def execute_plan(
-    plan: Plan, todo: list[PlannedRun], workers: Workers, watcher: Watcher
+    plan: Plan, todo: list[PlannedRun], workers: Workers, watcher: Watcher, together: int = 1
 ) -> Iterator[Outcome]:
     """Execute runs of a plan, and yield the outcome of each when it ends.
 
     A run that fails does not stop the others. First come tasks that others wait for, then the runs
-    in the order of the suite, then tasks that failed before.
+    in the order of the suite, then tasks that failed before; these are executed one by one.
     """
     order = itertools.count()
     ready: list[tuple[int, int, Task]] = []
@@ -137,9 +170,10 @@ def execute_plan(
         rank = 2 if task.tries else 1 if task.kind == "run" else 0
         heapq.heappush(ready, (rank, next(order), task))
 
-    for task in tasks_of(plan, todo, workers.patience):
+    for task in tasks_of(plan, todo, workers.patience, together):
         if not task.waits:
             offer(task)
+    ended: set[PlannedRun] = set()
     running: dict[Future, Task] = {}
     while ready or running:
         while ready and (workers.capacity is None or len(running) < workers.capacity):
@@ -149,18 +183,29 @@ def execute_plan(
         done, _ = wait(running, timeout=REFRESH_SECONDS, return_when=FIRST_COMPLETED)
         for future in done:
             task = running.pop(future)
-            result = workers.result(future)
-            if result.status == "done":
-                for follower in task.then:
-                    offer(follower)
-                if task.run:
-                    yield Outcome(task.run, "finished")
-            elif _again(task, result):
-                watcher.retried(task, result)
-                offer(task)
-            else:
-                for run in task.runs:
-                    yield _failure(run, task, result)
+            whole = workers.result(future)
+            parts = [(task, whole)]
+            if len(task.team) > 1:
+                each = whole.parts or (whole,) * len(task.team)
+                alone = [_run_task(plan, (run,), workers.patience) for run in task.team]
+                parts = list(zip(alone, each, strict=True))
+            for part, result in parts:
+                if result.status == "done":
+                    for follower in part.then:
+                        follower.waits -= 1
+                        if not follower.waits:
+                            offer(follower)
+                    for run in part.team:
+                        yield Outcome(run, "finished")
+                elif _again(part, result):
+                    watcher.retried(part, result)
+                    offer(part)
+                else:
+                    # A team that waits for several base policies may lose more than one.
+                    for run in dict.fromkeys(part.runs):
+                        if run not in ended:
+                            ended.add(run)
+                            yield _failure(run, part, result)
         watcher.refresh(list(running.values()))
 
 
@@ -176,7 +221,7 @@ def _again(task: Task, result: Result) -> bool:
 def _failure(run: PlannedRun, task: Task, result: Result) -> Outcome:
     if result.status == "busy":
         return Outcome(run, "elsewhere", result.reason)
-    if task.run:
+    if task.team:
         return Outcome(run, "failed", result.reason, result.trace)
     return Outcome(run, "failed", f"its {task.kind} failed: {result.reason}", result.trace)
 
@@ -184,4 +229,4 @@ def _failure(run: PlannedRun, task: Task, result: Result) -> Outcome:
 def _join(first: Task | None, then: Task | None) -> None:
     if first and then:
         first.then.append(then)
-        then.waits = True
+        then.waits += 1

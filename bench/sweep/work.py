@@ -20,6 +20,7 @@ from symsteer.bench.runs.base_policy import demonstration_file, find_base, prepa
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import RunBusyError, is_finished, run_id
 from symsteer.bench.runs.run import execute
+from symsteer.bench.runs.together import execute_together
 from symsteer.errors import UserError
 
 POLL_SECONDS = 0.5
@@ -37,6 +38,8 @@ class Result:
     reason: str = ""
     trace: str = ""
     """The traceback of an unexpected error."""
+    parts: tuple[Result, ...] = ()
+    """Of each run, if the task executed several."""
 
     def __post_init__(self) -> None:
         # The message of any library becomes one line of limited length.
@@ -59,19 +62,35 @@ def build_base(config: RunConfig, out: Path) -> Result:
     return _guarded(lambda: prepare_base(config, out, progress=False))
 
 
-def play(config: RunConfig, out: Path, patience: float) -> Result:
-    """Execute a run, or continue it.
+def play(configs: tuple[RunConfig, ...], out: Path, patience: float) -> Result:
+    """Execute runs, or continue them; several are trained together.
 
     Args:
-        config: of the run.
+        configs: of the runs.
         out: folder of the runs.
-        patience: seconds to wait until files of another machine are visible here: the base policy
-            that it has trained, or the released lock of the run.
+        patience: seconds to wait until files of another machine are visible here: the base policies
+            that it has trained, or the released lock of a run.
     """
-    folder = out / run_id(config, {})
     deadline = time.monotonic() + patience
-    while find_base(config, out) is None and time.monotonic() < deadline:
+    while any(find_base(c, out) is None for c in configs) and time.monotonic() < deadline:
         time.sleep(POLL_SECONDS)
+    if len(configs) == 1:
+        return _play(configs[0], out, deadline)
+    one_thread()
+    parts = []
+    for config, error in zip(configs, execute_together(configs, out), strict=True):
+        if isinstance(error, RunBusyError):
+            parts.append(_play(config, out, deadline))
+        else:
+            parts.append(_result(error))
+    gc.collect()
+    return Result(
+        "done" if all(part.status == "done" for part in parts) else "failed", parts=tuple(parts)
+    )
+
+
+def _play(config: RunConfig, out: Path, deadline: float) -> Result:
+    folder = out / run_id(config, {})
     while True:
         if is_finished(folder):
             return Result("done")
@@ -89,11 +108,18 @@ def _guarded(action: Callable[[], object]) -> Result:
         action()
     except RunBusyError:
         raise
-    except UserError as error:
-        return Result("failed", str(error))
     except Exception as error:
-        return Result("failed", f"{type(error).__name__}: {error}", traceback.format_exc())
+        return _result(error)
     finally:
         # Free the simulations of a failed run: a process can hold only a few.
         gc.collect()
-    return Result("done")
+    return _result(None)
+
+
+def _result(error: Exception | None) -> Result:
+    if error is None:
+        return Result("done")
+    if isinstance(error, UserError):
+        return Result("failed", str(error))
+    trace = "".join(traceback.format_exception(error))
+    return Result("failed", f"{type(error).__name__}: {error}", trace)

@@ -42,7 +42,8 @@ class Provenance(Block):
     `version` is SymSteer's (null in records before schema version 4). In a git checkout of the
     project `commit` names the code, and `dirty` says whether tracked files differ from it or git
     does not track some of the code. Elsewhere both are null and `sha256` names the code: the hash
-    of all Python files of the installed package.
+    of all Python files of the installed package. `together` counts the runs in the same process:
+    agents that are trained together learn the same as alone but for rounding.
     """
 
     commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
@@ -55,10 +56,15 @@ class Provenance(Block):
     platform: Name
     device: Name
     torch_threads: Annotated[Count, Field(ge=1)]
+    together: Annotated[Count, Field(ge=1)] = 1
 
     @classmethod
     def collect(
-        cls, device: str, torch_threads: int, extensions: Iterable[registry.Extension] = ()
+        cls,
+        device: str,
+        torch_threads: int,
+        extensions: Iterable[registry.Extension] = (),
+        together: int = 1,
     ) -> Provenance:
         """Describe this machine and the code that runs on it."""
         root = checkout()
@@ -74,6 +80,7 @@ class Provenance(Block):
             platform=f"{platform.system()} {platform.machine()}",
             device=device,
             torch_threads=torch_threads,
+            together=together,
         )
 
 

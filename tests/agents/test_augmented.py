@@ -47,7 +47,7 @@ def test_turned_batches_teach_the_critics_the_symmetry():
 def test_each_row_is_turned_as_a_whole(problem, monkeypatch, group, images):
     """Every vector of a row, in observations, noise, actions and bank, by one symmetry."""
     seen = []
-    monkeypatch.setattr(StandardAgent, "update", lambda self, batch: seen.append(batch) or {})
+    monkeypatch.setattr(StandardAgent, "learn", lambda self, batch: seen.append(batch) or {})
     agent = problem.agent("augmented", augmentation=group, dtype=torch.float64)
     batch = problem.batch(96, dtype=torch.float64)
     fields = agent.vector_fields
@@ -77,7 +77,7 @@ def test_each_row_is_turned_as_a_whole(problem, monkeypatch, group, images):
 
 def test_batches_are_turned_anew_and_alike_for_a_seed(problem, monkeypatch):
     seen = []
-    monkeypatch.setattr(StandardAgent, "update", lambda self, batch: seen.append(batch.obs) or {})
+    monkeypatch.setattr(StandardAgent, "learn", lambda self, batch: seen.append(batch.obs) or {})
     for seed in (0, 0, 1):
         agent = problem.agent("augmented", seed=seed)
         for _ in range(2):

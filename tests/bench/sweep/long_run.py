@@ -9,7 +9,7 @@ _TINY = tiny_config()
 LONG = dataclasses.replace(
     _TINY,
     env_steps=480,
-    checkpoint_every=120,
+    checkpoint_every=60,
     evaluation=dataclasses.replace(_TINY.evaluation, every=240),
 )
 """Long enough to be killed after its first checkpoint."""

@@ -194,7 +194,7 @@ def screen(sweep, width: int) -> list[str]:
     console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
     todo = sweep.runs[1:]
     display = LiveDisplay(sweep, todo, Estimate(), 3, console)
-    tasks = [task for task in tasks_of(sweep, todo) if task.run]
+    tasks = [task for task in tasks_of(sweep, todo) if task.team]
     base = Task("base policy", "edp for PickCube-v1", print, ())
     for task in (tasks[0], tasks[1], base):
         display.started(task)
@@ -227,7 +227,7 @@ def test_steps_beyond_the_budget_are_not_shown(sweep):
 
 def test_a_pipe_gets_one_plain_line_a_run_that_ended(sweep):
     stream = io.StringIO()
-    one = Task("run", "c", print, (), sweep.runs[1])
+    one = Task("run", "c", print, (), tuple(sweep.runs[1:2]))
     with Display(sweep, sweep.runs[1:], Estimate(), 2, Console(file=stream, width=20)) as display:
         display.started(one)
         display.refresh([one])
@@ -256,6 +256,45 @@ def test_a_reason_is_one_line_of_bounded_length():
     assert len(reason) == 500
 
 
+def test_a_team_has_a_live_line_for_each_of_its_runs(sweep):
+    console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
+    display = LiveDisplay(sweep, sweep.runs, Estimate(), 3, console)
+    team = Task("run", "c", print, (), tuple(sweep.runs[1:3]))
+    display.started(team)
+    display.refresh([team])
+    console.print(display.live.get_renderable())
+    first, second, *_ = console.file.getvalue().splitlines()
+    assert first.startswith("standard PickCube-v1 none s0")
+    assert second.startswith("approximate PickCube-v1 none s0")
+
+
+def test_learners_that_differ_in_seeds_and_variants_alone_are_a_team(tmp_path):
+    def learner(agent="standard", **changes):
+        return tiny_config(agent, **changes)
+
+    configs = (
+        *(learner(seed=seed) for seed in range(3)),
+        learner(seed=0, variant="wind:1"),
+        learner(seed=0, task="PushCube-v1"),
+        learner(seed=1, task="PushCube-v1"),
+        learner("equivariant", seed=0),
+        learner(options={"lr": 0.01}, seed=0),
+        *(learner("zero", seed=seed) for seed in range(2)),
+    )
+    plan = make_plan(Suite("teams", "", configs), tmp_path)
+
+    def teams(together):
+        tasks = [task for task in tasks_of(plan, plan.runs, together=together) if task.team]
+        return [[plan.runs.index(run) for run in task.team] for task in tasks], tasks
+
+    assert teams(1)[0] == [[i] for i in range(10)]
+    assert teams(3)[0] == [[0, 1, 2], [3], [4, 5], [6], [7], [8], [9]]
+    found, tasks = teams(4)
+    assert found == [[0, 1, 2, 3], [4, 5], [6], [7], [8], [9]]
+    # Each seed has a base policy of its own; a team waits for all of them, each once.
+    assert [task.waits for task in tasks] == [3, 2, 1, 1, 1, 1]
+
+
 def test_equal_demonstrations_and_bases_are_built_once(tmp_path):
     one = tiny_config()
     configs = (
@@ -270,5 +309,5 @@ def test_equal_demonstrations_and_bases_are_built_once(tmp_path):
     assert [task.kind for task in tasks] == ["demonstrations"] * 2 + ["base policy"] * 3 + [
         "run"
     ] * 5
-    assert [task.waits for task in tasks] == [False] * 2 + [True] * 8
+    assert [task.waits for task in tasks] == [0] * 2 + [1] * 8
     assert [len(task.then) for task in tasks[:5]] == [2, 1, 3, 1, 1]

@@ -37,7 +37,7 @@ class Witness:
         self.again: list[tuple[str, str]] = []
 
     def started(self, task: Task) -> None:
-        self.tasks.append((task.kind, task.run.agent if task.run else ""))
+        self.tasks.append((task.kind, " ".join(run.agent for run in task.team)))
 
     def retried(self, task: Task, result: Result) -> None:
         self.again.append((task.kind, result.reason))
@@ -58,6 +58,22 @@ def work(plan: Plan, tmp_path, witness: Witness) -> dict[str, Outcome]:
 
 def workers() -> list[int]:
     return [process.pid for process in multiprocessing.active_children()]
+
+
+def test_of_a_team_only_the_run_that_fails_is_tried_again(tmp_path):
+    configs = tuple(tiny_config("standard", options={"gamma": 0.5}, seed=seed) for seed in (0, 1))
+    plan = make_plan(Suite("team", "", configs), tmp_path / "runs")
+    (plan.out / plan.runs[1].run_id / CHECKPOINT).mkdir(parents=True)
+    pool, witness = LocalPool(1, tmp_path / "log"), Witness()
+    try:
+        outcomes = list(execute_plan(plan, plan.runs, pool, witness, together=2))
+    finally:
+        pool.stop()
+    assert [(o.run.seed, o.status) for o in outcomes] == [(0, "finished"), (1, "failed")]
+    assert witness.tasks[-2:] == [("run", "standard standard"), ("run", "standard")]
+    assert CHECKPOINT in outcomes[1].reason
+    record = read_record(plan.out / plan.runs[0].run_id / "record.json")
+    assert (record.status, record.provenance.together) == ("finished", 2)
 
 
 def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tmp_path):

@@ -1,0 +1,152 @@
+"""Members of a team learn what they would learn alone."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+from symsteer.agents import AGENTS
+from symsteer.agents.sac import SacAgent
+from symsteer.agents.team import Team, can_join
+
+LEARNERS = [name for name in AGENTS.builtin if issubclass(AGENTS.get(name), SacAgent)]
+SEEDS = (3, 1, 2)
+ROWS = 16
+
+
+def members(problem, name, seeds=SEEDS, **options):
+    """Agents that differ in seed, normaliser and decoder, with decisions of their own."""
+    agents = []
+    for seed in seeds:
+        agent = problem.agent(
+            name,
+            seed=seed,
+            dtype=torch.float64,
+            normalize_obs=lambda obs, seed=seed: obs / (1 + seed),
+            **options,
+        )
+        decode = agent.context.decode
+        object.__setattr__(
+            agent.context,
+            "decode",
+            lambda obs, noise, decode=decode, seed=seed: decode(obs, noise / (1 + seed)),
+        )
+        agent.observe(problem.transition(64, seed))
+        agents.append(agent)
+    return agents
+
+
+def batch_of(agent):
+    options = agent.options
+    return agent.replay.sample(ROWS, options.gamma, options.n_step)
+
+
+def alone(agents, updates):
+    return [[agent.update(batch_of(agent)) for _ in range(updates)] for agent in agents]
+
+
+def together(agents, updates):
+    team = Team(agents)
+    rounds = [team.update([batch_of(agent) for agent in agents]) for _ in range(updates)]
+    return team, [list(scalars) for scalars in zip(*rounds, strict=True)]
+
+
+def tensors(tree):
+    if isinstance(tree, torch.Tensor):
+        return [tree]
+    if isinstance(tree, dict):
+        tree = [tree[key] for key in sorted(tree, key=str)]
+    return [t for part in tree for t in tensors(part)] if isinstance(tree, list | tuple) else []
+
+
+def assert_same_state(agents, others):
+    for agent, other in zip(agents, others, strict=True):
+        mine, theirs = agent.state_dict(), other.state_dict()
+        assert mine.keys() == theirs.keys()
+        found, wanted = tensors(mine), tensors(theirs)
+        assert len(found) == len(wanted)
+        for x, y in zip(found, wanted, strict=True):
+            torch.testing.assert_close(x, y, rtol=1e-7, atol=1e-10)
+        assert agent.updates == other.updates
+
+
+@pytest.mark.parametrize("critic", ["noise", "aliased", "sampler"])
+@pytest.mark.parametrize("name", LEARNERS)
+def test_members_learn_what_they_learn_alone(problem, name, critic):
+    single, team = (members(problem, name, critic=critic) for _ in range(2))
+    expected, (_, found) = alone(single, 5), together(team, 5)
+    assert_same_state(team, single)
+    for mine, theirs in zip(found, expected, strict=True):
+        for scalars, others in zip(mine, theirs, strict=True):
+            assert scalars.keys() == others.keys()
+            for key, value in scalars.items():
+                torch.testing.assert_close(value, others[key], rtol=1e-7, atol=1e-10)
+    # They do differ from each other, and act with what they have learned.
+    obs = problem.batch(dtype=torch.float64).obs
+    noise = [agent.act(obs, deterministic=True) for agent in team]
+    assert not torch.allclose(noise[0], noise[1])
+    for agent, other in zip(team, single, strict=True):
+        torch.testing.assert_close(agent.act(obs), other.act(obs))
+        torch.testing.assert_close(agent.q_values(obs, noise[0]), other.q_values(obs, noise[0]))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"reduce": "subset", "critics": 4},
+        {"reduce": "mean", "soft_backup": True},
+        {"noise_bank": 0, "distill": "gaussian", "distill_steps": 0.5},
+        {"bound_penalty": 0.1, "timeouts_terminal": True, "activation": "tanh"},
+        {"actor_delay": 2, "distill": "actor", "layer_norm": False},
+    ],
+    ids=lambda options: "-".join(options),
+)
+def test_with_other_options(problem, options):
+    single, team = (members(problem, "equivariant", **options) for _ in range(2))
+    alone(single, 5)
+    together(team, 5)
+    assert_same_state(team, single)
+
+
+def test_agents_join_and_leave(problem):
+    """Alone, then together, then alone or in a smaller team; nothing is lost on the way."""
+    single, agents = (members(problem, "approximate") for _ in range(2))
+    alone(single, 7)
+    alone(agents, 2)
+    team, _ = together(agents, 2)
+    team.dissolve()
+    smaller, _ = together(agents[:2], 2)
+    alone(agents[2:], 2)
+    smaller.dissolve()
+    alone(agents, 1)
+    assert_same_state(agents, single)
+
+
+def test_a_checkpoint_of_a_member_is_its_own(problem):
+    """It holds what the team keeps for it, and not the others' parameters."""
+    agents = members(problem, "standard")
+    together(agents, 3)
+    state = copy.deepcopy(agents[1].state_dict())
+    for tensor in tensors(state):
+        assert tensor.untyped_storage().nbytes() == tensor.numel() * tensor.element_size()
+    (other,) = members(problem, "standard", seeds=SEEDS[1:2])
+    other.load_state_dict(state)
+    other.replay.load_state_dict(agents[1].replay.state_dict())
+    alone([other], 2)
+    together(agents, 2)
+    assert_same_state([other], agents[1:2])
+
+
+def test_only_classes_that_say_so_can_join(problem):
+    """The hooks of a subclass may not expect one more dimension."""
+    agent = problem.agent("standard")
+
+    class Own(type(agent)):
+        def actor_loss(self, q, noise, log_prob, batch):
+            return super().actor_loss(q, noise, log_prob, batch).mean()
+
+    assert can_join(type(agent))
+    assert not can_join(Own)
+    assert not can_join(AGENTS.get("zero"))

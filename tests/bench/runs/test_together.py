@@ -1,0 +1,146 @@
+"""Runs that share a process have the records of runs that do not, but for rounding."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+from symsteer.agents.standard import StandardAgent
+from symsteer.bench.runs.folder import run_id
+from symsteer.bench.runs.run import execute
+from symsteer.bench.runs.together import execute_together
+from symsteer.leaderboard.records import read_record
+from tests.bench.tiny_run import tiny_config
+
+SEEDS = (0, 1)
+OPTIONS = {"gamma": 0.5}
+
+
+def configs(agent="standard", seeds=SEEDS, **changes):
+    return [
+        tiny_config(agent, options=OPTIONS if agent != "zero" else None, seed=seed, **changes)
+        for seed in seeds
+    ]
+
+
+def outcome(folder):
+    """What an episode-by-episode comparison needs: successes, returns, and rounded diagnostics."""
+    record = read_record(folder / "record.json")
+    return record, [
+        (e.env_steps, e.updates, e.episodes.seed, e.episodes.success_once)
+        for e in record.evaluations
+    ]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The folder of runs that were executed one after the other."""
+    out = tmp_path_factory.mktemp("alone")
+    for config in configs():
+        execute(config, out, progress=False)
+    return out
+
+
+def assert_same(folder, other):
+    (mine, points), (theirs, others) = outcome(folder), outcome(other)
+    assert mine.status == theirs.status == "finished"
+    assert points == others
+    assert mine.budget == theirs.budget
+    for e, f in zip(mine.evaluations, theirs.evaluations, strict=True):
+        for key, value in e.diagnostics.items():
+            wanted = f.diagnostics[key]
+            if wanted is not None:
+                wanted = pytest.approx(wanted, rel=1e-2, abs=1e-2)
+            assert value == wanted, key
+
+
+@pytest.fixture(scope="module")
+def team(tmp_path_factory):
+    """The folder of the same runs, executed together."""
+    out = tmp_path_factory.mktemp("team")
+    assert execute_together(configs(), out) == [None] * len(SEEDS)
+    return out
+
+
+def test_the_records_are_those_of_single_runs(alone, team):
+    for config in configs():
+        name = run_id(config, {})
+        assert_same(team / name, alone / name)
+        assert read_record(team / name / "record.json").provenance.together == len(SEEDS)
+        assert read_record(alone / name / "record.json").provenance.together == 1
+
+
+def test_the_time_of_a_run_does_not_contain_that_of_the_others(team):
+    for config in configs():
+        clock = read_record(team / run_id(config, {}) / "record.json").wall_clock
+        parts = sum(
+            getattr(clock, part)
+            for part in ("simulate", "decode", "update", "evaluate", "diagnose")
+        )
+        assert 0 < clock.update < parts <= clock.total
+
+
+def test_a_killed_team_continues(alone, tmp_path, monkeypatch):
+    """One run got further than the others before the process was killed."""
+    from symsteer.bench.runs import trainer
+
+    written = []
+    stock = trainer.save_checkpoint
+
+    def save(folder, state):
+        stock(folder, state)
+        written.append(folder)
+        if len(written) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(trainer, "save_checkpoint", save)
+    changed = [dataclasses.replace(config, checkpoint_every=5) for config in configs()]
+    with pytest.raises(KeyboardInterrupt):
+        execute_together(changed, tmp_path)
+    states = [json.loads((tmp_path / run_id(c, {}) / "record.json").read_text()) for c in changed]
+    assert {state["status"] for state in states} == {"interrupted"}
+    monkeypatch.setattr(trainer, "save_checkpoint", stock)
+    assert execute_together(changed, tmp_path) == [None] * len(SEEDS)
+    out = tmp_path / "undisturbed"
+    assert execute_together(changed, out) == [None] * len(SEEDS)
+    for config in changed:
+        assert_same(tmp_path / run_id(config, {}), out / run_id(config, {}))
+
+
+def test_an_error_of_one_run_does_not_stop_the_others(alone, tmp_path, monkeypatch):
+    stock = StandardAgent.observe
+
+    def observe(self, transition):
+        if self.context.seed == 1 and self.decisions > 40:
+            raise FloatingPointError("a number is not finite")
+        stock(self, transition)
+
+    monkeypatch.setattr(StandardAgent, "observe", observe)
+    first, error = execute_together(configs(), tmp_path)
+    assert first is None
+    assert "not finite" in str(error)
+    names = [run_id(config, {}) for config in configs()]
+    assert_same(tmp_path / names[0], alone / names[0])
+    record = read_record(tmp_path / names[1] / "record.json")
+    assert record.status == "failed"
+    assert "not finite" in record.failure
+
+
+def test_runs_that_cannot_be_a_team_share_a_process_all_the_same(tmp_path):
+    mixed = [
+        *configs("zero", seeds=(0,)),
+        *configs(seeds=(0,)),
+        *configs("equivariant", seeds=(0,)),
+    ]
+    assert execute_together(mixed, tmp_path) == [None] * 3
+    for config in mixed:
+        assert read_record(tmp_path / run_id(config, {}) / "record.json").status == "finished"
+
+
+def test_finished_runs_are_left_alone(team):
+    paths = [team / run_id(config, {}) / "record.json" for config in configs()]
+    before = [path.read_bytes() for path in paths]
+    assert execute_together(configs(), team) == [None] * len(SEEDS)
+    assert [path.read_bytes() for path in paths] == before
