@@ -20,6 +20,7 @@ Subclasses override only what they change:
 ``critic_target``   target of the critics
 ``critic_loss``     loss of the critics
 ``actor_loss``      loss of the actor
+``augment``         changes a batch before the update
 ``critic_penalty``, ``actor_penalty``  regularisers, added to the losses
 ``constraints``     gaps of the trained multipliers; the temperature is one of them
 ``after_update``    called after each update; returns more scalars

@@ -36,10 +36,15 @@ class Team:
     """Updates its members together.
 
     Args:
-        members: of one class, with equal options, layouts and numbers of updates.
+        members: of one class, with equal options and layouts.
+
+    Raises:
+        ValueError: if they have not made equally many updates; their optimisers would not fit.
     """
 
     def __init__(self, members: Sequence[SacAgent]):
+        if len({member.updates for member in members}) > 1:
+            raise ValueError("the members of a team must have made equally many updates")
         self.members = list(members)
         self._stacks: list[_Stack] = []
         first = self.members[0]

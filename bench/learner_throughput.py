@@ -1,24 +1,28 @@
-"""CPU time of an update of each learner, side by side.
+"""CPU time of an update of each learner, side by side with what bounds it.
 
 The base policy has the default size and is untrained, transitions are random: neither changes the
-cost. All learners run in turns, so that a change in the machine's speed reaches all of them.
+cost. All contenders run in turns, so that a change in the machine's speed reaches all of them.
 """
 
 from __future__ import annotations
 
 import functools
+import importlib.util
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.options import Critic
 from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
+from symsteer.agents.team import Team, can_join
 from symsteer.bench.tasks import task_class
 from symsteer.policies import POLICIES
 
@@ -28,87 +32,170 @@ DECISIONS = 512
 WARM_UP = 5
 """Updates before the first measurement."""
 
+TEAM = 5
+"""Members of a team."""
+
+PRODUCTS = ("mm", "addmm", "bmm", "baddbmm")
+"""Operations that multiply matrices."""
+
+
+@dataclass
+class Contender:
+    """What is timed.
+
+    Attributes:
+        what: the update, its matrix products alone, or another library.
+        critic: of a learner.
+        members: learners that are updated at once.
+        run: one update.
+    """
+
+    agent: str
+    what: str
+    critic: str
+    members: int
+    parameters: int
+    run: Callable[[], Any]
+
 
 def measure(
     task: str, updates: int, repeats: int, report: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """Time the updates of every learner with each kind of critic, and the decoder alone.
+    """Time the updates of every learner.
 
     Args:
         task: gives the layouts.
         updates: in one measurement.
-        repeats: measurements of each learner.
+        repeats: measurements of each contender.
         report: receives a line for each round.
 
     Returns:
-        One row each: ``agent``, ``critic`` (None for the decoder), ``parameters``, ``batch_size``,
-        and CPU milliseconds of one update: ``median``, ``min``, ``max``.
+        One row each: the fields of :class:`Contender`, ``batch_size``, and CPU milliseconds of one
+        update of one member: ``median``, ``min``, ``max``.
     """
-    kind = task_class(task)
-    policy = POLICIES.get("edp")
-    base = policy(policy.Options(), kind.observation_layout, kind.action_layout)
-    context = AgentContext(
+    contenders = _contenders(task)
+    for contender in contenders:
+        for _ in range(WARM_UP):
+            contender.run()
+    times: list[list[float]] = [[] for _ in contenders]
+    for turn in range(repeats):
+        for found, contender in zip(times, contenders, strict=True):
+            begin = time.process_time()
+            for _ in range(updates):
+                contender.run()
+            seconds = time.process_time() - begin
+            found.append(1e3 * seconds / updates / contender.members)
+        report(f"round {turn + 1} of {repeats}")
+    return [
+        {
+            **{key: value for key, value in vars(contender).items() if key != "run"},
+            "batch_size": _batch_size(),
+            **{"median": statistics.median(found), "min": min(found), "max": max(found)},
+        }
+        for contender, found in zip(contenders, times, strict=True)
+    ]
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Text table of :func:`measure`; ratios to `standard` with critics of the noise."""
+    unit = next(
+        row["median"]
+        for row in rows
+        if (row["agent"], row["what"], row["critic"]) == ("standard", "update", "noise")
+    )
+    lines = [
+        f"CPU time of one update of one learner, batch {_batch_size()}, one thread; median of "
+        "the measurements (smallest to largest)",
+        "",
+        f"{'agent':18s} {'what':16s} {'critic':9s} {'parameters':>10s} {'ms':>7s} {'':18s} ratio",
+    ]
+    for row in rows:
+        spread = f"({row['min']:.1f} to {row['max']:.1f})"
+        parameters = f"{row['parameters']:,d}" if row["parameters"] else ""
+        what = row["what"] if row["members"] == 1 else f"in a team of {row['members']}"
+        lines.append(
+            f"{row['agent']:18s} {what:16s} {row['critic']:9s} {parameters:>10s} "
+            f"{row['median']:7.2f} {spread:18s} {row['median'] / unit:5.2f}"
+        )
+    return "\n".join(lines)
+
+
+def _contenders(task: str) -> list[Contender]:
+    found = []
+    for name in AGENTS.builtin:
+        agent_class = AGENTS.get(name)
+        if not issubclass(agent_class, SacAgent):
+            continue
+        for critic in get_args(Critic):
+            alone, *team = (_agent(task, name, critic, seed) for seed in range(1 + TEAM))
+            size = alone.parameter_counts()["total"]
+            update = functools.partial(_update, alone)
+            found.append(Contender(name, "update", critic, 1, size, update))
+            if name == "standard":
+                products = products_of(update)
+                found.append(Contender(name, "products alone", critic, 1, size, products))
+            if can_join(agent_class):
+                run = functools.partial(_update_team, Team(team))
+                found.append(Contender(name, "update", critic, TEAM, size, run))
+    context = _context(task, 0)
+    some, size = _decisions(context), _batch_size()
+    decode = functools.partial(context.decode, some.obs[:size], some.noise[:size])
+    found.append(Contender("decoder", "decode", "", 1, 0, decode))
+    found.append(Contender("decoder", "products alone", "", 1, 0, products_of(decode)))
+    if importlib.util.find_spec("stable_baselines3"):
+        found.append(Contender("stable-baselines3", "update", "noise", 1, 0, _sb3(context)))
+    return found
+
+
+def products_of(run: Callable[[], Any]) -> Callable[[], None]:
+    """The matrix products of a computation alone, on the same matrices."""
+    seen: list[tuple[Any, list[torch.Tensor]]] = []
+
+    class Products(TorchDispatchMode):
+        def __torch_dispatch__(
+            self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+        ) -> Any:
+            if function._schema.name.removeprefix("aten::") in PRODUCTS:
+                seen.append((function, [matrix.detach() for matrix in args]))
+            return function(*args, **(kwargs or {}))
+
+    with Products():
+        run()
+
+    def products() -> None:
+        with torch.no_grad():
+            for function, matrices in seen:
+                function(*matrices)
+
+    return products
+
+
+def _context(task: str, seed: int) -> AgentContext:
+    kind, policy = task_class(task), POLICIES.get("edp")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        base = policy(policy.Options(), kind.observation_layout, kind.action_layout)
+    return AgentContext(
         base.obs_layout,
         base.act_layout,
         base.horizon,
         base.execute,
         base.decode,
         base.normalized_observation,
+        seed=seed,
     )
-    rows: list[dict[str, Any]] = []
-    work: list[Callable[[], Any]] = []
-    for name in AGENTS.builtin:
-        agent_class = AGENTS.get(name)
-        if not issubclass(agent_class, SacAgent):
-            continue
-        for critic in get_args(Critic):
-            agent = agent_class(context, agent_class.Options(critic=critic))
-            agent.observe(_decisions(context))
-            rows.append(
-                {
-                    "agent": name,
-                    "critic": critic,
-                    "parameters": agent.parameter_counts()["total"],
-                    "batch_size": agent.options.batch_size,
-                }
-            )
-            work.append(functools.partial(_update, agent))
-    size = rows[0]["batch_size"]
-    some = _decisions(context)
-    rows.append({"agent": "decoder", "critic": None, "parameters": 0, "batch_size": size})
-    work.append(lambda: base.decode(some.obs[:size], some.noise[:size]))
-    for run in work:
-        for _ in range(WARM_UP):
-            run()
-    times: list[list[float]] = [[] for _ in rows]
-    for turn in range(repeats):
-        for found, run in zip(times, work, strict=True):
-            begin = time.process_time()
-            for _ in range(updates):
-                run()
-            found.append(1e3 * (time.process_time() - begin) / updates)
-        report(f"round {turn + 1} of {repeats}")
-    for row, found in zip(rows, times, strict=True):
-        row |= {"median": statistics.median(found), "min": min(found), "max": max(found)}
-    return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Text table of :func:`measure`; ratios to `standard` with critics of the noise."""
-    unit = next(r["median"] for r in rows if (r["agent"], r["critic"]) == ("standard", "noise"))
-    lines = [
-        f"CPU time of one update, batch {rows[0]['batch_size']}, one thread; median of "
-        "the measurements (smallest to largest)",
-        "",
-        f"{'agent':18s} {'critic':9s} {'parameters':>10s} {'ms':>7s} {'':18s} ratio",
-    ]
-    for row in rows:
-        spread = f"({row['min']:.1f} to {row['max']:.1f})"
-        lines.append(
-            f"{row['agent']:18s} {row['critic'] or '':9s} {row['parameters']:10,d} "
-            f"{row['median']:7.1f} {spread:18s} {row['median'] / unit:5.2f}"
-        )
-    return "\n".join(lines)
+def _agent(task: str, name: str, critic: str, seed: int) -> SacAgent:
+    agent_class, context = AGENTS.get(name), _context(task, seed)
+    agent = agent_class(context, agent_class.Options(critic=critic))
+    assert isinstance(agent, SacAgent)
+    agent.observe(_decisions(context))
+    return agent
+
+
+def _batch_size() -> int:
+    return AGENTS.get("standard").Options().batch_size
 
 
 def _decisions(context: AgentContext) -> Transition:
@@ -129,6 +216,48 @@ def _decisions(context: AgentContext) -> Transition:
     )
 
 
-def _update(agent: SacAgent) -> None:
+def _batch(agent: SacAgent) -> Any:
     options = agent.options
-    agent.update(agent.replay.sample(options.batch_size, options.gamma, options.n_step))
+    return agent.replay.sample(options.batch_size, options.gamma, options.n_step)
+
+
+def _update(agent: SacAgent) -> None:
+    agent.update(_batch(agent))
+
+
+def _update_team(team: Team) -> None:
+    team.update([_batch(agent) for agent in team.members])
+
+
+def _sb3(context: AgentContext) -> Callable[[], None]:
+    """Stable-Baselines3's SAC with networks and batches of the same sizes, on the noise."""
+    import gymnasium
+    import numpy as np
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.logger import Logger
+
+    options = AGENTS.get("standard").Options()
+    obs, noise = context.obs_layout.dim, context.noise_layout.dim
+
+    class Spaces(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (obs,), np.float32)
+        action_space = gymnasium.spaces.Box(-1, 1, (noise,), np.float32)
+
+        def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict]:
+            return np.zeros(obs, np.float32), {}
+
+    model = SAC(
+        "MlpPolicy",
+        Spaces(),
+        batch_size=options.batch_size,
+        policy_kwargs={"net_arch": [options.width] * options.depth},
+        device="cpu",
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    assert model.replay_buffer is not None
+    draw = np.random.default_rng(0)
+    for _ in range(DECISIONS):
+        row = [draw.standard_normal((1, n)).astype(np.float32) for n in (obs, obs, noise)]
+        zero = np.zeros(1, np.float32)
+        model.replay_buffer.add(row[0], row[1], row[2].clip(-1, 1), zero, zero, [{}])
+    return functools.partial(model.train, gradient_steps=1, batch_size=options.batch_size)

@@ -124,6 +124,13 @@ def test_agents_join_and_leave(problem):
     assert_same_state(agents, single)
 
 
+def test_members_must_have_made_equally_many_updates(problem):
+    agents = members(problem, "standard")
+    alone(agents[:1], 1)
+    with pytest.raises(ValueError, match="equally many updates"):
+        Team(agents)
+
+
 def test_a_checkpoint_of_a_member_is_its_own(problem):
     """It holds what the team keeps for it, and not the others' parameters."""
     agents = members(problem, "standard")

@@ -7,6 +7,8 @@ import time
 
 import numpy as np
 import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from symsteer.agents import AGENTS
 from symsteer.agents.sac import SacAgent
@@ -153,15 +155,39 @@ def test_the_whole_measurement():
     throughput.table(data)
 
 
-def test_every_learner_is_timed_with_every_kind_of_critic():
+def test_every_learner_is_timed_alone_and_in_a_team_with_every_kind_of_critic():
     rows = learner_throughput.measure(TASK, updates=1, repeats=2, report=lambda text: None)
-    kinds = {row["agent"]: set() for row in rows}
+    kinds = {(row["agent"], row["what"], row["members"], row["critic"]) for row in rows}
     for row in rows:
-        kinds[row["agent"]].add(row["critic"])
         assert 0 < row["min"] <= row["median"] <= row["max"]
-    assert kinds.pop("decoder") == {None}
     learners = {n for n in AGENTS.builtin if issubclass(AGENTS.get(n), SacAgent)}
-    assert kinds == {name: {"noise", "aliased", "sampler"} for name in learners}
+    for name in learners:
+        for critic in ("noise", "aliased", "sampler"):
+            assert {(name, "update", 1, critic), (name, "update", 5, critic)} <= kinds
+    others = {kind for kind in kinds if kind[0] not in learners}
+    assert others == {
+        ("decoder", "decode", 1, ""),
+        ("decoder", "products alone", 1, ""),
+        ("stable-baselines3", "update", 1, "noise"),
+    }
     text = learner_throughput.table(rows)
-    (line,) = (row for row in text.splitlines() if row.split()[:2] == ["standard", "noise"])
+    (line,) = (
+        row for row in text.splitlines() if row.split()[:3] == ["standard", "update", "noise"]
+    )
     assert line.endswith("1.00")
+
+
+def test_the_products_of_an_update_are_the_same_products():
+    """As many multiplications, and cheaper than the update that they are part of."""
+    a, b = torch.randn(8, 4), torch.randn(4, 2)
+    done = []
+
+    def compute():
+        done.append((a @ b).relu().sum())
+
+    products = learner_throughput.products_of(compute)
+    assert len(done) == 1
+    with FlopCounterMode(display=False) as counter:
+        products()
+    assert counter.get_total_flops() == 2 * 8 * 4 * 2
+    assert len(done) == 1
