@@ -186,6 +186,7 @@ def tune(
     out: Path = Path("runs"),
     workers: int = 0,
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
+    together: int = 1,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> int:
     """Search for the best settings of agents, with the same number of trials for each.
@@ -197,6 +198,8 @@ def tune(
         out: Folder of the runs; trials and chosen settings are written to OUT/tuning.
         workers: Number of runs at the same time; 0: one per core, or as many as fit on the cluster.
         ray: Address of a Ray cluster to run on: auto, or host:port of its head.
+        together: Runs of a trial that share a process and are trained as one, which is faster, if
+            they differ in seeds and variants alone.
         dry_run: Only show what would be tried.
     """
     from symsteer.bench.tuning.plan import read_plan
@@ -215,7 +218,7 @@ def tune(
         return 0
     from symsteer.bench.tuning.trials import to_text
 
-    tuner = Tuner(found, out, workers, ray)
+    tuner = Tuner(found, out, workers, ray, together)
     trials, chosen = tuner.play()
     print(f"\n{to_text(trials, chosen)}\n")
     for kind, path in tuner.places.items():

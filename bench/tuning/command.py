@@ -44,13 +44,22 @@ class Tuner:
         out: folder of the runs; the trials are in ``out/tuning``.
         workers: number of runs at the same time; 0: one per core, or as many as fit on the cluster.
         ray: address of a Ray cluster to use instead of this machine.
+        together: learners that share a process, if they differ in seeds and variants alone.
 
     Raises:
         UserError: if ``out`` holds trials of a plan that differs.
     """
 
-    def __init__(self, plan: TuningPlan, out: Path, workers: int = 0, ray: str | None = None):
-        self.plan, self.out, self.workers, self.ray = plan, out, workers, ray
+    def __init__(
+        self,
+        plan: TuningPlan,
+        out: Path,
+        workers: int = 0,
+        ray: str | None = None,
+        together: int = 1,
+    ):
+        self.plan, self.out = plan, out
+        self.workers, self.ray, self.together = workers, ray, together
         storage = open_storage(storage_path(out, plan.name))
         self.searches = {agent: Search(plan, agent, storage) for agent in plan.agents}
 
@@ -112,9 +121,8 @@ class Tuner:
         suite = Suite(
             f"tune-{self.plan.name}", self.plan.description, tuple(dict.fromkeys(configs))
         )
-        outcomes = run_plan(
-            make_plan(suite, self.out, self.ray is not None), self.workers, self.ray
-        )
+        plan = make_plan(suite, self.out, self.ray is not None)
+        outcomes = run_plan(plan, self.workers, self.ray, self.together)
         for outcome in outcomes:
             if outcome.status == "failed":
                 print(f"failed: {outcome.run.label}: {outcome.reason}", file=sys.stderr)

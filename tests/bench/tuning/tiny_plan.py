@@ -61,7 +61,7 @@ class KnownRuns:
         self.left, self.failing = stop_after, failing
         self.played: list[str] = []
 
-    def __call__(self, plan: Plan, workers: int, ray: str | None) -> list[Outcome]:
+    def __call__(self, plan: Plan, workers: int, ray: str | None, together: int) -> list[Outcome]:
         outcomes = []
         for run, config in plan.configs.items():
             folder = plan.out / run_id(config, {})
