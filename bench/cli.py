@@ -446,6 +446,8 @@ def throughput(
     cores: int = 0,
     memory: bool = False,
     learner: bool = False,
+    run: bool = False,
+    runs: Path = Path("runs"),
     json: bool = False,
 ) -> int:
     """Compare the speed of simulation with stock ManiSkill and with PhysX alone, in minutes.
@@ -458,6 +460,9 @@ def throughput(
         cores: Processes in the measurement on all cores; 0: one per core.
         memory: Only measure how memory grows over 10,000 steps with resets.
         learner: Only measure the CPU time of an update of each learner.
+        run: Only measure the CPU time of whole runs with the default settings, alone and in teams
+            of five, two agents; about an hour with five repeats.
+        runs: Folder that keeps the base policy of these runs.
         json: Print only JSON.
     """
     from symsteer.bench import throughput as speed
@@ -470,6 +475,14 @@ def throughput(
 
         rows = learner_throughput.measure(task, updates=20, repeats=repeats, report=report)
         print(speed.dump({"rows": rows}) if json else learner_throughput.table(rows))
+        return 0
+    if run:
+        from symsteer.bench import run_throughput
+        from symsteer.bench.runs.config import RunConfig
+
+        configs = [RunConfig(task=task, agent=agent) for agent in ("standard", "equivariant")]
+        rows = run_throughput.measure(configs, repeats, runs, report)
+        print(speed.dump({"rows": rows}) if json else run_throughput.table(rows))
         return 0
     if memory:
         growth = speed.memory_growth(task, report=report)

@@ -12,9 +12,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from symsteer.agents import AGENTS
 from symsteer.agents.sac import SacAgent
-from symsteer.bench import learner_throughput, throughput
+from symsteer.bench import learner_throughput, run_throughput, throughput
 from symsteer.bench.throughput import Replay, Row, Turn, _Stopwatch
 from symsteer.errors import UserError
+from tests.bench.tiny_run import tiny_config
 
 TASK = "PickCube-v1"
 
@@ -175,6 +176,22 @@ def test_every_learner_is_timed_alone_and_in_a_team_with_every_kind_of_critic():
         row for row in text.splitlines() if row.split()[:3] == ["standard", "update", "noise"]
     )
     assert line.endswith("1.00")
+
+
+def test_whole_runs_are_timed_alone_and_in_teams(tmp_path):
+    config = tiny_config("standard", options={"gamma": 0.5}, env_steps=160)
+    lines = []
+    rows = run_throughput.measure([config], 1, tmp_path, lines.append, team=2)
+    assert [(row["agent"], row["team"]) for row in rows] == [("standard", 1), ("standard", 2)]
+    for row in rows:
+        assert row["median"] > 0
+        assert all(row[part] > 0 for part in ("simulate", "update", "evaluate", "diagnose"))
+    assert len(lines) == 2
+    # Only the base policy is kept.
+    assert [path.name for path in tmp_path.iterdir()] == ["base"]
+    *_, alone, team = run_throughput.table(rows).splitlines()
+    assert alone.split()[:2] == ["standard", "1"]
+    assert team.split()[:2] == ["standard", "2"]
 
 
 def test_the_products_of_an_update_are_the_same_products():
