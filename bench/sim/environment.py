@@ -26,6 +26,12 @@ from symsteer.errors import UserError
 
 Simulator = Literal["cpu", "cuda"]
 
+# ManiSkill collects garbage at every reconfiguration. This took 0.27 s, most of it in the modules
+# and classes of torch and ManiSkill, which live as long as the process. They are taken out here,
+# before there is an environment: what is taken out is never collected.
+gc.collect()
+gc.freeze()
+
 MAX_SCENES = 900
 """PhysX scenes that one process may hold. With about 1,000 of them the interpreter ends with a
 fatal error (``_PyGILState_NoteThreadState``)."""

@@ -7,7 +7,6 @@ versions in `versions.PINNED`.
 
 from __future__ import annotations
 
-import gc
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -82,8 +81,3 @@ def install() -> None:
             super(WhiteTableSceneBuilder, self).build()
 
     WhiteTableSceneBuilder.build = build_table
-
-    # ManiSkill collects garbage at every reconfiguration. This took 0.27 s, most of it in the
-    # modules and classes of torch and ManiSkill, which live as long as the process.
-    gc.collect()
-    gc.freeze()

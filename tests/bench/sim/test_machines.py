@@ -130,6 +130,21 @@ def test_more_scenes_than_a_process_can_hold(monkeypatch):
         create(PickCubeEnv, 13, obs_mode="state")
 
 
+def test_the_first_environment_of_a_process_frees_its_scenes():
+    code = """
+import gc
+from symsteer.bench.sim import create, environment
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+env = create(PickCubeEnv, 3, obs_mode="state")
+env.close()
+del env
+gc.collect()
+print("scenes", environment._number_of_scenes())
+"""
+    result = run_python(code)
+    assert result.stdout.strip().endswith("scenes 0"), result.stdout + result.stderr
+
+
 def test_cuda_absent():
     """sim="cuda" without a GPU says so in one sentence."""
     if torch.cuda.is_available():
