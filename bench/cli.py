@@ -461,7 +461,7 @@ def throughput(
         memory: Only measure how memory grows over 10,000 steps with resets.
         learner: Only measure the CPU time of an update of each learner.
         run: Only measure the CPU time of whole runs with the default settings, alone and in teams
-            of five, two agents; about an hour with five repeats.
+            of five, two agents; about an hour for each repeat.
         runs: Folder that keeps the base policy of these runs.
         json: Print only JSON.
     """

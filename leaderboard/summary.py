@@ -486,13 +486,13 @@ def _table(
 def _label(twins: Sequence[Row]) -> None:
     """Name the rows of one agent; of several, by the settings that most of them do not have."""
     settings = [_settings(row.runs[0].record.config) if row.runs else {} for row in twins]
+    usual: dict[str, str | None] = {}
+    for key in sorted({key for config in settings for key in config}):
+        (first, number), *others = Counter(c.get(key, "unset") for c in settings).most_common(2)
+        usual[key] = None if others and others[0][1] == number else first
     for row, own in zip(twins, settings, strict=True):
-        texts = []
-        for key in sorted({key for config in settings for key in config}):
-            counts = Counter(config.get(key, "unset") for config in settings)
-            value, number = own.get(key, "unset"), max(counts.values())
-            if counts[value] < number or list(counts.values()).count(number) > 1:
-                texts.append(f"{key} {value}")
+        values = {key: own.get(key, "unset") for key in usual}
+        texts = [f"{key} {value}" for key, value in values.items() if value != usual[key]]
         if len(texts) > MOST_SETTINGS:
             texts = [f"{len(texts)} other settings", row.recipe[:6]]
         row.label = row.agent + (f" ({', '.join(texts)})" if texts else "")

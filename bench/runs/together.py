@@ -20,7 +20,7 @@ from symsteer.agents.team import Team, can_join
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import is_finished, run_id
 from symsteer.bench.runs.run import opened
-from symsteer.bench.runs.trainer import Trainer, Updates, following
+from symsteer.bench.runs.trainer import Trainer, Updates, next_batch
 
 
 @dataclass(eq=False)
@@ -71,11 +71,16 @@ def execute_together(configs: Sequence[RunConfig], out: Path) -> list[Exception 
                 if team is not None:
                     team.dissolve()
                 team = Team(agents) if len(agents) > 1 else None
+            waiting = [member for member in waiting if member not in chosen]
             begin = time.perf_counter()
             batches = [member.batch for member in chosen if member.batch is not None]
-            found = team.update(batches) if team else [agents[0].update(batches[0])]
+            try:
+                found = team.update(batches) if team else [agents[0].update(batches[0])]
+            except Exception as error:
+                for member in chosen:
+                    _fail(member, error, errors)
+                continue
             seconds = (time.perf_counter() - begin) / len(chosen)
-            waiting = [member for member in waiting if member not in chosen]
             for member, scalars in zip(chosen, found, strict=True):
                 member.trainer.add_update(seconds)
                 _advance(member, scalars, waiting, errors)
@@ -90,20 +95,21 @@ def _advance(
 ) -> None:
     """Let a run go on until it waits again, or ends."""
     try:
-        # A new generator takes nothing.
-        if scalars is None:
-            member.batch = next(member.updates, None)
-        else:
-            member.batch = following(member.updates, scalars)
+        member.batch = next_batch(member.updates, scalars)
     except Exception as error:
-        errors[member.index] = error
-        with contextlib.suppress(type(error)):
-            member.stack.__exit__(type(error), error, error.__traceback__)
+        _fail(member, error, errors)
         return
     if member.batch is None:
         member.stack.close()
     else:
         waiting.append(member)
+
+
+def _fail(member: _Member, error: Exception, errors: list[Exception | None]) -> None:
+    """End a run with an error; its record says so."""
+    errors[member.index] = error
+    with contextlib.suppress(type(error)):
+        member.stack.__exit__(type(error), error, error.__traceback__)
 
 
 def _next(waiting: Sequence[_Member]) -> list[_Member]:

@@ -30,7 +30,7 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation
 from symsteer.policies.contract import ChunkPolicy
 
-Updates: TypeAlias = Generator[Batch, Mapping[str, torch.Tensor], None]
+Updates: TypeAlias = Generator[Batch, Mapping[str, torch.Tensor] | None, None]
 """A run that hands out every batch that is due, and is sent the scalars of the update."""
 
 
@@ -176,12 +176,12 @@ class Trainer:
     def play(self) -> None:
         """Execute the rest of the run."""
         updates = self.updates_due()
-        batch = next(updates, None)
+        batch = next_batch(updates)
         while batch is not None:
             begin = time.perf_counter()
             scalars = self.agent.update(batch)
             self.add_update(time.perf_counter() - begin)
-            batch = following(updates, scalars)
+            batch = next_batch(updates, scalars)
 
     def add_update(self, seconds: float) -> None:
         """Count the time of an update that somebody else has made."""
@@ -281,7 +281,9 @@ class Trainer:
             for batch in agent.batches():
                 given = time.perf_counter()
                 self.update_seconds += given - begin
-                scalars.append((yield batch))
+                found = yield batch
+                assert found is not None
+                scalars.append(found)
                 begin = time.perf_counter()
                 self.waited += begin - given
                 self.updates += 1
@@ -347,8 +349,13 @@ class Trainer:
         return seconds["total"]
 
 
-def following(updates: Updates, scalars: Mapping[str, torch.Tensor]) -> Batch | None:
-    """Send the scalars of an update; the next batch that is due, or None at the end of the run."""
+def next_batch(updates: Updates, scalars: Mapping[str, torch.Tensor] | None = None) -> Batch | None:
+    """The next batch that is due, or None at the end of the run.
+
+    Args:
+        updates: the run.
+        scalars: of the update with the batch before; None for the first one.
+    """
     try:
         return updates.send(scalars)
     except StopIteration:

@@ -120,7 +120,8 @@ class LiveDisplay(Display):
 
     def retried(self, task: Task, result: Result) -> None:
         """A task failed and will be tried again."""
-        self.write("again", f"{self._label(task, *task.team)}: {result.reason}")
+        run = task.team[0] if task.team else None
+        self.write("again", f"{self._label(task, run)}: {result.reason}")
 
     def write(self, status: str, text: str) -> None:
         """Print one line above the live ones."""
@@ -145,17 +146,16 @@ class LiveDisplay(Display):
             table.add_column(no_wrap=True, justify="right", min_width=width)
         height = max(1, self.console.height - 3)
         for task, run in shown[:height]:
-            label = self._label(task, *([run] if run else []))
-            table.add_row(label, *self._row(task, progress[task, run], bars))
+            table.add_row(self._label(task, run), *self._row(task, progress[task, run], bars))
         lines: list[Any] = [table]
         if len(shown) > height:
             lines.append(Text(f"and {len(shown) - height} more", style="dim"))
         going = {run: progress[task, run] for task, run in shown if run}
         self.live.update(Group(*lines, self._whole(going)))
 
-    def _label(self, task: Task, *runs: PlannedRun) -> str:
+    def _label(self, task: Task, run: PlannedRun | None) -> str:
         """The label of a run, or of a task without runs."""
-        return self.labels[runs[0]] if runs else f"{task.kind} {task.label}"
+        return self.labels[run] if run else f"{task.kind} {task.label}"
 
     def _progress(self, task: Task, run: PlannedRun | None) -> Mapping[str, Any] | None:
         """The progress of a run, unless an earlier process wrote it."""

@@ -80,17 +80,14 @@ class Task:
     args: tuple
     team: tuple[PlannedRun, ...] = ()
     """The runs that it executes; several are trained together."""
+    needed_by: list[PlannedRun] = field(default_factory=list)
+    """The runs that cannot be executed if this task, which executes none, fails."""
     then: list[Task] = field(default_factory=list)
     """Tasks that need the result of this one."""
     waits: int = 0
     """Number of tasks whose results it still needs."""
     tries: int = 0
     losses: int = 0
-
-    @property
-    def runs(self) -> list[PlannedRun]:
-        """The runs that cannot be executed if this task fails."""
-        return [*self.team, *(run for task in self.then for run in task.runs)]
 
 
 def tasks_of(
@@ -124,6 +121,9 @@ def tasks_of(
             bases[base_key] = Task("base policy", words, build_base, args)
             _join(demonstrations[demos_key], bases[base_key])
         needs[run] = bases[base_key]
+        for shared in (demonstrations.get(demos_key), bases[base_key]):
+            if shared:
+                shared.needed_by.append(run)
     runs = []
     for team in _teams(plan, todo, together):
         runs.append(_run_task(plan, team, patience))
@@ -173,7 +173,26 @@ def execute_plan(
     for task in tasks_of(plan, todo, workers.patience, together):
         if not task.waits:
             offer(task)
-    ended: set[PlannedRun] = set()
+
+    def go_on(task: Task) -> None:
+        """Offer the tasks that waited for this one alone."""
+        for follower in task.then:
+            follower.waits -= 1
+            if not follower.waits and (follower.team or follower.needed_by):
+                offer(follower)
+
+    def leave_out(runs: list[PlannedRun], task: Task) -> None:
+        """Take runs out of the tasks that wait for this one; teams go on without them."""
+        for follower in task.then:
+            follower.needed_by = [run for run in follower.needed_by if run not in runs]
+            if follower.team:
+                follower.team = tuple(run for run in follower.team if run not in runs)
+                configs = tuple(plan.configs[run] for run in follower.team)
+                follower.args = (configs, *follower.args[1:])
+            else:
+                leave_out(runs, follower)
+                go_on(follower)
+
     running: dict[Future, Task] = {}
     while ready or running:
         while ready and (workers.capacity is None or len(running) < workers.capacity):
@@ -191,21 +210,18 @@ def execute_plan(
                 parts = list(zip(alone, each, strict=True))
             for part, result in parts:
                 if result.status == "done":
-                    for follower in part.then:
-                        follower.waits -= 1
-                        if not follower.waits:
-                            offer(follower)
+                    go_on(part)
                     for run in part.team:
                         yield Outcome(run, "finished")
                 elif _again(part, result):
                     watcher.retried(part, result)
                     offer(part)
                 else:
-                    # A team that waits for several base policies may lose more than one.
-                    for run in dict.fromkeys(part.runs):
-                        if run not in ended:
-                            ended.add(run)
-                            yield _failure(run, part, result)
+                    lost = [*part.team, *part.needed_by]
+                    leave_out(lost, part)
+                    go_on(part)
+                    for run in lost:
+                        yield _failure(run, part, result)
         watcher.refresh(list(running.values()))
 
 

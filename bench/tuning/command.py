@@ -27,6 +27,7 @@ from symsteer.bench.tuning.trials import (
     to_json,
     to_preset,
 )
+from symsteer.errors import UserError
 from symsteer.files import write_atomically
 
 STATES: Mapping[TrialState, State] = {
@@ -115,7 +116,11 @@ class Tuner:
             self._end(agent, trial, TrialState.COMPLETE if done else TrialState.FAIL, scores)
 
     def _run(self, configs: Sequence[RunConfig]) -> None:
-        """Execute runs; a run that fails is the fault of its options, and only shown."""
+        """Execute runs; a run that fails is the fault of its options, and only shown.
+
+        Raises:
+            UserError: if another process works on a run; its trial is not lost.
+        """
         if not configs:
             return
         suite = Suite(
@@ -124,6 +129,11 @@ class Tuner:
         plan = make_plan(suite, self.out, self.ray is not None)
         outcomes = run_plan(plan, self.workers, self.ray, self.together)
         for outcome in outcomes:
+            if outcome.status == "elsewhere":
+                raise UserError(
+                    f"another process works on {outcome.run.label}; start the search again when it "
+                    "has ended"
+                )
             if outcome.status == "failed":
                 print(f"failed: {outcome.run.label}: {outcome.reason}", file=sys.stderr)
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
 
 import pytest
 
 from symsteer.agents.standard import StandardAgent
+from symsteer.agents.team import Team
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.together import execute_together
@@ -60,7 +62,9 @@ def assert_same(folder, other):
 def team(tmp_path_factory):
     """The folder of the same runs, executed together."""
     out = tmp_path_factory.mktemp("team")
+    begin = time.perf_counter()
     assert execute_together(configs(), out) == [None] * len(SEEDS)
+    (out / "seconds").write_text(str(time.perf_counter() - begin))
     return out
 
 
@@ -73,6 +77,7 @@ def test_the_records_are_those_of_single_runs(alone, team):
 
 
 def test_the_time_of_a_run_does_not_contain_that_of_the_others(team):
+    total = 0.0
     for config in configs():
         clock = read_record(team / run_id(config, {}) / "record.json").wall_clock
         parts = sum(
@@ -80,6 +85,8 @@ def test_the_time_of_a_run_does_not_contain_that_of_the_others(team):
             for part in ("simulate", "decode", "update", "evaluate", "diagnose")
         )
         assert 0 < clock.update < parts <= clock.total
+        total += clock.total
+    assert total <= float((team / "seconds").read_text())
 
 
 def test_a_killed_team_continues(alone, tmp_path, monkeypatch):
@@ -126,6 +133,22 @@ def test_an_error_of_one_run_does_not_stop_the_others(alone, tmp_path, monkeypat
     record = read_record(tmp_path / names[1] / "record.json")
     assert record.status == "failed"
     assert "not finite" in record.failure
+
+
+def test_an_error_of_an_update_ends_its_team_alone(tmp_path, monkeypatch):
+    """The run of another kind, which shares the process, goes on."""
+
+    def update(self, batches):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(Team, "update", update)
+    mixed = [*configs(), *configs("equivariant", seeds=(0,))]
+    first, second, other = execute_together(mixed, tmp_path)
+    assert "out of memory" in str(first)
+    assert "out of memory" in str(second)
+    assert other is None
+    found = [read_record(tmp_path / run_id(c, {}) / "record.json").status for c in mixed]
+    assert found == ["failed", "failed", "finished"]
 
 
 def test_runs_that_cannot_be_a_team_share_a_process_all_the_same(tmp_path):

@@ -76,6 +76,24 @@ def test_of_a_team_only_the_run_that_fails_is_tried_again(tmp_path):
     assert (record.status, record.provenance.together) == ("finished", 2)
 
 
+def test_a_team_goes_on_without_the_runs_whose_base_policy_failed(tmp_path):
+    options = {"gamma": 0.5}
+    configs = tuple(tiny_config("standard", options=options, seed=seed) for seed in range(3))
+    plan = make_plan(Suite("baseless", "", configs), tmp_path / "runs")
+    for config in configs[:2]:
+        demonstration_path(config, plan.out).mkdir(parents=True)
+    pool = LocalPool(1, tmp_path / "log")
+    try:
+        outcomes = list(execute_plan(plan, plan.runs, pool, Witness(), together=3))
+    finally:
+        pool.stop()
+    assert sorted((o.run.seed, o.status) for o in outcomes) == [
+        (0, "failed"),
+        (1, "failed"),
+        (2, "finished"),
+    ]
+
+
 def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tmp_path):
     # Both pass every check on the configuration, and something is in their way: of the run's own
     # checkpoint, and of its demonstrations.

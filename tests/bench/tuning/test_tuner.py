@@ -10,6 +10,7 @@ import pytest
 
 from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.agents.presets import preset_options
+from symsteer.bench.sweep.schedule import Outcome
 from symsteer.bench.tuning import command
 from symsteer.bench.tuning.command import Tuner, preview
 from symsteer.bench.tuning.plan import read_plan
@@ -122,6 +123,20 @@ def test_options_with_which_runs_fail_cost_their_trial(play, capsys):
     assert len(trials) == 24
     assert all(choice.options["lr"] <= 0.02 for choice in chosen)
     assert "Q is not finite" in capsys.readouterr().err
+
+
+def test_a_run_of_another_process_costs_no_trial(play, tmp_path, monkeypatch):
+    def busy(plan, workers, ray, together):
+        return [Outcome(run, "elsewhere", "busy") for run in plan.runs]
+
+    monkeypatch.setattr(command, "run_plan", busy)
+    tuner = Tuner(read_plan(write_plan(tmp_path)), tmp_path / "runs")
+    with pytest.raises(UserError, match=r"another process works on PickCube"):
+        tuner.play()
+    assert tuner.results == []
+    trials, _, _ = play()
+    assert len(trials) == 24
+    assert trials[0].state == "complete"
 
 
 def test_what_is_written_can_be_read_again(play, tmp_path):
