@@ -181,6 +181,15 @@ class BatchedCpuMixin(BaseEnv):
         """
         self.scene.px.hold_forces(body._body_data_index.numpy(), force.numpy())
 
+    def pause(self, scenes: torch.Tensor) -> None:
+        """Save the physics of environments whose further steps do not matter.
+
+        Args:
+            scenes: ``[N]`` bool, those that stand still until the next call or reconfiguration.
+                The others do not notice.
+        """
+        self.scene.px.pause(scenes.numpy())
+
     def _step_action(self, action: Any) -> Any:
         if self._code_runs_between_substeps():
             return super()._step_action(action)
@@ -243,6 +252,9 @@ class CudaMixin(BaseEnv):
     def hold_force(self, body: Actor, force: torch.Tensor) -> None:
         """Apply a force in every substep; see `BatchedCpuMixin.hold_force`."""
         self._held[body.name] = (body, force)
+
+    def pause(self, scenes: torch.Tensor) -> None:
+        """Do nothing: the GPU simulates all scenes at once; see `BatchedCpuMixin.pause`."""
 
     def _setup_scene(self) -> None:
         self._held.clear()

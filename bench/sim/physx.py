@@ -85,6 +85,7 @@ class BatchedPhysx:
         self._pending_substeps = 0
         self._deferring = False
         self._initialized = False
+        self._paused = np.zeros(len(self.systems), dtype=bool)
         # Per scene: forces by row of the body that they act on in every substep.
         self._held: list[dict[int, np.ndarray]] = [{} for _ in self.systems]
 
@@ -286,6 +287,11 @@ class BatchedPhysx:
         if not self._deferring:
             self.finish_substeps()
 
+    def pause(self, scenes: np.ndarray) -> None:
+        """Let scenes stand still, ``[N]`` bool; the others take substeps (again)."""
+        self.finish_substeps()
+        self._paused = scenes.copy()
+
     @contextmanager
     def deferred_substeps(self) -> Iterator[None]:
         """Take the substeps of this block at its end, scene by scene.
@@ -308,20 +314,17 @@ class BatchedPhysx:
         if count == 0:
             return
         substeps = range(count)
-        if not any(self._held):
-            for step in self._step_calls:
-                for _ in substeps:
-                    step()
-        else:
-            nothing = np.zeros(3, dtype=np.float32)
-            for step, held in zip(self._step_calls, self._held, strict=True):
-                pushes = [(self._bodies[row].add_force_torque, f) for row, f in held.items()]
-                for _ in substeps:
-                    for push, force in pushes:
-                        push(force, nothing)
-                    step()
+        nothing = np.zeros(3, dtype=np.float32)
+        moving = np.flatnonzero(~self._paused)
+        for i in moving.tolist():
+            step, held = self._step_calls[i], self._held[i]
+            pushes = [(self._bodies[row].add_force_torque, force) for row, force in held.items()]
+            for _ in substeps:
+                for push, force in pushes:
+                    push(force, nothing)
+                step()
         if self._initialized:
-            self._stale[:] = True
+            self._stale[moving] = True
             self._contacts.invalidate()
 
     # ------------------------------------------------------------------ fetch

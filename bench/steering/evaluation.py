@@ -115,7 +115,8 @@ def long_episodes(
 ) -> LongEpisodes:
     """Play one episode of the stochastic actor from each seed until its return is known.
 
-    All environments of a batch stop together, when the last of them is done. See
+    All environments of a batch stop together, when the last of them is done; the others stand
+    still until then. See
     :class:`~symsteer.agents.episodes.LongEpisodes` for what counts, :func:`random_beginnings` for
     the noise.
 
@@ -192,6 +193,7 @@ def _long_batch(
         running = running & ~succeeded & ~last
         if not running.any():
             break
+        env.pause(~running)
         obs = result.obs_after
     return {name: torch.stack(values) for name, values in steps.items()}
 

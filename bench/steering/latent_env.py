@@ -177,6 +177,10 @@ class LatentNoiseEnv:
         for t in range(actions.shape[1]):
             yield obs[:, t], {key: value[:, t] for key, value in info.items()}
 
+    def pause(self, rows: torch.Tensor) -> None:
+        """Let environments ``[N]`` bool, whose results do not matter, stand still until a reset."""
+        self.env.unwrapped.pause(rows.cpu())
+
     def close(self) -> None:
         """Free the simulation."""
         self.env.close()

@@ -269,6 +269,10 @@ class ShardedEnv(gym.Env):
             requests.append((name, part, local) if len(mine) else None)
         self._ask("call", requests)
 
+    def pause(self, scenes: torch.Tensor) -> None:
+        """Save the physics of environments ``[N]`` bool; see ``BatchedCpuMixin.pause``."""
+        self._ask("call", [("pause", scenes[rows]) for rows in self._rows])
+
     def transform_state(self, state: dict, angle: float, reflect: bool = False) -> dict:
         """Turn a state about the workspace centre; see ``SymmetricTask.transform_state``."""
         request = ("transform_state", _tensors(state), angle, reflect)

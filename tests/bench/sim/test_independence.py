@@ -37,6 +37,24 @@ def test_partial_reset_leaves_others_alone(kit, task):
     assert torch.equal(after[:, [0, 2]], expected[:, [0, 2]])
 
 
+def test_paused_environments_stand_still_and_the_others_do_not_notice(kit):
+    env, twin = (kit.batched("PushCube", N, control_mode="pd_ee_delta_pose") for _ in range(2))
+    actions = kit.actions(env, 16)
+    for e in (env, twin):
+        e.reset(seed=list(range(N)))
+        kit.rollout(e, actions[:8])
+    before = kit.flat(env.get_state_dict())
+    env.pause(torch.tensor([True, False, True, False]))
+    after, expected = kit.rollout(env, actions[8:12]), kit.rollout(twin, actions[8:12])
+    assert torch.equal(after[:, [1, 3]], expected[:, [1, 3]])
+    assert not torch.equal(after[-1], expected[-1])
+    assert torch.equal(kit.flat(env.get_state_dict())[[0, 2]], before[[0, 2]])
+    env.pause(torch.zeros(N, dtype=torch.bool))
+    after, expected = kit.rollout(env, actions[12:]), kit.rollout(twin, actions[12:])
+    assert torch.equal(after[:, [1, 3]], expected[:, [1, 3]])
+    assert not torch.equal(kit.flat(env.get_state_dict())[[0, 2]], before[[0, 2]])
+
+
 def test_partial_set_state_leaves_others_alone(kit):
     """The same for set_state_dict with an index."""
     env = kit.batched("PickCube", N)

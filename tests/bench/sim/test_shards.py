@@ -185,6 +185,22 @@ def test_results_are_the_callers_own(pair):
     assert torch.equal(obs, kept)
 
 
+def test_paused_environments():
+    one, two = both(4)
+    seeds, moves = [3, 4, 5, 6], actions(6, 4)
+    paused = torch.tensor([False, True, True, False])
+    for env in (one, two):
+        env.reset(seed=seeds)
+    for number, action in enumerate(moves):
+        if number == 2:
+            before = one.get_state_dict()["actors"]["cube"][paused].clone()
+            for env in (one, two):
+                env.unwrapped.pause(paused)
+        assert_same(one.step(action), two.step(action))
+    assert torch.equal(one.get_state_dict()["actors"]["cube"][paused], before)
+    two.close()
+
+
 def decided(one: Any, two: Any, execute: int) -> tuple[LatentNoiseEnv, LatentNoiseEnv]:
     """Latent-noise environments in which the first two decisions of a test are the same."""
     return tuple(LatentNoiseEnv(env, NoiseIsAction(execute)) for env in (one, two))

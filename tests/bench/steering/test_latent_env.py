@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from symsteer.bench.steering.evaluation import rollout, steerability
+from symsteer.bench.steering.evaluation import long_episodes, long_limit, rollout, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import HELD_OUT_SEED, held_out_seeds
 from symsteer.bench.tasks import make, task_class
@@ -177,6 +177,42 @@ def test_rollout_measures_success_once_and_at_the_end(env):
     # Exactly one decision of each solved episode is terminal, and nothing after it is "running".
     assert result.terminal.sum(0).tolist() == [0, 1, 1, 1]
     assert torch.equal(-result.running.sum(0) + result.terminal.sum(0), episodes["return"].long())
+
+
+def test_long_episodes_that_are_done_stand_still(env, monkeypatch):
+    """Those that begin at random end earlier; the others are the same as if these went on."""
+
+    def play():
+        latent = LatentNoiseEnv(env, NoiseIsAction(execute=4), ignore_terminations=True)
+        latent.max_episode_steps = long_limit(env.max_episode_steps, 4, gamma=0.1)
+        noise = torch.Generator().manual_seed(0)
+
+        def sample(obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return torch.randn(4, 4, 7, generator=noise), torch.zeros(4)
+
+        generator = torch.Generator().manual_seed(1)
+        return long_episodes(latent, sample, [0, 1, 2, 3], 0.1, generator)
+
+    paused = []
+    pause = LatentNoiseEnv.pause
+
+    def recorded(self, rows):
+        paused.append(rows)
+        pause(self, rows)
+
+    monkeypatch.setattr(LatentNoiseEnv, "pause", recorded)
+    still = play()
+    assert torch.stack(paused).any(0).tolist() == [False, True, False, True]
+    monkeypatch.setattr(LatentNoiseEnv, "pause", lambda self, rows: None)
+    moving = play()
+    assert torch.equal(still.obs[:, [0, 2]], moving.obs[:, [0, 2]])
+    assert not torch.equal(still.obs, moving.obs)
+    for name in ("reward", "terminal", "last", "on_policy", "off_policy"):
+        assert torch.equal(getattr(still, name), getattr(moving, name)), name
+    # Nothing after the last decision of a column counts.
+    for column in (1, 3):
+        end = int(still.last[:, column].nonzero())
+        assert torch.equal(still.obs[: end + 1, column], moving.obs[: end + 1, column])
 
 
 def test_evaluation_refuses_an_environment_that_ends_at_success(env):

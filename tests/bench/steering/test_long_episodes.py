@@ -39,10 +39,13 @@ class Walk:
     def reset(self, seeds):
         self.distance = torch.tensor(seeds, dtype=torch.float32)
         self.won = torch.zeros(len(seeds), dtype=torch.bool)
+        self.paused = self.won.clone()
+        self.moves = torch.zeros(len(seeds))
         return self.distance[:, None]
 
     def step(self, noise):
         self.steps += 1
+        self.moves += ~self.paused
         forward = (noise.sum((1, 2)) > 0) & (self.distance != STUCK)
         self.distance = torch.where(
             forward, self.distance - 1, torch.full_like(self.distance, STUCK)
@@ -53,6 +56,9 @@ class Walk:
             success_once=self.won.clone(),
             obs_after=self.distance[:, None],
         )
+
+    def pause(self, rows):
+        self.paused = rows
 
 
 def forward(obs):
@@ -193,6 +199,15 @@ def test_an_episode_goes_on_until_its_return_is_known_and_no_longer():
     assert env.steps == LIMIT - 1 + TAIL
     assert played.on_policy.sum() == LIMIT
     assert played.last.nonzero().tolist() == [[LIMIT - 2 + TAIL, 0]]
+
+
+def test_environments_that_are_done_stand_still():
+    _, env = play([4, 2, STUCK, 1], num_envs=4, endless=False)
+    assert env.steps == LIMIT
+    # The random beginnings of the second and the last walker may make them stuck.
+    assert env.moves[0] == 4
+    assert env.moves[2] == LIMIT
+    assert env.moves.max() == LIMIT
 
 
 def test_off_policy_decisions_are_the_last_random_ones():
