@@ -29,6 +29,9 @@ from symsteer.policies.geometry import Layout
 Role = Literal["reference", "learner", "control"]
 """``reference``: every learner must beat it. ``control``: trained, but must not win."""
 
+Deterministic = Callable[[torch.Tensor], torch.Tensor]
+"""``obs [B, obs_dim] -> noise [B, Tp, Da]``."""
+
 Decode = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 Normalize = Callable[[torch.Tensor], torch.Tensor]
 
@@ -184,6 +187,10 @@ class Agent:
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Scalars that an evaluation reports in addition to success (docs/metrics.md)."""
+        return {}
+
+    def alternatives(self) -> Mapping[str, Deterministic]:
+        """Other ways to act, whose success the final evaluation measures, too, by name."""
         return {}
 
     def parameter_counts(self) -> dict[str, int]:

@@ -11,7 +11,7 @@ commute with permutations of the features, so regular fields stay regular fields
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal, Protocol, cast
 
 import torch
@@ -73,6 +73,16 @@ class Ensemble(nn.Module):
                 self._expanded = self._expand()
         return self._expanded
 
+    def layers(self) -> Iterator[tuple[nn.Module, dict[str, torch.Tensor]]]:
+        """Every layer of every member with its parameters.
+
+        In a team, equal layers of all members come as one: the first of them, with the parameters
+        of all, which then have one more dimension in front.
+        """
+        for member in self.members:
+            for layer in cast(nn.ModuleList, member):
+                yield layer, dict(layer.named_parameters())
+
     def changed(self) -> None:
         """Drop the cache. Call this after every change of parameters (optimiser step, loading)."""
         self._expanded = None
@@ -122,4 +132,4 @@ def shrink_(layer: nn.Module, factor: float) -> None:
 
 def count(module: nn.Module) -> int:
     """Number of trainable parameters."""
-    return sum(parameter.numel() for parameter in module.parameters())
+    return sum(parameter.numel() for parameter in module.parameters() if parameter.requires_grad)

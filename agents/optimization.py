@@ -52,5 +52,5 @@ def descend(
 ) -> None:
     """One gradient step on a loss plus its regulariser; in a team on the sum over members."""
     optimizer.zero_grad()
-    (loss if penalty is None else loss + penalty).sum().backward()
+    (loss.sum() if penalty is None else loss.sum() + penalty.sum()).backward()
     optimizer.step()

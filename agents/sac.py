@@ -21,7 +21,8 @@ Subclasses override only what they change:
 ``critic_loss``     loss of the critics
 ``actor_loss``      loss of the actor
 ``augment``         changes a batch before the update
-``critic_penalty``, ``actor_penalty``  regularisers, added to the losses
+``penalty``         a regulariser, added to the loss of a network
+``settle``          changes a network after each of its steps
 ``constraints``     gaps of the trained multipliers; the temperature is one of them
 ``after_update``    called after each update; returns more scalars
 ====================  ===============================================================
@@ -211,12 +212,8 @@ class SacAgent(Agent):
         """Change a batch before the update."""
         return batch
 
-    def critic_penalty(self, batch: Batch) -> torch.Tensor | None:
-        """A regulariser, added to the critics' loss; None: no regulariser."""
-        return None
-
-    def actor_penalty(self, batch: Batch) -> torch.Tensor | None:
-        """A regulariser, added to the actor's loss; None: no regulariser."""
+    def penalty(self, name: str, batch: Batch) -> torch.Tensor | None:
+        """A regulariser, added to the loss of a network; None: no regulariser."""
         return None
 
     def constraints(
@@ -224,6 +221,9 @@ class SacAgent(Agent):
     ) -> dict[str, torch.Tensor]:
         """Gap of each constraint in ``multipliers``, a scalar; negative: the multiplier grows."""
         return {"alpha": -log_prob.mean(-1) - self.target_entropy}
+
+    def settle(self, name: str) -> None:
+        """Called after each step of a network; may change its parameters, in place."""
 
     def after_update(self, batch: Batch) -> dict[str, torch.Tensor]:
         """Called after each update; returns more scalars."""
@@ -375,7 +375,7 @@ class SacAgent(Agent):
         stored = batch.noise if self.options.critic == "noise" else batch.actions
         q = self._q(self.critic.weights(), obs, stored.flatten(-2))
         critic_loss = self.critic_loss(q, target, batch)
-        self._descend("critic", critic_loss, self.critic_penalty(batch))
+        self._descend("critic", critic_loss, batch)
         scalars = {"losses/critic": critic_loss.detach()}
         judge = detached(self.critic.weights())  # no gradient of other losses in the critics
 
@@ -409,7 +409,7 @@ class SacAgent(Agent):
         else:
             values = self._q(judge, obs, self.judged(batch.obs, noise))
         actor_loss = self.actor_loss(values, noise, log_prob, batch)
-        self._descend("actor", actor_loss, self.actor_penalty(batch))
+        self._descend("actor", actor_loss, batch)
         log_prob = log_prob.detach()
         gaps = self.constraints(noise.detach(), log_prob, batch)
         return {
@@ -441,7 +441,7 @@ class SacAgent(Agent):
             wanted = self._q(judge, features, actions)
         found = self._q(self.noise_critic.weights(), features, noise)
         loss = (found - wanted).square().mean(-1).sum(-1)
-        self._descend("noise_critic", loss, None)
+        self._descend("noise_critic", loss, batch)
         return loss.detach()
 
     def _random_pairs(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
@@ -552,8 +552,10 @@ class SacAgent(Agent):
     def _critics(self, inputs: Layout) -> Ensemble:
         return self._network([self.critic_layers(inputs) for _ in range(self.options.critics)])
 
-    def _descend(self, name: str, loss: torch.Tensor, penalty: torch.Tensor | None = None) -> None:
-        descend(loss, self.optimizers[name], penalty)
+    def _descend(self, name: str, loss: torch.Tensor, batch: Batch) -> None:
+        descend(loss, self.optimizers[name], self.penalty(name, batch))
+        with torch.no_grad():
+            self.settle(name)
         self.networks[name].changed()
 
     @property

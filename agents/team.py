@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
 import torch
@@ -178,6 +178,10 @@ class StackedEnsemble(Ensemble):
         super().changed()
         for ensemble in self._ensembles:
             ensemble.changed()
+
+    def layers(self) -> Iterator[tuple[nn.Module, dict[str, torch.Tensor]]]:
+        for layer, leaves in self._stacked:
+            yield layer.layer, leaves
 
     def apply_weights(self, weights: Weights, x: torch.Tensor) -> torch.Tensor:
         """``[runs, B, in] -> [runs, members, B, out]``."""

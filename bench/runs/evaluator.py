@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 
-from symsteer.agents.agent import Agent, HasCritic
+from symsteer.agents.agent import Agent, Deterministic, HasCritic
 from symsteer.agents.episodes import LongEpisodes, Played, Rollout
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.steering.evaluation import long_episodes, long_limit, rollout
+from symsteer.bench.steering.evaluation import Act, long_episodes, long_limit, rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import DIAGNOSTIC_SEED, diagnostic_seeds, held_out_seeds
 from symsteer.bench.tasks import make
@@ -104,6 +104,15 @@ class Evaluator:
             generator = torch.Generator(device).manual_seed(seed)
             return agent.diagnostics(Played(self.played, long, self.feasible, generator))
 
+    def compare(self, count: int) -> dict[str, float]:
+        """Success of the agent's other ways to act, on the first ``count`` held-out seeds."""
+        found = {}
+        with self._unchanged_agent() as agent:
+            for name, act in agent.alternatives().items():
+                episodes = rollout(self.env, _without_rows(act), held_out_seeds(count)).episodes
+                found[f"success_{name}"] = episodes["success_once"].double().mean().item()
+        return found
+
     def close(self) -> None:
         """Free the simulation."""
         self.env.close()
@@ -130,6 +139,10 @@ class Evaluator:
             yield self.agent
         finally:
             self.agent.generator.set_state(state)
+
+
+def _without_rows(act: Deterministic) -> Act:
+    return lambda obs, rows: act(obs)
 
 
 def discount(agent: Agent) -> float:

@@ -217,9 +217,13 @@ class Trainer:
         wanted = self.config.evaluation
         columns = self.evaluator.play(wanted.final_episodes if final else wanted.episodes).episodes
         played = time.perf_counter()
-        diagnostics = self.evaluator.diagnose(
-            wanted.final_diagnostic_episodes if final else wanted.diagnostic_episodes
+        diagnostics = dict(
+            self.evaluator.diagnose(
+                wanted.final_diagnostic_episodes if final else wanted.diagnostic_episodes
+            )
         )
+        if final:
+            diagnostics |= self.evaluator.compare(wanted.final_episodes)
         self.evaluate_seconds += played - begin
         self.diagnose_seconds += time.perf_counter() - played
         evaluation = Evaluation(
@@ -229,7 +233,7 @@ class Trainer:
             wall_clock=self.seconds["total"],
             final=final,
             episodes=Episodes.model_validate(columns),
-            diagnostics=dict(diagnostics),
+            diagnostics=diagnostics,
         )
         for observer in self.observers:
             observer.evaluated(self, evaluation)

@@ -7,12 +7,16 @@ the lift per group element follows EDP, arXiv 2407.01812). ``tests/policies`` co
 number of free parameters with escnn's basis.
 
 Every layer can be written as one ordinary matrix, ``dense()``. Inference computes it once, and
-several networks can be stacked into one matrix product.
+several networks can be stacked into one matrix product. ``nearest()`` is the Reynolds projection of
+any matrix onto those of the layer.
 """
 
 from __future__ import annotations
 
+import abc
+import copy
 import math
+from typing import Self
 
 import torch
 from torch import nn
@@ -20,7 +24,38 @@ from torch import nn
 from symsteer.policies.geometry import Group, Layout
 
 
-class Lift(nn.Module):
+class EquivariantLayer(nn.Module, abc.ABC):
+    """What the layers have in common."""
+
+    group: Group
+    weight: torch.Tensor
+    bias: torch.Tensor
+
+    @abc.abstractmethod
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The map as (matrix, bias)."""
+
+    @abc.abstractmethod
+    def nearest(
+        self, matrix: torch.Tensor, bias: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The equivariant map with the smallest distance to another one, as (matrix, bias).
+
+        It is the mean of rho_out(g)^-1 M rho_in(g) over the group; the parameters are not used.
+
+        Args:
+            matrix: ``[..., out, in]``.
+            bias: ``[..., out]``.
+        """
+
+    def without_parameters(self) -> Self:
+        """A copy that has the geometry alone, for :meth:`nearest`."""
+        bare = copy.copy(self)
+        bare._parameters = dict.fromkeys(self._parameters)
+        return bare
+
+
+class Lift(EquivariantLayer):
     """Vector to regular fields: f(g) = W rho(g)^-1 x + b.
 
     Shapes: ``[..., dim] -> [..., order, channels]``.
@@ -40,12 +75,21 @@ class Lift(nn.Module):
         stacked = torch.einsum("cd,ged->gce", self.weight, rho).flatten(0, 1)
         return stacked, self.bias.repeat(self.group.order)
 
+    def nearest(
+        self, matrix: torch.Tensor, bias: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        rho = self.group.representation(self.layout, matrix.dtype, matrix.device)
+        order = self.group.order
+        weight = torch.einsum("...gce,ged->...cd", matrix.unflatten(-2, (order, -1)), rho) / order
+        stacked = torch.einsum("...cd,ged->...gce", weight, rho).flatten(-3, -2)
+        return stacked, _mean_over_group(bias, order)
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         out = nn.functional.linear(x, *self.dense())
         return out.unflatten(-1, (self.group.order, self.channels))
 
 
-class RegularLinear(nn.Module):
+class RegularLinear(EquivariantLayer):
     """Group convolution: f'(g) = sum_h W(g^-1 h) f(h) + b.
 
     Shapes: ``[..., order, in] -> [..., order, out]``.
@@ -73,12 +117,25 @@ class RegularLinear(nn.Module):
         )
         return circulant, self.bias.repeat(order)
 
+    def nearest(
+        self, matrix: torch.Tensor, bias: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        order = self.group.order
+        blocks = matrix.unflatten(-1, (order, -1)).unflatten(-3, (order, -1)).transpose(-3, -2)
+        # blocks[g, h] is W(g^-1 h), so W(u) is the mean of blocks[g, gu].
+        flat = blocks.flatten(-4, -3)
+        start = order * torch.arange(order, device=matrix.device)[:, None]
+        same = (start + self.group.multiplication.to(matrix.device)).flatten()
+        weight = flat.index_select(-3, same).unflatten(-3, (order, order)).mean(-4)
+        blocks = weight.index_select(-3, self.index.flatten()).unflatten(-3, (order, order))
+        return blocks.transpose(-3, -2).flatten(-2).flatten(-3, -2), _mean_over_group(bias, order)
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         out = nn.functional.linear(x.flatten(-2), *self.dense())
         return out.unflatten(-1, (self.group.order, self.out_channels))
 
 
-class Project(nn.Module):
+class Project(EquivariantLayer):
     """Regular fields to a vector: y = mean_g rho(g) (V f(g) + b).
 
     Shapes: ``[..., order, in] -> [..., dim]``. The mean keeps only the invariant part of the bias.
@@ -97,5 +154,19 @@ class Project(nn.Module):
         stacked = torch.einsum("gde,ec->dgc", rho, self.weight).flatten(1) / self.group.order
         return stacked, rho.mean(0) @ self.bias
 
+    def nearest(
+        self, matrix: torch.Tensor, bias: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        rho = self.group.representation(self.layout, matrix.dtype, matrix.device)
+        blocks = matrix.unflatten(-1, (self.group.order, -1))
+        weight = torch.einsum("gde,...dgc->...ec", rho, blocks) / self.group.order
+        return torch.einsum("gde,...ec->...dgc", rho, weight).flatten(-2), bias @ rho.mean(0).mT
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return nn.functional.linear(x.flatten(-2), *self.dense())
+
+
+def _mean_over_group(bias: torch.Tensor, order: int) -> torch.Tensor:
+    """``[..., order * channels]`` with the mean over the group in every place."""
+    fields = bias.unflatten(-1, (order, -1))
+    return fields.mean(-2, keepdim=True).expand_as(fields).flatten(-2)

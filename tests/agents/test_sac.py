@@ -403,8 +403,10 @@ def test_losses_penalties_and_multipliers_of_an_agent_are_used(problem):
         def critic_target(self, batch, following):
             return torch.full_like(batch.reward, 3.0)
 
-        def actor_penalty(self, batch):
-            return 1e3 * sum(p.square().sum() for p in self.actor.parameters())
+        def penalty(self, name, batch):
+            if name == "actor":
+                return 1e3 * sum(p.square().sum() for p in self.actor.parameters())
+            return None
 
         def constraints(self, noise, log_prob, batch):
             norm = noise.norm(dim=1).mean()

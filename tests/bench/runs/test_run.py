@@ -134,6 +134,14 @@ def test_every_agent_runs_on_a_broken_world(broken):
     assert len(policies) == 1
 
 
+def test_the_final_evaluation_plays_the_other_ways_to_act(broken):
+    *before, final = read_record(broken["constrained"] / "record.json").evaluations
+    assert 0 <= final.diagnostics["success_truncated"] <= 1
+    assert all("success_truncated" not in e.diagnostics for e in before)
+    other = read_record(broken["equivariant"] / "record.json").evaluations[-1]
+    assert "success_truncated" not in other.diagnostics
+
+
 def test_a_finished_run_is_not_overwritten(finished):
     config, folder = finished
     before = (folder / "record.json").read_bytes()

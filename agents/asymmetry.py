@@ -1,0 +1,127 @@
+"""Agents between strict and free: equivariant layers that may leave the symmetry.
+
+The matrix W of every layer is the sum of its nearest equivariant matrix P(W) and an asymmetric part
+A. The agents differ in how A is parametrised and held. All start with A = 0, where the equivariant
+agent starts. Agents with a penalty on A have the same dial: after each step of Adam with rate lr,
+
+    A <- A / (1 + 2 lr penalty),
+
+the proximal step for the loss ``penalty |A|^2`` (Parikh and Boyd, Proximal Algorithms, 2014). As a
+weight decay inside Adam the same penalty hardly binds, because Adam divides it by the size of the
+gradient. Here a step of Adam moves a number by about lr at most, so that the numbers of A stay
+below 1 / (2 penalty): 0 lets A go, infinity is the equivariant agent.
+"""
+
+from __future__ import annotations
+
+import abc
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import nn
+
+from symsteer.agents.episodes import Played
+from symsteer.agents.equivariant import EquivariantAgent
+from symsteer.agents.networks import Ensemble, dense
+from symsteer.agents.options import SacOptions
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Layout
+from symsteer.policies.networks.equivariant import EquivariantLayer
+
+Parameters = Mapping[str, torch.Tensor]
+"""Parameters of a layer by name; those of several equal layers have one more dimension in front."""
+
+LayersOf = Callable[[], list[EquivariantLayer]]
+"""Makes new equivariant layers of a network."""
+
+
+class AsymmetricLayer(nn.Module, abc.ABC):
+    """An equivariant layer that may leave the symmetry.
+
+    Attributes:
+        strict: says which matrices are equivariant here.
+    """
+
+    strict: EquivariantLayer
+
+    @abc.abstractmethod
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Weight ``[out, in]`` and bias ``[out]``."""
+
+
+class AsymmetricAgent(EquivariantAgent):
+    """Layers that may leave the symmetry; subclasses say which, and what holds them."""
+
+    def asymmetric_layers(self, make: LayersOf) -> list[nn.Module]:
+        """Layers that may leave the symmetry and equal equivariant ones at the start."""
+        raise NotImplementedError(f"{type(self).__name__} must say which layers it has")
+
+    def actor_layers(self) -> list[nn.Module]:
+        return self.asymmetric_layers(cast(LayersOf, super().actor_layers))
+
+    def critic_layers(self, inputs: Layout) -> list[nn.Module]:
+        make = functools.partial(super().critic_layers, inputs)
+        return self.asymmetric_layers(cast(LayersOf, make))
+
+    def diagnostics(self, played: Played) -> Mapping[str, float | None]:
+        """Also |A| / |W| of each network, over all layers."""
+        shares = {f"asymmetry_{k}": asymmetry(network) for k, network in self.networks.items()}
+        return {**super().diagnostics(played), **shares}
+
+
+@dataclass(frozen=True)
+class PenaltyOptions(SacOptions):
+    """Options of the agents with a penalty on the asymmetric part."""
+
+    penalty: float = 1.0
+    """The dial: weight of the squared asymmetric part, which keeps its numbers below
+    1 / (2 penalty). 0: free; inf: strict."""
+    actor_penalty: float | None = None
+    """The same for the actor alone; default: `penalty`."""
+    critic_penalty: float | None = None
+    """The same for the critics alone; default: `penalty`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("penalty", "actor_penalty", "critic_penalty"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise UserError(f"agent option {name} must not be negative, not {value}")
+
+
+class PulledLayer(AsymmetricLayer):
+    """A layer whose asymmetric part can be made smaller."""
+
+    @abc.abstractmethod
+    def pull(self, parameters: Parameters, factor: float) -> None:
+        """Multiply the asymmetric part by a factor, in place."""
+
+
+class PenaltyAgent(AsymmetricAgent):
+    """Layers whose asymmetric part is pulled to 0 after each step."""
+
+    Options = PenaltyOptions
+    options: PenaltyOptions
+
+    def settle(self, name: str) -> None:
+        """The proximal step."""
+        own = self.options.actor_penalty if name == "actor" else self.options.critic_penalty
+        penalty = self.options.penalty if own is None else own
+        if penalty > 0:
+            for layer, parameters in self.networks[name].layers():
+                cast(PulledLayer, layer).pull(parameters, 1 / (1 + 2 * self.options.lr * penalty))
+
+
+@torch.no_grad()
+def asymmetry(network: Ensemble) -> float:
+    """|W - P(W)| / |W| over the matrices and biases of all layers (Frobenius norms)."""
+    apart, whole = [], []
+    for layer, _ in network.layers():
+        parts = dense(layer)
+        nearest = cast(AsymmetricLayer, layer).strict.nearest(*parts)
+        apart += [(part - near).norm() for part, near in zip(parts, nearest, strict=True)]
+        whole += [part.norm() for part in parts]
+    return (torch.stack(apart).norm() / torch.stack(whole).norm()).item()

@@ -1,0 +1,110 @@
+"""Constrained equivariance (ACE, arXiv 2505.13631): the asymmetric part is trained away.
+
+Every layer is W = W_eq + gamma W_neq with a number gamma that starts at 1, under the constraint
+gamma = 0. Descent on the Lagrangian and ascent on its multiplier lambda alternate:
+
+    equality:  L = J + sum lambda gamma,              lambda <- lambda + eta gamma,
+    elastic:   L = J + sum lambda (|gamma| - u) + rho/2 u^2,   u = lambda / rho,
+               lambda <- max(lambda + eta (|gamma| - u), 0).
+
+``elastic`` leaves a gamma where the constraint costs too much. These are the updates of the paper;
+those of its published code differ. Our choices: gamma is trained by Adam as all parameters are;
+W_neq starts at 0, so that the agent starts equivariant. The final evaluation also plays the actor
+with gamma = 0 (``success_truncated``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import nn
+
+from symsteer.agents.agent import Deterministic
+from symsteer.agents.asymmetry import AsymmetricAgent, AsymmetricLayer, LayersOf
+from symsteer.agents.networks import Dense, dense, shrink_
+from symsteer.agents.options import SacOptions
+from symsteer.agents.replay import Batch
+from symsteer.errors import UserError
+from symsteer.policies.networks.equivariant import EquivariantLayer
+
+
+@dataclass(frozen=True)
+class ConstrainedOptions(SacOptions):
+    """Options of the constrained agent."""
+
+    dual_lr: float = 1e-3
+    """Rate eta of the ascent on the multipliers; 0: no constraint."""
+    elastic: bool = False
+    """Allow a slack u at the price rho/2 u^2."""
+    slack_price: float = 1.0
+    """rho: the price of the slack, with `elastic`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.dual_lr >= 0:
+            raise UserError(f"agent option dual_lr must not be negative, not {self.dual_lr}")
+        if not self.slack_price > 0:
+            raise UserError(f"agent option slack_price must be positive, not {self.slack_price}")
+
+
+class Constrained(AsymmetricLayer):
+    """An equivariant layer plus gamma times a plain one; keeps its multiplier lambda."""
+
+    def __init__(self, strict: EquivariantLayer):
+        super().__init__()
+        self.strict = strict
+        outputs, inputs = dense(strict)[0].shape
+        self.free = Dense(inputs, outputs)
+        shrink_(self.free, 0.0)
+        self.gamma = nn.Parameter(torch.ones(()))
+        # A parameter, because a team stacks parameters; the optimiser leaves it alone.
+        self.multiplier = nn.Parameter(torch.zeros(()), requires_grad=False)
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = dense(self.strict)
+        return weight + self.gamma * self.free.weight, bias + self.gamma * self.free.bias
+
+
+class ConstrainedAgent(AsymmetricAgent):
+    """The equivariant agent with a plain part in every layer, which dual ascent removes."""
+
+    name = "constrained"
+    in_teams = True
+    Options = ConstrainedOptions
+    options: ConstrainedOptions
+
+    def asymmetric_layers(self, make: LayersOf) -> list[nn.Module]:
+        return [Constrained(layer) for layer in make()]
+
+    def penalty(self, name: str, batch: Batch) -> torch.Tensor | None:
+        """The part of the Lagrangian that depends on gamma."""
+        terms = []
+        for _, own in self.networks[name].layers():
+            size = own["gamma"].abs() if self.options.elastic else own["gamma"]
+            terms.append((own["multiplier"].detach() * size).sum())
+        return torch.stack(terms).sum()
+
+    def settle(self, name: str) -> None:
+        """One step of dual ascent."""
+        options = self.options
+        for _, own in self.networks[name].layers():
+            gamma, multiplier = own["gamma"], own["multiplier"]
+            if options.elastic:
+                slack = multiplier / options.slack_price
+                multiplier.add_(options.dual_lr * (gamma.abs() - slack)).clamp_(min=0)
+            else:
+                multiplier.add_(options.dual_lr * gamma)
+
+    def alternatives(self) -> dict[str, Deterministic]:
+        """The actor with gamma = 0, which is equivariant."""
+        return {"truncated": self.act_truncated}
+
+    @torch.no_grad()
+    def act_truncated(self, obs: torch.Tensor) -> torch.Tensor:
+        """Noise ``[B, Tp, Da]`` of the deterministic actor with gamma = 0."""
+        layers = [cast(Constrained, layer) for layer, _ in self.actor.layers()]
+        parts = [dense(layer.strict) for layer in layers]
+        weights = [(weight[None], bias[None, None]) for weight, bias in parts]
+        return self.chunk(self.distribution.mode(self._heads(weights, self._features(obs))[0]))

@@ -1,0 +1,42 @@
+"""Projection regularisation (arXiv 2601.05028): plain layers that are pulled to the symmetry.
+
+Every layer is a plain matrix W with the penalty ``|W - P(W)|^2``, where P is the Reynolds
+projection P(W) = mean_g rho_out(g)^-1 W rho_in(g). W starts as that of an equivariant layer.
+The paper also penalises P(W); here nothing holds the symmetric part.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from symsteer.agents.asymmetry import LayersOf, Parameters, PenaltyAgent, PulledLayer
+from symsteer.agents.networks import dense
+from symsteer.policies.networks.equivariant import EquivariantLayer
+
+
+class Projected(PulledLayer):
+    """A plain layer; its asymmetric part is what the projection removes."""
+
+    def __init__(self, strict: EquivariantLayer):
+        super().__init__()
+        self.weight, self.bias = (nn.Parameter(part.detach().clone()) for part in dense(strict))
+        self.strict = strict.without_parameters()
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.weight, self.bias
+
+    def pull(self, parameters: Parameters, factor: float) -> None:
+        own = parameters["weight"], parameters["bias"]
+        for part, near in zip(own, self.strict.nearest(*own), strict=True):
+            part.lerp_(near, 1 - factor)
+
+
+class ProjectedAgent(PenaltyAgent):
+    """Plain layers that start equivariant and are pulled to their projections."""
+
+    name = "projected"
+    in_teams = True
+
+    def asymmetric_layers(self, make: LayersOf) -> list[nn.Module]:
+        return [Projected(layer) for layer in make()]

@@ -1,0 +1,225 @@
+"""Agents between strict and free: their limits, their dial, and where they start."""
+
+import copy
+import math
+
+import pytest
+import torch
+
+from symsteer.agents.agent import AgentContext
+from symsteer.agents.asymmetry import asymmetry
+from symsteer.agents.constrained import ConstrainedAgent, ConstrainedOptions
+from symsteer.agents.networks import dense
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Group
+from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
+from tests.agents.conftest import ACT, OBS
+from tests.agents.test_equivariance import errors, trained
+from tests.agents.test_sac import solve
+
+WITH_DIAL = ("residual-pathway", "relaxed", "projected")
+ALL = (*WITH_DIAL, "constrained")
+FREE = {"constrained": {"dual_lr": 0.0}, **{name: {"penalty": 0.0} for name in WITH_DIAL}}
+
+
+def layers_of(name):
+    """Layers of all kinds with the matrices of the group on their inputs and outputs."""
+    group = Group.parse(name)
+    order = group.order
+    # (u f)(g) = f(u^-1 g)
+    moves = group.multiplication[group.inverse]
+    shift = torch.nn.functional.one_hot(moves, order).double()
+    rho_obs, rho_act = (group.representation(x, torch.float64, "cpu") for x in (OBS, ACT))
+
+    def regular(fields):
+        return torch.stack([torch.kron(m, torch.eye(fields).double()) for m in shift])
+
+    return {
+        "lift": (Lift(OBS, group, 3), rho_obs, regular(3)),
+        "convolution": (RegularLinear(group, 3, 2), regular(3), regular(2)),
+        "project": (Project(group, 3, ACT), regular(3), rho_act),
+    }
+
+
+@pytest.mark.parametrize("kind", ["lift", "convolution", "project"])
+@pytest.mark.parametrize("name", ["C8", "C4", "D4"])
+def test_the_nearest_map_is_the_mean_over_the_group(name, kind):
+    layer, rho_in, rho_out = layers_of(name)[kind]
+    layer = layer.double()
+    matrix, bias = dense(layer)
+    assert all(
+        torch.allclose(near, own)
+        for near, own in zip(layer.nearest(matrix, bias), (matrix, bias), strict=True)
+    )
+    generator = torch.Generator().manual_seed(0)
+    several = torch.randn(2, *matrix.shape, generator=generator, dtype=torch.float64)
+    biases = torch.randn(2, *bias.shape, generator=generator, dtype=torch.float64)
+    near, near_bias = layer.without_parameters().nearest(several, biases)
+    expected = (rho_out.mT @ several[:, None] @ rho_in).mean(1)
+    torch.testing.assert_close(near, expected)
+    torch.testing.assert_close(near_bias, (biases[:, None, None] @ rho_out).squeeze(2).mean(1))
+    assert not torch.allclose(near, several)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_they_start_where_the_strict_agent_starts_and_leave_it(problem, name):
+    options = {"dtype": torch.float64, "initial_output": 1.0, **FREE[name]}
+    agent = problem.agent(name, **options)
+    # Layers are made in single precision.
+    assert max(errors(agent, problem, "C8", torch.float64).values()) < 1e-6
+    assert asymmetry(agent.actor) < 1e-7
+    trained(problem, agent, torch.float64)
+    worst = errors(agent, problem, "C8", torch.float64)
+    assert min(worst.values()) > 1e-4, worst
+    assert min(asymmetry(network) for network in agent.networks.values()) > 1e-4
+
+
+@pytest.mark.parametrize("name", WITH_DIAL)
+def test_a_large_penalty_gives_a_strict_agent(problem, name):
+    agent = problem.agent(name, dtype=torch.float64, initial_output=1.0, penalty=math.inf)
+    trained(problem, agent, torch.float64)
+    assert max(errors(agent, problem, "C8", torch.float64).values()) < 1e-10
+    large = problem.agent(name, dtype=torch.float64, initial_output=1.0, penalty=1e8)
+    trained(problem, large, torch.float64)
+    assert max(errors(large, problem, "C8", torch.float64).values()) < 1e-4
+
+
+def test_with_a_large_penalty_the_residual_pathway_is_the_equivariant_agent(problem):
+    options = {"dtype": torch.float64, "initial_output": 1.0}
+    strict = trained(problem, problem.agent("equivariant", **options), torch.float64)
+    agent = problem.agent("residual-pathway", penalty=math.inf, **options)
+    # The plain paths draw numbers when they are made.
+    agent.load_state_dict(with_strict_layers(agent, problem.agent("equivariant", **options)))
+    trained(problem, agent, torch.float64)
+    batch = problem.batch(seed=9, dtype=torch.float64)
+    for mine, theirs in zip(agent.moments(batch.obs), strict.moments(batch.obs), strict=True):
+        torch.testing.assert_close(mine, theirs)
+    torch.testing.assert_close(
+        agent.q_values(batch.obs, batch.noise), strict.q_values(batch.obs, batch.noise)
+    )
+
+
+def with_strict_layers(agent, strict):
+    """The agent's state with the equivariant layers and the target critics of another agent."""
+    state = agent.state_dict()
+    for name, network in strict.state_dict()["networks"].items():
+        for key, value in network.items():
+            *path, last = key.split(".")
+            state["networks"][name][".".join([*path, "strict", last])] = value
+    state["target"] = strict.state_dict()["target"]
+    return state
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_without_a_penalty_they_solve_a_broken_problem(problem, name):
+    """Best is 0, the strict agent reaches less than -0.8."""
+    reward, error = solve(problem, name, broken=True, **FREE[name])
+    assert reward > -0.65
+    assert error > 0.5
+
+
+@pytest.mark.parametrize("name", WITH_DIAL)
+def test_with_a_large_penalty_they_do_not(problem, name):
+    reward, error = solve(problem, name, broken=True, rounds=150, penalty=1e8)
+    assert reward < -0.8
+    assert error < 1e-4
+
+
+@pytest.mark.parametrize("name", WITH_DIAL)
+def test_the_dial_orders_them(problem, name):
+    sizes = []
+    for penalty in (0.0, 10.0, 1000.0):
+        agent = problem.agent(name, dtype=torch.float64, penalty=penalty)
+        trained(problem, agent, torch.float64)
+        sizes.append([asymmetry(network) for network in agent.networks.values()])
+    for free, held, strict in zip(*sizes, strict=True):
+        assert free > 1.05 * held > 2 * strict
+
+
+def test_actor_and_critics_may_have_penalties_of_their_own(problem):
+    agent = problem.agent("projected", dtype=torch.float64, penalty=0.0, actor_penalty=1e9)
+    trained(problem, agent, torch.float64)
+    assert asymmetry(agent.actor) < 1e-7 < asymmetry(agent.critic)
+    agent = problem.agent("projected", dtype=torch.float64, penalty=0.0, critic_penalty=1e9)
+    trained(problem, agent, torch.float64)
+    assert max(asymmetry(agent.critic), asymmetry(agent.noise_critic)) < 1e-7
+    assert asymmetry(agent.actor) > 1e-4
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_in_a_symmetric_problem_the_measured_error_falls(problem, name, monkeypatch):
+    """From layers that are far from the symmetry."""
+    options = {"dual_lr": 0.3} if name == "constrained" else {"penalty": 10.0}
+    made = []
+
+    def far(self, context, options=None):
+        original(self, context, options)
+        generator = torch.Generator().manual_seed(0)
+        for network in self.networks.values():
+            for layer, parameters in network.layers():
+                key = "weights" if name == "relaxed" else "weight"
+                key = key if key in parameters else "free.weight"
+                size = dense(layer)[0].abs().mean()
+                with torch.no_grad():
+                    noise = torch.randn(parameters[key].shape, generator=generator)
+                    parameters[key].add_(noise if name == "relaxed" else size * noise)
+            network.changed()
+        made.append((self, [asymmetry(network) for network in self.networks.values()]))
+
+    kind = type(problem.agent(name))
+    original = kind.__init__
+    monkeypatch.setattr(kind, "__init__", far)
+    reward, error = solve(problem, name, broken=False, rounds=300, **options)
+    ((agent, before),) = made
+    after = [asymmetry(network) for network in agent.networks.values()]
+    assert min(before) > 0.3
+    # A step of Adam changes gamma by 0.001.
+    most = 0.75 if name == "constrained" else 0.5
+    assert all(b < most * a for a, b in zip(before, after, strict=True)), (before, after)
+    assert reward > -1
+    assert error < 0.3
+
+
+def test_multipliers_follow_the_paper():
+    context = AgentContext(OBS, ACT, 3, 2, lambda obs, noise: noise.tanh(), lambda obs: obs)
+    agent = ConstrainedAgent(context, ConstrainedOptions(width=32, dual_lr=0.5))
+    layers = [parameters for _, parameters in agent.actor.layers()]
+    with torch.no_grad():
+        layers[1]["gamma"].fill_(-2.0)
+        agent.settle("actor")
+        agent.settle("actor")
+    assert [layer["multiplier"].item() for layer in layers] == [1.0, -2.0, 1.0]
+    assert agent.penalty("actor", None).item() == pytest.approx(1 + 4 + 1)
+    agent = ConstrainedAgent(
+        context, ConstrainedOptions(width=32, dual_lr=0.5, elastic=True, slack_price=2.0)
+    )
+    layers = [parameters for _, parameters in agent.actor.layers()]
+    with torch.no_grad():
+        layers[1]["gamma"].fill_(-2.0)
+        layers[2]["gamma"].fill_(0.0)
+        layers[2]["multiplier"].fill_(0.4)
+        agent.settle("actor")
+        agent.settle("actor")
+    # lambda + 0.5 (|gamma| - lambda / 2), twice.
+    found = [layer["multiplier"].item() for layer in layers]
+    assert found == pytest.approx([0.875, 1.75, 0.4 * 0.75**2])
+
+
+def test_the_truncated_actor_is_equivariant(problem):
+    agent = problem.agent("constrained", dtype=torch.float64, initial_output=1.0, dual_lr=0.0)
+    trained(problem, agent, torch.float64)
+    truncated = copy.copy(agent)
+    truncated.act = lambda obs, deterministic: agent.alternatives()["truncated"](obs)
+    found = errors(truncated, problem, "C8", torch.float64)
+    assert found["deterministic"] < 1e-10 < 1e-4 < found["mean"]
+
+
+def test_bad_options_are_refused(problem):
+    for name, options, words in (
+        ("relaxed", {"filters": 0}, "filters must be at least 1"),
+        ("projected", {"actor_penalty": -1.0}, "actor_penalty must not be negative"),
+        ("constrained", {"dual_lr": -1.0}, "dual_lr must not be negative"),
+        ("constrained", {"slack_price": 0.0}, "slack_price must be positive"),
+    ):
+        with pytest.raises(UserError, match=words):
+            problem.agent(name, **options)
