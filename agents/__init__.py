@@ -26,6 +26,8 @@ AGENTS: Registry[type[Agent]] = Registry(
         "relaxed": "symsteer.agents.relaxed:RelaxedAgent",
         "projected": "symsteer.agents.projected:ProjectedAgent",
         "constrained": "symsteer.agents.constrained:ConstrainedAgent",
+        "displaced": "symsteer.agents.displaced:DisplacedAgent",
+        "residual": "symsteer.agents.residual:ResidualAgent",
         "wrong-group": "symsteer.agents.wrong_group:WrongGroupAgent",
         "base": "symsteer.agents.references:BaseAgent",
         "zero": "symsteer.agents.references:ZeroAgent",

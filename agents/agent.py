@@ -119,6 +119,8 @@ class AgentOptions:
 class Agent:
     """Chooses noise for the frozen policy. Subclasses override what they need.
 
+    What an agent plays is its *action* ``[rows, Da]``. Most agents play noise, with Tp rows.
+
     Attributes:
         name: in configurations and records.
         role: see :data:`Role`; the record holds it.
@@ -136,9 +138,14 @@ class Agent:
         self.options = self.Options() if options is None else options
         self.device, self.dtype = torch.device(context.device), context.dtype
         self.obs_layout, self.act_layout = context.obs_layout, context.act_layout
-        self.horizon = context.horizon
+        self.rows = self.action_rows(context)
         self.generator = self._new_generator()
         self.replay: ReplayBuffer | None = None
+
+    @staticmethod
+    def action_rows(context: AgentContext) -> int:
+        """Rows of an action: those of the noise."""
+        return context.horizon
 
     @classmethod
     def check(cls, options: Any, budget: Budget) -> None:
@@ -174,6 +181,10 @@ class Agent:
         """
         raise NotImplementedError(f"{type(self).__name__} must say how it acts")
 
+    def decode(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """What actions ``[B, rows, Da]`` do: chunks ``[B, Tp, Da]``; noise is decoded."""
+        return self.context.decode(obs, action)
+
     def observe(self, transition: Transition) -> None:
         """Receive one decision of all training environments, e.g. to store it."""
 
@@ -203,7 +214,7 @@ class Agent:
             "agent": self.name,
             "obs_layout": self.obs_layout.to_json(),
             "act_layout": self.act_layout.to_json(),
-            "horizon": self.horizon,
+            "horizon": self.context.horizon,
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -226,10 +237,10 @@ class Agent:
         self.generator.set_state(state["generator"].cpu())
 
     def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
-        """``count`` chunks from N(0, I), ``[count, Tp, Da]``: the noise of the base policy."""
+        """``count`` actions ``[count, rows, Da]`` of the base policy: noise from N(0, I)."""
         return torch.randn(
             count,
-            self.horizon,
+            self.rows,
             self.act_layout.dim,
             generator=generator or self.generator,
             device=self.device,

@@ -88,7 +88,7 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
         "equivariance_actor": actor_equivariance_error(agent, obs, group),
         "equivariance_critic": orbit["orbit_variance"] ** 0.5 / max(size, 1e-30),
         "equivariance_decode": equivariance_error(
-            context.decode,
+            agent.decode,
             (obs, noise),
             (context.obs_layout, context.act_layout),
             context.act_layout,
@@ -98,13 +98,13 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
 
 
 def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -> float:
-    """Error of the deterministic actor: max over g of rms ||mu(gs) - g mu(s)|| / rms ||mu(s)||.
+    """Error of the actor's mean: max over g of rms ||mu(gs) - g mu(s)|| / rms ||mu(s)||.
 
     Args:
         obs: ``[B, obs_dim]``.
     """
     return equivariance_error(
-        lambda x: agent.act(x, deterministic=True),
+        agent.mode,
         (obs,),
         (agent.obs_layout,),
         agent.act_layout,
@@ -290,7 +290,7 @@ def critic_preference(agent: SacAgent, obs: torch.Tensor, generator: torch.Gener
         generator: draws the random noise, on the agent's device.
     """
     own = agent.act(obs, deterministic=True)
-    random = torch.randn(own.shape, generator=generator, device=own.device, dtype=own.dtype)
+    random = agent.gaussian_noise(len(obs), generator)
     gap = agent.q_values(obs, own) - agent.q_values(obs, random)
     return {"critic_preference": gap.mean().item()}
 
@@ -303,13 +303,13 @@ def policy_statistics(agent: SacAgent, obs: torch.Tensor) -> Scalars:
     - ``saturated_share`` = share of irrep blocks of drawn w with norm > 0.95 bound.
     """
     noise, log_prob = agent.sample(obs)
-    mode = agent.act(obs, deterministic=True)
+    mode, noise = (agent.drawn_part(action) for action in (agent.mode(obs), noise))
     return {
         "alpha": agent.alpha.item(),
         "entropy": -log_prob.mean().item(),
-        "noise_norm": noise.flatten(1).norm(dim=1).mean().item(),
-        "mode_norm": mode.flatten(1).norm(dim=1).mean().item(),
-        "saturated_share": agent.distribution.saturated(noise.flatten(1)).double().mean().item(),
+        "noise_norm": noise.norm(dim=1).mean().item(),
+        "mode_norm": mode.norm(dim=1).mean().item(),
+        "saturated_share": agent.distribution.saturated(noise).double().mean().item(),
     }
 
 

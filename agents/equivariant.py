@@ -57,7 +57,7 @@ class EquivariantAgent(SacAgent):
 
 def equivariant_actor_layers(agent: SacAgent) -> list[nn.Module]:
     """Layers from observation to means and scales; small initial output."""
-    layers = equivariant_layers(agent.obs_layout, agent.actor_layout, agent.options)
+    layers = equivariant_layers(agent.actor_inputs, agent.actor_layout, agent.options)
     shrink_(layers[-1], agent.options.initial_output)
     return layers
 

@@ -42,7 +42,7 @@ class GoldenTicketAgent(Agent):
     def __init__(self, context: AgentContext, options: GoldenTicketOptions | None = None):
         super().__init__(context, options)
         self.ticket = torch.zeros(
-            self.horizon, self.act_layout.dim, device=self.device, dtype=self.dtype
+            self.rows, self.act_layout.dim, device=self.device, dtype=self.dtype
         )
         self.searched: dict[str, float | None] = {}
 

@@ -27,5 +27,5 @@ class ZeroAgent(Agent):
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Zeros ``[B, Tp, Da]``."""
         return torch.zeros(
-            len(obs), self.horizon, self.act_layout.dim, device=self.device, dtype=self.dtype
+            len(obs), self.rows, self.act_layout.dim, device=self.device, dtype=self.dtype
         )

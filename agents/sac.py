@@ -94,7 +94,7 @@ class SacAgent(Agent):
     def __init__(self, context: AgentContext, options: SacOptions | None = None):
         super().__init__(context, options)
         options = self.options
-        self.noise_layout = context.noise_layout
+        self.noise_layout = self.act_layout.repeat(self.drawn_rows)
         hard = options.bound_penalty == 0
         self.distribution = SquashedGaussian(self.noise_layout, options.noise_bound, hard)
         blocks = Field("log_scales", 0, self.distribution.blocks)
@@ -235,10 +235,18 @@ class SacAgent(Agent):
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Noise ``[B, Tp, Da]``; random during the warm-up, if not ``deterministic``."""
         if deterministic:
-            return self.chunk(self.distribution.mode(self.moments(obs)[0]))
+            return self.mode(obs)
         if self.decisions < self.options.warmup:
             return self.random_noise(self.options.warmup_noise, len(obs), self.warm_up_generator)
         return self.sample(obs)[0]
+
+    @torch.no_grad()
+    def mode(self, obs: torch.Tensor) -> torch.Tensor:
+        """Noise ``[B, Tp, Da]`` at the mean of the policy; turns with the scene if the actor does.
+
+        Diagnostics of symmetry measure it.
+        """
+        return self.chunk(self.distribution.mode(self.moments(obs)[0]))
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -278,7 +286,7 @@ class SacAgent(Agent):
 
     def executed(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """The actions ``[B, Ta, Da]`` that noise ``[B, Tp, Da]`` is decoded to."""
-        return self.context.decode(obs, noise)[..., : self.context.execute, :]
+        return self.decode(obs, noise)[..., : self.context.execute, :]
 
     def reduced(self, q: torch.Tensor) -> torch.Tensor:
         """One value per state, ``[B]``, of all critics' values ``[critics, B]``."""
@@ -307,6 +315,25 @@ class SacAgent(Agent):
         return self.chunk(self.distribution.squash(noise.flatten(1)))
 
     @property
+    def keeps_bank(self) -> bool:
+        """Whether random noises are decoded when a decision is stored."""
+        return self.options.critic == "aliased"
+
+    @property
+    def drawn_rows(self) -> int:
+        """Rows of an action that the actor draws: all of them."""
+        return self.rows
+
+    @property
+    def actor_inputs(self) -> Layout:
+        """What the actor sees: the observation."""
+        return self.obs_layout
+
+    def drawn_part(self, action: torch.Tensor) -> torch.Tensor:
+        """The part of actions ``[B, rows, Da]`` that the actor draws, flat."""
+        return action.flatten(1)
+
+    @property
     def reward_scale(self) -> float:
         """Factor on rewards in training."""
         return self.options.reward_scale
@@ -318,7 +345,7 @@ class SacAgent(Agent):
 
     def chunk(self, noise: torch.Tensor) -> torch.Tensor:
         """Flat noise ``[..., Tp * Da]`` as a chunk ``[..., Tp, Da]``."""
-        return noise.unflatten(-1, (self.horizon, self.act_layout.dim))
+        return noise.unflatten(-1, (-1, self.act_layout.dim))
 
     # Learning.
 
@@ -330,7 +357,8 @@ class SacAgent(Agent):
     def observe_demonstrations(self, decisions: Transition) -> None:
         """Keep the decisions beside the replay; they are not part of checkpoints."""
         banked = self._banked(decisions.obs, self._new_generator(2))
-        self.demonstrations.add({**vars(decisions), **banked})
+        noise = decisions.noise.new_zeros(len(decisions.noise), self.rows, self.act_layout.dim)
+        self.demonstrations.add({**vars(decisions), "noise": noise, **banked})
         # One row begins at every control step.
         self.demonstrations.stride = self.context.execute
 
@@ -408,6 +436,12 @@ class SacAgent(Agent):
             values = self._q(detached(self.noise_critic.weights()), obs, noise)
         else:
             values = self._q(judge, obs, self.judged(batch.obs, noise))
+        return self._climb(values, noise, log_prob, batch)
+
+    def _climb(
+        self, values: torch.Tensor, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
+    ) -> dict[str, torch.Tensor]:
+        """The step, for what the actor drew and its values ``[critics, B]``."""
         actor_loss = self.actor_loss(values, noise, log_prob, batch)
         self._descend("actor", actor_loss, batch)
         log_prob = log_prob.detach()
@@ -463,7 +497,7 @@ class SacAgent(Agent):
     def _banked(self, obs: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Random noises for each stored decision and what they are decoded to."""
         size = self.options.noise_bank
-        if self.options.critic != "aliased" or not size:
+        if not self.keeps_bank or not size:
             return {}
         noise = self.random_noise(self._bank_source, size * len(obs), generator)
         actions = self.executed(obs.repeat_interleave(size, 0), noise)
@@ -566,7 +600,7 @@ class SacAgent(Agent):
 
     def _new_replay(self, capacity: int) -> ReplayBuffer:
         obs, act = (self.obs_layout.dim,), self.act_layout.dim
-        chunk, executed = (self.horizon, act), (self.context.execute, act)
+        chunk, executed = (self.rows, act), (self.context.execute, act)
         shapes: dict[str, tuple[int, ...]] = {
             "obs": obs,
             "noise": chunk,
@@ -576,7 +610,7 @@ class SacAgent(Agent):
             "terminal": (),
             "truncated": (),
         }
-        if self.options.critic == "aliased" and (size := self.options.noise_bank):
+        if self.keeps_bank and (size := self.options.noise_bank):
             shapes |= {"bank_noise": (size, *chunk), "bank_actions": (size, *executed)}
         return ReplayBuffer(capacity, shapes, self.device, self.context.seed, self.dtype)
 

@@ -20,7 +20,7 @@ class StandardAgent(SacAgent):
 
     def actor_layers(self) -> list[nn.Module]:
         layers = plain_layers(
-            self.obs_layout.dim, self.actor_width(), self.options.depth, self.actor_layout.dim
+            self.actor_inputs.dim, self.actor_width(), self.options.depth, self.actor_layout.dim
         )
         shrink_(layers[-1], self.options.initial_output)
         return layers
@@ -51,7 +51,7 @@ class MatchedStandardAgent(StandardAgent):
     def actor_width(self) -> int:
         rival = nn.ModuleList(equivariant_actor_layers(self))
         return matched_width(
-            count(rival), self.obs_layout.dim, self.options.depth, self.actor_layout.dim
+            count(rival), self.actor_inputs.dim, self.options.depth, self.actor_layout.dim
         )
 
     def critic_width(self, inputs: Layout) -> int:

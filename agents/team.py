@@ -70,6 +70,7 @@ class Team:
         """One update of each member with its batch; the scalars of each."""
         turned = [m.augment(batch) for m, batch in zip(self.members, batches, strict=True)]
         stacked = Batch({name: torch.stack([b[name] for b in turned]) for name in turned[0]})
+        self.core.decisions = self.members[0].decisions
         scalars = self.core.learn(stacked)
         found = []
         for index, (member, batch) in enumerate(zip(self.members, turned, strict=True)):

@@ -25,6 +25,7 @@ LONG_ENVS = 32
 def make_env(
     config: RunConfig,
     base: ChunkPolicy,
+    agent: Agent,
     num_envs: int,
     variants: Sequence[VariantSpec],
     ignore_terminations: bool,
@@ -39,7 +40,7 @@ def make_env(
         sim=config.sim,
         workers=min(workers, num_envs),
     )
-    return LatentNoiseEnv(env, base, ignore_terminations, config.seed)
+    return LatentNoiseEnv(env, base, ignore_terminations, config.seed, decode=agent.decode)
 
 
 class Evaluator:
@@ -69,7 +70,13 @@ class Evaluator:
         self.config, self.agent, self.feasible = config, agent, feasible
         self.played: Rollout | None = None
         self.made = functools.partial(
-            make_env, config, base, variants=variants, ignore_terminations=True, workers=workers
+            make_env,
+            config,
+            base,
+            agent,
+            variants=variants,
+            ignore_terminations=True,
+            workers=workers,
         )
         self.env = self.made(num_envs=config.evaluation.episodes)
         self.long_env: LatentNoiseEnv | None = None
@@ -97,6 +104,7 @@ class Evaluator:
                 long = long_episodes(
                     self._long_env(min(count, LONG_ENVS)),
                     agent.sample,
+                    agent.gaussian_noise,
                     diagnostic_seeds(count),
                     discount(agent),
                     torch.Generator(device).manual_seed(DIAGNOSTIC_SEED + seed + 1),

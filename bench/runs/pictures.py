@@ -215,7 +215,7 @@ def episode_frames(
         done = False
         while not done:
             obs = obs.to(config.device)
-            actions = policy.decode(obs, agent.act(obs, deterministic=True)).to(env.device)
+            actions = agent.decode(obs, agent.act(obs, deterministic=True)).to(env.device)
             for t in range(policy.execute):
                 obs, _, _, truncated, info = env.step(actions[:, t])
                 done = bool(info["success"] | truncated)

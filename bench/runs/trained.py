@@ -57,7 +57,7 @@ class Trained:
                 f"{list(given.shape)}; make the environments with make_env()"
             )
         own = given.to(self.agent.device, torch.float32)
-        chunk = self.policy.decode(own, self.agent.act(own, deterministic))
+        chunk = self.agent.decode(own, self.agent.act(own, deterministic))
         return chunk[:, : self.policy.execute].to(given.device)
 
     def make_env(self, num_envs: int = 1, variant: str | None = None, **options: Any) -> Any:

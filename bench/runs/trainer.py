@@ -306,7 +306,13 @@ class Trainer:
     def _make_env(self, ignore_terminations: bool) -> LatentNoiseEnv:
         config = self.config
         env = make_env(
-            config, self.base, config.num_envs, config.variants, ignore_terminations, self.workers
+            config,
+            self.base,
+            self.agent,
+            config.num_envs,
+            config.variants,
+            ignore_terminations,
+            self.workers,
         )
         env.clock = self.clock
         return env

@@ -69,6 +69,9 @@ def _rollout_batch(
 Sample = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 """``obs [N, obs_dim] -> noise [N, Tp, Da], its log-probability [N]``, drawn from the actor."""
 
+Draw = Callable[[int, torch.Generator], torch.Tensor]
+"""Actions ``[N, rows, Da]`` of the base policy, drawn by a generator."""
+
 TAIL_WEIGHT = 0.05
 """Largest weight of the unknown future in a return that Q-values are compared with."""
 
@@ -109,6 +112,7 @@ def random_beginnings(count: int, decisions: int) -> list[int]:
 def long_episodes(
     env: LatentNoiseEnv,
     sample: Sample,
+    draw: Draw,
     seeds: Sequence[int],
     gamma: float,
     generator: torch.Generator,
@@ -124,9 +128,10 @@ def long_episodes(
         env: with ``ignore_terminations``. Its time limit is that of :func:`long_limit`, or the
             task's own, if time-outs end episodes.
         sample: the actor; called once per decision for the N parallel environments.
+        draw: the base policy, for the beginnings.
         seeds: any number; they are played in batches of N.
         gamma: discount per decision.
-        generator: draws the noise from N(0, I), on the environment's device.
+        generator: of the base policy's draws, on the environment's device.
     """
     within = math.ceil(env.env.max_episode_steps / env.execute)
     begin = random_beginnings(len(seeds), within)
@@ -137,6 +142,7 @@ def long_episodes(
         part = _long_batch(
             env,
             sample,
+            draw,
             [seeds[row] for row in rows],
             torch.tensor([begin[row] for row in rows], device=env.device),
             tail_decisions(gamma),
@@ -161,6 +167,7 @@ def long_episodes(
 def _long_batch(
     env: LatentNoiseEnv,
     sample: Sample,
+    draw: Draw,
     seeds: list[int],
     begin: torch.Tensor,
     tail: int,
@@ -178,10 +185,8 @@ def _long_batch(
     running = torch.ones_like(begin, dtype=torch.bool)
     for t in range(int(wanted.max())):
         noise, log_prob = sample(obs)
-        normal = torch.randn(
-            noise.shape, generator=generator, dtype=noise.dtype, device=noise.device
-        )
-        noise = torch.where((t < begin)[:, None, None], normal, noise)
+        random = draw(len(obs), generator)
+        noise = torch.where((t < begin)[:, None, None], random, noise)
         result = env.step(noise)
         succeeded = running & result.success_once
         last = running & ~succeeded & (t + 1 == wanted)

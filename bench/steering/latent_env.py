@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from symsteer.agents.agent import Decode
 from symsteer.agents.replay import Transition
 from symsteer.bench.steering.seeds import training_seeds
 from symsteer.policies.contract import ChunkPolicy
@@ -53,6 +54,7 @@ class LatentNoiseEnv:
         env: parallel ManiSkill environments from :func:`symsteer.bench.tasks.make`.
         policy: frozen decoder with the same layouts. All inputs and outputs are on its device,
             also if physics runs on another one.
+        decode: turns actions of an agent into chunks; default: those of the policy.
         ignore_terminations: episodes go on to the time limit after a success, as in ManiSkill's
             evaluation. If False, a success ends the episode.
         seed: of the run, for :meth:`training_seeds`.
@@ -68,6 +70,7 @@ class LatentNoiseEnv:
     ignore_terminations: bool = False
     seed: int = 0
     max_episode_steps: int = 0
+    decode: Decode | None = None
     clock: Clock = field(default_factory=Clock)
 
     def __post_init__(self) -> None:
@@ -103,7 +106,7 @@ class LatentNoiseEnv:
         """
         start = time.perf_counter()
         obs = next_obs = self._obs
-        chunk = self.policy.decode(obs, noise)
+        chunk = (self.decode or self.policy.decode)(obs, noise)
         actions = chunk.to(self.env.device)
         decoded = time.perf_counter()
         alive = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)

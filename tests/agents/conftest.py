@@ -71,9 +71,10 @@ class Problem:
         context = self.context(seed, dtype, normalize_obs)
         return agent(context, agent.Options(**{**shared, **options}))
 
-    def shapes(self):
+    def shapes(self, rows=None):
         obs = (self.obs_layout.dim,)
-        noise, actions = ((count, self.act_layout.dim) for count in (self.horizon, EXECUTE))
+        counts = (rows or self.horizon, EXECUTE)
+        noise, actions = ((count, self.act_layout.dim) for count in counts)
         return {
             "obs": obs,
             "noise": noise,
@@ -86,21 +87,21 @@ class Problem:
             "bank_actions": (BANK, *actions),
         }
 
-    def batch(self, size=32, seed=0, dtype=torch.float32, terminal=None):
+    def batch(self, size=32, seed=0, dtype=torch.float32, terminal=None, rows=None):
         g = torch.Generator().manual_seed(seed)
 
         def draw(*shape):
             return torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)
 
         ends = (torch.rand(size, generator=g) < 0.3).to(dtype)
-        rows = {name: draw(size, *shape) for name, shape in self.shapes().items()}
-        rows["terminal"] = ends if terminal is None else torch.full((size,), terminal, dtype=dtype)
-        rows["truncated"] = torch.zeros(size, dtype=dtype)
-        rows["discount"] = torch.full((size,), 0.95, dtype=dtype)
-        return Batch(rows)
+        found = {name: draw(size, *shape) for name, shape in self.shapes(rows).items()}
+        found["terminal"] = ends if terminal is None else torch.full((size,), terminal, dtype=dtype)
+        found["truncated"] = torch.zeros(size, dtype=dtype)
+        found["discount"] = torch.full((size,), 0.95, dtype=dtype)
+        return Batch(found)
 
-    def transition(self, size=32, seed=0):
-        batch = self.batch(size, seed)
+    def transition(self, size=32, seed=0, rows=None):
+        batch = self.batch(size, seed, rows=rows)
         return Transition(**{field.name: batch[field.name] for field in fields(Transition)})
 
     def replay(self, size=128, seed=0, dtype=torch.float32):

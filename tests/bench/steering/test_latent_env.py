@@ -190,8 +190,11 @@ def test_long_episodes_that_are_done_stand_still(env, monkeypatch):
         def sample(obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             return torch.randn(4, 4, 7, generator=noise), torch.zeros(4)
 
+        def draw(count: int, generator: torch.Generator) -> torch.Tensor:
+            return torch.randn(count, 4, 7, generator=generator)
+
         generator = torch.Generator().manual_seed(1)
-        return long_episodes(latent, sample, [0, 1, 2, 3], 0.1, generator)
+        return long_episodes(latent, sample, draw, [0, 1, 2, 3], 0.1, generator)
 
     paused = []
     pause = LatentNoiseEnv.pause

@@ -65,6 +65,10 @@ def forward(obs):
     return torch.ones(len(obs), 2, 1), torch.full((len(obs),), 0.5)
 
 
+def normal(count, generator):
+    return torch.randn(count, 2, 1, generator=generator)
+
+
 def true_values(obs, noise):
     """Q of the actor that always goes forward; two critics."""
     distance = obs[:, 0].double()
@@ -76,7 +80,7 @@ def true_values(obs, noise):
 def play(seeds, num_envs=4, sample=forward, **kwargs):
     env = Walk(num_envs, **kwargs)
     generator = torch.Generator().manual_seed(0)
-    return long_episodes(env, sample, seeds, GAMMA, generator), env
+    return long_episodes(env, sample, normal, seeds, GAMMA, generator), env
 
 
 def errors(played, q_values, alpha=0.0, reduce="min", subset=2):

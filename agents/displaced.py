@@ -1,0 +1,79 @@
+"""Latent policy displacement (LP-DS, arXiv 2606.01151): stay near the noise of the base policy.
+
+The noise is that of the base policy plus a displacement, w = eps + Delta(s) with eps ~ N(0, I), and
+the actor maximises Q under the constraint E |Delta|^2 <= delta:
+
+    E[alpha (|Delta(s)|^2 - delta) - min_j Q_j(s, w)],   alpha grows while the constraint is broken.
+
+|Delta|^2 / 2 is the KL divergence of w from the base policy's noise, and invariant under the group.
+There is no entropy bonus, no squash and no bound. Evaluations draw eps, too, as the base policy
+does; the final one also plays Delta alone (``success_mean``). Our choice: delta is given per number
+of the noise, as a share of the variance of eps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from symsteer.agents.agent import AgentContext, Deterministic
+from symsteer.agents.either import EitherAgent, EitherOptions
+from symsteer.agents.networks import Weights
+from symsteer.agents.options import NoiseSource
+from symsteer.errors import UserError
+
+
+@dataclass(frozen=True)
+class DisplacedOptions(EitherOptions):
+    """Options of the displaced agent."""
+
+    displacement: float = 0.25
+    """delta: mean squared displacement per number of the noise."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.displacement > 0:
+            raise UserError(f"agent option displacement must be positive, not {self.displacement}")
+        if self.soft_backup:
+            raise UserError("the displaced agent has no entropy bonus: leave out soft_backup")
+
+
+class DisplacedAgent(EitherAgent):
+    """Moves the base policy's noise by a displacement whose size is limited."""
+
+    name = "displaced"
+    in_teams = True
+    Options = DisplacedOptions
+    options: DisplacedOptions
+
+    def __init__(self, context: AgentContext, options: DisplacedOptions | None = None):
+        super().__init__(context, options)
+        self.distribution.hard = False
+        # What the learner calls log-probability is |Delta|^2 here, and its entropy -|Delta|^2.
+        self.target_entropy = -self.options.displacement * self.noise_layout.dim
+
+    @property
+    def _bank_source(self) -> NoiseSource:
+        return "gaussian"
+
+    def alternatives(self) -> dict[str, Deterministic]:
+        """The displacement alone."""
+        return {"mean": self.mode}
+
+    @torch.no_grad()
+    def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
+        """Noise ``[B, Tp, Da]``; it is random even if ``deterministic``."""
+        if deterministic:
+            return self.sample(obs)[0]
+        return super().act(obs)
+
+    def _heads(self, policy: Weights, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        mean, log_scale = super()._heads(policy, obs)
+        return mean, torch.zeros_like(log_scale)
+
+    def _sample(
+        self, mean: torch.Tensor, log_scale: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        noise, _ = super()._sample(mean, log_scale)
+        return noise, mean.square().sum(-1)

@@ -1,0 +1,65 @@
+"""The displaced agent stays near the base policy's noise and climbs Q as far as it may."""
+
+import pytest
+import torch
+
+from symsteer.errors import UserError
+from tests.agents.test_equivariance import errors, trained
+from tests.agents.test_known_values import OBS as REACH_OBS
+from tests.agents.test_known_values import best, play, reach, states
+
+
+def test_it_starts_as_the_base_policy(problem):
+    agent = problem.agent("displaced", dtype=torch.float64)
+    batch = problem.batch(256, dtype=torch.float64)
+    noise = agent.act(batch.obs, deterministic=True)
+    assert noise.std() == pytest.approx(1, abs=0.05)
+    assert agent.mode(batch.obs).abs().max() < 0.05
+    again = agent.act(batch.obs, deterministic=True)
+    assert not torch.equal(noise, again)
+    shift = agent.mode(batch.obs).flatten(1)
+    _, price = agent.sample(batch.obs)
+    torch.testing.assert_close(price, shift.square().sum(1))
+
+
+@pytest.mark.parametrize("displacement", [0.05, 0.5])
+def test_the_multiplier_keeps_the_mean_displacement(displacement):
+    """A plain climb of Q would go farther: see the next test."""
+    agent = reach(
+        "displaced",
+        displacement=displacement,
+        initial_alpha=0.1,
+        alpha_lr=0.03,
+    )
+    obs = states(1024, torch.Generator().manual_seed(2))
+    assert REACH_OBS.dim == obs.shape[1]
+    size = agent.mode(obs).square().mean().item()
+    assert size == pytest.approx(displacement, rel=0.4)
+
+
+def test_with_a_large_displacement_its_mean_is_almost_the_best():
+    agent = reach("displaced", displacement=4.0)
+    obs = states(1024, torch.Generator().manual_seed(2))
+    way = play(obs, lambda obs: agent.executed(obs, agent.alternatives()["mean"](obs)))
+    assert way.mean() > best(obs).mean() - 0.15
+
+
+def test_with_equivariant_layers_it_keeps_the_symmetry(problem):
+    agent = problem.agent(
+        "displaced", layers="equivariant", dtype=torch.float64, initial_output=1.0
+    )
+    trained(problem, agent, torch.float64)
+    agent.act = lambda obs, deterministic: agent.mode(obs)
+    assert max(errors(agent, problem, "C8", torch.float64).values()) < 1e-10
+    plain = problem.agent("displaced", dtype=torch.float64, initial_output=1.0)
+    worst = errors(plain, problem, "C8", torch.float64)
+    assert min(worst[key] for key in ("mean", "q", "noise_q")) > 1e-2
+
+
+def test_bad_options_are_refused(problem):
+    with pytest.raises(UserError, match="displacement must be positive"):
+        problem.agent("displaced", displacement=0.0)
+    with pytest.raises(UserError, match="no entropy bonus"):
+        problem.agent("displaced", soft_backup=True)
+    with pytest.raises(UserError, match="layers"):
+        problem.agent("displaced", layers="convolutional")
