@@ -28,6 +28,7 @@ AGENTS: Registry[type[Agent]] = Registry(
         "constrained": "symsteer.agents.constrained:ConstrainedAgent",
         "displaced": "symsteer.agents.displaced:DisplacedAgent",
         "residual": "symsteer.agents.residual:ResidualAgent",
+        "best-of-n": "symsteer.agents.best_of_n:BestOfNAgent",
         "wrong-group": "symsteer.agents.wrong_group:WrongGroupAgent",
         "base": "symsteer.agents.references:BaseAgent",
         "zero": "symsteer.agents.references:ZeroAgent",

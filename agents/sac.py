@@ -41,7 +41,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import nn
@@ -88,6 +88,9 @@ class SacAgent(Agent):
     in_teams: ClassVar[bool] = False
     """Whether the hooks of this very class work on the stacked tensors of a team, which have one
     more dimension in front; subclasses say it anew."""
+
+    bank_at: ClassVar[Literal["obs", "next_obs"]] = "obs"
+    """The state of a decision at which its bank of noises is decoded."""
 
     replay: ReplayBuffer
 
@@ -356,7 +359,7 @@ class SacAgent(Agent):
 
     def observe_demonstrations(self, decisions: Transition) -> None:
         """Keep the decisions beside the replay; they are not part of checkpoints."""
-        banked = self._banked(decisions.obs, self._new_generator(2))
+        banked = self._banked(getattr(decisions, self.bank_at), self._new_generator(2))
         noise = decisions.noise.new_zeros(len(decisions.noise), self.rows, self.act_layout.dim)
         self.demonstrations.add({**vars(decisions), "noise": noise, **banked})
         # One row begins at every control step.
@@ -368,7 +371,8 @@ class SacAgent(Agent):
 
     def observe(self, transition: Transition) -> None:
         """Store the decisions; each one after ``learning_starts`` adds ``utd`` due updates."""
-        self.replay.add({**vars(transition), **self._banked(transition.obs, self.bank_generator)})
+        banked = self._banked(getattr(transition, self.bank_at), self.bank_generator)
+        self.replay.add({**vars(transition), **banked})
         if self.decisions >= self.options.first_update:
             self.owed += len(transition.reward) * self.options.utd
         self.decisions += len(transition.reward)
@@ -396,7 +400,7 @@ class SacAgent(Agent):
 
     def learn(self, batch: Batch) -> dict[str, torch.Tensor]:
         """The same, with the batch as it is; in a team the batches of all members, stacked."""
-        obs, alpha = self._features(batch.obs), self.alpha
+        obs = self._features(batch.obs)
         with torch.no_grad():
             following = self.drawn(batch.next_obs)
             target = self.critic_target(batch, following)
@@ -425,7 +429,6 @@ class SacAgent(Agent):
             "train/q_mean": q.mean((-2, -1)),
             "train/q_max_abs": q.abs().amax((-2, -1)),
             "train/target_mean": target.mean(-1) / self.reward_scale,
-            "train/alpha": alpha,
             **self.after_update(batch),
         }
 
@@ -442,6 +445,7 @@ class SacAgent(Agent):
         self, values: torch.Tensor, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
     ) -> dict[str, torch.Tensor]:
         """The step, for what the actor drew and its values ``[critics, B]``."""
+        alpha = self.alpha
         actor_loss = self.actor_loss(values, noise, log_prob, batch)
         self._descend("actor", actor_loss, batch)
         log_prob = log_prob.detach()
@@ -449,6 +453,7 @@ class SacAgent(Agent):
         return {
             "losses/actor": actor_loss.detach(),
             **{f"losses/{name}": self.multipliers[name].step(gap) for name, gap in gaps.items()},
+            "train/alpha": alpha,
             "train/entropy": -log_prob.mean(-1),
         }
 
@@ -559,14 +564,14 @@ class SacAgent(Agent):
             setattr(self, name, type(getattr(self, name))(state[name]))
 
     def parameter_counts(self) -> dict[str, int]:
-        """Numbers of trainable parameters (without target critics), and the actor's width."""
+        """Numbers of trainable parameters (without target critics), and the hidden width."""
         sizes = {name: count(network) for name, network in self.networks.items()}
-        total, actor = sum(sizes.values()), sizes["actor"]
+        total, actor = sum(sizes.values()), sizes.get("actor", 0)
         return {
             "actor": actor,
             "critic": total - actor,
             "total": total,
-            "width": self.actor.width,
+            "width": next(iter(self.networks.values())).width,
         }
 
     # Inner parts.

@@ -58,7 +58,7 @@ class Team:
             normalize_obs=_each([member.context.normalize_obs for member in members]),
         )
         networks = {name: self._network(name) for name in first.networks}
-        core.actor, core.critic = networks["actor"], networks["critic"]
+        core.actor, core.critic = networks.get("actor"), networks["critic"]
         core.noise_critic = networks.get("noise_critic", networks["critic"])
         core.optimizers = {name: self._optimizer(name, networks[name]) for name in networks}
         core.multipliers = {name: self._multiplier(name) for name in first.multipliers}

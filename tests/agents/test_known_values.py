@@ -92,7 +92,8 @@ def null_problem(name, **options):
 @pytest.mark.parametrize(("name", "critic"), [("wrong-group", "aliased"), *KINDS])
 def test_nothing_to_gain(name, critic):
     norms, shares = null_problem(name, critic=critic)
-    assert max(norms) < DRIFT, norms
+    if name != "best-of-n":  # it has no actor that could drift
+        assert max(norms) < DRIFT, norms
     for key, share in shares.items():
         assert share.mean().item() == pytest.approx(1, abs=0.1), key
         assert share.std() < 0.1, key
@@ -179,8 +180,11 @@ def reach(name, **options):
     return agent
 
 
-# The displaced agent goes on with random noise: its values are not those of the best policy.
-@pytest.mark.parametrize(("name", "critic"), [kind for kind in KINDS if kind[0] != "displaced"])
+# These go on with random noise: their values are not those of the best policy.
+RANDOM = ("displaced", "best-of-n")
+
+
+@pytest.mark.parametrize(("name", "critic"), [kind for kind in KINDS if kind[0] not in RANDOM])
 def test_values_and_steps_are_almost_the_best(name, critic):
     agent = reach(name, critic=critic)
     generator = torch.Generator().manual_seed(2)

@@ -164,7 +164,11 @@ def test_log_probabilities_of_a_soft_bound_are_those_of_a_gaussian(problem):
 # Presets.
 
 REFUSED = {
-    **{("residual", preset): "its critic is sampler" for preset in ("dsrl", "dsrl-na", "first")},
+    **{
+        (name, preset): "its critic is sampler"
+        for name in ("residual", "best-of-n")
+        for preset in ("dsrl", "dsrl-na", "first")
+    },
     **{("displaced", preset): "no entropy bonus" for preset in ("dsrl", "dsrl-na")},
 }
 """What a preset sets contradicts what the agent is."""

@@ -1,0 +1,135 @@
+"""Best of n: critics choose among chunks of the base policy; nothing else is learned.
+
+In each decision n noises are drawn from N(0, I) and decoded, and the chunk whose executed actions
+have the largest Q is played, as in IDQL (arXiv 2304.10573) and Q-chunking (arXiv 2507.07969). The
+critics' target follows the same choice:
+
+    y = R + gamma (1 - d) max_i min_j Qbar_j(s', a'_i),   a'_i = decode(s', w_i).
+
+The candidates of the next state are decoded once, when a decision is stored. There is no actor, so
+that nothing can leave what the base policy does; with one candidate it is the base policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+
+from symsteer.agents.agent import AgentContext
+from symsteer.agents.either import EitherAgent, EitherOptions
+from symsteer.agents.episodes import Played
+from symsteer.agents.networks import Ensemble, Weights
+from symsteer.agents.options import Critic, NoiseSource
+from symsteer.agents.replay import Batch
+from symsteer.agents.sac import Drawn
+from symsteer.errors import UserError
+
+
+@dataclass(frozen=True)
+class BestOfNOptions(EitherOptions):
+    """Options of best of n."""
+
+    critic: Critic = "sampler"
+    """`sampler`: critics of the executed actions; this agent knows no other ones."""
+    noise_bank: int = 8
+    """n: chunks to choose from, in a decision and in the critics' target."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.critic != "sampler":
+            raise UserError(
+                f"best-of-n judges executed actions: its critic is sampler, not {self.critic}"
+            )
+        if self.noise_bank < 1:
+            raise UserError(f"best-of-n needs a noise_bank of at least 1, not {self.noise_bank}")
+        if self.soft_backup:
+            raise UserError("best-of-n has no entropy bonus: leave out soft_backup")
+        if self.n_step != 1:
+            raise UserError(
+                f"best-of-n keeps the candidates of the next decision alone: n_step is 1 for it, "
+                f"not {self.n_step}"
+            )
+
+
+class BestOfNAgent(EitherAgent):
+    """Plays the best of n chunks of the base policy, by its critics."""
+
+    name = "best-of-n"
+    in_teams = True
+    bank_at = "next_obs"
+    Options = BestOfNOptions
+    options: BestOfNOptions
+
+    def __init__(self, context: AgentContext, options: BestOfNOptions | None = None):
+        super().__init__(context, options)
+        self.multipliers = {}
+
+    @property
+    def networks(self) -> dict[str, Ensemble]:
+        """The critics."""
+        return {"critic": self.critic}
+
+    @property
+    def keeps_bank(self) -> bool:
+        """The candidates."""
+        return True
+
+    @property
+    def alpha(self) -> torch.Tensor:
+        """There is no entropy bonus."""
+        return torch.zeros((), device=self.device, dtype=self.dtype)
+
+    @torch.no_grad()
+    def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
+        """Noise ``[B, Tp, Da]``; candidates are random even if ``deterministic``."""
+        if not deterministic and self.decisions < self.options.warmup:
+            return super().act(obs)
+        return self.mode(obs)
+
+    @torch.no_grad()
+    def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The same; there is no log-probability, and it is given as 0."""
+        noise = self.mode(obs)
+        return noise, noise.new_zeros(len(noise))
+
+    @torch.no_grad()
+    def mode(self, obs: torch.Tensor) -> torch.Tensor:
+        """The best of n new noises, ``[B, Tp, Da]``."""
+        size = self.options.noise_bank
+        noise = self.gaussian_noise(size * len(obs))
+        repeated = obs.repeat_interleave(size, 0)
+        q = self.reduced(self.q_values(repeated, noise)).view(len(obs), size)
+        rows = torch.arange(len(obs), device=self.device)
+        return noise.unflatten(0, (len(obs), size))[rows, q.argmax(1)]
+
+    def drawn(self, obs: torch.Tensor) -> Drawn:
+        """Nothing is drawn: the candidates are in the batch."""
+        features = self._features(obs)
+        nothing = features[..., :0]
+        return Drawn(features, nothing, nothing, nothing)
+
+    def critic_target(self, batch: Batch, following: Drawn) -> torch.Tensor:
+        """The target with the best candidate, ``[B]``."""
+        actions = batch["bank_actions"].flatten(-2)
+        size = actions.shape[-2]
+        features = following.obs.unsqueeze(-2).expand(*actions.shape[:-1], -1)
+        q = self.reduced(self._q(self.target, features.flatten(-3, -2), actions.flatten(-3, -2)))
+        best = q.unflatten(-1, (-1, size)).amax(-1)
+        ends = batch.terminal
+        if self.options.timeouts_terminal:
+            ends = ends.maximum(batch.truncated)
+        return self.options.reward_scale * batch.reward + batch.discount * (1 - ends) * best
+
+    def _improve(self, batch: Batch, obs: torch.Tensor, judge: Weights) -> dict[str, torch.Tensor]:
+        return {}
+
+    @property
+    def _bank_source(self) -> NoiseSource:
+        return "gaussian"
+
+    def diagnostics(self, played: Played) -> Mapping[str, float | None]:
+        """Those of the critics; an actor's are not measured."""
+        absent = ("alpha", "entropy", "saturated", "equivariance_actor", "mode_norm")
+        return {**super().diagnostics(played), **dict.fromkeys(absent)}
