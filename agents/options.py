@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -154,3 +155,13 @@ class SacOptions(AgentOptions):
         for name in names:
             if not holds(getattr(self, name)):
                 raise UserError(f"agent option {name} must {rule}, not {getattr(self, name)}")
+
+
+def critics_of(options: type[SacOptions]) -> list[Critic]:
+    """The kinds of critics that an agent's options accept."""
+    found: list[Critic] = []
+    for critic in get_args(Critic):
+        with contextlib.suppress(UserError):
+            options(critic=critic)
+            found.append(critic)
+    return found

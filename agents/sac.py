@@ -624,7 +624,14 @@ class SacAgent(Agent):
             return self.context.normalize_obs(obs).to(self.dtype)
 
     def _heads(self, policy: Weights, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        out = self.actor.apply_weights(policy, obs).select(-3, 0)
+        return self._parameters(self._actor_output(policy, obs))
+
+    def _actor_output(self, policy: Weights, obs: torch.Tensor) -> torch.Tensor:
+        """``[B, dim]`` of ``actor_layout``."""
+        return self.actor.apply_weights(policy, obs).select(-3, 0)
+
+    def _parameters(self, out: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and log-scale before the squash."""
         mean, raw = out.split([self.distribution.dim, self.distribution.blocks], dim=-1)
         share = (math.log(self.options.initial_scale) - LOG_SCALE_MIN) / (
             LOG_SCALE_MAX - LOG_SCALE_MIN

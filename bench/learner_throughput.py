@@ -12,14 +12,14 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext
-from symsteer.agents.options import Critic
+from symsteer.agents.options import critics_of
 from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
@@ -126,7 +126,7 @@ def _contenders(task: str) -> list[Contender]:
         agent_class = AGENTS.get(name)
         if not issubclass(agent_class, SacAgent):
             continue
-        for critic in get_args(Critic):
+        for critic in critics_of(agent_class.Options):
             alone, *team = (_agent(task, name, critic, seed) for seed in range(1 + TEAM))
             size = alone.parameter_counts()["total"]
             update = functools.partial(_update, alone)
@@ -138,7 +138,7 @@ def _contenders(task: str) -> list[Contender]:
                 run = functools.partial(_update_team, Team(team))
                 found.append(Contender(name, "update", critic, TEAM, size, run))
     context = _context(task, 0)
-    some, size = _decisions(context), _batch_size()
+    some, size = _decisions(context, context.horizon), _batch_size()
     decode = functools.partial(context.decode, some.obs[:size], some.noise[:size])
     found.append(Contender("decoder", "decode", "", 1, 0, decode))
     found.append(Contender("decoder", "products alone", "", 1, 0, products_of(decode)))
@@ -190,7 +190,7 @@ def _agent(task: str, name: str, critic: str, seed: int) -> SacAgent:
     agent_class, context = AGENTS.get(name), _context(task, seed)
     agent = agent_class(context, agent_class.Options(critic=critic))
     assert isinstance(agent, SacAgent)
-    agent.observe(_decisions(context))
+    agent.observe(_decisions(context, agent.rows))
     return agent
 
 
@@ -198,7 +198,7 @@ def _batch_size() -> int:
     return AGENTS.get("standard").Options().batch_size
 
 
-def _decisions(context: AgentContext) -> Transition:
+def _decisions(context: AgentContext, rows: int) -> Transition:
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape: int) -> torch.Tensor:
@@ -207,7 +207,7 @@ def _decisions(context: AgentContext) -> Transition:
     obs_dim, act_dim = context.obs_layout.dim, context.act_layout.dim
     return Transition(
         obs=0.1 * draw(obs_dim),
-        noise=draw(context.horizon, act_dim),
+        noise=draw(rows, act_dim),
         actions=draw(context.execute, act_dim).tanh(),
         reward=draw(),
         next_obs=0.1 * draw(obs_dim),

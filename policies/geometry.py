@@ -365,6 +365,27 @@ def equivariance_error(
     return worst
 
 
+def group_average(
+    function: Callable[..., torch.Tensor],
+    inputs: Sequence[torch.Tensor],
+    layouts: Sequence[Layout],
+    output_layout: Layout,
+    group: Group,
+) -> torch.Tensor:
+    """mean over g of g^-1 f(g x): an equivariant function from any function f.
+
+    Arguments are those of :func:`equivariance_error`.
+    """
+    outputs = []
+    for index, (angle, reflect) in enumerate(group.elements):
+        out = function(
+            *(n.transform(x, angle, reflect) for x, n in zip(inputs, layouts, strict=True))
+        )
+        # The matrices are orthogonal.
+        outputs.append(out @ group.representation(output_layout, out.dtype, out.device)[index])
+    return torch.stack(outputs).mean(0)
+
+
 def _escnn() -> Any:
     try:
         import escnn.gspaces

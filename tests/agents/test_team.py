@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from symsteer.agents import AGENTS
+from symsteer.agents.options import critics_of
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
 
@@ -72,12 +73,7 @@ def assert_same_state(agents, others):
         assert agent.updates == other.updates
 
 
-KINDS = [
-    (name, critic)
-    for name in LEARNERS
-    for critic in ("noise", "aliased", "sampler")
-    if name not in ("residual", "best-of-n") or critic == "sampler"
-]
+KINDS = [(name, critic) for name in LEARNERS for critic in critics_of(AGENTS.get(name).Options)]
 
 
 @pytest.mark.parametrize(("name", "critic"), KINDS)

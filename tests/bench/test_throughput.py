@@ -11,6 +11,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from symsteer.agents import AGENTS
+from symsteer.agents.options import critics_of
 from symsteer.agents.sac import SacAgent
 from symsteer.bench import learner_throughput, run_throughput, throughput
 from symsteer.bench.throughput import Replay, Row, Turn, _Stopwatch
@@ -163,7 +164,7 @@ def test_every_learner_is_timed_alone_and_in_a_team_with_every_kind_of_critic():
         assert 0 < row["min"] <= row["median"] <= row["max"]
     learners = {n for n in AGENTS.builtin if issubclass(AGENTS.get(n), SacAgent)}
     for name in learners:
-        for critic in ("noise", "aliased", "sampler"):
+        for critic in critics_of(AGENTS.get(name).Options):
             assert {(name, "update", 1, critic), (name, "update", 5, critic)} <= kinds
     others = {kind for kind in kinds if kind[0] not in learners}
     assert others == {
