@@ -26,6 +26,7 @@ AGENTS: Registry[type[Agent]] = Registry(
         "relaxed": "symsteer.agents.relaxed:RelaxedAgent",
         "projected": "symsteer.agents.projected:ProjectedAgent",
         "constrained": "symsteer.agents.constrained:ConstrainedAgent",
+        "partial": "symsteer.agents.partial:PartialAgent",
         "ensemble": "symsteer.agents.ensemble:GroupEnsembleAgent",
         "displaced": "symsteer.agents.displaced:DisplacedAgent",
         "residual": "symsteer.agents.residual:ResidualAgent",

@@ -109,7 +109,7 @@ class SacAgent(Agent):
         self.target_entropy = options.target_entropy * self.noise_layout.dim
         with torch.random.fork_rng(devices=[]):  # does not change the global generator
             torch.manual_seed(context.seed)
-            self.actor = self._network([self.actor_layers()])
+            self.actor = self._network(self._actors())
             judged = self.noise_inputs if options.critic == "noise" else self.action_inputs
             self.critic = self._critics(judged)
             self.noise_critic = self.critic
@@ -587,6 +587,9 @@ class SacAgent(Agent):
     def _network(self, members: list[list[nn.Module]]) -> Ensemble:
         network = Ensemble(members, self.options.layer_norm, self.options.activation)
         return network.to(self.device, self.dtype)
+
+    def _actors(self) -> list[list[nn.Module]]:
+        return [self.actor_layers()]
 
     def _critics(self, inputs: Layout) -> Ensemble:
         return self._network([self.critic_layers(inputs) for _ in range(self.options.critics)])

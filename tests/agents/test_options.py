@@ -170,6 +170,8 @@ REFUSED = {
         for preset in ("dsrl", "dsrl-na", "first")
     },
     **{("displaced", preset): "no entropy bonus" for preset in ("dsrl", "dsrl-na")},
+    **{("partial", preset): "aliased or sampler" for preset in ("dsrl", "first")},
+    ("partial", "dsrl-na"): "noise_bank of at least 1",
 }
 """What a preset sets contradicts what the agent is."""
 

@@ -9,10 +9,9 @@ import torch
 
 from symsteer.agents import AGENTS
 from symsteer.agents.options import critics_of
-from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
 
-LEARNERS = [name for name in AGENTS.builtin if issubclass(AGENTS.get(name), SacAgent)]
+LEARNERS = [name for name in AGENTS.builtin if can_join(AGENTS.get(name))]
 SEEDS = (3, 1, 2)
 ROWS = 16
 

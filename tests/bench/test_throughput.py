@@ -180,7 +180,7 @@ def test_every_learner_is_timed_alone_and_in_a_team_with_every_kind_of_critic():
 
 
 def test_whole_runs_are_timed_alone_and_in_teams(tmp_path):
-    config = tiny_config("standard", options={"gamma": 0.5}, env_steps=160)
+    config = tiny_config("standard", env_steps=160)
     lines = []
     rows = run_throughput.measure([config], 1, tmp_path, lines.append, team=2)
     assert [(row["agent"], row["team"]) for row in rows] == [("standard", 1), ("standard", 2)]

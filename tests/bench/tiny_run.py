@@ -7,7 +7,11 @@ from symsteer.agents import AGENTS
 from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
 from symsteer.policies import POLICIES
 
-AGENT = {"width": 16, "batch_size": 16, "warmup": 16, "utd": 1.0, "group": "C4"}
+AGENT = {
+    **{"width": 16, "batch_size": 16, "warmup": 16, "utd": 1.0, "group": "C4"},
+    # Episodes that Q is compared with are longer the larger the discount is.
+    "gamma": 0.5,
+}
 POLICY = {"channels": 8, "width": 16, "depth": 1, "steps": 20, "batch_size": 32}
 
 

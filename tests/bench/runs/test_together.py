@@ -17,14 +17,10 @@ from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config
 
 SEEDS = (0, 1)
-OPTIONS = {"gamma": 0.5}
 
 
 def configs(agent="standard", seeds=SEEDS, **changes):
-    return [
-        tiny_config(agent, options=OPTIONS if agent != "zero" else None, seed=seed, **changes)
-        for seed in seeds
-    ]
+    return [tiny_config(agent, seed=seed, **changes) for seed in seeds]
 
 
 def outcome(folder):

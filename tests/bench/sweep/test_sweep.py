@@ -61,7 +61,7 @@ def workers() -> list[int]:
 
 
 def test_of_a_team_only_the_run_that_fails_is_tried_again(tmp_path):
-    configs = tuple(tiny_config("standard", options={"gamma": 0.5}, seed=seed) for seed in (0, 1))
+    configs = tuple(tiny_config("standard", seed=seed) for seed in (0, 1))
     plan = make_plan(Suite("team", "", configs), tmp_path / "runs")
     (plan.out / plan.runs[1].run_id / CHECKPOINT).mkdir(parents=True)
     pool, witness = LocalPool(1, tmp_path / "log"), Witness()
@@ -77,8 +77,7 @@ def test_of_a_team_only_the_run_that_fails_is_tried_again(tmp_path):
 
 
 def test_a_team_goes_on_without_the_runs_whose_base_policy_failed(tmp_path):
-    options = {"gamma": 0.5}
-    configs = tuple(tiny_config("standard", options=options, seed=seed) for seed in range(3))
+    configs = tuple(tiny_config("standard", seed=seed) for seed in range(3))
     plan = make_plan(Suite("baseless", "", configs), tmp_path / "runs")
     for config in configs[:2]:
         demonstration_path(config, plan.out).mkdir(parents=True)
