@@ -10,7 +10,7 @@ import functools
 import importlib.util
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,21 +59,26 @@ class Contender:
 
 
 def measure(
-    task: str, updates: int, repeats: int, report: Callable[[str], None]
+    task: str,
+    updates: int,
+    repeats: int,
+    report: Callable[[str], None],
+    agents: Sequence[str] = tuple(AGENTS.builtin),
 ) -> list[dict[str, Any]]:
-    """Time the updates of every learner.
+    """Time the updates of learners.
 
     Args:
         task: gives the layouts.
         updates: in one measurement.
         repeats: measurements of each contender.
         report: receives a line for each round.
+        agents: names; those that are no learners are left out.
 
     Returns:
         One row each: the fields of :class:`Contender`, ``batch_size``, and CPU milliseconds of one
         update of one member: ``median``, ``min``, ``max``.
     """
-    contenders = _contenders(task)
+    contenders = _contenders(task, agents)
     for contender in contenders:
         for _ in range(WARM_UP):
             contender.run()
@@ -120,9 +125,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _contenders(task: str) -> list[Contender]:
+def _contenders(task: str, agents: Sequence[str]) -> list[Contender]:
     found = []
-    for name in AGENTS.builtin:
+    for name in agents:
         agent_class = AGENTS.get(name)
         if not issubclass(agent_class, SacAgent):
             continue

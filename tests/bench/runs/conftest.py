@@ -1,5 +1,6 @@
 """Finished runs for the tests of this folder."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,8 @@ def broken(finished) -> dict[str, Path]:
     from symsteer.bench.runs.run import execute
 
     _, folder = finished
-    change = {"variant": "action_gain:0.5", "env_steps": 240}
+    evaluation = dataclasses.replace(tiny_config().evaluation, every=240)
+    change = {"variant": "action_gain:0.5", "env_steps": 240, "evaluation": evaluation}
     return {
         name: execute(tiny_config(agent=name, **change), folder.parent, progress=False)
         for name in AGENTS.builtin
