@@ -25,9 +25,8 @@ from torch import nn
 
 from symsteer.agents.episodes import Played
 from symsteer.agents.equivariant import EquivariantAgent
-from symsteer.agents.networks import Ensemble, dense
+from symsteer.agents.networks import Dense, Ensemble, dense, shrink_
 from symsteer.agents.options import SacOptions
-from symsteer.errors import UserError
 from symsteer.policies.geometry import Layout
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
@@ -50,6 +49,17 @@ class AsymmetricLayer(nn.Module, abc.ABC):
     @abc.abstractmethod
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Weight ``[out, in]`` and bias ``[out]``."""
+
+
+class TwoPaths(AsymmetricLayer):
+    """An equivariant layer and a plain one of the same shape, which starts at 0."""
+
+    def __init__(self, strict: EquivariantLayer):
+        super().__init__()
+        self.strict = strict
+        outputs, inputs = dense(strict)[0].shape
+        self.free = Dense(inputs, outputs)
+        shrink_(self.free, 0.0)
 
 
 class AsymmetricAgent(EquivariantAgent):
@@ -78,7 +88,7 @@ class PenaltyOptions(SacOptions):
 
     penalty: float = 1.0
     """The dial: weight of the squared asymmetric part, which keeps its numbers below
-    1 / (2 penalty). 0: free; inf: strict."""
+    1 / (2 penalty). 0: free; 1e8: strict to 1e-4."""
     actor_penalty: float | None = None
     """The same for the actor alone; default: `penalty`."""
     critic_penalty: float | None = None
@@ -86,10 +96,11 @@ class PenaltyOptions(SacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("penalty", "actor_penalty", "critic_penalty"):
-            value = getattr(self, name)
-            if value is not None and not value >= 0:
-                raise UserError(f"agent option {name} must not be negative, not {value}")
+        self._require(
+            "not be negative",
+            lambda value: value is None or value >= 0,
+            *("penalty", "actor_penalty", "critic_penalty"),
+        )
 
 
 class PulledLayer(AsymmetricLayer):

@@ -1,8 +1,8 @@
 """Best of n: critics choose among chunks of the base policy; nothing else is learned.
 
 In each decision n noises are drawn from N(0, I) and decoded, and the chunk whose executed actions
-have the largest Q is played, as in IDQL (arXiv 2304.10573) and Q-chunking (arXiv 2507.07969). The
-critics' target follows the same choice:
+have the largest Q is played, as in IDQL (arXiv 2304.10573). The critics' target follows the same
+choice, as in Q-chunking (arXiv 2507.07969):
 
     y = R + gamma (1 - d) max_i min_j Qbar_j(s', a'_i),   a'_i = decode(s', w_i).
 
@@ -48,7 +48,7 @@ class BestOfNOptions(EitherOptions):
             raise UserError("best-of-n has no entropy bonus: leave out soft_backup")
         if self.n_step != 1:
             raise UserError(
-                f"best-of-n keeps the candidates of the next decision alone: n_step is 1 for it, "
+                "best-of-n keeps the candidates of the next decision alone: n_step is 1 for it, "
                 f"not {self.n_step}"
             )
 
@@ -116,11 +116,7 @@ class BestOfNAgent(EitherAgent):
         size = actions.shape[-2]
         features = following.obs.unsqueeze(-2).expand(*actions.shape[:-1], -1)
         q = self.reduced(self._q(self.target, features.flatten(-3, -2), actions.flatten(-3, -2)))
-        best = q.unflatten(-1, (-1, size)).amax(-1)
-        ends = batch.terminal
-        if self.options.timeouts_terminal:
-            ends = ends.maximum(batch.truncated)
-        return self.options.reward_scale * batch.reward + batch.discount * (1 - ends) * best
+        return self.backed_up(batch, q.unflatten(-1, (-1, size)).amax(-1))
 
     def _improve(self, batch: Batch, obs: torch.Tensor, judge: Weights) -> dict[str, torch.Tensor]:
         return {}

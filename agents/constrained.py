@@ -22,11 +22,10 @@ import torch
 from torch import nn
 
 from symsteer.agents.agent import Deterministic
-from symsteer.agents.asymmetry import AsymmetricAgent, AsymmetricLayer, LayersOf
-from symsteer.agents.networks import Dense, dense, shrink_
+from symsteer.agents.asymmetry import AsymmetricAgent, LayersOf, TwoPaths
+from symsteer.agents.networks import dense
 from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Batch
-from symsteer.errors import UserError
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
 
@@ -43,21 +42,15 @@ class ConstrainedOptions(SacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.dual_lr >= 0:
-            raise UserError(f"agent option dual_lr must not be negative, not {self.dual_lr}")
-        if not self.slack_price > 0:
-            raise UserError(f"agent option slack_price must be positive, not {self.slack_price}")
+        self._require("not be negative", lambda value: value >= 0, "dual_lr")
+        self._require("be positive", lambda value: value > 0, "slack_price")
 
 
-class Constrained(AsymmetricLayer):
-    """An equivariant layer plus gamma times a plain one; keeps its multiplier lambda."""
+class Constrained(TwoPaths):
+    """The equivariant path plus gamma times the plain one; keeps the multiplier lambda."""
 
     def __init__(self, strict: EquivariantLayer):
-        super().__init__()
-        self.strict = strict
-        outputs, inputs = dense(strict)[0].shape
-        self.free = Dense(inputs, outputs)
-        shrink_(self.free, 0.0)
+        super().__init__(strict)
         self.gamma = nn.Parameter(torch.ones(()))
         # A parameter, because a team stacks parameters; the optimiser leaves it alone.
         self.multiplier = nn.Parameter(torch.zeros(()), requires_grad=False)

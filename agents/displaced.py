@@ -33,8 +33,7 @@ class DisplacedOptions(EitherOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.displacement > 0:
-            raise UserError(f"agent option displacement must be positive, not {self.displacement}")
+        self._require("be positive", lambda value: value > 0, "displacement")
         if self.soft_backup:
             raise UserError("the displaced agent has no entropy bonus: leave out soft_backup")
 

@@ -24,7 +24,6 @@ from symsteer.agents.networks import Weights
 from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent
-from symsteer.errors import UserError
 from symsteer.policies.geometry import Group, Layout
 
 
@@ -39,11 +38,9 @@ class GroupEnsembleOptions(SacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("actor_regularizer", "critic_regularizer"):
-            if not getattr(self, name) >= 0:
-                raise UserError(
-                    f"agent option {name} must not be negative, not {getattr(self, name)}"
-                )
+        self._require(
+            "not be negative", lambda value: value >= 0, "actor_regularizer", "critic_regularizer"
+        )
 
 
 class GroupEnsembleAgent(StandardAgent):

@@ -71,8 +71,7 @@ class PartialOptions(SacOptions):
         super().__post_init__()
         if self.gate not in get_args(Gate):
             raise unknown("gate", self.gate, get_args(Gate))
-        if not self.fence >= 0:
-            raise UserError(f"agent option fence must not be negative, not {self.fence}")
+        self._require("not be negative", lambda value: value >= 0, "fence")
         if self.critic == "noise":
             raise UserError(
                 "the partial agent judges executed actions: its critic is aliased or sampler"

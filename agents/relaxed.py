@@ -29,7 +29,6 @@ from symsteer.agents.asymmetry import (
     PulledLayer,
 )
 from symsteer.agents.networks import dense, shrink_
-from symsteer.errors import UserError
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift
 
 
@@ -42,8 +41,7 @@ class RelaxedOptions(PenaltyOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.filters < 1:
-            raise UserError(f"agent option filters must be at least 1, not {self.filters}")
+        self._require("be at least 1", lambda value: value >= 1, "filters")
 
 
 class Relaxed(PulledLayer):

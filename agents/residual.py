@@ -6,9 +6,10 @@ noise is decoded to, and adds a correction:
     a = clip(decode(s, eps) + bound r),   r ~ pi(. | s, decode(s, eps)),
 
 with |r| <= 1 for each irrep block, so that the bound is radial and commutes with the group. The
-critics judge executed actions. After Policy Decorator (arXiv 2412.13630) and its relatives.
-``ramp`` lets the bound grow from 0. An action of this agent has the rows of the noise, then those
-of r: ``[Tp + Ta, Da]``.
+critics judge executed actions, as in Policy Decorator (arXiv 2412.13630). Our choices: its actor
+sees the observation alone, and it plays the correction with a probability that grows; here the
+bound grows (``ramp``). An action of this agent has the rows of the noise, then those of r:
+``[Tp + Ta, Da]``.
 """
 
 from __future__ import annotations
@@ -48,12 +49,8 @@ class ResidualOptions(EitherOptions):
                 "the residual agent judges executed actions: its critic is sampler, not "
                 f"{self.critic}"
             )
-        if not 0 < self.residual_bound <= 2:
-            raise UserError(
-                f"agent option residual_bound must lie in (0, 2], not {self.residual_bound}"
-            )
-        if self.ramp < 0:
-            raise UserError(f"agent option ramp must not be negative, not {self.ramp}")
+        self._require("lie in (0, 2]", lambda value: 0 < value <= 2, "residual_bound")
+        self._require("not be negative", lambda value: value >= 0, "ramp")
 
 
 class ResidualAgent(EitherAgent):
@@ -65,8 +62,6 @@ class ResidualAgent(EitherAgent):
     options: ResidualOptions
 
     def __init__(self, context: AgentContext, options: ResidualOptions | None = None):
-        # The learner's constructor builds the networks from these.
-        self.chunk_rows, self.executed_rows = context.horizon, context.execute
         super().__init__(context, options)
         self.distribution = SquashedGaussian(self.noise_layout, 1.0).to(self.device, self.dtype)
 
@@ -87,7 +82,7 @@ class ResidualAgent(EitherAgent):
     @property
     def drawn_rows(self) -> int:
         """The correction."""
-        return self.executed_rows
+        return self.context.execute
 
     @property
     def actor_inputs(self) -> Layout:
@@ -96,7 +91,7 @@ class ResidualAgent(EitherAgent):
 
     def drawn_part(self, action: torch.Tensor) -> torch.Tensor:
         """The correction ``[B, Ta * Da]``."""
-        return action[:, self.chunk_rows :].flatten(1)
+        return action[:, self.context.horizon :].flatten(1)
 
     @property
     def bound(self) -> float:
@@ -107,11 +102,11 @@ class ResidualAgent(EitherAgent):
 
     def decode(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """The base policy's chunks with corrected executed actions, ``[B, Tp, Da]``."""
-        chunk = self.context.decode(obs, action[..., : self.chunk_rows, :])
+        chunk = self.context.decode(obs, action[..., : self.context.horizon, :])
         first, rest = chunk.split(
-            [self.executed_rows, self.chunk_rows - self.executed_rows], dim=-2
+            [self.context.execute, self.context.horizon - self.context.execute], dim=-2
         )
-        return torch.cat([self.corrected(first, action[..., self.chunk_rows :, :]), rest], -2)
+        return torch.cat([self.corrected(first, action[..., self.context.horizon :, :]), rest], -2)
 
     def corrected(self, actions: torch.Tensor, correction: torch.Tensor) -> torch.Tensor:
         """Actions ``[..., Ta, Da]`` plus a correction of the same shape, within norm 1."""
@@ -120,7 +115,7 @@ class ResidualAgent(EitherAgent):
     def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
         """Actions of the base policy ``[count, Tp + Ta, Da]``: the correction is 0."""
         noise = super().gaussian_noise(count, generator)
-        noise[:, self.chunk_rows :] = 0
+        noise[:, self.context.horizon :] = 0
         return noise
 
     def random_noise(
@@ -161,8 +156,7 @@ class ResidualAgent(EitherAgent):
         """Corrections that the actor draws at observations in environment units."""
         count = obs.shape[-2]
         noise = self.random(lambda generator: self.gaussian_noise(count, generator))
-        actions = self.context.decode(obs, noise[..., : self.chunk_rows, :])
-        return self._corrected(obs, actions[..., : self.executed_rows, :])
+        return self._corrected(obs, self._base_actions(obs, noise))
 
     def _improve(self, batch: Batch, obs: torch.Tensor, judge: Weights) -> dict[str, torch.Tensor]:
         """One step of the actor at actions of the base policy that were decoded before."""
@@ -181,13 +175,18 @@ class ResidualAgent(EitherAgent):
 
     # Inner parts.
 
+    def _base_actions(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """The executed actions ``[..., Ta, Da]`` that the noise of an action is decoded to."""
+        chunk = self.context.decode(obs, action[..., : self.context.horizon, :])
+        return chunk[..., : self.context.execute, :]
+
     def _moments(
         self, obs: torch.Tensor, action: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        actions = self.context.decode(obs, action[:, : self.chunk_rows])[:, : self.executed_rows]
-        inputs = torch.cat([self._features(obs), actions.flatten(1)], -1)
+        actions = self._base_actions(obs, action).flatten(1)
+        inputs = torch.cat([self._features(obs), actions], -1)
         return self._heads(self.actor.weights(), inputs)
 
     def _with(self, action: torch.Tensor, correction: torch.Tensor) -> torch.Tensor:
-        action[:, self.chunk_rows :] = self.chunk(correction)
+        action[:, self.context.horizon :] = self.chunk(correction)
         return action

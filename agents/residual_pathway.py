@@ -10,20 +10,12 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from symsteer.agents.asymmetry import LayersOf, Parameters, PenaltyAgent, PulledLayer
-from symsteer.agents.networks import Dense, dense, shrink_
-from symsteer.policies.networks.equivariant import EquivariantLayer
+from symsteer.agents.asymmetry import LayersOf, Parameters, PenaltyAgent, PulledLayer, TwoPaths
+from symsteer.agents.networks import dense
 
 
-class ResidualPathway(PulledLayer):
-    """The sum of an equivariant layer and a plain layer of the same shape, which starts at 0."""
-
-    def __init__(self, strict: EquivariantLayer):
-        super().__init__()
-        self.strict = strict
-        outputs, inputs = dense(strict)[0].shape
-        self.free = Dense(inputs, outputs)
-        shrink_(self.free, 0.0)
+class ResidualPathway(TwoPaths, PulledLayer):
+    """The sum of both paths."""
 
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         weight, bias = dense(self.strict)

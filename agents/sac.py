@@ -184,6 +184,10 @@ class SacAgent(Agent):
         next_q = self.reduced(self._q(self.target, following.obs, following.judged))
         if self.options.soft_backup:
             next_q = next_q - self.alpha.unsqueeze(-1) * following.log_prob
+        return self.backed_up(batch, next_q)
+
+    def backed_up(self, batch: Batch, next_q: torch.Tensor) -> torch.Tensor:
+        """Rewards plus discounted values ``[B]`` of the next states, in scaled rewards."""
         ends = batch.terminal
         if self.options.timeouts_terminal:
             ends = ends.maximum(batch.truncated)
