@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,10 +18,13 @@ from symsteer.bench.sweep.suite import Suite
 from symsteer.bench.tuning.plan import TuningPlan
 from symsteer.bench.tuning.search import Search, open_storage, storage_path
 from symsteer.bench.tuning.trials import (
+    DEFAULTS,
     Chosen,
     Score,
+    Setting,
     State,
     TrialResult,
+    best_single,
     choose,
     mean_auc,
     score_of,
@@ -65,11 +69,12 @@ class Tuner:
         self.searches = {agent: Search(plan, agent, storage) for agent in plan.agents}
 
     def play(self) -> tuple[list[TrialResult], list[Chosen]]:
-        """Execute all trials that are left and compare what is chosen with the defaults."""
+        """Execute all that is left: trials, single options, comparison on fresh cells."""
         while batch := [(a, trial) for a, s in self.searches.items() for trial in s.batch()]:
             self._round(batch)
             self._write([])
-        chosen = self._confirm([found for a in self.plan.agents if (found := self._best(a))])
+        chosen = [found for a in self.plan.agents if (found := self._best(a))]
+        chosen = self._confirm(self._try_singles(chosen))
         self._write(chosen)
         return self.results, chosen
 
@@ -151,20 +156,64 @@ class Tuner:
     def _best(self, agent: str) -> Chosen | None:
         return choose([trial for trial in self.results if trial.agent == agent])
 
+    def _try_singles(self, chosen: Sequence[Chosen]) -> list[Chosen]:
+        """The same choices with scores of the defaults with one of their options."""
+        tried = [
+            {name: self.plan.cells(c.agent, single) for name, single in self._singles(c).items()}
+            for c in chosen
+        ]
+        self._run([config for each in tried for configs in each.values() for config in configs])
+        scores = [{name: self._scores(cells) for name, cells in each.items()} for each in tried]
+        return [
+            # An option with which a run fails is left out.
+            dataclasses.replace(
+                c, singles={name: own for name, own in each.items() if len(own) == len(cells[name])}
+            )
+            for c, each, cells in zip(chosen, scores, tried, strict=True)
+        ]
+
+    def _singles(self, chosen: Chosen) -> dict[str, dict[str, Any]]:
+        """The defaults with one option of the choice, by option."""
+        if chosen.agent not in self.plan.singles:
+            return {}
+        defaults = self.plan.defaults(chosen.agent)
+        return {
+            name: {**defaults, name: value}
+            for name, value in chosen.options.items()
+            if value != defaults[name]
+        }
+
     def _confirm(self, chosen: Sequence[Chosen]) -> list[Chosen]:
         """The same choices with scores on the fresh cells."""
-
-        def cells(choice: Chosen, options: Mapping[str, Any]) -> list[RunConfig]:
-            return self.plan.cells(choice.agent, options, "confirm")
-
-        pairs = [(cells(c, c.options), cells(c, self.plan.defaults(c.agent))) for c in chosen]
-        self._run([config for pair in pairs for configs in pair for config in configs])
+        compared = [self._fresh_cells(choice) for choice in chosen]
+        self._run([config for each in compared for configs in each.values() for config in configs])
         return [
-            Chosen(
-                **{**vars(c), "confirmed": self._scores(a), "default_confirmed": self._scores(b)}
-            )
-            for c, (a, b) in zip(chosen, pairs, strict=True)
+            dataclasses.replace(c, fresh={s: self._scores(configs) for s, configs in each.items()})
+            for c, each in zip(chosen, compared, strict=True)
         ]
+
+    def _fresh_cells(self, chosen: Chosen) -> dict[Setting, list[RunConfig]]:
+        """The runs of every setting on the fresh cells."""
+        agent, defaults = chosen.agent, self.plan.defaults(chosen.agent)
+        trials = {trial.number: trial for trial in self.results if trial.agent == agent}
+        settings: dict[Setting, Mapping[str, Any]] = {
+            "defaults": defaults,
+            "chosen": chosen.options,
+        }
+        if agent in self.plan.singles:
+            name = best_single(chosen, trials[DEFAULTS].scores)
+            single = {name: chosen.options[name]} if name else {}
+            settings["one_option"] = {**defaults, **single}
+        cells = {
+            name: self.plan.cells(agent, options, "confirm") for name, options in settings.items()
+        }
+        cells["by_task"] = [
+            config
+            for task, number in chosen.by_task.items()
+            for config in self.plan.cells(agent, trials[number].options, "confirm")
+            if config.task == task
+        ]
+        return cells
 
     def _write(self, chosen: Sequence[Chosen]) -> None:
         places = self.places
@@ -187,13 +236,18 @@ def preview(plan: TuningPlan) -> str:
         f"{agent}: {plan.trials} trials of {len(space)} options: {', '.join(space)}"
         for agent, space in plan.spaces.items()
     ]
+    runs = sum(
+        plan.trials * cells + 3 * fresh + (agent in plan.singles) * (len(space) * cells + fresh)
+        for agent, space in plan.spaces.items()
+    )
     lines += [
         "",
         f"{cells} runs a trial, {plan.probe} of a trial that is given up; then {fresh} runs each "
-        "with the chosen settings and with the defaults",
-        f"at most {len(plan.agents) * (plan.trials * cells + 2 * fresh):,} runs",
+        "with the defaults, the chosen settings, and those chosen for each task",
     ]
-    return "\n".join(lines)
+    if plan.singles:
+        lines.append(f"options by themselves, {cells} runs each: {', '.join(plan.singles)}")
+    return "\n".join([*lines, f"at most {runs:,} runs"])
 
 
 def _result(agent: str, trial: FrozenTrial) -> TrialResult:

@@ -1,7 +1,8 @@
 """What is tuned: agents, cells, numbers of trials and search spaces, as a TOML file.
 
 ``[grid]`` and ``[run]`` describe the cells as in a suite, one run per trial each. ``[confirm]`` is
-the grid of fresh cells on which the chosen settings are compared with the defaults. ``[space]`` has
+the grid of fresh cells on which the chosen settings are compared with the defaults. Every option of
+the agents in ``singles`` is also tried by itself. ``[space]`` has
 the options that all agents share, ``[space.AGENT]`` those of one agent. An option has a list of
 choices, or ``{ low = 1e-4, high = 1e-2, log = true }``.
 """
@@ -28,7 +29,10 @@ from symsteer.names import unknown
 NUMBERS = {"trials": 20, "batch": 4, "probe": 2, "seed": 0}
 """Whole numbers of a plan and their defaults."""
 
-KEYS = ("description", "agents", *NUMBERS, "grid", "run", "confirm", "space")
+LATER = ("trials", "batch", "singles")
+"""What may change after the first trial."""
+
+KEYS = ("description", "agents", "singles", *NUMBERS, "grid", "run", "confirm", "space")
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,7 @@ class TuningPlan:
         probe: cells after which a trial may be given up.
         seed: of the search.
         spaces: search space of each agent.
+        singles: agents of which every option is also tried by itself.
         data: the tables of the file.
     """
 
@@ -75,6 +80,7 @@ class TuningPlan:
     probe: int
     seed: int
     spaces: Mapping[str, Space]
+    singles: tuple[str, ...]
     data: Mapping[str, Any]
 
     @property
@@ -84,8 +90,8 @@ class TuningPlan:
 
     @property
     def digest(self) -> str:
-        """Hash of all that decides what a trial is; more trials may be added later."""
-        kept = {key: value for key, value in self.data.items() if key not in ("trials", "batch")}
+        """Hash of all that decides what a trial is."""
+        kept = {key: value for key, value in self.data.items() if key not in LATER}
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
     def defaults(self, agent: str) -> dict[str, Any]:
@@ -134,9 +140,13 @@ def read_plan(name_or_path: str) -> TuningPlan:
         spaces={
             agent: _space(agent, data["space"], data["agents"], source) for agent in data["agents"]
         },
+        singles=tuple(data.get("singles", ())),
         data=data,
         **numbers,
     )
+    for agent in plan.singles:
+        if agent not in plan.spaces:
+            raise unknown("agent", agent, plan.agents, f"{source}, singles")
     for agent in plan.agents:
         plan.cells(agent, plan.defaults(agent), "confirm")
         if plan.probe > (count := len(plan.cells(agent, plan.defaults(agent)))):

@@ -20,7 +20,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from symsteer.bench.tuning.plan import Choices, Range, TuningPlan
+from symsteer.bench.tuning.plan import LATER, Choices, Range, TuningPlan
 from symsteer.errors import UserError
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -61,8 +61,8 @@ class Search:
             self.study.enqueue_trial(plan.defaults(agent))
         elif self.study.user_attrs.get("plan") != plan.digest:
             raise UserError(
-                f"{plan.source} is not as it was when its trials began; restore it (only trials "
-                "and batch may change), or name another folder with --out"
+                f"{plan.source} is not as it was when its trials began; restore it (only "
+                f"{', '.join(LATER)} may change), or name another folder with --out"
             )
 
     def batch(self) -> list[Trial]:

@@ -6,13 +6,14 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.stats import rankdata
 
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import RECORD, run_id
+from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.records.curves import area_under_curve
 
@@ -36,8 +37,17 @@ class Score:
     success: float
     seconds: float
 
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self.cell.split()[0]
+
 
 State = Literal["complete", "pruned", "failed"]
+
+Setting = Literal["defaults", "one_option", "chosen", "by_task"]
+"""Settings that are compared on fresh cells: the agent's defaults, these with one option of the
+choice, the choice, and a choice for each task."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +75,15 @@ class TrialResult:
 
 @dataclass(frozen=True)
 class Chosen:
-    """The setting of an agent, and how it compares with the defaults on fresh cells.
+    """The setting of an agent, and how it compares with others on fresh cells.
 
     Attributes:
         trial: its number.
         rank: mean over the cells of its rank among the complete trials; 1 is best.
         default_rank: the same of the defaults.
-        confirmed, default_confirmed: scores on fresh cells; empty before they were run.
+        by_task: number of the trial that is best on the cells of one task.
+        singles: scores on the cells of trials of the defaults with one option of the choice.
+        fresh: scores on fresh cells.
     """
 
     agent: str
@@ -79,8 +91,9 @@ class Chosen:
     options: Mapping[str, Any]
     rank: float
     default_rank: float
-    confirmed: Sequence[Score] = field(default_factory=list)
-    default_confirmed: Sequence[Score] = field(default_factory=list)
+    by_task: Mapping[str, int]
+    singles: Mapping[str, Sequence[Score]] = field(default_factory=dict)
+    fresh: Mapping[Setting, Sequence[Score]] = field(default_factory=dict)
 
 
 def score_of(config: RunConfig, out: Path) -> Score | None:
@@ -106,9 +119,9 @@ def mean_auc(scores: Sequence[Score]) -> float:
     return float(np.mean([score.auc for score in scores]))
 
 
-def mean_ranks(trials: Sequence[TrialResult]) -> list[float]:
-    """Mean rank of complete trials over the cells by their areas; ties share their mean rank."""
-    areas = np.array([[score.auc for score in trial.scores] for trial in trials])
+def mean_ranks(settings: Sequence[Sequence[Score]]) -> list[float]:
+    """Mean rank of settings over the same cells by their areas; ties share their mean rank."""
+    areas = np.array([[score.auc for score in scores] for scores in settings])
     return rankdata(-areas, axis=0).mean(axis=1).tolist()
 
 
@@ -120,10 +133,25 @@ def choose(trials: Sequence[TrialResult]) -> Chosen | None:
     complete = [trial for trial in trials if trial.state == "complete"]
     if not complete or complete[0].number != DEFAULTS:
         return None
-    ranks = mean_ranks(complete)
+    ranks = mean_ranks([trial.scores for trial in complete])
     best = int(np.argmin(ranks))
     found = complete[best]
-    return Chosen(found.agent, found.number, found.options, ranks[best], ranks[0])
+    by_task = {}
+    for task in dict.fromkeys(score.task for score in found.scores):
+        own = [[score for score in trial.scores if score.task == task] for trial in complete]
+        by_task[task] = complete[int(np.argmin(mean_ranks(own)))].number
+    return Chosen(found.agent, found.number, found.options, ranks[best], ranks[0], by_task)
+
+
+def best_single(chosen: Chosen, defaults: Sequence[Score]) -> str | None:
+    """The option whose chosen value alone has the best mean rank; None: the defaults have.
+
+    Args:
+        chosen: with ``singles``.
+        defaults: scores of the agent's defaults on the same cells.
+    """
+    names = [None, *chosen.singles]
+    return names[int(np.argmin(mean_ranks([defaults, *chosen.singles.values()])))]
 
 
 def to_json(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> dict[str, Any]:
@@ -134,18 +162,47 @@ def to_json(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> dict[str
     }
 
 
+def from_json(data: Mapping[str, Any]) -> tuple[list[TrialResult], list[Chosen]]:
+    """The opposite of :func:`to_json`.
+
+    Raises:
+        UserError: if the data are not those of a search.
+    """
+
+    def scores(each: Sequence[Mapping[str, Any]]) -> list[Score]:
+        return [Score(**score) for score in each]
+
+    try:
+        trials = [TrialResult(**{**t, "scores": scores(t["scores"])}) for t in data["trials"]]
+        chosen = [
+            Chosen(
+                **{
+                    **c,
+                    **{k: {n: scores(s) for n, s in c[k].items()} for k in ("singles", "fresh")},
+                }
+            )
+            for c in data["chosen"]
+        ]
+    except (KeyError, TypeError) as error:
+        raise UserError(
+            f"these are not the trials of a search ({error}); name the file PLAN.json that "
+            "`symsteer tune` wrote"
+        ) from None
+    return trials, chosen
+
+
 def to_text(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
     """A table with a row for each agent that has a chosen setting."""
     header = ["agent", "trials", "pruned", "failed", "chosen", "rank", "of defaults"]
-    header += ["AUC", "of defaults", "fresh AUC", "of defaults"]
+    header += ["AUC", "of defaults", "fresh: defaults", "one option", "chosen", "by task"]
     rows = [header]
     for choice in chosen:
         own = [trial for trial in trials if trial.agent == choice.agent]
         states = [trial.state for trial in own]
         by_number = {trial.number: trial for trial in own}
         fresh = [
-            f"{mean_auc(scores):.3f}" if scores else "-"
-            for scores in (choice.confirmed, choice.default_confirmed)
+            f"{mean_auc(choice.fresh[setting]):.3f}" if choice.fresh.get(setting) else "-"
+            for setting in get_args(Setting)
         ]
         rows.append(
             [

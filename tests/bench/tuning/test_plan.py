@@ -71,6 +71,11 @@ def test_no_cell_of_a_plan_is_on_a_leaderboard():
         ("[32, 64]", "[-1, 64]", "batch_size"),
         ("probe = 1", "probe = 3", "probe is 3, but there are only 2 cells"),
         ('"none", ', '"noone", ', "noone"),
+        (
+            "probe = 1",
+            'singles = ["standart"]',
+            "singles: there is no agent 'standart'; did you mean 'standard'",
+        ),
     ],
 )
 def test_mistakes(tmp_path, old, new, message):

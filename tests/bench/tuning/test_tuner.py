@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -14,7 +15,15 @@ from symsteer.bench.sweep.schedule import Outcome
 from symsteer.bench.tuning import command
 from symsteer.bench.tuning.command import Tuner, preview
 from symsteer.bench.tuning.plan import read_plan
-from symsteer.bench.tuning.trials import Score, TrialResult, choose, mean_ranks, to_text
+from symsteer.bench.tuning.trials import (
+    Score,
+    TrialResult,
+    best_single,
+    choose,
+    mean_auc,
+    mean_ranks,
+    to_text,
+)
 from symsteer.cli import main
 from symsteer.errors import UserError
 from tests.bench.tuning.tiny_plan import BEST, TEXT, KnownRuns, write_plan
@@ -33,13 +42,17 @@ def play(tmp_path, monkeypatch):
     return run
 
 
+def scores_of(*areas):
+    return [Score(f"task-{i % 2} cell", area, area, 60.0) for i, area in enumerate(areas)]
+
+
 def trial(number, *areas, state="complete"):
-    scores = [Score(f"cell {i}", area, area, 60.0) for i, area in enumerate(areas)]
+    scores = scores_of(*areas)
     return TrialResult("standard", number, state, {"lr": number}, scores)
 
 
 def test_ranks_are_means_over_cells_and_ties_share_them():
-    assert mean_ranks([trial(0, 0.5, 0.9), trial(1, 0.7, 0.9), trial(2, 0.1, 0.2)]) == [
+    assert mean_ranks([scores_of(0.5, 0.9), scores_of(0.7, 0.9), scores_of(0.1, 0.2)]) == [
         pytest.approx(x) for x in ((2 + 1.5) / 2, (1 + 1.5) / 2, 3.0)
     ]
 
@@ -51,6 +64,24 @@ def test_the_best_mean_rank_is_chosen_not_the_best_mean():
     assert np.argmax([t.auc for t in trials]) == 1
     assert (found.trial, found.rank) == (2, pytest.approx(4 / 3))
     assert found.default_rank == pytest.approx((3 + 2 + 2) / 3)
+
+
+def test_every_task_has_a_best_trial_of_its_own():
+    trials = [
+        trial(0, 0.5, 0.9, 0.5, 0.9),
+        trial(1, 0.7, 0.1, 0.4, 0.2),
+        trial(2, 0.6, 0.8, 0.8, 0.8),
+    ]
+    assert choose(trials).by_task == {"task-0": 2, "task-1": 0}
+
+
+def test_the_best_single_option_may_be_none():
+    found = dataclasses.replace(
+        choose([trial(0, 0.5, 0.5)]),
+        singles={"lr": scores_of(0.6, 0.4), "tau": scores_of(0.7, 0.6)},
+    )
+    assert best_single(found, scores_of(0.5, 0.5)) == "tau"
+    assert best_single(found, scores_of(0.8, 0.8)) is None
 
 
 def test_trials_that_were_given_up_are_not_chosen():
@@ -74,7 +105,7 @@ def test_the_search_comes_closer_to_the_known_optimum_than_the_defaults(play):
     for choice in chosen:
         best = BEST[choice.agent]
         assert abs(math.log(choice.options["lr"] / best)) < abs(math.log(6e-4 / best))
-        fresh, default = ([s.auc for s in x] for x in (choice.confirmed, choice.default_confirmed))
+        fresh, default = ([s.auc for s in choice.fresh[x]] for x in ("chosen", "defaults"))
         assert len(fresh) == len(default) == 2
         assert min(fresh) > max(default)
 
@@ -87,6 +118,21 @@ def test_bad_trials_are_given_up_after_the_probe(play):
         assert len(t.scores) == (1 if t.state == "pruned" else 2)
     # Chosen settings and defaults on two fresh cells each, for two agents.
     assert len(runs.played) == sum(len(t.scores) for t in trials) + 8
+
+
+def test_options_are_tried_by_themselves_where_the_plan_says_so(play):
+    """Success depends on lr alone, so lr alone is as good as the choice."""
+    trials, chosen, _ = play(
+        text=TEXT.replace("trials = 12", 'trials = 12\nsingles = ["standard"]')
+    )
+    standard, equivariant = chosen
+    options = {"lr", "batch_size"} if standard.options["batch_size"] == 32 else {"lr"}
+    assert set(standard.singles) == options
+    assert mean_auc(standard.singles["lr"]) > mean_auc(trials[0].scores)
+    assert equivariant.singles == {}
+    areas = {setting: [s.auc for s in scores] for setting, scores in standard.fresh.items()}
+    assert areas["one_option"] == areas["chosen"] > areas["defaults"]
+    assert set(equivariant.fresh) == {"defaults", "chosen", "by_task"}
 
 
 def test_a_search_that_was_killed_continues_with_the_same_trials(play):
@@ -111,7 +157,9 @@ def test_more_trials_can_be_added_later(play):
 
 def test_trials_of_another_plan_are_refused(play):
     play()
-    with pytest.raises(UserError, match=r"tiny.toml is not as it was .*only trials and batch"):
+    with pytest.raises(
+        UserError, match=r"tiny.toml is not as it was .*only trials, batch, singles"
+    ):
         play(text=TEXT.replace("high = 1e-1", "high = 1e-2"))
 
 
@@ -144,7 +192,7 @@ def test_what_is_written_can_be_read_again(play, tmp_path):
     folder = tmp_path / "runs" / "tuning"
     data = json.loads((folder / "tiny.json").read_text())
     assert [t["options"] for t in data["trials"]] == [dict(t.options) for t in trials]
-    assert data["chosen"][1]["confirmed"][0]["auc"] == chosen[1].confirmed[0].auc
+    assert data["chosen"][1]["fresh"]["chosen"][0]["auc"] == chosen[1].fresh["chosen"][0].auc
     path = str(folder / "tiny-preset.toml")
     found = preset_options(path, "equivariant", EquivariantAgent.Options)
     assert found == {k: pytest.approx(v, rel=1e-3) for k, v in chosen[1].options.items()}
@@ -160,7 +208,7 @@ def test_the_table_has_a_row_for_each_agent(play):
 def test_the_preview_counts_the_runs(tmp_path):
     text = preview(read_plan(write_plan(tmp_path)))
     assert "standard: 12 trials of 2 options: lr, batch_size" in text
-    assert "at most 56 runs" in text
+    assert "at most 60 runs" in text
 
 
 REAL = """

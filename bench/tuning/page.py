@@ -1,0 +1,228 @@
+"""Writes the tables of docs/tuning.md from the committed trials.
+
+python -m symsteer.bench.tuning.page                            # from the committed trials
+python -m symsteer.bench.tuning.page RUNS/tuning/core.json      # replaces them first
+
+The committed trials are leaderboard/results/tuning/core.json.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from symsteer.bench.tuning.trials import (
+    DEFAULTS,
+    Chosen,
+    Setting,
+    TrialResult,
+    from_json,
+    mean_auc,
+)
+from symsteer.errors import UserError
+from symsteer.files import write_together
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+PAGE = CHECKOUT / "docs" / "tuning.md"
+TRIALS = CHECKOUT / "leaderboard" / "results" / "tuning" / "core.json"
+BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
+MANY = 4
+"""Numbers of a range are shown in thirds if there are more of them."""
+
+
+def generate(page: str, data: dict[str, Any]) -> str:
+    """Replace the tables of docs/tuning.md.
+
+    Args:
+        page: its text.
+        data: of ``PLAN.json``.
+
+    Raises:
+        UserError: the page lacks the marks around the tables.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise UserError(
+            f"docs/tuning.md lacks the marks {BEGIN.strip()} and {END.strip()}; restore the page"
+        )
+    trials, chosen = from_json(data)
+    tables = render(trials, chosen, data["data"]["probe"])
+    return f"{before}{BEGIN}\n{tables}\n\n{END}{after}"
+
+
+def render(trials: Sequence[TrialResult], chosen: Sequence[Chosen], probe: int) -> str:
+    """All tables, in markdown.
+
+    Args:
+        trials: of all agents.
+        chosen: their settings; empty before all trials have ended.
+        probe: cells that every trial has.
+    """
+    parts = [
+        ("What was tried", effort(trials)),
+        ("What was chosen", choices(trials, chosen)),
+        ("On fresh cells", comparison(chosen)),
+        ("One option alone", singles(trials, chosen)),
+        ("Response to each option", response(trials, probe)),
+    ]
+    return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
+
+
+def effort(trials: Sequence[TrialResult]) -> str:
+    """Trials, runs and hours of each agent."""
+    rows = []
+    for agent in _agents(trials):
+        own = [trial for trial in trials if trial.agent == agent]
+        states = [trial.state for trial in own]
+        scores = [score for trial in own for score in trial.scores]
+        hours = sum(score.seconds for score in scores) / 3600
+        counts = [len(own), *(states.count(s) for s in ("complete", "pruned", "failed"))]
+        rows.append([f"`{agent}`", *map(str, counts), str(len(scores)), f"{hours:.1f}"])
+    head = ["agent", "trials", "complete", "given up", "failed", "runs", "hours of one core"]
+    return _table(head, rows)
+
+
+def choices(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
+    """The options that were chosen; those that are not the default are bold."""
+    names = dict.fromkeys(name for choice in chosen for name in choice.options)
+    defaults = {t.agent: t.options for t in trials if t.number == DEFAULTS}
+
+    def cell(choice: Chosen, name: str) -> str:
+        if name not in choice.options:
+            return ""
+        text = _value(choice.options[name])
+        return text if choice.options[name] == defaults[choice.agent][name] else f"**{text}**"
+
+    rows = [[f"`{name}`", *(cell(choice, name) for choice in chosen)] for name in names]
+    rows.append(["mean rank", *(f"{choice.rank:.1f}" for choice in chosen)])
+    rows.append(["of the defaults", *(f"{choice.default_rank:.1f}" for choice in chosen)])
+    return _table(["option", *(f"`{choice.agent}`" for choice in chosen)], rows) if chosen else ""
+
+
+def comparison(chosen: Sequence[Chosen]) -> str:
+    """Mean area on fresh cells, and how often a setting beats the defaults there."""
+    rows = []
+    for choice in chosen:
+        defaults = {score.cell: score.auc for score in choice.fresh.get("defaults", ())}
+        row = [f"`{choice.agent}`"]
+        for setting in get_args(Setting):
+            scores = choice.fresh.get(setting, ())
+            if not scores:
+                row.append("-")
+            elif setting == "defaults":
+                row.append(f"{mean_auc(scores):.3f}")
+            else:
+                gaps = [s.auc - defaults[s.cell] for s in scores if s.cell in defaults]
+                better = sum(gap > 0 for gap in gaps)
+                row.append(
+                    f"{mean_auc(scores):.3f} ({np.mean(gaps):+.3f} [{min(gaps):+.2f}, "
+                    f"{max(gaps):+.2f}], better in {better} of {len(gaps)})"
+                )
+        rows.append(row)
+    head = ["agent", "defaults", "one option", "chosen", "chosen for each task"]
+    return _table(head, rows) if rows else ""
+
+
+def singles(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
+    """Mean area of the defaults with one option of the choice, on the cells of the trials."""
+    rows = []
+    for choice in chosen:
+        if not choice.singles:
+            continue
+        own = {t.number: mean_auc(t.scores) for t in trials if t.agent == choice.agent and t.scores}
+        each = {
+            f"`{name}` {_value(choice.options[name])}": mean_auc(scores)
+            for name, scores in choice.singles.items()
+        }
+        each = dict(sorted(each.items(), key=lambda item: -item[1]))
+        texts = ", ".join(f"{name}: {area:.3f}" for name, area in each.items())
+        rows.append(
+            [f"`{choice.agent}`", f"{own[DEFAULTS]:.3f}", f"{own[choice.trial]:.3f}", texts]
+        )
+    head = ["agent", "defaults", "chosen", "defaults with one option of the choice"]
+    return _table(head, rows) if rows else ""
+
+
+def response(trials: Sequence[TrialResult], probe: int) -> str:
+    """Standing of the trials with each value of an option, and their number.
+
+    The standing of a trial is the share of the agent's other trials that it beats in mean area over
+    the first cells, which all trials have; ties count half.
+    """
+    standings: dict[str, list[tuple[TrialResult, float]]] = {}
+    for agent in _agents(trials):
+        own = [t for t in trials if t.agent == agent and len(t.scores) >= probe]
+        areas = np.array([mean_auc(t.scores[:probe]) for t in own])
+        beaten = (areas[:, None] > areas).mean(1) + ((areas[:, None] == areas).mean(1)) / 2
+        # Without the trial itself, which is a tie.
+        others = (beaten * len(own) - 0.5) / max(1, len(own) - 1)
+        standings[agent] = list(zip(own, 100 * others, strict=True))
+    every = [pair for own in standings.values() for pair in own]
+    rows = []
+    for name in dict.fromkeys(name for trial, _ in every for name in trial.options):
+        values = [trial.options[name] for trial, _ in every if name in trial.options]
+        for label, low, high in _groups(values):
+            row = [f"`{name}` {label}"]
+            for pairs in (*standings.values(), every):
+                inside = [
+                    standing
+                    for trial, standing in pairs
+                    if name in trial.options and low <= trial.options[name] <= high
+                ]
+                row.append(f"{np.mean(inside):.0f} ({len(inside)})" if inside else "-")
+            rows.append(row)
+    return _table(["option", *(f"`{agent}`" for agent in standings), "all"], rows)
+
+
+def _groups(values: Sequence[Any]) -> list[tuple[str, Any, Any]]:
+    """The values of an option, or thirds of them: text, first and last value."""
+    distinct = sorted(set(values))
+    if len(distinct) <= MANY:
+        return [(_value(value), value, value) for value in distinct]
+    thirds = np.array_split(np.sort(values), 3)
+    return [(f"{_value(t[0])} to {_value(t[-1])}", t[0], t[-1]) for t in thirds]
+
+
+def _agents(trials: Sequence[TrialResult]) -> list[str]:
+    return list(dict.fromkeys(trial.agent for trial in trials))
+
+
+def _value(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---", *("--:" for _ in head[1:])], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write docs/tuning.md, from new trials if a path is given; returns the exit code."""
+    path = Path(arguments[0]) if arguments else TRIALS
+    try:
+        if not PAGE.is_file():
+            raise UserError(
+                f"there is no {PAGE}: the page can be written in a checkout of SymSteer only"
+            )
+        try:
+            text = path.read_text()
+            data = json.loads(text)
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path} cannot be read as trials: {error}") from None
+        page = generate(PAGE.read_text(), data)
+        write_together({TRIALS: text.encode(), PAGE: page.encode()})
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"wrote the tables of {len(data['trials'])} trials to {PAGE}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,107 @@
+"""The tables of docs/tuning.md."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from symsteer.bench.tuning import page
+from symsteer.bench.tuning.trials import Chosen, Score, TrialResult, to_json
+
+
+def scores(*areas):
+    return [Score(f"task {i}", area, area, 1800.0) for i, area in enumerate(areas)]
+
+
+def trial(number, lr, *areas, state="complete"):
+    return TrialResult("standard", number, state, {"lr": lr, "critics": 2}, scores(*areas))
+
+
+TRIALS = [
+    trial(0, 1e-3, 0.2, 0.4),
+    trial(1, 2e-3, 0.6, 0.8),
+    trial(2, 3e-3, 0.1, state="pruned"),
+    trial(3, 4e-3, 0.9, 0.7),
+    trial(4, 5e-3, 0.2, 0.1),
+    trial(5, 6e-3, state="failed"),
+]
+CHOSEN = [
+    Chosen(
+        "standard",
+        3,
+        {"lr": 4e-3, "critics": 2},
+        1.5,
+        3.0,
+        {"task": 3},
+        {"lr": scores(0.5, 0.5)},
+        {
+            "defaults": scores(0.3, 0.5),
+            "one_option": scores(0.4, 0.5),
+            "chosen": scores(0.7, 0.4),
+            "by_task": scores(0.7, 0.4),
+        },
+    )
+]
+
+
+def rows(text):
+    return {line.split(" | ")[0].strip("| "): line for line in text.splitlines()[2:]}
+
+
+def test_effort_counts_trials_and_hours():
+    assert rows(page.effort(TRIALS))["`standard`"] == "| `standard` | 6 | 4 | 1 | 1 | 9 | 4.5 |"
+
+
+def test_choices_that_are_not_the_default_are_bold():
+    found = rows(page.choices(TRIALS, CHOSEN))
+    assert found["`lr`"] == "| `lr` | **0.004** |"
+    assert found["`critics`"] == "| `critics` | 2 |"
+
+
+def test_settings_are_compared_cell_by_cell():
+    (row,) = rows(page.comparison(CHOSEN)).values()
+    assert "| 0.400 | 0.450 (+0.050 [+0.00, +0.10], better in 1 of 2) |" in row
+    assert "0.550 (+0.150 [-0.10, +0.40], better in 1 of 2)" in row
+
+
+def test_single_options_stand_beside_the_choice():
+    (row,) = rows(page.singles(TRIALS, CHOSEN)).values()
+    assert row == "| `standard` | 0.300 | 0.800 | `lr` 0.004: 0.500 |"
+
+
+def test_the_response_is_the_share_of_other_trials_that_are_beaten():
+    """First cells of five trials: .2, .6, .1, .9, .2, so 37.5, 75, 0, 100 and 37.5 percent."""
+    found = rows(page.response(TRIALS, 1))
+    assert found["`critics` 2"] == "| `critics` 2 | 50 (5) | 50 (5) |"
+    thirds = [line for name, line in found.items() if name.startswith("`lr`")]
+    assert [line.split(" | ")[1] for line in thirds] == ["56 (2)", "50 (2)", "38 (1)"]
+
+
+def test_the_page_is_written_between_its_marks(tmp_path, monkeypatch, capsys):
+    text, trials = tmp_path / "tuning.md", tmp_path / "results" / "core.json"
+    text.write_text(f"before\n{page.BEGIN}old\n{page.END}after\n")
+    source = tmp_path / "new.json"
+    source.write_text(json.dumps({"data": {"probe": 1}, **to_json(TRIALS, CHOSEN)}))
+    monkeypatch.setattr(page, "PAGE", text)
+    monkeypatch.setattr(page, "TRIALS", trials)
+    assert page.main([str(source)]) == 0
+    assert trials.read_text() == source.read_text()
+    written = text.read_text()
+    assert written.startswith(f"before\n{page.BEGIN}\n### What was tried\n")
+    assert written.endswith(f"{page.END}after\n")
+    assert "old" not in written
+    assert page.main([]) == 0
+    assert text.read_text() == written
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [("{}", "not the trials"), ("x", "cannot be read")]
+)
+def test_other_files_are_refused(tmp_path, monkeypatch, capsys, content, message):
+    path = tmp_path / "other.json"
+    path.write_text(content)
+    monkeypatch.setattr(page, "PAGE", tmp_path / "tuning.md")
+    (tmp_path / "tuning.md").write_text(f"{page.BEGIN}{page.END}")
+    assert page.main([str(path)]) == 2
+    assert message in capsys.readouterr().err
