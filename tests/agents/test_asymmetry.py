@@ -136,6 +136,19 @@ def test_the_dial_orders_them(problem, name):
         assert free > 1.05 * held > 2 * strict
 
 
+def test_the_penalty_limits_the_asymmetric_numbers(problem):
+    """Steps of lr outwards end where a pull inwards takes lr away: at 1 / (2 penalty)."""
+    agent = problem.agent("residual-pathway", lr=0.01, penalty=5.0)
+    numbers = [layer.free.weight for layer, _ in agent.actor.layers()]
+    for _ in range(100):
+        with torch.no_grad():
+            for weight in numbers:
+                weight += 0.01
+            agent.settle("actor")
+    for weight in numbers:
+        torch.testing.assert_close(weight, torch.full_like(weight, 0.1), rtol=1e-3, atol=0)
+
+
 def test_actor_and_critics_may_have_penalties_of_their_own(problem):
     agent = problem.agent("projected", dtype=torch.float64, penalty=0.0, actor_penalty=1e9)
     trained(problem, agent, torch.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,7 +13,7 @@ from symsteer.agents.standard import StandardAgent
 from symsteer.agents.team import Team
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.run import execute
-from symsteer.bench.runs.together import execute_together
+from symsteer.bench.runs.together import _next, execute_together
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config
 
@@ -83,6 +84,20 @@ def test_the_time_of_a_run_does_not_contain_that_of_the_others(team):
         assert 0 < clock.update < parts <= clock.total
         total += clock.total
     assert total <= float((team / "seconds").read_text())
+
+
+def test_runs_that_are_behind_are_served_first():
+    """So they become a team with the others again."""
+
+    def member(index, updates, options="equal"):
+        agent = StandardAgent.__new__(StandardAgent)
+        agent.updates, agent.options, agent.description = updates, options, dict
+        return SimpleNamespace(index=index, agent=agent)
+
+    ahead, behind, other, last = member(0, 8), member(1, 5), member(2, 5, "other"), member(3, 5)
+    assert _next([ahead, last, behind]) == [behind, last]
+    assert _next([other, ahead, behind, last]) == [other]
+    assert _next([ahead]) == [ahead]
 
 
 def test_a_killed_team_continues(alone, tmp_path, monkeypatch):
