@@ -33,6 +33,9 @@ class Impulses:
 class PairImpulseQuery:
     """Asks for the impulse on the first body of each pair by the second one."""
 
+    start = 0
+    """First of its rows among those of all queries."""
+
     def __init__(self, body_pairs: Sequence[tuple[Any, Any]]) -> None:
         self.cuda_impulses = Impulses(len(body_pairs))
         self._entries: dict[tuple[Any, Any], _Entries] = defaultdict(list)
@@ -47,6 +50,9 @@ class PairImpulseQuery:
 
 class BodyImpulseQuery:
     """Asks for the net contact impulse on each body."""
+
+    start = 0
+    """First of its rows among those of all queries."""
 
     def __init__(self, bodies: Sequence[Any]) -> None:
         self.cuda_impulses = Impulses(len(bodies))
@@ -63,22 +69,36 @@ class BodyImpulseQuery:
 Query = TypeVar("Query", PairImpulseQuery, BodyImpulseQuery)
 
 
+class _Found:
+    """The contact points of one scene that enter a result: impulse, row and sign."""
+
+    def __init__(self) -> None:
+        self.impulses: list[np.ndarray] = []
+        self.rows: list[int] = []
+        self.signs: list[int] = []
+
+    def clear(self) -> None:
+        self.impulses.clear()
+        self.rows.clear()
+        self.signs.clear()
+
+
 class ContactReader:
     """Reads the contacts of all scenes at most once per substep, for all queries."""
 
     def __init__(self, systems: Sequence[physx.PhysxCpuSystem]) -> None:
         self._systems = systems
         self._queries: list[PairImpulseQuery | BodyImpulseQuery] = []
-        # Per scene: query, row and signed impulse of every contact that enters a result.
-        self._found: list[list[tuple[int, int, np.ndarray]]] = [[] for _ in systems]
+        self._found = [_Found() for _ in systems]
         self._forgotten: set[int] = set(range(len(systems)))
         self._must_read = True
         self._must_sum = True
-        # Query, row and sign by pair of bodies, filled as pairs come into contact.
-        self._known_pairs: dict[tuple[Any, Any], list[tuple[int, int, int]]] = {}
+        # What a contact between two bodies enters, filled as pairs come into contact.
+        self._known_pairs: dict[tuple[Any, Any], _Entries] = {}
 
     def register(self, query: Query) -> Query:
         """Add a query."""
+        query.start = sum(len(earlier.cuda_impulses.array) for earlier in self._queries)
         self._queries.append(query)
         self._known_pairs.clear()
         self._must_read = True
@@ -114,23 +134,33 @@ class ContactReader:
                 if entries is None:
                     entries = self._known_pairs[pair] = self._entries(*pair)
                 if entries:
-                    impulse = np.sum([point.impulse for point in contact.points], axis=0)
-                    found.extend((query, row, sign * impulse) for query, row, sign in entries)
+                    impulses = [point.impulse for point in contact.points]
+                    for row, sign in entries:
+                        found.impulses += impulses
+                        found.rows += [row] * len(impulses)
+                        found.signs += [sign] * len(impulses)
         self._must_read = False
         self._must_sum = True
 
-    def _entries(self, first: Any, second: Any) -> list[tuple[int, int, int]]:
+    def _entries(self, first: Any, second: Any) -> _Entries:
         return [
-            (index, row, sign)
-            for index, query in enumerate(self._queries)
+            (query.start + row, sign)
+            for query in self._queries
             for row, sign in query.entries(first, second)
         ]
 
     def _sum(self) -> None:
-        totals = [np.zeros(query.cuda_impulses.array.shape) for query in self._queries]
-        for found in self._found:
-            for index, row, impulse in found:
-                totals[index][row] += impulse
-        for query, total in zip(self._queries, totals, strict=True):
-            query.cuda_impulses.array[:] = total
+        """One sum for all queries, whose rows follow each other."""
+        count = sum(len(query.cuda_impulses.array) for query in self._queries)
+        impulses = [impulse for found in self._found for impulse in found.impulses]
+        total = np.zeros((count, 3))
+        if impulses:
+            signs = np.array([sign for found in self._found for sign in found.signs])
+            rows = np.array([row for found in self._found for row in found.rows])
+            signed = signs[:, None] * np.concatenate(impulses).reshape(-1, 3)
+            for axis in range(3):
+                total[:, axis] = np.bincount(rows, signed[:, axis], count)
+        for query in self._queries:
+            array = query.cuda_impulses.array
+            array[:] = total[query.start : query.start + len(array)]
         self._must_sum = False
