@@ -12,9 +12,9 @@ actions. The gates get no gradient of the losses of actor and critics.
 
 Found in the paper: the gate, its loss, both mixtures. Our choices, for they were not found:
 
-- disagreement: d = mean over irrep blocks k of |f_E - f_N|_k^2 / (c_k + c), where c_k is the
-  running mean square of the change that is predicted, the reward being one more block, and c its
-  mean over blocks: units do not matter, and blocks that never change do not count;
+- disagreement: d = mean over irrep blocks k of |f_E - f_N|_k^2 c_k / (c_k + c)^2, where c_k is the
+  running variance of the change that is predicted (about 0 for vectors), the reward being one more
+  block, and c its mean over blocks: units do not matter, and blocks that never vary do not count;
 - label: 1 above the fence m + ``fence`` (m - q25) of log d in the batch, else 0; m is the median,
   so that the symmetry may be broken in almost half of the states;
 - sampled actions: the bank of decoded noise. A network is trained towards their maximum, so that
@@ -47,7 +47,7 @@ from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent, plain_layers
 from symsteer.errors import UserError
 from symsteer.names import unknown
-from symsteer.policies.geometry import Field, Layout
+from symsteer.policies.geometry import Field, Group, Layout
 
 Gate = Literal["hard", "soft"]
 
@@ -119,9 +119,9 @@ class PartialAgent(StandardAgent):
             self.own = {name: self._network([own]) for name, own in layers.items()}
         for name, network in self.own.items():
             self.optimizers[name] = adam(self.parameter_groups(network), self.options.lr)
-        membership = F.one_hot(following.block_index).to(self.device, self.dtype)
-        # [dim, blocks]: the mean over a block's numbers.
-        self.blocks = membership / membership.sum(0)
+        self.blocks = following.block_means.to(self.device, self.dtype)
+        reflections = Group.parse(self.options.group).reflections
+        self.invariant = following.invariant_mask(reflections).to(self.device, self.dtype)
         ones = torch.ones(self.blocks.shape[1], device=self.device, dtype=self.dtype)
         self.sizes = ones
 
@@ -188,7 +188,8 @@ class PartialAgent(StandardAgent):
         wanted = torch.cat([next_obs - obs, reward], -1)
         # The first update has nothing to remember.
         share = 1 - MEMORY if self.updates > 1 else 1.0
-        self.sizes.lerp_((wanted.square() @ self.blocks).mean(0), share)
+        centred = wanted - wanted.mean(0) * self.invariant
+        self.sizes.lerp_((centred.square() @ self.blocks).mean(0), share)
         found = {}
         for name in ("strict_predictor", "plain_predictor"):
             found[name] = self.own[name](inputs)[0]
@@ -216,7 +217,7 @@ class PartialAgent(StandardAgent):
     def _distance(self, one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
         """d ``[B]`` of two predictions ``[B, dim]``."""
         apart = (one - other).square() @ self.blocks
-        return (apart / (self.sizes + self.sizes.mean())).mean(-1).clamp(min=1e-12)
+        return (apart * block_weights(self.sizes)).mean(-1).clamp(min=1e-12)
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Also the mean of lambda(s) on the states that were visited."""
@@ -232,3 +233,12 @@ class PartialAgent(StandardAgent):
         """Continue exactly where :meth:`state_dict` was taken."""
         super().load_state_dict(state)
         self.sizes.copy_(state["sizes"])
+
+
+def block_weights(sizes: torch.Tensor) -> torch.Tensor:
+    """Weights of squared differences in blocks, from what blocks vary by, ``[blocks]``.
+
+    c_k / (c_k + c)^2 with the mean c: about 1 / c_k for a block that varies much, 0 for one that
+    never does.
+    """
+    return sizes / (sizes + sizes.mean()).square()

@@ -103,9 +103,9 @@ class SacAgent(Agent):
         blocks = Field("log_scales", 0, self.distribution.blocks)
         # Output of the actor: the means, then one invariant number per irrep block.
         self.actor_layout = Layout([*self.noise_layout.fields, blocks])
-        self.noise_inputs = _side_by_side(obs=self.obs_layout, noise=self.noise_layout)
+        self.noise_inputs = Layout.join(obs=self.obs_layout, noise=self.noise_layout)
         executed = self.act_layout.repeat(context.execute)
-        self.action_inputs = _side_by_side(obs=self.obs_layout, actions=executed)
+        self.action_inputs = Layout.join(obs=self.obs_layout, actions=executed)
         self.target_entropy = options.target_entropy * self.noise_layout.dim
         with torch.random.fork_rng(devices=[]):  # does not change the global generator
             torch.manual_seed(context.seed)
@@ -673,14 +673,3 @@ def _copied(tree: Any) -> Any:
 
 def _flat(weights: Weights) -> list[torch.Tensor]:
     return [tensor for layer in weights for tensor in layer]
-
-
-def _side_by_side(**layouts: Layout) -> Layout:
-    """The layout of several concatenated vectors."""
-    return Layout(
-        [
-            Field(f"{prefix}.{f.name}", f.frequency, f.multiplicity, f.odd)
-            for prefix, layout in layouts.items()
-            for f in layout.fields
-        ]
-    )

@@ -251,8 +251,9 @@ def status(
 
 
 def list_names() -> int:
-    """Name the tasks, embodiments, variants, agents, policies, suites and tuning plans."""
+    """Name the tasks, embodiments, variants, agents, policies, detectors, suites and plans."""
     from symsteer.agents import AGENTS
+    from symsteer.agents.detectors import DETECTORS
     from symsteer.bench.sweep.grid import read_suite, suite_names
     from symsteer.bench.tasks import EMBODIMENTS, TASKS
     from symsteer.bench.tuning import plan_summaries
@@ -272,6 +273,7 @@ def list_names() -> int:
         "suites (symsteer sweep SUITE)",
         ((suite.name, f"{suite.description} ({len(suite.runs)} runs)") for suite in suites),
     )
+    _print_names("detectors of broken symmetry (symsteer detect RUN)", _summaries(DETECTORS))
     _print_names("tuning plans (symsteer tune PLAN)", plan_summaries().items())
     return 0
 
@@ -435,6 +437,48 @@ def audit(
         print(text(found[0]))
     if out is not None and not json:
         print(f"wrote {out}")
+    return 0
+
+
+def detect(
+    folder: Annotated[Path, tyro.conf.arg(metavar="RUN")],
+    /,
+    detector: tuple[str, ...] = (),
+    count: int = 64,
+    group: str = "C8",
+    seed: int = 0,
+    out: Path | None = None,
+    json: bool = False,
+) -> int:
+    """Score detectors of broken symmetry on a run's decisions (docs/detect.md).
+
+    The run is one in a broken world, with keep_replay.
+
+    Args:
+        folder: Folder of the run.
+        detector: Detectors; default: all. `symsteer list` names them.
+        count: States of the scripted expert and of the base policy, each; all their turned copies
+            are simulated.
+        group: Symmetry group.
+        seed: Seed of states, detectors and intervals.
+        out: Folder for detect.json and detect.png.
+        json: Print only JSON.
+    """
+    from json import dumps
+
+    from symsteer.agents.detectors import DETECTORS
+    from symsteer.bench.detect import report
+    from symsteer.bench.detect.study import detect
+
+    def progress(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    about, truth, found = detect(folder, detector or tuple(DETECTORS), count, group, seed, progress)
+    print(dumps(report.to_json(about, found)) if json else f"\n{report.text(about, found)}")
+    if out is not None:
+        report.write(out, about, truth, found)
+        if not json:
+            print(f"\nwrote {out}")
     return 0
 
 

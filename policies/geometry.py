@@ -132,6 +132,23 @@ class Layout:
             ]
         )
 
+    @property
+    def block_means(self) -> torch.Tensor:
+        """A matrix ``[dim, blocks]``: ``x @ block_means`` has the mean of each block."""
+        membership = torch.nn.functional.one_hot(self.block_index)
+        return membership / membership.sum(0)
+
+    @classmethod
+    def join(cls, **layouts: Layout) -> Layout:
+        """The layout of several concatenated vectors."""
+        return cls(
+            [
+                Field(f"{prefix}.{f.name}", f.frequency, f.multiplicity, f.odd)
+                for prefix, layout in layouts.items()
+                for f in layout.fields
+            ]
+        )
+
     def repeat(self, count: int) -> Layout:
         """The layout of ``count`` concatenated vectors."""
         return Layout(

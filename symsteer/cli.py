@@ -66,12 +66,13 @@ VERBS = {
     ),
     "list": Verb(
         f"{BENCH}:list_names",
-        "Name the tasks, embodiments, variants, agents, policies, suites and tuning plans.",
+        "Name the tasks, embodiments, variants, agents, policies, detectors, suites and plans.",
         computes=False,
     ),
     "demos": Verb(f"{BENCH}:demos", "Write demonstrations of the scripted expert."),
     "base": Verb(f"{BENCH}:base", "Train base policies and compare their success."),
     "audit": Verb(f"{BENCH}:audit", "Measure how broken the symmetry of a task is."),
+    "detect": Verb(f"{BENCH}:detect", "Score detectors of broken symmetry on a run's decisions."),
     "throughput": Verb(f"{BENCH}:throughput", "Measure the speed of the simulation."),
     "doctor": Verb(f"{BENCH}:doctor", "Show what this machine can do.", computes=False),
 }

@@ -292,16 +292,22 @@ def _reset_defect(resets: Resets, layout: Layout, seed: int) -> tuple[Estimate, 
     return energy_distance(x, y, seed)
 
 
+def departures(copies: Copies, body: str) -> torch.Tensor:
+    """Distance of each copy of a body from the majority of its state's copies, metres, ``[S, G]``.
+
+    The medoid is the copy that is closest to all others, so it belongs to the majority.
+    """
+    end = copies.positions[body][:, :-1, 1]
+    apart = (end[:, :, None] - end[:, None]).norm(dim=-1)
+    cost = (apart * copies.reached.double()[:, None]).sum(dim=-1)
+    medoid = torch.where(copies.reached, cost, torch.inf).argmin(dim=1)
+    return apart[torch.arange(len(apart)), medoid]
+
+
 def _map(copies: Copies) -> list[Bin]:
     bins = []
     for body in ("tool", "object"):
-        end = copies.positions[body][:, :-1, 1]
-        apart = (end[:, :, None] - end[:, None]).norm(dim=-1)
-        exists = copies.reached.double()
-        # The medoid is the copy that is closest to all others, so it belongs to the majority.
-        cost = (apart * exists[:, None]).sum(dim=-1)
-        medoid = torch.where(copies.reached, cost, torch.inf).argmin(dim=1)
-        departure = apart[torch.arange(len(apart)), medoid][copies.reached].numpy()
+        departure = departures(copies, body)[copies.reached].numpy()
         place = copies.place[body][copies.reached].numpy()
         index = np.floor(place / BIN).astype(int)
         squares, which, count = np.unique(index, axis=0, return_inverse=True, return_counts=True)

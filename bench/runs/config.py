@@ -93,6 +93,8 @@ class RunConfig:
     """Control steps of each environment between two checkpoints. After each checkpoint, all
     environments begin new episodes in fresh scenes, because a checkpoint cannot contain the
     contacts that PhysX remembers."""
+    keep_replay: bool = False
+    """Write all decisions to `replay.safetensors` at the end; `symsteer detect` needs them."""
     sim: Literal["cpu", "cuda"] = "cpu"
     """Device of the simulation."""
     device: Literal["cpu", "cuda"] = "cpu"

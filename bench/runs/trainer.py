@@ -23,6 +23,7 @@ from symsteer.bench.runs.checkpoint import save_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.evaluator import Evaluator, discount, make_env, timeouts_end
 from symsteer.bench.runs.folder import CHECKPOINT
+from symsteer.bench.runs.replays import store_replay
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import task_class
 from symsteer.bench.variants import build, evaluation_variants, highest_cost
@@ -199,6 +200,8 @@ class Trainer:
             yield from self._train()
             self.evaluate(final=True)
             self.final = True
+            if self.config.keep_replay and self.agent.replay is not None:
+                store_replay(self.agent.replay, self.folder)
             self._checkpoint()
         self.evaluator.close()
         for observer in self.observers:

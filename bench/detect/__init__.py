@@ -1,0 +1,1 @@
+"""Detectors of broken symmetry, scored against the audit."""
