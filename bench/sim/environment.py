@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import weakref
+from collections.abc import Iterable
 from functools import cache
 from typing import Any, Literal
 
@@ -26,9 +27,9 @@ from symsteer.errors import UserError
 
 Simulator = Literal["cpu", "cuda"]
 
-# ManiSkill collects garbage at every reconfiguration. This took 0.27 s, most of it in the modules
-# and classes of torch and ManiSkill, which live as long as the process. They are taken out here,
-# before there is an environment: what is taken out is never collected.
+# Collecting garbage takes 0.27 s, most of it in the modules and classes of torch and ManiSkill,
+# which live as long as the process. They are taken out here, before there is an environment: what
+# is taken out is never collected.
 gc.collect()
 gc.freeze()
 
@@ -36,15 +37,19 @@ MAX_SCENES = 900
 """PhysX scenes that one process may hold. With about 1,000 of them the interpreter ends with a
 fatal error (``_PyGILState_NoteThreadState``)."""
 
+MAX_DROPPED = 256
+"""PhysX scenes without an environment that may wait until garbage is collected."""
+
 _LIVE_SCENES: weakref.WeakSet[BatchedScene] = weakref.WeakSet()
+_DROPPED_SCENES: weakref.WeakSet[BatchedScene] = weakref.WeakSet()
 
 
 def _make_room(count: int) -> None:
     """Raise `UserError` unless this process can hold ``count`` more scenes."""
-    if _number_of_scenes() + count > MAX_SCENES:
+    if _count(_LIVE_SCENES) + count > MAX_SCENES:
         # Closed environments hold their scenes until they are collected.
         gc.collect()
-    if (there := _number_of_scenes()) + count > MAX_SCENES:
+    if (there := _count(_LIVE_SCENES)) + count > MAX_SCENES:
         raise UserError(
             f"one process holds at most {MAX_SCENES} PhysX scenes: {count} were asked for and "
             f"{there} exist already (a reset that reconfigures needs twice as many); make fewer "
@@ -52,8 +57,9 @@ def _make_room(count: int) -> None:
         )
 
 
-def _number_of_scenes() -> int:
-    return sum(len(scene.sub_scenes) for scene in _LIVE_SCENES)
+def _count(scenes: Iterable[BatchedScene]) -> int:
+    """The number of PhysX scenes."""
+    return sum(len(scene.sub_scenes) for scene in scenes)
 
 
 class _BatchedDevice:
@@ -134,6 +140,16 @@ class BatchedCpuMixin(BaseEnv):
     @_sim_device.setter
     def _sim_device(self, device: sapien.Device) -> None:
         """Ignore the plain CPU device that `BaseEnv` assigns."""
+
+    def _clear(self) -> None:
+        """Drop the scenes. ManiSkill collects garbage each time, this only if many wait for it."""
+        if self.scene is not None:
+            _DROPPED_SCENES.add(self.scene)
+        self._close_viewer()
+        self.__dict__.update(agent=None, scene=None)
+        self.__dict__.update(_sensors={}, _human_render_cameras={}, _hidden_objects=[])
+        if self._camera_device is not None or _count(_DROPPED_SCENES) > MAX_DROPPED:
+            gc.collect()
 
     def _setup_scene(self) -> None:
         self._set_scene_config()

@@ -116,7 +116,7 @@ def test_bad_settings(monkeypatch, settings, message):
 def test_more_scenes_than_a_process_can_hold(monkeypatch):
     """Closed environments free their scenes; too many scenes are refused before PhysX crashes."""
     gc.collect()
-    before = batched._number_of_scenes()
+    before = batched._count(batched._LIVE_SCENES)
     monkeypatch.setattr("symsteer.bench.sim.environment.MAX_SCENES", before + 12)
     for _ in range(4):
         env = create(PickCubeEnv, 5, obs_mode="state")
@@ -130,6 +130,22 @@ def test_more_scenes_than_a_process_can_hold(monkeypatch):
         create(PickCubeEnv, 13, obs_mode="state")
 
 
+def test_dropped_scenes_are_collected_before_they_are_many(monkeypatch):
+    monkeypatch.setattr("symsteer.bench.sim.environment.MAX_DROPPED", 9)
+    gc.collect()
+    gc.disable()
+    try:
+        env, dropped = create(PickCubeEnv, 4, obs_mode="state"), []
+        for _ in range(5):
+            env.reset(seed=0, options={"reconfigure": True})
+            dropped.append(batched._count(batched._DROPPED_SCENES))
+        env.close()
+    finally:
+        gc.enable()
+    # The task still names actors of the last scene when the third one is dropped.
+    assert dropped == [4, 8, 4, 8, 4]
+
+
 def test_the_first_environment_of_a_process_frees_its_scenes():
     code = """
 import gc
@@ -139,7 +155,7 @@ env = create(PickCubeEnv, 3, obs_mode="state")
 env.close()
 del env
 gc.collect()
-print("scenes", environment._number_of_scenes())
+print("scenes", environment._count(environment._LIVE_SCENES))
 """
     result = run_python(code)
     assert result.stdout.strip().endswith("scenes 0"), result.stdout + result.stderr
