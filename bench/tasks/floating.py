@@ -177,6 +177,9 @@ class FloatingGripper(FloatingPandaGripper):
     """
 
     uid = "symsteer_floating_gripper"
+    # Only the fingers could touch each other. Their joints' limits stop closed ones all the same,
+    # and their contact is half of the physics of a task with a closed gripper.
+    disable_self_collisions = True
     root_height = 0.3
     # About critically damped for the hand's 0.76 kg: a target is reached to 90 % within one
     # control step of 50 ms.
