@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import ClassVar
 
 import torch
@@ -30,7 +29,7 @@ class GateDetector(Detector):
             lr=LR,
             reward_scale=1.0,
         )
-        self.agent = PartialAgent(dataclasses.replace(context), options)
+        self.agent = PartialAgent(context, options)
 
     def learn(self, replay: Batch) -> None:
         """The agent's own training of predictors and gates."""

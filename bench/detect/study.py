@@ -88,6 +88,7 @@ def detect(
         raise UserError(
             f"there is no {policy_path(folder)}; restore it from where the run was made"
         )
+    policy = policy.to("cpu")
     settings = AuditSettings(
         config.task,
         config.embodiment,
