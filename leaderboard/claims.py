@@ -239,7 +239,8 @@ def paired(table: Table, claim: Claim) -> dict[Pair, Sample]:
 
 
 def _values(table: Table, agent: str, measure: str) -> dict[Pair, float]:
-    """A number for each run of an agent that has it; of several recipes, of that with most runs."""
+    """A number for each run of an agent that has it; of several recipes, of the usual one, or of
+    that with most runs."""
 
     def of(run: Run) -> float | None:
         if measure == "diverged":
@@ -253,8 +254,13 @@ def _values(table: Table, agent: str, measure: str) -> dict[Pair, float]:
         return abs(float(np.mean(biases))) if biases else None
 
     rows = [row for row in table.rows if row.agent == agent]
-    found = [{r.pair: float(v) for r in row.runs if (v := of(r)) is not None} for row in rows]
-    return max(found, key=len, default={})
+    found = [
+        (row.usual, {r.pair: float(v) for r in row.runs if (v := of(r)) is not None})
+        for row in rows
+    ]
+    return (
+        max(found, key=lambda pair: (pair[0] and bool(pair[1]), len(pair[1])))[1] if found else {}
+    )
 
 
 def _shares(cells: Used, claim: Claim, drawn: Estimate) -> tuple[Effect | None, str]:

@@ -150,7 +150,8 @@ def _overview(summary: Summary) -> str:
         cells = []
         for agent in summary.agents:
             rows_of = [row for row in table.rows if row.agent == agent]
-            cells.append("<br>".join(_glance(row) for row in rows_of) or NOTHING)
+            shown = [row for row in rows_of if row.usual] or rows_of
+            cells.append("<br>".join(_glance(row) for row in shown) or NOTHING)
         rows.append([cell_name(table, summary), *cells])
     return grid(header, rows, left=1)
 

@@ -60,6 +60,9 @@ evaluated after the decision that crosses the planned step, and decisions differ
 MOST_SETTINGS = 3
 """Settings that the label of a row shows."""
 
+CELL = frozenset({"task", "embodiment", "variant", "evaluation_variant", "env_steps"})
+"""Configuration keys that tell tables apart."""
+
 MACHINE = frozenset({"device", "threads", "torch_threads", "workers", "progress", "out"})
 """Configuration keys, at any depth, that may differ between runs of one row, as seeds may."""
 
@@ -252,6 +255,8 @@ class Row:
     runs: list[Run]
     missing: int = 0
     label: str = ""
+    usual: bool = False
+    """Whether most runs of the agent, in all tables, have the settings of this row."""
     success: Interval | None = None
     last: Interval | None = None
     difference: Interval | None = None
@@ -324,9 +329,12 @@ class Table:
         return [row for row in self.rows if row.finished and not row.is_reference]
 
     def row_of(self, agent: str) -> Row | None:
-        """The agent's row with the most finished runs; None if it finished none."""
+        """The agent's row with its usual settings, else that with the most finished runs.
+
+        None if the agent finished none.
+        """
         rows = [row for row in self.rows if row.agent == agent and row.finished]
-        return max(rows, key=lambda row: len(row.finished), default=None)
+        return max(rows, key=lambda row: (row.usual, len(row.finished)), default=None)
 
     @property
     def runs(self) -> list[Run]:
@@ -421,8 +429,22 @@ def summarize(runs: Sequence[Run]) -> Summary:
     # An agent has one role: that of its newest run.
     by_age = sorted(chosen, key=lambda run: (run.record.started, run.record.run_id))
     roles = {run.agent: run.record.role for run in by_age}
-    built = [_table(key, rows, roles) for key, rows in sorted(tables.items())]
+    usual = _usual_settings(chosen)
+    built = [_table(key, rows, roles, usual) for key, rows in sorted(tables.items())]
     return Summary(built, set_aside)
+
+
+def _usual_settings(runs: Iterable[Run]) -> dict[str, dict[str, str]]:
+    """The settings with which most runs of an agent were made, over all tables; if there is one."""
+    counts: dict[str, Counter[tuple[tuple[str, str], ...]]] = defaultdict(Counter)
+    for run in runs:
+        counts[run.agent][tuple(sorted(_settings(run.record.config).items()))] += 1
+    usual = {}
+    for agent, counter in counts.items():
+        (first, number), *others = counter.most_common(2)
+        if not others or others[0][1] < number:
+            usual[agent] = dict(first)
+    return usual
 
 
 def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
@@ -446,7 +468,10 @@ def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
 
 
 def _table(
-    key: Key, groups: Mapping[tuple[str, str], list[Run]], roles: Mapping[str, Role]
+    key: Key,
+    groups: Mapping[tuple[str, str], list[Run]],
+    roles: Mapping[str, Role],
+    usual: Mapping[str, Mapping[str, str]],
 ) -> Table:
     seeds = {run.seed for runs in groups.values() for run in runs}
     rows = []
@@ -456,9 +481,9 @@ def _table(
         rows.append(Row(agent, roles[agent], recipe, runs, len(seeds - have)))
     for agent in roles.keys() - {agent for agent, _ in groups}:
         rows.append(Row(agent, roles[agent], "", [], len(seeds)))
-    rows.sort(key=lambda row: (row_place(row.agent, row.role), row.recipe))
     for agent in {row.agent for row in rows}:
-        _label([row for row in rows if row.agent == agent])
+        _label([row for row in rows if row.agent == agent], usual.get(agent))
+    rows.sort(key=lambda row: (row_place(row.agent, row.role), not row.usual, row.label))
     for row in rows:
         _fill(row, key.env_steps)
     table = Table(key, rows, _threshold(rows))
@@ -483,14 +508,26 @@ def _table(
     return table
 
 
-def _label(twins: Sequence[Row]) -> None:
-    """Name the rows of one agent; of several, by the settings that most of them do not have."""
+def _label(twins: Sequence[Row], common: Mapping[str, str] | None) -> None:
+    """Name the rows of one agent; of several, by the settings in which they differ from the usual.
+
+    Usual are those with which most runs of the agent were made in all tables, or if no row has
+    them, of each setting the value that most rows have.
+
+    Args:
+        twins: the rows.
+        common: settings of most runs.
+    """
     settings = [_settings(row.runs[0].record.config) if row.runs else {} for row in twins]
+    keys = sorted({key for config in settings for key in config})
     usual: dict[str, str | None] = {}
-    for key in sorted({key for config in settings for key in config}):
+    for key in keys:
         (first, number), *others = Counter(c.get(key, "unset") for c in settings).most_common(2)
         usual[key] = None if others and others[0][1] == number else first
+    if common in settings:
+        usual = {key: common.get(key, "unset") for key in keys}
     for row, own in zip(twins, settings, strict=True):
+        row.usual = own == common
         values = {key: own.get(key, "unset") for key in usual}
         texts = [f"{key} {value}" for key, value in values.items() if value != usual[key]]
         if len(texts) > MOST_SETTINGS:
@@ -502,7 +539,7 @@ def _settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """The settings that define a row as texts; those of the agent without a prefix."""
     found: dict[str, str] = {}
     for key, value in config.items():
-        if key in MACHINE or _is_seed(key):
+        if key in MACHINE or key in CELL or _is_seed(key):
             continue
         if isinstance(value, Mapping):
             found |= _settings(value, "" if key == "agent_options" else f"{prefix}{key}.")

@@ -118,7 +118,7 @@ def test_seeds_and_machine_settings_do_not_split_a_row_but_hyperparameters_do() 
     rows = summarize(runs).tables[0].rows
     assert [len(r.runs) for r in rows] in ([1, 2], [2, 1])
     assert {r.label for r in rows} == {
-        "standard (learning_rate 0.0003)",
+        "standard",  # most runs have its settings
         "standard (learning_rate 0.001)",
     }
 
@@ -135,6 +135,23 @@ def test_of_several_rows_of_an_agent_only_unusual_settings_are_named() -> None:
         "standard (critic noise)",
         "standard (lr 0.001, utd 2)",
     }
+
+
+def test_the_settings_of_most_runs_in_all_tables_stand_for_the_agent() -> None:
+    """An ablation with as many runs as the rest of its table is an ablation all the same."""
+    usual, other = {"lr": 3e-4, "critic": "aliased"}, {"lr": 3e-4, "critic": "noise"}
+    runs = [
+        *(of(0.9, seed=seed, agent_options=usual) for seed in range(2)),
+        *(of(0.2, seed=seed, agent_options=other) for seed in range(3)),
+        *(of(0.9, seed=seed, agent_options=usual, variant="wind:1") for seed in range(2)),
+    ]
+    first, second = sorted(summarize(runs).tables, key=lambda table: table.key.variant)
+    assert [(r.label, r.usual) for r in first.rows] == [
+        ("standard", True),
+        ("standard (critic noise)", False),
+    ]
+    assert first.row_of("standard").label == "standard"
+    assert [(r.label, r.usual) for r in second.rows] == [("standard", True)]
 
 
 def test_the_difference_to_base_is_paired_by_policy_seed_and_episode() -> None:
