@@ -17,13 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
 import torch
 
 from symsteer.agents.episodes import Played
 from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.errors import UserError
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Layout
 
 Role = Literal["reference", "learner", "control"]
@@ -62,6 +63,26 @@ class AgentContext:
     device: torch.device = torch.device("cpu")  # noqa: RUF009 (immutable)
     dtype: torch.dtype = torch.float32
     seed: int = 0
+
+    @classmethod
+    def of(cls, policy: ChunkPolicy, device: torch.device | str = "cpu", seed: int = 0) -> Self:
+        """The problem of steering a frozen policy.
+
+        Args:
+            policy: on this device.
+            device: of all tensors.
+            seed: of the agent.
+        """
+        return cls(
+            policy.obs_layout,
+            policy.act_layout,
+            policy.horizon,
+            policy.execute,
+            policy.decode,
+            policy.normalized_observation,
+            torch.device(device),
+            seed=seed,
+        )
 
     @property
     def noise_layout(self) -> Layout:

@@ -13,8 +13,9 @@ actions. The gates get no gradient of the losses of actor and critics.
 Found in the paper: the gate, its loss, both mixtures. Our choices, for they were not found:
 
 - disagreement: d = mean over irrep blocks k of |f_E - f_N|_k^2 c_k / (c_k + c)^2, where c_k is the
-  running variance of the change that is predicted (about 0 for vectors), the reward being one more
-  block, and c its mean over blocks: units do not matter, and blocks that never vary do not count;
+  running variance of the change that is predicted (of vectors: its mean square), the reward being
+  one more block, and c its mean over blocks: units do not matter, and blocks that never vary do not
+  count;
 - label: 1 above the fence m + ``fence`` (m - q25) of log d in the batch, else 0; m is the median,
   so that the symmetry may be broken in almost half of the states;
 - sampled actions: the bank of decoded noise. A network is trained towards their maximum, so that

@@ -255,12 +255,11 @@ def _values(table: Table, agent: str, measure: str) -> dict[Pair, float]:
 
     rows = [row for row in table.rows if row.agent == agent]
     found = [
-        (row.usual, {r.pair: float(v) for r in row.runs if (v := of(r)) is not None})
+        (row.usual, len(values), values)
         for row in rows
+        if (values := {r.pair: float(v) for r in row.runs if (v := of(r)) is not None})
     ]
-    return (
-        max(found, key=lambda pair: (pair[0] and bool(pair[1]), len(pair[1])))[1] if found else {}
-    )
+    return max(found, key=lambda each: each[:2], default=(False, 0, {}))[2]
 
 
 def _shares(cells: Used, claim: Claim, drawn: Estimate) -> tuple[Effect | None, str]:

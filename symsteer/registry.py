@@ -1,11 +1,12 @@
-"""One registry for agents, policies, variants and tasks, open to other packages.
+"""One registry for agents, policies, variants, tasks and detectors, open to other packages.
 
 A name stands for a class. It comes from one of three places:
 
 - SymSteer's own table: ``symsteer.agents.AGENTS``, ``symsteer.policies.POLICIES``,
-  ``symsteer.bench.variants.VARIANTS``, ``symsteer.bench.tasks.TASKS``;
+  ``symsteer.bench.variants.VARIANTS``, ``symsteer.bench.tasks.TASKS``,
+  ``symsteer.agents.detectors.DETECTORS``;
 - an entry point of an installed distribution, in the group ``symsteer.agents``,
-  ``symsteer.policies``, ``symsteer.variants`` or ``symsteer.tasks``;
+  ``symsteer.policies``, ``symsteer.variants``, ``symsteer.tasks`` or ``symsteer.detectors``;
 - ``package.module:Class``, to try a class that is not installed.
 
 Names and summaries are read without importing any of the classes: ``symsteer --help`` and

@@ -24,10 +24,10 @@ from symsteer.bench.audit.report import (
     to_markdown,
 )
 from symsteer.bench.audit.result import VERSION, old_version
+from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.errors import UserError
 from symsteer.files import write_together
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 PAGE = CHECKOUT / "docs" / "audit.md"
 SUMMARY = CHECKOUT / "leaderboard" / "results" / "audit" / "summary.json"
 TASK_PAGES = CHECKOUT / "docs" / "tasks"
@@ -35,8 +35,6 @@ MARK = "<!-- audit:{} -->\n"
 """Line of a task's page after which everything is generated."""
 GRADES = ((0.01, "near exact"), (0.05, "close"), (0.15, "rough"))
 """Limits of the defect of a decision."""
-
-BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
 
 
 def render(rows: Sequence[dict[str, Any]]) -> str:
@@ -84,13 +82,7 @@ def generate(page: str, rows: Sequence[dict[str, Any]]) -> str:
     Raises:
         UserError: the page lacks the marks around the tables.
     """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise UserError(
-            f"docs/audit.md lacks the marks {BEGIN.strip()} and {END.strip()}; restore the page"
-        )
-    return f"{before}{BEGIN}\n{render(rows)}\n{END}{after}"
+    return with_tables(page, render(rows), "docs/audit.md")
 
 
 def grade(row: dict[str, Any]) -> str:
@@ -153,10 +145,7 @@ def read_summary(path: Path) -> list[dict[str, Any]]:
 def main(arguments: Sequence[str]) -> int:
     """Write docs/audit.md and the tasks' pages; returns the exit code."""
     try:
-        if not PAGE.is_file():
-            raise UserError(
-                f"there is no {PAGE}: the pages can be written in a checkout of SymSteer only"
-            )
+        check_checkout(PAGE)
         rows = [row for path in arguments or [str(SUMMARY)] for row in read_summary(Path(path))]
         pages = {PAGE: generate(PAGE.read_text(), rows)}
         for task in dict.fromkeys(row["task"] for row in rows):

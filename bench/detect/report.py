@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -66,7 +65,7 @@ def text(about: dict[str, Any], found: Sequence[Detection]) -> str:
 def write(folder: Path, about: dict[str, Any], truth: Truth, found: Sequence[Detection]) -> None:
     """Write ``detect.json`` and ``detect.png``."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "detect.json", json.loads(json.dumps(to_json(about, found))))
+    write_json(folder / "detect.json", to_json(about, found))
     maps(about, truth, found).savefig(folder / "detect.png", dpi=120)
 
 

@@ -27,7 +27,7 @@ RESAMPLES = 1_000
 
 @dataclass(frozen=True)
 class Measure:
-    """An estimate with its 95 % interval over orbits; None where it is not defined."""
+    """An estimate with its 95 % interval over orbits."""
 
     value: float
     low: float
@@ -45,6 +45,8 @@ class Detection:
         place_auroc: for "this copy is the one that ends elsewhere", over all copies.
         correlation: Spearman's, with the departure.
         scores: of every copy, ``[S, G]``.
+
+    A measure is None where it is not defined, e.g. if no copy is broken.
     """
 
     detector: str
@@ -100,15 +102,7 @@ def detect(
     )
     truth = measure_truth(settings, policy)
     report(f"truth: {int(truth.broken.sum())} of {int(truth.reached.sum())} copies are broken")
-    context = AgentContext(
-        policy.obs_layout,
-        policy.act_layout,
-        policy.horizon,
-        policy.execute,
-        policy.decode,
-        policy.normalized_observation,
-        seed=seed,
-    )
+    context = AgentContext.of(policy, seed=seed)
     found = []
     for name, kind in kinds.items():
         detector = kind(context, Group.parse(group))

@@ -105,15 +105,7 @@ def load(path: str | Path, device: str = "cpu") -> Trained:
         }
         return Trained(run.policy, run.agent, config, world)
     policy = load_policy(path, device=device)
-    context = AgentContext(
-        policy.obs_layout,
-        policy.act_layout,
-        policy.horizon,
-        policy.execute,
-        policy.decode,
-        policy.normalized_observation,
-        torch.device(device),
-    )
+    context = AgentContext.of(policy, device)
     known = policy.report.get("world", {})
     world = {key: known[key] for key in ("task", "embodiment") if key in known}
     return Trained(policy, BaseAgent(context), None, {**world, "variant": "none"} if world else {})

@@ -47,16 +47,7 @@ def budget_of(config: RunConfig) -> Budget:
 
 def new_agent(config: RunConfig, base: ChunkPolicy) -> Agent:
     """An untrained agent for a run's base policy."""
-    context = AgentContext(
-        obs_layout=base.obs_layout,
-        act_layout=base.act_layout,
-        horizon=base.horizon,
-        execute=base.execute,
-        decode=base.decode,
-        normalize_obs=base.normalized_observation,
-        device=torch.device(config.device),
-        seed=config.seed,
-    )
+    context = AgentContext.of(base, config.device, config.seed)
     return AGENTS.get(config.agent)(context, config.agent_options)
 
 

@@ -16,6 +16,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.bench.tuning.trials import (
     DEFAULTS,
     Chosen,
@@ -27,10 +28,8 @@ from symsteer.bench.tuning.trials import (
 from symsteer.errors import UserError
 from symsteer.files import write_together
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 PAGE = CHECKOUT / "docs" / "tuning.md"
 TRIALS = CHECKOUT / "leaderboard" / "results" / "tuning" / "core.json"
-BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
 MANY = 4
 """Numbers of a range are shown in thirds if there are more of them."""
 
@@ -45,15 +44,8 @@ def generate(page: str, data: dict[str, Any]) -> str:
     Raises:
         UserError: the page lacks the marks around the tables.
     """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise UserError(
-            f"docs/tuning.md lacks the marks {BEGIN.strip()} and {END.strip()}; restore the page"
-        )
     trials, chosen = from_json(data)
-    tables = render(trials, chosen, data["data"]["probe"])
-    return f"{before}{BEGIN}\n{tables}\n\n{END}{after}"
+    return with_tables(page, render(trials, chosen, data["data"]["probe"]), "docs/tuning.md")
 
 
 def render(trials: Sequence[TrialResult], chosen: Sequence[Chosen], probe: int) -> str:
@@ -206,10 +198,7 @@ def main(arguments: Sequence[str]) -> int:
     """Write docs/tuning.md, from new trials if a path is given; returns the exit code."""
     path = Path(arguments[0]) if arguments else TRIALS
     try:
-        if not PAGE.is_file():
-            raise UserError(
-                f"there is no {PAGE}: the page can be written in a checkout of SymSteer only"
-            )
+        check_checkout(PAGE)
         try:
             text = path.read_text()
             data = json.loads(text)

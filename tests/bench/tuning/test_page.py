@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from symsteer.bench.pages import BEGIN, END
 from symsteer.bench.tuning import page
 from symsteer.bench.tuning.trials import Chosen, Score, TrialResult, to_json
 
@@ -80,7 +81,7 @@ def test_the_response_is_the_share_of_other_trials_that_are_beaten():
 
 def test_the_page_is_written_between_its_marks(tmp_path, monkeypatch, capsys):
     text, trials = tmp_path / "tuning.md", tmp_path / "results" / "core.json"
-    text.write_text(f"before\n{page.BEGIN}old\n{page.END}after\n")
+    text.write_text(f"before\n{BEGIN}old\n{END}after\n")
     source = tmp_path / "new.json"
     source.write_text(json.dumps({"data": {"probe": 1}, **to_json(TRIALS, CHOSEN)}))
     monkeypatch.setattr(page, "PAGE", text)
@@ -88,8 +89,8 @@ def test_the_page_is_written_between_its_marks(tmp_path, monkeypatch, capsys):
     assert page.main([str(source)]) == 0
     assert trials.read_text() == source.read_text()
     written = text.read_text()
-    assert written.startswith(f"before\n{page.BEGIN}\n### What was tried\n")
-    assert written.endswith(f"{page.END}after\n")
+    assert written.startswith(f"before\n{BEGIN}\n### What was tried\n")
+    assert written.endswith(f"{END}after\n")
     assert "old" not in written
     assert page.main([]) == 0
     assert text.read_text() == written
@@ -102,6 +103,6 @@ def test_other_files_are_refused(tmp_path, monkeypatch, capsys, content, message
     path = tmp_path / "other.json"
     path.write_text(content)
     monkeypatch.setattr(page, "PAGE", tmp_path / "tuning.md")
-    (tmp_path / "tuning.md").write_text(f"{page.BEGIN}{page.END}")
+    (tmp_path / "tuning.md").write_text(f"{BEGIN}{END}")
     assert page.main([str(path)]) == 2
     assert message in capsys.readouterr().err
