@@ -52,7 +52,7 @@ class DenoisingOptions(GradientOptions):
     """Residual blocks of the MLP."""
     diffusion_steps: int = 100
     """K: noise levels in training."""
-    sampling_steps: int = 4
+    sampling_steps: int = 2
     """DDIM steps of the sampler."""
     prediction: Prediction = "sample"
     """What the network predicts: the clean chunk (sample) or the noise (epsilon)."""
