@@ -21,7 +21,6 @@ AGENTS: Registry[type[Agent]] = Registry(
         "standard-matched": "symsteer.agents.standard:MatchedStandardAgent",
         "augmented": "symsteer.agents.augmented:AugmentedAgent",
         "equivariant": "symsteer.agents.equivariant:EquivariantAgent",
-        "approximate": "symsteer.agents.approximate:ApproximateAgent",
         "residual-pathway": "symsteer.agents.residual_pathway:ResidualPathwayAgent",
         "relaxed": "symsteer.agents.relaxed:RelaxedAgent",
         "projected": "symsteer.agents.projected:ProjectedAgent",

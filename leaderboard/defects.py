@@ -304,6 +304,13 @@ class DefectMap:
         """Those that have points."""
         return sorted({e for (e, _, _), panel in self.panels.items() if panel.points})
 
+    def agents(self, embodiment: str) -> list[str]:
+        """Those of `WITH_SYMMETRY` that have points."""
+        with_points = {
+            a for (e, a, _), panel in self.panels.items() if e == embodiment and panel.points
+        }
+        return [agent for agent in WITH_SYMMETRY if agent in with_points]
+
     def panel(self, embodiment: str, agent: str, measure: str) -> Panel:
         """A panel, without points if there are none."""
         empty = Panel(embodiment, agent, measure)

@@ -23,7 +23,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
 from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel
 from symsteer.leaderboard.findings import Findings
-from symsteer.leaderboard.paper import BASE, STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.paper import BASE, STANDARD
 from symsteer.leaderboard.statistics import Interval, Sample, success_interval
 from symsteer.leaderboard.summary import (
     MIN_SEEDS,
@@ -46,6 +46,7 @@ STYLES: dict[str, Style] = {
     "standard-matched": ("#E69F00", "D", "-"),
     "augmented": ("#CC79A7", "v", "-"),
     "equivariant": ("#0072B2", "o", "-"),
+    "residual-pathway": ("#117733", "^", "-"),
     "approximate": ("#009E73", "^", "-"),
     "wrong-group": ("#000000", "X", (0, (3, 1.5))),
 }
@@ -297,9 +298,10 @@ def advantage_map(found: DefectMap, embodiment: str) -> Figure:
     goes through the task's mean; the fan around it has the slopes of the 95 % interval.
     """
     figure = Figure(figsize=(9.0, 6.9), layout="constrained")
-    shape = len(WITH_SYMMETRY), len(MEASURES)
+    agents = found.agents(embodiment)
+    shape = len(agents), len(MEASURES)
     grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
-    panels = [[found.panel(embodiment, a, m) for m in MEASURES] for a in WITH_SYMMETRY]
+    panels = [[found.panel(embodiment, a, m) for m in MEASURES] for a in agents]
     points = [point for row in panels for panel in row for point in panel.points]
     tasks = sorted({point.table.key.task for point in points})
     markers = {task: PLACE_MARKERS[i % len(PLACE_MARKERS)] for i, task in enumerate(tasks)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel, audit_commands
-from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.summary import MIN_SEEDS, Summary
 from symsteer.leaderboard.tables import cell_name
 from symsteer.leaderboard.text import NOTHING, code, difference, grid, image, interval
@@ -35,7 +35,8 @@ def map_section(summary: Summary, found: DefectMap, figures: Figures) -> list[st
     """Paragraphs of the section, without its heading."""
     parts = [MAP.strip()]
     for embodiment in found.embodiments:
-        panels = [found.panel(embodiment, a, m) for a in WITH_SYMMETRY for m in MEASURES]
+        agents = found.agents(embodiment)
+        panels = [found.panel(embodiment, a, m) for a in agents for m in MEASURES]
         parts.append(f"### {code(embodiment)}")
         if drawn := figures.get((embodiment,)):
             parts += [image(*figure) for figure in drawn.values()]

@@ -13,8 +13,9 @@ WITHOUT_SYMMETRY = (STANDARD, "standard-matched", "augmented")
 """Rivals without symmetry in their networks: the plain agent, the same with the parameters of the
 equivariant agent, and the fair one, which learns from rotated data."""
 
-WITH_SYMMETRY = ("equivariant", "approximate")
-"""The agents of the map, which shows their advantage over `STANDARD`."""
+WITH_SYMMETRY = ("equivariant", "residual-pathway", "approximate")
+"""The agents of the map, which shows their advantage over `STANDARD`. The last one is that of the
+first leaderboard, which `residual-pathway` has replaced."""
 
 ROW_ORDER = (BASE, "zero", "golden-ticket", *WITHOUT_SYMMETRY, *WITH_SYMMETRY, "wrong-group")
 """Other agents follow in alphabetical order; references come before learners, then controls. The

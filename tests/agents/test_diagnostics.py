@@ -8,6 +8,7 @@ import torch
 
 from symsteer.agents import diagnostics
 from symsteer.policies.geometry import Group
+from tests.agents.test_equivariance import trained
 
 C8 = Group.parse("C8")
 
@@ -72,15 +73,16 @@ def test_agreement_by_hand():
 def test_orbit_variance_and_actor_error_tell_the_agents_apart(problem):
     batch = problem.batch(64)
     results = {}
-    for name in ("equivariant", "approximate", "standard"):
-        agent = problem.agent(name, initial_output=1.0)
+    for name in ("equivariant", "residual-pathway", "standard"):
+        held = {"penalty": 100.0} if name == "residual-pathway" else {}
+        agent = trained(problem, problem.agent(name, initial_output=1.0, **held), torch.float32)
         orbit = diagnostics.orbit_variance(agent, batch.obs, batch.noise, C8)
         error = diagnostics.actor_equivariance_error(agent, batch.obs, C8)
         results[name] = (orbit["orbit_share"], error)
     assert results["equivariant"][0] < 1e-9
     assert results["equivariant"][1] < 1e-5
-    assert 1e-6 < results["approximate"][0] < 0.2
-    assert 1e-4 < results["approximate"][1] < 0.2
+    assert 1e-6 < results["residual-pathway"][0] < 0.2
+    assert 1e-4 < results["residual-pathway"][1] < 0.2
     assert min(results["standard"]) > 0.2
 
 

@@ -162,35 +162,3 @@ def test_normalizers_must_commute_with_the_group(problem):
 def test_the_plain_agent_is_not_equivariant(problem):
     agent = problem.agent("standard", dtype=torch.float64, initial_output=1.0)
     assert min(errors(agent, problem, "C8", torch.float64).values()) > 1e-2
-
-
-@pytest.mark.parametrize("name", GROUPS)
-def test_approximate_agent_is_exact_while_its_free_path_is_zero(problem, name):
-    options = {"group": name, "dtype": torch.float64, "initial_output": 1.0}
-    exact = problem.agent("approximate", free_init=0.0, **options)
-    assert max(errors(exact, problem, name, torch.float64).values()) < 1e-10
-    trained(problem, exact, torch.float64)
-    assert min(errors(exact, problem, name, torch.float64).values()) > 1e-3
-    slightly = problem.agent("approximate", free_init=0.01, **options)
-    worst = errors(slightly, problem, name, torch.float64)
-    assert min(worst.values()) > 1e-10
-    assert max(worst.values()) < 0.2
-
-
-def test_approximate_agent_contains_the_equivariant_one(problem):
-    options = {"dtype": torch.float64, "initial_output": 1.0}
-    approximate = problem.agent("approximate", free_init=0.0, **options)
-    equivariant = problem.agent("equivariant", **options)
-    for ours, theirs in (
-        (approximate.actor, equivariant.actor),
-        (approximate.critic, equivariant.critic),
-    ):
-        for mine, other in zip(ours.members, theirs.members, strict=True):
-            for layer, strict in zip(mine, other, strict=True):
-                strict.load_state_dict(layer.equivariant.state_dict())
-        theirs.changed()
-    batch = problem.batch(dtype=torch.float64)
-    for a, b in zip(approximate.moments(batch.obs), equivariant.moments(batch.obs), strict=True):
-        assert torch.equal(a, b)
-    q = [agent.q_values(batch.obs, batch.noise) for agent in (approximate, equivariant)]
-    assert torch.equal(*q)

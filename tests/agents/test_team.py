@@ -115,7 +115,7 @@ def test_with_other_options(problem, options):
 
 def test_agents_join_and_leave(problem):
     """Alone, then together, then alone or in a smaller team; nothing is lost on the way."""
-    single, agents = (members(problem, "approximate") for _ in range(2))
+    single, agents = (members(problem, "residual-pathway") for _ in range(2))
     alone(single, 7)
     alone(agents, 2)
     team, _ = together(agents, 2)

@@ -54,7 +54,7 @@ def sentence(capsys) -> str:
         (["--policy.name", "plian"], "did you mean 'plain'"),
         (["--env-steps", "0"], "between 1 and"),
         (["--seed", str(2**32)], "seed is"),
-        (["--agent", "approximate", "--agent.free-init", "inf"], "free_init is inf"),
+        (["--agent", "residual-pathway", "--agent.penalty", "inf"], "penalty is inf"),
         (["--variant", "action_gain:0.5,wind:0.5"], "joined with +"),
         (["--demos", "nowhere.h5"], "nowhere.h5"),
         (["--base-policy", "nowhere.safetensors"], "nowhere.safetensors"),
@@ -163,7 +163,7 @@ def test_list_names_everything(monkeypatch, capsys):
     assert symsteer(monkeypatch, "list") == 0
     out = capsys.readouterr().out
     lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
-    for word in ("StackCube-v1", "panda", "action_gain", "approximate", "plain", "demo"):
+    for word in ("StackCube-v1", "panda", "action_gain", "residual-pathway", "plain", "demo"):
         assert len(lines[word].split()) > 3, word
 
 

@@ -23,7 +23,7 @@ from symsteer.leaderboard.records import (
 )
 
 START = datetime(2026, 1, 31, 12, 0, tzinfo=UTC)
-LEARNING = ("standard", "standard-matched", "equivariant", "approximate")
+LEARNING = ("standard", "standard-matched", "equivariant", "residual-pathway", "approximate")
 REFERENCES = ("base", "zero", "golden-ticket")
 
 

@@ -362,11 +362,10 @@ def test_unknown_names_are_refused_with_the_nearest(changes: dict[str, Any], wor
 
 
 def test_the_committed_studies_can_be_tested() -> None:
-    """Every agent that they name has a row, and the claims of the paper are all there."""
-    study = read_study("first")
-    assert study.source == "paper.toml"
-    assert "withdrawn" in study.notice
-    assert study.claims == read_study("paper").claims
+    """Those of the paper, with the agents of then and of today."""
+    first, study = read_study("first"), read_study("paper")
+    assert "withdrawn" in first.notice
+    assert [c.name for c in first.claims] == [c.name for c in study.claims]
     records = cells({"none": {"standard": 0.5, "equivariant": 0.7}})
     found = outcomes(records, *study.claims)
     assert {claim.measure for claim in study.claims} == {"auc", "success", "diverged", "bias"}

@@ -56,7 +56,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     records = []
     for variant, defect in (DEFECTS | {"wind:0.75": 0.3}).items():
         rates = {"base": 0.3, "zero": 0.4, "golden-ticket": 0.45, "standard": 0.5}
-        rates |= {"standard-matched": 0.5, "equivariant": 0.8 - defect, "approximate": 0.7}
+        rates |= {"standard-matched": 0.5, "equivariant": 0.8 - defect, "residual-pathway": 0.7}
         records += make_cell(rates, episodes=100, variant=variant)
     for record in records:
         if record.settings.agent == "golden-ticket":
@@ -116,7 +116,7 @@ def test_the_main_table_ranks_with_ties_and_never_references(board: Path) -> Non
         "`zero`": "\u2013",
         "`golden-ticket`": "\u2013",
         "`equivariant`": "1",
-        "`approximate`": "2",
+        "`residual-pathway`": "2",
         "`standard`": "3=",
         "`standard-matched`": "3=",
     }
@@ -135,7 +135,7 @@ def test_the_main_table_ranks_with_ties_and_never_references(board: Path) -> Non
 def test_learners_are_held_against_the_best_reference(board: Path) -> None:
     text = text_of(board)
     assert "Best reference: `golden-ticket`, 0.45. Against it: `equivariant` +0.35 [" in text
-    assert "`approximate` clearly above in 5, clearly below in 0 of 5" in text
+    assert "`residual-pathway` clearly above in 5, clearly below in 0 of 5" in text
 
 
 def test_the_best_reference_counts_where_five_runs_steer_its_policy() -> None:
@@ -170,7 +170,7 @@ def test_every_claim_has_a_verdict(board: Path) -> None:
     assert [row[-1] for row in rows] == [supported, supported, few, few, supported]
     shown = dict(zip(header, rows[-1], strict=True))
     assert shown["Effect"] == (
-        "success, `approximate` minus `equivariant`, broken cells of `floating` minus the same in "
+        "success, `residual-pathway` minus `equivariant`, broken cells of `floating` minus the same in "
         "unbroken cells"
     )
     # -0.1 in the unbroken cell; -0.1 + the defect in the broken ones, 0.25 on average.

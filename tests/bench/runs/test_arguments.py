@@ -18,8 +18,8 @@ def test_options_of_the_named_agent_and_policy():
         [
             "--policy.width",
             "48",
-            "--agent=approximate",
-            "--agent.free-penalty",
+            "--agent=residual-pathway",
+            "--agent.penalty",
             "0.25",
             "--agent.no-layer-norm",
             "--policy.name",
@@ -33,8 +33,8 @@ def test_options_of_the_named_agent_and_policy():
             "--quiet",
         ]
     )
-    assert (config.agent, config.policy_name) == ("approximate", "plain")
-    assert config.agent_options.free_penalty == 0.25
+    assert (config.agent, config.policy_name) == ("residual-pathway", "plain")
+    assert config.agent_options.penalty == 0.25
     assert not config.agent_options.layer_norm
     assert config.policy == type(config.policy)(width=48)
     assert (config.task, config.evaluation.every) == ("PushCube-v1", 77)
@@ -65,7 +65,7 @@ def test_a_preset_replaces_defaults_and_explicit_options_win():
 
 def test_help_shows_the_options_of_the_named_agent(capsys):
     shown = {}
-    for agent in ("approximate", "base"):
+    for agent in ("residual-pathway", "base"):
         with pytest.raises(SystemExit) as end:
             parse_run(["--agent", agent, "--help"])
         assert end.value.code == 0
@@ -74,18 +74,18 @@ def test_help_shows_the_options_of_the_named_agent(capsys):
         assert "--agent STR" in text
         assert "--policy.width INT" in text
         assert "Parallel training environments." in text
-    assert "--agent.free-penalty FLOAT" in shown["approximate"]
-    assert "Discount per decision" in shown["approximate"]
+    assert "--agent.penalty FLOAT" in shown["residual-pathway"]
+    assert "Discount per decision" in shown["residual-pathway"]
     assert "--agent.gamma" not in shown["base"]
 
 
 def test_unknown_options_name_the_nearest(capsys):
     with pytest.raises(SystemExit) as end:
-        parse_run(["--agent", "approximate", "--agent.free-penalti", "1"])
+        parse_run(["--agent", "residual-pathway", "--agent.penalti", "1"])
     assert end.value.code == 2
-    assert "--agent.free-penalty" in capsys.readouterr().err
-    with pytest.raises(UserError, match="did you mean 'approximate'"):
-        parse_run(["--agent", "aproximate", "--help"])
+    assert "--agent.penalty" in capsys.readouterr().err
+    with pytest.raises(UserError, match="did you mean 'residual-pathway'"):
+        parse_run(["--agent", "residual-pathwy", "--help"])
 
 
 def test_the_last_value_counts():

@@ -26,7 +26,7 @@ from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG
 from tests.bench.tiny_run import tiny_config
 
-AGENTS = ("equivariant", "standard", "approximate", "standard-matched", "zero")
+AGENTS = ("equivariant", "standard", "augmented", "standard-matched", "zero")
 
 
 def planned(agent="equivariant", task="PickCube-v1", env_steps=1000, embodiment="floating"):
@@ -47,7 +47,7 @@ def test_a_run_is_judged_by_the_most_similar_finished_ones():
     assert estimate.left([planned("standard", env_steps=4000)], {}, 1) == pytest.approx(200)
     assert estimate.left([planned("standard", task="PushCube-v1")], {}, 1) == pytest.approx(50)
     # Learners are alike; other agents are only compared with themselves.
-    assert estimate.left([planned("approximate")], {}, 1) == pytest.approx(100)
+    assert estimate.left([planned("augmented")], {}, 1) == pytest.approx(100)
     assert estimate.left([planned("golden-ticket")], {}, 1) is None
     half = {"env_steps": 500, "budget": 1000, "steps_per_second": 10.0}
     assert estimate.left([], {planned("standard"): half}, 1) == pytest.approx(25)
@@ -207,7 +207,7 @@ def test_the_live_lines(sweep):
     wide = screen(sweep, 120)
     assert wide[0].startswith("standard PickCube-v1 none s0")
     assert wide[0].split("━")[-1].split() == ["120/480", "25%", "12", "steps/s", "30", "s"]
-    assert wide[1].startswith("approximate PickCube-v1 none s0")
+    assert wide[1].startswith("augmented PickCube-v1 none s0")
     assert wide[1].endswith("starting")
     assert wide[2].startswith("base policy edp for PickCube-v1")
     assert wide[3] == "1 of 5 runs finished, time left unknown"
@@ -265,7 +265,7 @@ def test_a_team_has_a_live_line_for_each_of_its_runs(sweep):
     console.print(display.live.get_renderable())
     first, second, *_ = console.file.getvalue().splitlines()
     assert first.startswith("standard PickCube-v1 none s0")
-    assert second.startswith("approximate PickCube-v1 none s0")
+    assert second.startswith("augmented PickCube-v1 none s0")
 
 
 def test_learners_that_differ_in_seeds_and_variants_alone_are_a_team(tmp_path):

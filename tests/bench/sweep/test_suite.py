@@ -86,7 +86,8 @@ def test_the_suite_first_describes_the_committed_records():
         # None was minus half a nat for each number of the noise; now it is given per number.
         assert config["sac"]["target_entropy"] is None
         assert config["policy_seed"] == config["demonstrations"]["seed"] == 0
-    assert not recorded
+    # This agent was replaced.
+    assert {key[BASIC.index("agent")] for key in recorded} == {"approximate"}
 
 
 def test_agents_and_variants_of_a_seed_share_its_base_policy(tmp_path):
@@ -111,8 +112,8 @@ def test_agents_and_variants_of_a_seed_share_its_base_policy(tmp_path):
 def test_an_option_applies_to_the_agents_that_have_it(tmp_path):
     text = """
         [grid]
-        agent = ["zero", "standard", "approximate"]
-        "agent.free_penalty" = [0.2, 0.4]
+        agent = ["zero", "standard", "residual-pathway"]
+        "agent.penalty" = [0.2, 0.4]
         [run.agent]
         preset = "first"
         gamma = 0.9
@@ -121,9 +122,9 @@ def test_an_option_applies_to_the_agents_that_have_it(tmp_path):
     """
     runs = load_suite(write(tmp_path, text)).runs
     # A value that changes nothing for an agent does not repeat its run.
-    assert [c.agent for c in runs] == ["zero", "standard", "approximate", "approximate"]
+    assert [c.agent for c in runs] == ["zero", "standard", "residual-pathway", "residual-pathway"]
     assert [c.agent_options.gamma for c in runs[1:]] == [0.8, 0.9, 0.9]
-    assert [c.agent_options.free_penalty for c in runs[2:]] == [0.2, 0.4]
+    assert [c.agent_options.penalty for c in runs[2:]] == [0.2, 0.4]
     preset = preset_options("first", "standard", type(runs[1].agent_options))
     for key in set(preset) - {"gamma"}:
         assert getattr(runs[1].agent_options, key) == preset[key]
@@ -136,7 +137,7 @@ def test_a_grid_may_set_one_agent_only_and_choose_presets_and_policies(tmp_path)
         "agent.standard.width" = [32, 64]
         "policy.name" = ["edp", "plain"]
         [run]
-        agent = "approximate"
+        agent = "residual-pathway"
     """
     runs = load_suite(write(tmp_path, text)).runs
     default = build_config({"agent": "equivariant"}, "").agent_options.width
@@ -154,17 +155,17 @@ def test_options_in_which_runs_differ_are_shown(tmp_path):
     """Also where another agent of the suite does not have the option."""
     text = """
         [grid]
-        agent = ["zero", "approximate"]
-        "agent.free_penalty" = [0.2, 0.4]
+        agent = ["zero", "residual-pathway"]
+        "agent.penalty" = [0.2, 0.4]
     """
     plan = make_plan(load_suite(write(tmp_path, text)), tmp_path)
     assert [run.extra for run in plan.runs] == [
         {},
-        {"agent.free_penalty": 0.2},
-        {"agent.free_penalty": 0.4},
+        {"agent.penalty": 0.2},
+        {"agent.penalty": 0.4},
     ]
-    assert "approximate free_penalty 0.2 seed 0" in plan.runs[1].label
-    assert re.search(r"agent.free_penalty +0.2 +1 +0", preview(plan))
+    assert "residual-pathway penalty 0.2 seed 0" in plan.runs[1].label
+    assert re.search(r"agent.penalty +0.2 +1 +0", preview(plan))
 
 
 @pytest.mark.parametrize(
@@ -174,7 +175,7 @@ def test_options_in_which_runs_differ_are_shown(tmp_path):
         ("[run.agent]\ngama = 0.9", r"\(agent equivariant\): .* did you mean 'gamma'"),
         ("[grid]\nagent = ['zero']\n'agent.gamma' = [0.9]", r"\(agent zero\): .* 'gamma'"),
         ("[grid]\nagent = ['zero']\n[run.agent.standard]\ngamma = 0.9", "no agent 'standard'"),
-        ("[run.agent.equivariant]\nfree_penalty = 1", r"\(agent equivariant\)"),
+        ("[run.agent.equivariant]\npenalty = 1", r"\(agent equivariant\)"),
         ("[run.agent]\nname = 'equivarant'", "did you mean 'equivariant'"),
         ("[run.agent]\npreset = 'frist'", "did you mean 'first'"),
         ("[run.agent]\npreset = 1", "agent.preset must be a text"),
