@@ -15,8 +15,7 @@ from symsteer.policies.geometry import Group
 class Denoiser(nn.Module, abc.ABC):
     """Predicts a clean chunk (or its noise) from a noisy one.
 
-    The observation is encoded once per decision, the noise levels once per call of the sampler;
-    the condition of :meth:`forward` is the sum of both.
+    The observation is encoded once per call of the sampler, the noise levels once for all.
 
     Attributes:
         group: the finite group with which the network commutes exactly; C1 for none.
@@ -26,15 +25,18 @@ class Denoiser(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
-        """The observation's part of the condition; ``[B, obs_dim] -> [B, ...]``."""
+        """What the network sees of the observation; ``[B, obs_dim] -> [B, ...]``."""
 
     @abc.abstractmethod
     def encode_time(self, t: torch.Tensor) -> torch.Tensor:
-        """The noise level's part of the condition; ``[B] -> [B, ...]``."""
+        """What it sees of the noise level; ``[B] -> [B, ...]``."""
 
     @abc.abstractmethod
-    def forward(self, x: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
-        """Predict; ``x [B, Tp, Da]``, ``condition [B, ...]`` -> ``[B, Tp, Da]``."""
+    def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        """Predict; ``x [B, Tp, Da]``, what the encoders give -> ``[B, Tp, Da]``.
+
+        ``time`` has B rows, or one for all.
+        """
 
     def expanded(self) -> Self:
         """A copy for inference; subclasses compute here what is the same in every call."""

@@ -1,10 +1,9 @@
 """Networks for one slice of a chunk: a residual MLP and a temporal U-Net.
 
 They have no symmetry of their own: :class:`symsteer.policies.symmetry.lifted.LiftedDenoiser` runs
-the same network on every group element's slice, with the group axis folded into the batch. Both
-take the chunk's features and one vector of conditioning numbers, which scale and shift the hidden
-features (FiLM, arXiv 1709.07871). The U-Net follows the conditional one of Diffusion Policy (arXiv
-2303.04137), two levels deep.
+the same network on every group element's slice. Both take the chunk's features and conditioning
+numbers, which scale and shift the hidden features (FiLM, arXiv 1709.07871). The U-Net follows the
+conditional one of Diffusion Policy (arXiv 2303.04137), two levels deep.
 """
 
 from __future__ import annotations
@@ -21,7 +20,11 @@ class ResidualMLP(nn.Module):
 
     h <- h + V silu((1 + scale) U norm(h) + shift), ``depth`` times.
 
-    Shapes: ``h [N, width]``, ``condition [N, condition_dim]`` -> ``[N, width]``.
+    Scale and shift are sums of what ``context`` and ``time`` say. They are not added up beforehand:
+    the sum of all of them would take more time than the products with U.
+
+    Shapes: ``h [B, slices, width]``, ``context [B, slices, condition_dim]``, ``time [B or 1, 1,
+    condition_dim]`` -> ``[B, slices, width]``.
     """
 
     def __init__(self, width: int, depth: int):
@@ -33,12 +36,14 @@ class ResidualMLP(nn.Module):
         self.outer = nn.ModuleList(nn.Linear(width, width) for _ in range(depth))
         self.out_norm = nn.LayerNorm(width)
 
-    def forward(self, h: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
-        films = condition.split(2 * self.width, dim=-1)
-        for film, norm, inner, outer in zip(films, self.norms, self.inner, self.outer, strict=True):
-            scale, shift = film.chunk(2, dim=-1)
+    def forward(self, h: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        films = (part.split(self.width, dim=-1) for part in (context, time))
+        pairs = iter(zip(*films, strict=True))
+        for norm, inner, outer in zip(self.norms, self.inner, self.outer, strict=True):
+            (scale, time_scale), (shift, time_shift) = next(pairs), next(pairs)
             u = inner(norm(h))
-            h = h + outer(functional.silu(torch.addcmul(u + shift, u, scale)))
+            by_time = torch.addcmul(time_shift, u, 1 + time_scale)
+            h = h + outer(functional.silu(torch.addcmul(by_time + shift, u, scale)))
         return functional.silu(self.out_norm(h))
 
 

@@ -69,12 +69,12 @@ class LiftedDenoiser(Denoiser):
         self.time_out = nn.Linear(TIME_FEATURES, self.slice_network.condition_dim, bias=False)
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
-        """The observation's part of the condition; ``[B, obs_dim] -> [B, order, condition]``."""
+        """What the network sees of it; ``[B, obs_dim] -> [B, order, condition]``."""
         embedding = functional.silu(self.obs_mix(functional.silu(self.obs_lift(obs))))
         return self.condition(embedding)
 
     def encode_time(self, t: torch.Tensor) -> torch.Tensor:
-        """The noise level's part of the condition; ``[B] -> [B, 1, condition]``."""
+        """What the network sees of the noise level; ``[B] -> [B, 1, condition]``."""
         half = TIME_FEATURES // 2
         rates = torch.exp(
             torch.arange(half, device=t.device, dtype=torch.float64) * (-math.log(1e4) / half)
@@ -83,18 +83,15 @@ class LiftedDenoiser(Denoiser):
         features = torch.cat([phases.sin(), phases.cos()], dim=-1).to(self.time_in.weight.dtype)
         return self.time_out(functional.silu(self.time_in(features)))[:, None]
 
-    def forward(self, x: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
-        """Predict; ``x [B, Tp, Da]``, ``condition [B, order, c]`` -> ``[B, Tp, Da]``."""
-        batch, order = len(x), self.group.order
+    def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        """Predict; ``x [B, Tp, Da]``, ``context [B, order, c]``, ``time [B or 1, 1, c]``."""
         if self.flat:
-            slices = self.chunk_lift(x.flatten(1)).flatten(0, 1)
-        else:
-            # [B, T, order, width] -> [B * order, T, width]
-            slices = self.chunk_lift(x).transpose(1, 2).flatten(0, 1)
-        slices = self.slice_network(slices, condition.flatten(0, 1)).unflatten(0, (batch, order))
-        if self.flat:
+            slices = self.slice_network(self.chunk_lift(x.flatten(1)), context, time)
             return self.project(slices).view_as(x)
-        return self.project(slices.transpose(1, 2))
+        # [B, T, order, width] -> [B * order, T, width]
+        slices = self.chunk_lift(x).transpose(1, 2).flatten(0, 1)
+        slices = self.slice_network(slices, (context + time).flatten(0, 1))
+        return self.project(slices.unflatten(0, context.shape[:2]).transpose(1, 2))
 
     def expanded(self) -> LiftedDenoiser:
         """A copy for inference whose equivariant layers hold their dense matrices ready."""

@@ -7,6 +7,7 @@ and may change the training batches in :meth:`DiffusionPolicy.augment`.
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
@@ -104,7 +105,7 @@ class DiffusionPolicy(GradientPolicy):
         self.diffusion = Diffusion(options.diffusion_steps, options.prediction, options.snr_cap)
         self.denoiser = self.make_denoiser()
         self.group = self.denoiser.group
-        self._expanded: Denoiser | None = None
+        self._expanded: tuple[Denoiser, Sequence[torch.Tensor]] | None = None
         self.freeze()
 
     @abc.abstractmethod
@@ -127,19 +128,16 @@ class DiffusionPolicy(GradientPolicy):
         levels, noise = levels.to(device), noise.to(device)
         obs, clean = self.augment(obs, chunks, generator)
         noisy = self.diffusion.add_noise(clean, noise, levels)
-        condition = self.denoiser.encode(self.normalized_observation(obs))
-        output = self.denoiser(noisy, condition + self.denoiser.encode_time(levels))
+        context = self.denoiser.encode(self.normalized_observation(obs))
+        output = self.denoiser(noisy, context, self.denoiser.encode_time(levels))
         return self.diffusion.loss(output, clean, noise, levels)
 
     def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Follow the deterministic sampler from ``noise``; see :meth:`ChunkPolicy.decode`."""
-        denoiser = self._inference_denoiser()
+        denoiser, times = self._inference()
         context = denoiser.encode(self.normalized_observation(obs))
-        levels = self.diffusion.timesteps(self.options.sampling_steps)
-        times = denoiser.encode_time(torch.tensor(levels, device=obs.device))
-        by_level = dict(zip(levels, times, strict=True))
         clean = self.diffusion.sample(
-            lambda x, t: denoiser(x, context + by_level[t]),
+            lambda x, t: denoiser(x, context, times[t]),
             noise,
             self.options.sampling_steps,
             # Normalised demonstrations lie within radius 1, block by block.
@@ -156,10 +154,13 @@ class DiffusionPolicy(GradientPolicy):
         """The options that decoding uses."""
         return {key: getattr(self.options, key) for key in DECODE_FIELDS}
 
-    def _inference_denoiser(self) -> Denoiser:
+    def _inference(self) -> tuple[Denoiser, Sequence[torch.Tensor]]:
+        """The denoiser with dense matrices, and what it sees of each noise level."""
         if self._expanded is None:
+            denoiser = self.denoiser.expanded()
+            levels = torch.arange(self.options.diffusion_steps, device=self.device)
             # Not registered as a submodule: it is a cache, not part of the state.
-            self.__dict__["_expanded"] = self.denoiser.expanded()
+            self.__dict__["_expanded"] = denoiser, denoiser.encode_time(levels).split(1)
         return self.__dict__["_expanded"]
 
     def _apply(self, fn, recurse=True):

@@ -170,8 +170,8 @@ def test_every_claim_has_a_verdict(board: Path) -> None:
     assert [row[-1] for row in rows] == [supported, supported, few, few, supported]
     shown = dict(zip(header, rows[-1], strict=True))
     assert shown["Effect"] == (
-        "success, `residual-pathway` minus `equivariant`, broken cells of `floating` minus the same in "
-        "unbroken cells"
+        "success, `residual-pathway` minus `equivariant`, broken cells of `floating` minus the "
+        "same in unbroken cells"
     )
     # -0.1 in the unbroken cell; -0.1 + the defect in the broken ones, 0.25 on average.
     assert shown["Size, 95 % interval"].startswith("+0.250 [+0.")
