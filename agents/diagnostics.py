@@ -13,7 +13,7 @@ import scipy.stats
 import torch
 
 from symsteer.agents.episodes import LongEpisodes, Played
-from symsteer.policies.geometry import Group, equivariance_error
+from symsteer.policies.geometry import Group, Layout, equivariance_error
 
 if TYPE_CHECKING:
     from symsteer.agents.sac import SacAgent
@@ -27,9 +27,23 @@ class HasValues(Protocol):
     """What the errors of Q need of an agent."""
 
     options: Any
+    obs_layout: Layout
+    act_layout: Layout
 
     def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Every critic's value in reward units, ``[critics, B]``."""
+        ...
+
+
+class HasPolicy(HasValues, Protocol):
+    """What the preference of the critics needs."""
+
+    def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
+        """Noise ``[B, Tp, Da]``."""
+        ...
+
+    def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
+        """Noise of the base policy ``[count, Tp, Da]``."""
         ...
 
 
@@ -278,7 +292,7 @@ def _mean_and_std(x: torch.Tensor) -> tuple[float, float] | tuple[None, None]:
     return (x.mean().item(), x.std(unbiased=False).item()) if len(x) else (None, None)
 
 
-def critic_preference(agent: SacAgent, obs: torch.Tensor, generator: torch.Generator) -> Scalars:
+def critic_preference(agent: HasPolicy, obs: torch.Tensor, generator: torch.Generator) -> Scalars:
     """By how much the critics prefer the actor to the base policy.
 
     ``critic_preference`` = mean over states and critics of Q(s, deterministic actor) - Q(s, w),
@@ -315,7 +329,7 @@ def policy_statistics(agent: SacAgent, obs: torch.Tensor) -> Scalars:
 
 @torch.no_grad()
 def orbit_variance(
-    agent: SacAgent, obs: torch.Tensor, noise: torch.Tensor, group: Group
+    agent: HasValues, obs: torch.Tensor, noise: torch.Tensor, group: Group
 ) -> Scalars:
     """Variance of Q over group orbits: 0 for invariant critics.
 

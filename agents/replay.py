@@ -157,6 +157,12 @@ class ReplayBuffer:
             rows = torch.where(joined, following, rows)
         return batch
 
+    def in_order(self) -> dict[str, torch.Tensor]:
+        """All whole steps, oldest first; each has one row for each environment."""
+        count = self.size - self.size % self.stride
+        rows = torch.arange(self.position - count, self.position, device=self.device)
+        return {name: kept[rows % self.capacity] for name, kept in self.storage.items()}
+
     def state_dict(self) -> dict[str, Any]:
         """The filled rows, the position, the stride and the generator."""
         return {

@@ -1,4 +1,4 @@
-"""Problems whose Q-values are known: every learner must find them, and must not drift from them.
+"""Problems whose Q-values are known: actor-critics must find them, and must not drift from them.
 
 The null problem: successors are random, every decision costs the same, no episode ends. All noise
 is equally good, Q is r / (1 - gamma) everywhere. An actor that climbs errors of its critics leaves
@@ -18,10 +18,15 @@ from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.presets import preset_options
 from symsteer.agents.replay import Transition
+from symsteer.agents.sac import SacAgent
 from symsteer.policies.geometry import Field, Layout
 from symsteer.policies.normalizer import clip_blocks
 
-LEARNERS = [name for name in AGENTS.builtin if AGENTS.get(name).role == "learner"]
+LEARNERS = [
+    name
+    for name in AGENTS.builtin
+    if AGENTS.get(name).role == "learner" and issubclass(AGENTS.get(name), SacAgent)
+]
 KINDS = [(name, AGENTS.get(name).Options().critic) for name in LEARNERS]
 KINDS += itertools.product(("standard", "equivariant"), ("noise", "sampler"))
 OWN = {
