@@ -93,6 +93,7 @@ class KernelBestOfNAgent(Agent):
             self.options.points,
             {
                 "obs": (self.obs_layout.dim,),
+                "noise": (self.rows, self.act_layout.dim),
                 "actions": (context.execute, self.act_layout.dim),
                 "reward": (),
                 "next_obs": (self.obs_layout.dim,),
