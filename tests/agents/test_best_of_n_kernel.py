@@ -1,8 +1,11 @@
 """Best of n with a kernel critic: returns, regression, invariance, and what it gains."""
 
+import math
+
 import pytest
 import torch
 
+from symsteer.agents import best_of_n_kernel as bk
 from symsteer.agents.agent import AgentContext, Budget
 from symsteer.agents.best_of_n_kernel import KernelBestOfNAgent, KernelOptions
 from symsteer.agents.replay import Transition
@@ -60,6 +63,32 @@ def test_returns_end_with_success_and_go_on_after_a_time_out():
     middle = torch.tensor([-3.0, -4.0], dtype=torch.float64) + GAMMA * last
     first = torch.tensor([-1 + GAMMA * middle[0], -2 + GAMMA * tail], dtype=torch.float64)
     torch.testing.assert_close(found, torch.stack([first, middle, last]))
+
+
+def test_episodes_that_are_left_for_fresh_scenes_are_loose_ends():
+    """No flag says so: the next observation is another one. A time-out ends, whatever follows."""
+    agent = made(candidates=1, refit=100)
+    s = torch.randn(4, 2, OBS.dim, dtype=torch.float64)
+    act = torch.zeros(2, 1, ACT.dim, dtype=torch.float64)
+    agent.observe(decisions(s[0], act, [-1, -2], s[1], [0, 0], [0, 1]))
+    agent.observe(decisions(torch.stack([s[3, 0], s[1, 1]]), act, [-3, -4], s[2], [1, 1], [0, 0]))
+    found = agent._returns(agent.replay.in_order())
+    tail = -10 / 4 / (1 - GAMMA)
+    assert found.tolist() == pytest.approx([-1 + GAMMA * tail, -2 + GAMMA * tail, -3, -4])
+
+
+def test_the_marginal_likelihood_is_that_of_a_gaussian():
+    agent = learned(made(refit=320, points=320), rounds=5)
+    inputs = torch.randn(40, OBS.dim + ACT.dim, dtype=torch.float64)
+    wanted = torch.randn(40, dtype=torch.float64)
+    length, ridge = 0.7, 0.3
+    kernel = bk._kernel(inputs / length, agent._orbits(inputs / length))
+    covariance = kernel + ridge * torch.eye(40)
+    best = wanted @ covariance.inverse() @ wanted / 40
+    density = torch.distributions.MultivariateNormal(torch.zeros(40).double(), best * covariance)
+    constant = 0.5 * (1 + math.log(2 * math.pi))
+    found = agent._likelihood(inputs, wanted, length, ridge)
+    assert found == pytest.approx(density.log_prob(wanted).item() / 40 + constant)
 
 
 def test_only_whole_steps_of_the_last_points_are_used_oldest_first():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from symsteer.bench.audit.result import AuditSettings
-from symsteer.bench.detect.study import auroc
-from symsteer.bench.detect.truth import measure_truth
+from symsteer.bench.detect.study import _detection, auroc
+from symsteer.bench.detect.truth import Truth, measure_truth
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.stored import stored_config, stored_policy
@@ -43,8 +44,9 @@ def call(monkeypatch, capsys, *arguments):
     return code, capsys.readouterr()
 
 
-def test_the_truth_is_where_copies_end_elsewhere(run):
+def test_the_truth_is_where_copies_end_elsewhere(run, monkeypatch):
     """A patch of friction at x > 0 acts on objects there: these copies end near their start."""
+    monkeypatch.setattr("symsteer.bench.detect.truth.LEAST_DEPARTURE", 0.0)
     config, _ = stored_config(run)
     settings = AuditSettings(
         config.task, variant=config.variant, group="C4", states="expert", count=24
@@ -57,6 +59,12 @@ def test_the_truth_is_where_copies_end_elsewhere(run):
     # Copies are turned about the origin by the elements of the group.
     turned = torch.stack([-truth.place["object"][:, 0, 1], truth.place["object"][:, 0, 0]], 1)
     torch.testing.assert_close(truth.place["object"][:, 1], turned, atol=1e-4, rtol=0)
+    # Some copies in the unbroken world do not end exactly where the others do.
+    assert truth.limit > 0
+    quarter = math.pi / 2
+    layout = stored_policy(run, config).act_layout
+    torch.testing.assert_close(truth.actions[:, 1], layout.transform(truth.actions[:, 0], quarter))
+    assert not torch.allclose(truth.actions[:, 1], truth.actions[:, 0], atol=0.1)
     seen = truth.obs[..., stored_policy(run, config).obs_layout.slice("cube_xy")]
     torch.testing.assert_close(seen.double(), truth.place["object"].double(), atol=2e-3, rtol=0)
 
@@ -80,6 +88,24 @@ def test_areas_under_roc_curves():
     assert auroc(scores, labels) == pytest.approx(3.5 / 4)
     assert auroc(-scores, labels) == pytest.approx(0.5 / 4)
     assert np.isnan(auroc(scores, labels | True))
+
+
+def test_scores_of_copies_and_of_orbits():
+    """Two orbits of four copies are whole, one has lost a copy that would be broken."""
+    departure = torch.tensor([[0.0, 0.0, 0.0, 0.1], [0.0] * 4, [0.0, 0.0, 0.0, 0.1]])
+    reached = torch.ones(3, 4, dtype=torch.bool)
+    reached[2, 3] = False
+    nothing = torch.zeros(3, 4, 2)
+    truth = Truth(nothing, nothing, departure, 0.05, reached, {"tool": nothing})
+    assert truth.broken.nonzero().tolist() == [[0, 3]]
+    # The broken copy has the largest score of all, its orbit also the smallest one.
+    scores = torch.tensor([[0.0, 0.5, 0.5, 0.9], [0.3, 0.6, 0.3, 0.3], [0.3, 0.3, 0.7, 9.0]])
+    found = _detection("d", "s", scores, truth, 0)
+    assert (found.auroc.value, found.place_auroc.value) == (1.0, 1.0)
+    assert found.correlation.value > 0.3
+    worse = _detection("d", "s", -scores, truth, 0)
+    assert worse.place_auroc.value == 0.0
+    assert worse.auroc.value == 1.0
 
 
 def test_mistakes(run, tmp_path, monkeypatch, capsys):
