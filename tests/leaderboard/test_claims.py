@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.claims import Outcome, claims
+from symsteer.leaderboard.claims import Outcome, _values, claims
 from symsteer.leaderboard.defects import Audit, Defect
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.statistics import Interval, ShareDifference
@@ -111,6 +112,19 @@ def test_no_difference_is_undecided_until_it_is_shown_to_be_small() -> None:
     # One that claims to be equal is contradicted by a difference.
     large = cells({"none": {"standard": 0.1, "equivariant": 0.9}})
     assert outcomes(large, claim_of(predicted=0))[0].verdict == "contradicted"
+
+
+def test_of_several_settings_the_usual_ones_stand_for_an_agent() -> None:
+    def row(usual: bool, diverged: bool, count: int, agent: str = "standard") -> SimpleNamespace:
+        runs = [SimpleNamespace(pair=("p", seed), diverged=diverged) for seed in range(count)]
+        return SimpleNamespace(agent=agent, usual=usual, runs=runs)
+
+    def stands(*rows: SimpleNamespace) -> dict[Any, float]:
+        return _values(cast(Any, SimpleNamespace(rows=rows)), "standard", "diverged")
+
+    assert stands(row(False, True, 3), row(True, False, 2)) == {("p", 0): 0.0, ("p", 1): 0.0}
+    assert stands(row(False, True, 2), row(False, False, 1)) == {("p", 0): 1.0, ("p", 1): 1.0}
+    assert stands(row(True, True, 2, "other")) == {}
 
 
 def test_verdicts_are_corrected_within_a_family() -> None:

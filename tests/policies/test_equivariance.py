@@ -184,6 +184,10 @@ def test_new_weights_reach_decode(world):
     after = policy.decode(obs, noise)
     assert not torch.allclose(before, after, atol=1e-3)
     assert torch.equal(after, other.decode(obs, noise))
+    with torch.no_grad():
+        policy.denoiser.project.weight.mul_(3)
+    policy.freeze()
+    assert not torch.allclose(policy.decode(obs, noise), after, atol=1e-3)
 
 
 def test_the_network_sees_its_condition_and_noise_level(trained, world):
