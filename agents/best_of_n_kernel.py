@@ -29,19 +29,20 @@ from symsteer.agents.diagnostics import (
     SYMMETRY_STATES,
     bound_violation,
     critic_preference,
+    decode_equivariance_error,
     orbit_variance,
     value_errors,
 )
 from symsteer.agents.episodes import Played
 from symsteer.agents.replay import ReplayBuffer, Transition
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Group, Layout, equivariance_error
+from symsteer.policies.geometry import Group, Layout
 
 LENGTHS = (0.25, 0.5, 1.0, 2.0)
 """Candidates for l, in median distances."""
 
 RIDGES = (0.03, 0.1, 0.3, 1.0)
-"""Candidates for the variance of a return given x, as a share of the returns' variance."""
+"""Candidates for the variance of a return given x, in units of that of the kernel."""
 
 SELECTION = 400
 """Decisions of which the marginal likelihood is computed."""
@@ -238,11 +239,10 @@ class KernelBestOfNAgent(Agent):
 
     def _values(self, obs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Q of ``obs [B, obs_dim]`` in environment units and flat executed actions, ``[B]``."""
-        to_obs, to_actions, length = self.fitted["scales"]
-        parts = (self._features(obs) / to_obs, actions / to_actions)
-        queries = torch.cat(parts, 1) / length
         if not self.fits:
-            return queries.new_zeros(len(queries))
+            return actions.new_zeros(len(actions))
+        to_obs, to_actions, length = self.fitted["scales"]
+        queries = torch.cat([self._features(obs) / to_obs, actions / to_actions], 1) / length
         orbits, coefficients = self.fitted["orbits"], self.fitted["coefficients"]
         kernels = (_kernel(part, orbits) @ coefficients for part in queries.split(QUERIES))
         return self.fitted["prior"] + torch.cat(list(kernels))
@@ -284,12 +284,8 @@ class KernelBestOfNAgent(Agent):
             "noise_norm": noise.flatten(1).norm(dim=1).mean().item(),
             "orbit_variance": orbit["orbit_variance"],
             "equivariance_critic": orbit["orbit_variance"] ** 0.5 / max(size, 1e-30),
-            "equivariance_decode": equivariance_error(
-                self.decode,
-                (obs[few], noise[few]),
-                (self.obs_layout, self.act_layout),
-                self.act_layout,
-                self.group,
+            "equivariance_decode": decode_equivariance_error(
+                self, obs[few], noise[few], self.group
             ),
         }
 

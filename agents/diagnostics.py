@@ -16,6 +16,7 @@ from symsteer.agents.episodes import LongEpisodes, Played
 from symsteer.policies.geometry import Group, Layout, equivariance_error
 
 if TYPE_CHECKING:
+    from symsteer.agents.agent import Agent
     from symsteer.agents.sac import SacAgent
 
 Scalars = dict[str, float]
@@ -81,7 +82,6 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
     group = Group.parse(options.group)
     orbit = orbit_variance(agent, obs, noise, group)
     size = agent.q_values(obs, noise).double().square().mean().sqrt().item()
-    context = agent.context
     return {
         "q_mean": smallest.mean().item(),
         "q_min": smallest.min().item(),
@@ -101,14 +101,20 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
         "orbit_variance": orbit["orbit_variance"],
         "equivariance_actor": actor_equivariance_error(agent, obs, group),
         "equivariance_critic": orbit["orbit_variance"] ** 0.5 / max(size, 1e-30),
-        "equivariance_decode": equivariance_error(
-            agent.decode,
-            (obs, noise),
-            (context.obs_layout, context.act_layout),
-            context.act_layout,
-            group,
-        ),
+        "equivariance_decode": decode_equivariance_error(agent, obs, noise, group),
     }
+
+
+def decode_equivariance_error(
+    agent: Agent, obs: torch.Tensor, noise: torch.Tensor, group: Group
+) -> float:
+    """Error of decoding: max over g of rms ||decode(gs, gw) - g decode(s, w)|| / rms ||decode||.
+
+    Args:
+        obs, noise: ``[B, obs_dim]``, ``[B, rows, Da]``.
+    """
+    layouts = (agent.obs_layout, agent.act_layout)
+    return equivariance_error(agent.decode, (obs, noise), layouts, agent.act_layout, group)
 
 
 def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -> float:

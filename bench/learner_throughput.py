@@ -180,15 +180,7 @@ def _context(task: str, seed: int) -> AgentContext:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         base = policy(policy.Options(), kind.observation_layout, kind.action_layout)
-    return AgentContext(
-        base.obs_layout,
-        base.act_layout,
-        base.horizon,
-        base.execute,
-        base.decode,
-        base.normalized_observation,
-        seed=seed,
-    )
+    return AgentContext.of(base, seed=seed)
 
 
 def _agent(task: str, name: str, critic: str, seed: int) -> SacAgent:
