@@ -188,9 +188,11 @@ class KernelBestOfNAgent(Agent):
         inputs = torch.cat([x / scale for x, scale in zip((obs, actions), scales, strict=True)], 1)
         chosen = torch.randperm(len(wanted), generator=self.fit_generator, device=self.device)
         chosen = chosen[:SELECTION]
+        few = inputs[chosen]
+        kernels = {length: _kernel(few / length, self._orbits(few / length)) for length in LENGTHS}
         length, ridge = max(
             itertools.product(LENGTHS, RIDGES),
-            key=lambda pair: self._likelihood(inputs[chosen], wanted[chosen], *pair),
+            key=lambda pair: _likelihood(kernels[pair[0]], wanted[chosen], pair[1]),
         )
         orbits = self._orbits(inputs / length)
         factor = _factor(_kernel(inputs / length, orbits), ridge)
@@ -226,16 +228,6 @@ class KernelBestOfNAgent(Agent):
             going_on = rows["reward"][here] + gamma * then
             returns[here] = torch.where(follows[here], going_on, returns[here])
         return returns
-
-    def _likelihood(
-        self, inputs: torch.Tensor, wanted: torch.Tensor, length: float, ridge: float
-    ) -> float:
-        """Log marginal likelihood per return, at the best variance, up to a constant."""
-        inputs = inputs / length
-        factor = _factor(_kernel(inputs, self._orbits(inputs)), ridge)
-        white = torch.linalg.solve_triangular(factor, wanted.double().unsqueeze(1), upper=False)
-        variance = white.square().mean()
-        return (-factor.diagonal().log().mean() - 0.5 * variance.log()).item()
 
     def _values(self, obs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Q of ``obs [B, obs_dim]`` in environment units and flat executed actions, ``[B]``."""
@@ -317,6 +309,13 @@ def _kernel(queries: torch.Tensor, orbits: torch.Tensor) -> torch.Tensor:
     """k_G of ``queries [B, dim]`` and points with ``orbits [order, N, dim]``, ``[B, N]``."""
     distances = torch.cdist(queries, orbits.flatten(0, 1)).square_().mul_(-0.5)
     return distances.exp_().view(len(queries), *orbits.shape[:2]).mean(1)
+
+
+def _likelihood(kernel: torch.Tensor, wanted: torch.Tensor, ridge: float) -> float:
+    """Log marginal likelihood per return, at the best variance, up to a constant."""
+    factor = _factor(kernel, ridge)
+    white = torch.linalg.solve_triangular(factor, wanted.double().unsqueeze(1), upper=False)
+    return (-factor.diagonal().log().mean() - 0.5 * white.square().mean().log()).item()
 
 
 def _factor(kernel: torch.Tensor, ridge: float) -> torch.Tensor:

@@ -87,7 +87,7 @@ def test_the_marginal_likelihood_is_that_of_a_gaussian():
     best = wanted @ covariance.inverse() @ wanted / 40
     density = torch.distributions.MultivariateNormal(torch.zeros(40).double(), best * covariance)
     constant = 0.5 * (1 + math.log(2 * math.pi))
-    found = agent._likelihood(inputs, wanted, length, ridge)
+    found = bk._likelihood(kernel, wanted, ridge)
     assert found == pytest.approx(density.log_prob(wanted).item() / 40 + constant)
 
 
