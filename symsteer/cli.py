@@ -128,12 +128,10 @@ def demo(out: Path = Path("runs/demo")) -> int:
     """
     from symsteer.bench.cli import sweep
     from symsteer.leaderboard.command import report
+    from symsteer.leaderboard.glance import glance
 
     exit_code = sweep("demo", out=out, together=2)
     report((out,), out=out / "leaderboard")
-    # Here, because it imports scipy.
-    from symsteer.leaderboard.glance import glance
-
     print(f"\n{glance((out,))}")
     print(
         f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"

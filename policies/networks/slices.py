@@ -21,7 +21,7 @@ class ResidualMLP(nn.Module):
     h <- h + V silu((1 + scale) U norm(h) + shift), ``depth`` times.
 
     Scale and shift are sums of what ``context`` and ``time`` say. They are not added up beforehand:
-    the sum of all of them would take more time than the products with U.
+    for each noise level that would write and read an array as large as ``context``.
 
     Shapes: ``h [B, slices, width]``, ``context [B, slices, condition_dim]``, ``time [B or 1, 1,
     condition_dim]`` -> ``[B, slices, width]``.
