@@ -40,7 +40,7 @@ from symsteer.leaderboard.summary import (
     area_pairs,
     success_pairs,
 )
-from symsteer.variant import UNBROKEN, parse_variant, variant_text
+from symsteer.variant import UNBROKEN, VariantSpec, parse_variant, variant_text
 
 AUDIT = Path(__file__).resolve().parent / "results" / "audit" / "summary.json"
 """The audit of all tasks and variants that the repository and every wheel contain."""
@@ -160,11 +160,16 @@ def fingerprint(audit: Audit) -> str:
 
 def _in_order(variant: str) -> str:
     """One spelling for one variant, its parts in alphabetical order; other texts as they are."""
+    specs = sorted(_parsed(variant), key=lambda spec: spec.text)
+    return variant_text(specs) if specs else variant
+
+
+def _parsed(variant: str) -> tuple[VariantSpec, ...]:
+    """The parts of a variant; none for other texts."""
     try:
-        specs = parse_variant(variant)
+        return parse_variant(variant)
     except UserError:
-        return variant
-    return variant_text(sorted(specs, key=lambda spec: spec.text))
+        return ()
 
 
 def defect_of(key: Key, audit: Audit) -> Defect | None:
@@ -181,7 +186,12 @@ def audit_commands(keys: Sequence[Key]) -> list[str]:
     wanted: dict[tuple[str, str, str], list[str]] = {}
     for key in sorted(keys):
         words = (key.task, key.embodiment, key.variant, key.group)
-        if key.group and all(re.fullmatch(r"[A-Za-z0-9][\w.:+-]*", w, re.ASCII) for w in words):
+        constant = all(spec.is_constant for spec in _parsed(key.variant))
+        if (
+            key.group
+            and constant
+            and all(re.fullmatch(r"[A-Za-z0-9][\w.:+-]*", w, re.ASCII) for w in words)
+        ):
             variants = wanted.setdefault((key.task, key.embodiment, key.group), [])
             if key.variant not in variants:
                 variants.append(key.variant)

@@ -1,5 +1,12 @@
 """The text of a variant: ``none``, ``name:strength``, or several joined by ``+``.
 
+| text | strength |
+|---|---|
+| ``wind:0.5`` | 0.5 |
+| ``wind:0.2..0.8`` | uniform in [0.2, 0.8], drawn anew for each episode |
+| ``wind:1@0.5`` | 0, and 1 from half of the run's budget on |
+| ``wind:1@0.25..0.75`` | 0, rising from a quarter of the budget on to 1 at three quarters |
+
 Only this module reads and writes this text. The registry of variants (``symsteer.bench.variants``)
 knows which names exist.
 """
@@ -8,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
@@ -24,19 +31,35 @@ class VariantSpec:
     Attributes:
         name: of the variant.
         strength: in [0, 1]; one number, or one per environment.
+        low: None, or the lowest strength of an episode, where each draws its own; ``strength`` is
+            then the highest.
+        rise: None, or the shares of a run's budget between which the strength rises from 0; equal
+            ones for a step.
 
     Raises:
-        UserError: if a strength is not a number in [0, 1].
+        UserError: if a strength is not a number in [0, 1], or a range is empty.
     """
 
     name: str
     strength: float | tuple[float, ...]
+    low: float | None = None
+    rise: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not all(isinstance(value, Real) and 0 <= value <= 1 for value in self._strengths):
             raise UserError(
                 f"the strength of variant {self.name!r} must lie in [0, 1], one number or one per "
                 f"environment; it is {self.strength}"
+            )
+        if self.low is not None and not 0 <= self.low < self._strengths[0]:
+            raise UserError(
+                f"the strengths of variant {self.name!r} must be a range such as 0.2..0.8 within "
+                f"[0, 1]; they are {self.low:g}..{self.strength}"
+            )
+        if self.rise is not None and not 0 < self.rise[0] <= self.rise[1] <= 1:
+            raise UserError(
+                f"variant {self.name!r} must begin within the budget, at a share in (0, 1], and "
+                f"reach its strength by its end, e.g. {self.name}:1@0.5 or {self.name}:1@0.25..0.75"
             )
 
     @property
@@ -49,12 +72,33 @@ class VariantSpec:
         return self.strength == 0
 
     @property
+    def is_constant(self) -> bool:
+        """Whether the strength is the same in all episodes of a run."""
+        return self.low is None and self.rise is None
+
+    def at(self, share: float) -> VariantSpec:
+        """What it is when ``share`` of a run's budget is used."""
+        if self.rise is None:
+            return self
+        begin, end = self.rise
+        if share >= end:
+            return replace(self, rise=None)
+        factor = max(0.0, share - begin) / (end - begin) if end > begin else 0.0
+        if not factor:
+            return VariantSpec(self.name, 0.0)
+        assert not isinstance(self.strength, tuple)
+        low = None if self.low is None else self.low * factor
+        return replace(self, strength=self.strength * factor, low=low, rise=None)
+
+    @property
     def text(self) -> str:
-        """``name:strength`` in the shortest form; strengths per environment as their mean."""
-        mean = sum(self._strengths) / len(self._strengths)
-        short = f"{mean:g}"
-        exact = short if float(short) == mean or isinstance(self.strength, tuple) else repr(mean)
-        return f"{self.name}:{exact}"
+        """The shortest form; strengths per environment as their mean."""
+        if isinstance(self.strength, tuple):
+            return f"{self.name}:{sum(self.strength) / len(self.strength):g}"
+        rise = () if self.rise is None else tuple(dict.fromkeys(self.rise))
+        strengths = (self.strength,) if self.low is None else (self.low, self.strength)
+        when = f"@{_range_text(rise)}" if rise else ""
+        return f"{self.name}:{_range_text(strengths)}{when}"
 
 
 def parse_variant(
@@ -101,12 +145,18 @@ def parse_variant(
                 "give it once"
             )
         if colon:
-            specs.append(VariantSpec(name, _number(name, number, text)))
+            specs.append(_spec(name, number, text))
         elif strength is not None and len(parts) == 1:
             specs.append(VariantSpec(name, values))
         else:
             raise UserError(f"the variant {name!r} needs a strength in [0, 1], e.g. {name}:0.5")
     return tuple(specs)
+
+
+def specs_at(specs: Iterable[VariantSpec], share: float) -> tuple[VariantSpec, ...]:
+    """What variants are when ``share`` of a run's budget is used, without those that do nothing."""
+    present = (spec.at(share) for spec in specs)
+    return tuple(spec for spec in present if not spec.changes_nothing)
 
 
 def variant_text(specs: Iterable[VariantSpec]) -> str:
@@ -150,14 +200,31 @@ def _as_tuple(values: Any) -> tuple:
     return values if isinstance(values, tuple) else (values,)
 
 
-def _number(name: str, number: str, text: str) -> float:
+def _range_text(values: Iterable[float]) -> str:
+    """Numbers in their shortest form, joined by dots."""
+    texts = (f"{value:g}" if float(f"{value:g}") == value else repr(value) for value in values)
+    return "..".join(texts)
+
+
+def _spec(name: str, number: str, text: str) -> VariantSpec:
+    """The strength ``S`` or ``LOW..HIGH``, followed by nothing, ``@T`` or ``@T..U``."""
+    strengths, at, shares = number.partition("@")
     try:
-        value = float(number)
+        low, high = _range(strengths)
+        rise = _range(shares) if at else None
     except ValueError:
-        value = math.nan
-    if math.isnan(value):
         raise UserError(
             f"no strength can be read for {name!r} in {text!r}; write name:number with a number "
-            f"in [0, 1], e.g. {name}:0.5"
-        )
-    return value
+            f"in [0, 1], e.g. {name}:0.5, or a range of them, e.g. {name}:0.2..0.8; @0.5 after it "
+            "means from half of the budget on"
+        ) from None
+    return VariantSpec(name, high, low if ".." in strengths else None, rise)
+
+
+def _range(text: str) -> tuple[float, float]:
+    """The ends of ``LOW..HIGH``, or one number twice."""
+    low, dots, high = text.partition("..")
+    ends = float(low), float(high if dots else low)
+    if any(math.isnan(end) for end in ends):
+        raise ValueError
+    return ends

@@ -84,7 +84,12 @@ class AuditSettings:
         """
         task_class(self.task)
         check_embodiment(self.embodiment)
-        read(self.variant)
+        for spec in read(self.variant):
+            if not spec.is_constant:
+                raise UserError(
+                    f"{spec.text} has many strengths, but an audit measures one: "
+                    f"give a number, e.g. {spec.name}:{spec.strength}"
+                )
         check_group(self.group)
         for name, least in (("count", LEAST_STATES), ("chunk", 1), ("resets", 16)):
             if getattr(self, name) < least:

@@ -51,10 +51,11 @@ class Evaluator:
         base: the frozen policy.
         agent: the agent that plays.
         feasible: lowest and highest return that the reward allows, per decision.
-        variants: of these episodes.
+        variants: of the first episodes.
         workers: processes that share the environments.
 
     Attributes:
+        variants: of the episodes now.
         played: the deterministic episodes of the last :meth:`play`; None before the first one.
     """
 
@@ -68,18 +69,23 @@ class Evaluator:
         workers: int = 1,
     ):
         self.config, self.agent, self.feasible = config, agent, feasible
+        self.variants = tuple(variants)
         self.played: Rollout | None = None
         self.made = functools.partial(
-            make_env,
-            config,
-            base,
-            agent,
-            variants=variants,
-            ignore_terminations=True,
-            workers=workers,
+            make_env, config, base, agent, ignore_terminations=True, workers=workers
         )
-        self.env = self.made(num_envs=config.evaluation.episodes)
+        self.env = self._env(config.evaluation.episodes)
         self.long_env: LatentNoiseEnv | None = None
+
+    def enter(self, variants: Sequence[VariantSpec]) -> None:
+        """Play further episodes with these variants."""
+        if self.variants != tuple(variants):
+            self.close()
+            self.variants = tuple(variants)
+            self.env, self.long_env = self._env(self.config.evaluation.episodes), None
+
+    def _env(self, num_envs: int) -> LatentNoiseEnv:
+        return self.made(num_envs=num_envs, variants=self.variants)
 
     def play(self, count: int) -> Rollout:
         """Episodes of the deterministic actor on the first ``count`` held-out seeds."""
@@ -132,7 +138,7 @@ class Evaluator:
         if self.long_env is None or self.long_env.num_envs != num_envs:
             if self.long_env is not None:
                 self.long_env.close()
-            self.long_env = env = self.made(num_envs=num_envs)
+            self.long_env = env = self._env(num_envs)
             if not timeouts_end(self.agent):
                 env.max_episode_steps = long_limit(
                     env.max_episode_steps, env.execute, discount(self.agent)

@@ -42,12 +42,12 @@ from symsteer.bench.runs.stored import (
 )
 from symsteer.bench.runs.trainer import Trainer, budget_of, feasible_return
 from symsteer.bench.tasks import check_embodiment, task_class
-from symsteer.bench.variants import evaluation_variants, read
+from symsteer.bench.variants import build, evaluation_variants, read
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, read_record
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import save_policy
-from symsteer.variant import variant_text
+from symsteer.variant import specs_at, variant_text
 
 
 def check(config: RunConfig) -> None:
@@ -59,7 +59,7 @@ def check(config: RunConfig) -> None:
     """
     task_class(config.task)
     check_embodiment(config.embodiment)
-    read(config.variants)
+    build(specs_at(read(config.variants), 1))
     if any(spec.changes_nothing for spec in config.variants):
         raise UserError(
             f"the variant {config.variant} has a part of strength 0, which changes nothing; leave "
@@ -229,7 +229,8 @@ def evaluate(
     run = restored(folder)
     config, folder = run.config, run.folder
     _check_all(config, workers)
-    own = evaluation_variants(config.variants)
+    share = 1.0 if run.state["final"] else run.state["env_steps"] / config.env_steps
+    own = evaluation_variants(config.variants, share)
     variants = own if variant is None else read(variant)
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:

@@ -2,13 +2,15 @@
 
 A checkpoint is written when all environments begin new episodes in fresh scenes. It contains
 everything that the rest of the run depends on. So a run that was killed and continued has the same
-record as one that was not, except for times (on the CPU; CUDA's sums are not repeatable).
+record as one that was not, except for times (on the CPU; CUDA's sums are not repeatable). At the
+same times the world changes, if a variant begins or grows in the course of the run.
 
 Observers (:mod:`symsteer.bench.runs.observers`) write the results.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
@@ -30,6 +32,7 @@ from symsteer.bench.variants import build, evaluation_variants, highest_cost
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation
 from symsteer.policies.contract import ChunkPolicy
+from symsteer.variant import VariantSpec, specs_at
 
 Updates: TypeAlias = Generator[Batch, Mapping[str, torch.Tensor] | None, None]
 """A run that hands out every batch that is due, and is sent the scalars of the update."""
@@ -60,7 +63,7 @@ def feasible_return(config: RunConfig, agent: Agent, base: ChunkPolicy) -> tuple
         discount(agent),
         base.execute,
         bootstrap_truncation=not timeouts_end(agent),
-        step_cost=highest_cost(build(config.variants)),
+        step_cost=highest_cost(build(specs_at(config.variants, 1))),
     )
 
 
@@ -105,6 +108,10 @@ class Trainer:
         workers: processes that share the environments.
         together: number of runs in this process.
 
+    Attributes:
+        share: of the budget that was used when the environments began in fresh scenes; variants
+            have the strength that belongs to it.
+
     Raises:
         UserError: if the checkpoint was made with another base policy or agent.
     """
@@ -127,6 +134,7 @@ class Trainer:
         self.train_until: int | None = None
         self.next_evaluation = 0
         self.fresh_starts = 0
+        self.share = 0.0
         self.final = False
         self.clock = Clock()
         self.update_seconds = self.evaluate_seconds = self.diagnose_seconds = 0.0
@@ -136,7 +144,7 @@ class Trainer:
         for observer in observers:
             observer.began(self, checkpoint)
         try:
-            variants = evaluation_variants(config.variants)
+            variants = evaluation_variants(config.variants, self.share)
             self.evaluator = Evaluator(config, base, self.agent, self.feasible, variants, workers)
         except BaseException as error:
             self.stop(error)
@@ -209,6 +217,8 @@ class Trainer:
         for observer in self.observers:
             observer.entered(self, "evaluation")
         wanted = self.config.evaluation
+        share = 1.0 if final else self.share
+        self.evaluator.enter(evaluation_variants(self.config.variants, share))
         columns = self.evaluator.play(wanted.final_episodes if final else wanted.episodes).episodes
         played = time.perf_counter()
         diagnostics = dict(
@@ -253,11 +263,20 @@ class Trainer:
         end = min(self.train_until, self.config.env_steps)
         if self.env_steps >= end:
             return
-        env = self._make_env(ignore_terminations=False)
-        env.control_steps, env.decisions = self.env_steps, self.decisions
+        env, world = self._make_env(ignore_terminations=False), self.world
         while self.env_steps < end:
+            self.share = self.env_steps / self.config.env_steps
+            if self.world != world:
+                env.close()
+                env, world = self._make_env(ignore_terminations=False), self.world
+            env.control_steps, env.decisions = self.env_steps, self.decisions
             yield from self._train_until_checkpoint(env, end)
         env.close()
+
+    @property
+    def world(self) -> tuple[VariantSpec, ...]:
+        """The variants of the training environments now."""
+        return specs_at(self.config.variants, self.share)
 
     def _train_until_checkpoint(self, env: LatentNoiseEnv, end: int) -> Updates:
         """Train from one fresh start of all environments to the next, or to the end."""
@@ -267,6 +286,10 @@ class Trainer:
             self.next_evaluation = config.evaluation.every
         obs = env.reset(env.training_seeds(self.fresh_starts, config.num_envs))
         pause = self.env_steps + config.checkpoint_every * config.num_envs
+        for share in (share for spec in config.variants for share in spec.rise or ()):
+            change = math.ceil(share * config.env_steps)
+            if self.env_steps < change:
+                pause = min(pause, change)
         while self.env_steps < min(pause, end):
             step = env.step(agent.act(obs))
             obs = step.obs_after
@@ -304,7 +327,7 @@ class Trainer:
             self.base,
             self.agent,
             config.num_envs,
-            config.variants,
+            self.world,
             ignore_terminations,
             self.workers,
         )
@@ -346,6 +369,7 @@ class Trainer:
             *("next_evaluation", "fresh_starts", "final"),
         ):
             setattr(self, name, state[name])
+        self.share = self.env_steps / self.config.env_steps
         seconds = state["seconds"]
         self.clock.simulate, self.clock.decode = seconds["simulate"], seconds["decode"]
         self.update_seconds, self.evaluate_seconds = seconds["update"], seconds["evaluate"]

@@ -147,8 +147,18 @@ class SymmetricTask(GymEnv):
             self.agent.reset(torch.as_tensor(qpos, device=self.device))
             self.agent.robot.set_pose(sapien.Pose(p=self.body.root_position))
             self._place_objects(rng, len(env_idx))
+            self._draw_strengths(env_idx)
             for variant in self.variants:
                 variant.reset(env_idx)
+
+    def _draw_strengths(self, env_idx: torch.Tensor) -> None:
+        """New strengths of the variants whose episodes draw theirs."""
+        drawing = [variant for variant in self.variants if variant.low is not None]
+        for variant in drawing:
+            variant.draw(env_idx)
+        if drawing:
+            self._forces_held = False
+            self.__dict__.pop("policy_origin", None)
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """The scripted expert's intent in the present state.
@@ -308,8 +318,7 @@ class SymmetricTask(GymEnv):
         """Environments in which some variant has a strength above zero, ``[N]`` bool."""
         broken = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         for variant in self.variants:
-            strength = torch.as_tensor(variant.strength, device=self.device)
-            broken = broken | (strength != 0)
+            broken = broken | variant.active
         return broken
 
     # ------------------------------------------------------------------ resets

@@ -68,7 +68,8 @@ class Embodiment:
 
         Args:
             agent: the robot, whose controller is new.
-            bias: in units of a full step of each environment, ``[N, 2]``.
+            bias: in units of a full step of each environment, ``[N, 2]``. What is written into
+                it later counts from then on.
         """
         raise NotImplementedError
 
@@ -156,7 +157,7 @@ class Floating(Embodiment):
         )
 
     def set_bias(self, agent: Any, bias: torch.Tensor) -> None:
-        agent.controller.controllers["root"].bias = self.horizontal_step * bias
+        agent.controller.controllers["root"].bias = bias
 
     def transform_robot(self, state: torch.Tensor, angle: float, reflect: bool) -> torch.Tensor:
         root, q, v = state[:, :13], state[:, 13:21], state[:, 21:29]
@@ -248,11 +249,11 @@ class PandaArm(Embodiment):
     def set_bias(self, agent: Any, bias: torch.Tensor) -> None:
         # The stock controller bounds its action, so the drift is added after that.
         arm = agent.controller.controllers["arm"]
-        scale, drift = arm._clip_and_scale_action, self.step * bias
+        scale = arm._clip_and_scale_action
         xy = ACTION_LAYOUT.slice("xy")
 
         def scale_and_drift(action: torch.Tensor) -> torch.Tensor:
-            step = scale(action)
+            step, drift = scale(action), self.step * bias
             drifted = step.clone()
             drifted[:, xy] += drift
             return torch.where((drift != 0).any(dim=1, keepdim=True), drifted, step)

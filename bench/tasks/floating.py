@@ -70,7 +70,7 @@ class PlanarPoseController(PDJointPosController):
     config: PlanarPoseControllerConfig
     _target_qpos: torch.Tensor
     bias: torch.Tensor | None = None
-    """Drift of the actuator, added to every bounded horizontal increment, ``[N, 2]`` metres."""
+    """Drift of the actuator, added to every bounded horizontal increment, ``[N, 2]`` full steps."""
 
     def _initialize_action_space(self) -> None:
         self.single_action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
@@ -98,7 +98,7 @@ class PlanarPoseController(PDJointPosController):
         low, high = (height - config.root_height for height in config.height_range)
         step = config.horizontal_step * xy
         if self.bias is not None:
-            step = step + self.bias
+            step = step + config.horizontal_step * self.bias
         position = torch.cat(
             [
                 _shorten(position[:, :2] + step, config.reach),

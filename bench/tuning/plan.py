@@ -3,8 +3,8 @@
 ``[grid]`` and ``[run]`` describe the cells as in a suite, one run per trial each. ``[confirm]`` is
 the grid of fresh cells on which the chosen settings are compared with the defaults. Every option of
 the agents in ``singles`` is also tried by itself. ``[space]`` has
-the options that all agents share, ``[space.AGENT]`` those of one agent. An option has a list of
-choices, or ``{ low = 1e-4, high = 1e-2, log = true }``.
+the options of all agents that have them, ``[space.AGENT]`` those of one agent. An option has a list
+of choices, or ``{ low = 1e-4, high = 1e-2, log = true }``; an empty list takes it from an agent.
 """
 
 from __future__ import annotations
@@ -130,6 +130,11 @@ def read_plan(name_or_path: str) -> TuningPlan:
     for key in ("agents", "grid", "confirm", "space"):
         if not data.get(key):
             raise UserError(f"{source}: {key} is missing; every tuning plan has it")
+    agents = data["agents"]
+    names = dict.fromkeys(name for agent in agents for name in _option_names(agent))
+    for key in data["space"]:
+        if key not in names and key not in agents:
+            raise unknown("option or agent", key, [*names, *agents], f"{source}, space")
     numbers = {
         key: _number(data.get(key, default), key, source) for key, default in NUMBERS.items()
     }
@@ -137,9 +142,7 @@ def read_plan(name_or_path: str) -> TuningPlan:
         name=path.stem,
         source=source,
         description=str(data.get("description", "")),
-        spaces={
-            agent: _space(agent, data["space"], data["agents"], source) for agent in data["agents"]
-        },
+        spaces={agent: _space(agent, data["space"], agents, source) for agent in agents},
         singles=tuple(data.get("singles", ())),
         data=data,
         **numbers,
@@ -162,12 +165,16 @@ def _number(value: Any, key: str, source: str) -> int:
 
 def _space(agent: str, tables: Mapping[str, Any], agents: Sequence[str], source: str) -> Space:
     options = AGENTS.get(agent).Options
-    fields = [field.name for field in dataclasses.fields(options)]
-    shared = {key: value for key, value in tables.items() if key not in agents}
-    space: dict[str, Range | Choices] = {}
-    for name, value in {**shared, **tables.get(agent, {})}.items():
+    fields = _option_names(agent)
+    own = tables.get(agent, {})
+    for name in own:
         if name not in fields:
             raise unknown(f"option of {agent}", name, fields, f"{source}, space")
+    shared = {key: value for key, value in tables.items() if key not in agents and key in fields}
+    space: dict[str, Range | Choices] = {}
+    for name, value in {**shared, **own}.items():
+        if value == [] and name in own:
+            continue
         space[name] = found = _values(name, value, source)
         ends = found.values if isinstance(found, Choices) else (found.low, found.high)
         for end in ends:
@@ -178,6 +185,10 @@ def _space(agent: str, tables: Mapping[str, Any], agents: Sequence[str], source:
                 "the first trial has the defaults, so widen it"
             )
     return space
+
+
+def _option_names(agent: str) -> list[str]:
+    return [field.name for field in dataclasses.fields(AGENTS.get(agent).Options)]
 
 
 def _values(name: str, value: Any, source: str) -> Range | Choices:

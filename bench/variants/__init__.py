@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from symsteer.errors import UserError
 from symsteer.names import unknown
 from symsteer.registry import Registry
-from symsteer.variant import UNBROKEN, VariantSpec, parse_variant
+from symsteer.variant import UNBROKEN, VariantSpec, parse_variant, specs_at
 
 if TYPE_CHECKING:
     from symsteer.bench.variants.base import Variant
@@ -75,8 +75,15 @@ def build(specs: Iterable[VariantSpec]) -> tuple[Variant, ...]:
     """The variants that do something: those of strength 0 are left out.
 
     Raises:
-        UserError: if a class cannot be imported.
+        UserError: if a class cannot be imported, or a strength depends on a run's budget.
     """
+    specs = tuple(specs)
+    for spec in specs:
+        if spec.rise is not None:
+            raise UserError(
+                f"{spec.text} begins in the course of a run, but environments by themselves have "
+                f"no budget; give {spec.at(1).text}, or use it with `symsteer run` or a suite"
+            )
     return tuple(VARIANTS.get(spec.name)(spec) for spec in specs if not spec.changes_nothing)
 
 
@@ -85,13 +92,20 @@ def parse(variant: str | Sequence[VariantSpec], strength: Any = None) -> tuple[V
     return build(read(variant, strength))
 
 
-def evaluation_variants(specs: Iterable[VariantSpec]) -> tuple[VariantSpec, ...]:
+def evaluation_variants(
+    specs: Iterable[VariantSpec], share: float = 1.0
+) -> tuple[VariantSpec, ...]:
     """The variants in which agents are evaluated: those of training alone are left out.
+
+    Args:
+        specs: of a run.
+        share: of the run's budget that is used.
 
     Raises:
         UserError: if a class cannot be imported.
     """
-    return tuple(spec for spec in specs if not VARIANTS.get(spec.name).training_only)
+    present = specs_at(specs, share)
+    return tuple(spec for spec in present if not VARIANTS.get(spec.name).training_only)
 
 
 def highest_cost(variants: Iterable[Variant]) -> float:

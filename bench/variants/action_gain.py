@@ -18,7 +18,7 @@ class ActionGain(Variant):
 
     def action(self, action: torch.Tensor) -> torch.Tensor:
         x = self.env.action_layout.slice("xy").start
-        gain = 1.0 - 0.6 * torch.as_tensor(self.strength, device=action.device)
+        gain = 1.0 - 0.6 * self.amount
         executed = action.clone()
         executed[:, x] = action[:, x] * gain
         return executed

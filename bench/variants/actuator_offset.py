@@ -17,6 +17,9 @@ class ActuatorOffset(Variant):
     """
 
     def load_scene(self) -> None:
-        along = 0.3 * self.amount
-        bias = torch.stack([along, torch.zeros_like(along)], dim=1)
-        self.env.body.set_bias(self.env.agent, bias)
+        self.bias = torch.zeros(self.env.num_envs, 2, device=self.env.device)
+        self.strengths_changed()
+        self.env.body.set_bias(self.env.agent, self.bias)
+
+    def strengths_changed(self) -> None:
+        self.bias[:, 0] = 0.3 * self.amount

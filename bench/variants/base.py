@@ -3,7 +3,7 @@
 A variant acts through its hooks, which the task calls inside ``env.step`` and ``env.reset``, so
 that it acts for every user of ``gym.make``. At strength 0 no hook is called. Where strengths
 differ between environments, a hook leaves those of strength 0 unchanged: they are the unbroken
-task to the bit (on the CPU).
+task to the bit (on the CPU). Where each episode draws its strength, ``amount`` changes at resets.
 
 To add one, write a file in this folder with a subclass of :class:`Variant` and name it in
 ``symsteer.bench.variants.VARIANTS``, or offer the class as an entry point ``symsteer.variants``.
@@ -17,9 +17,14 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
+from symsteer.bench.variants.noise import uniform
 from symsteer.bench.variants.world import World
+from symsteer.errors import UserError
 from symsteer.policies.geometry import Layout
 from symsteer.variant import VariantSpec
+
+STREAM = 2**20
+"""Of the strengths' random numbers; control steps have smaller ones."""
 
 if TYPE_CHECKING:
     from mani_skill.utils.structs import Actor, Pose
@@ -36,12 +41,16 @@ class Variant:
 
     Attributes:
         name: as in the registry.
-        strength: one number, or one per environment as a tensor ``[N]``.
+        strength: one number, or one per environment as a tensor ``[N]``; the highest one, where
+            each episode draws its own.
+        low: None, or the lowest strength that an episode draws.
         env: the environments that it acts in, once :meth:`bind` was called.
     """
 
     training_only: ClassVar[bool] = False
     """Whether agents are evaluated without it."""
+    part_of_scene: ClassVar[bool] = False
+    """Whether its strength cannot change while a scene exists."""
 
     env: World
 
@@ -49,6 +58,12 @@ class Variant:
         self.name = spec.name
         values = torch.as_tensor(spec.strength, dtype=torch.float32)
         self.strength: float | torch.Tensor = values if values.ndim else float(values)
+        self.low = spec.low
+        if self.low is not None and self.part_of_scene:
+            raise UserError(
+                f"{self.name} is built with the scene, so that its strength cannot be drawn anew "
+                f"for each episode; give one number, e.g. {self.name}:0.5"
+            )
 
     def bind(self, env: World) -> None:
         """Remember the environments that it acts in, before their first scene is built."""
@@ -58,12 +73,22 @@ class Variant:
     def amount(self) -> torch.Tensor:
         """Strength of each environment, ``[N]`` float32 on the environments' device."""
         strength = torch.as_tensor(self.strength, dtype=torch.float32, device=self.env.device)
-        return strength.expand(self.env.num_envs)
+        strength = strength.expand(self.env.num_envs)
+        return strength if self.low is None else strength.clone()
 
     @functools.cached_property
     def active(self) -> torch.Tensor:
-        """Where the strength is above zero, ``[N]`` bool."""
+        """Where the strength is, or may be, above zero, ``[N]`` bool."""
         return self.amount > 0
+
+    def draw(self, env_idx: torch.Tensor) -> None:
+        """New strengths of the environments ``env_idx``, each a function of its episode's key."""
+        if self.low is None:
+            return
+        share = uniform(self.env.episode_key[env_idx], STREAM)
+        _ = self.active
+        self.amount[env_idx] = (self.low + (self.strength - self.low) * share).float()
+        self.strengths_changed()
 
     def only_active(self, changed: torch.Tensor, original: torch.Tensor) -> torch.Tensor:
         """``changed [N, ...]`` where the strength is above zero, ``original`` elsewhere."""
@@ -71,6 +96,9 @@ class Variant:
         return torch.where(mask, changed, original)
 
     # ------------------------------------------------------------------- hooks
+
+    def strengths_changed(self) -> None:
+        """``amount`` has changed; what was computed from it must be computed anew."""
 
     def load_scene(self) -> None:
         """Add to a scene that is being built (robot and task are in it, nothing is simulated)."""

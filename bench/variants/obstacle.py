@@ -23,6 +23,8 @@ class Obstacle(Variant):
     of different strength hold different bodies, which ManiSkill allows on CUDA too.
     """
 
+    part_of_scene = True
+
     @property
     def position(self) -> tuple[float, float]:
         """Of the post's axis, metres in the world."""

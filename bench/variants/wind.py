@@ -28,9 +28,11 @@ class Wind(Variant):
         prepare_for_force(body, self.active, stacks=len(self.env.moving_bodies) > 1)
         g = -float(self.env.sim_config.scene_config.gravity[2])
         friction = ((friction_of(body, n) + friction_of(table, n)) / 2).clamp(max=1)
-        push = 0.75 * self.amount * friction * masses(body, n) * g
-        still = torch.zeros_like(push)
-        self.push = torch.stack([push, still, still], dim=1)
+        self.friction_of_table, self.weight = friction, masses(body, n) * g
 
     def force(self, body: Actor) -> torch.Tensor | None:
-        return self.push if body is self.env.manipulated else None
+        if body is not self.env.manipulated:
+            return None
+        push = 0.75 * self.amount * self.friction_of_table * self.weight
+        still = torch.zeros_like(push)
+        return torch.stack([push, still, still], dim=1)

@@ -18,7 +18,10 @@ class Body(Protocol):
         """How far the tool goes in one control step at action 1, metres."""
 
     def set_bias(self, agent: Any, bias: torch.Tensor) -> None:
-        """Add ``bias [N, 2]``, in full steps, to every horizontal step after its bound."""
+        """Add ``bias [N, 2]``, in full steps, to every horizontal step after its bound.
+
+        What is written into ``bias`` later counts from then on.
+        """
 
 
 class World(Protocol):

@@ -35,6 +35,8 @@ PROCESSES.set_forkserver_preload(["tests.bench.runs.test_resume", "torch._dynamo
 CONFIG = tiny_config(
     env_steps=960,
     checkpoint_every=60,
+    # The world changes in the course of the run.
+    variant="action_gain:1@0.2..0.6+perception_bias:0..1",
     # After the first checkpoint some noise is still drawn at random.
     options={"utd": 0.3, "warmup": 80},
 )

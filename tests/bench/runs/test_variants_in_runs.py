@@ -1,10 +1,13 @@
-"""Runs in variants that change training only, or the cost of steps."""
+"""Runs in variants that change training only, the cost of steps, or with time."""
 
 import pytest
 
 from symsteer.bench.runs import evaluator
+from symsteer.bench.runs.observers import observers_of
 from symsteer.bench.runs.run import execute
+from symsteer.bench.runs.trainer import Observer
 from symsteer.bench.tasks import make, task_class
+from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from symsteer.variant import variant_text
 from tests.bench.tiny_run import tiny_config
@@ -37,3 +40,44 @@ def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, mon
             evaluation.episodes.return_, evaluation.episodes.episode_len, strict=True
         ):
             assert -1.5 * length <= cost <= 0
+
+
+def test_the_world_may_break_in_the_course_of_a_run(finished, monkeypatch):
+    """At the given shares of the budget, all environments begin in a new world."""
+    _, folder = finished
+    made, begun, evaluated = [], [], []
+
+    def noting(task, **kwargs):
+        made.append((kwargs["num_envs"], variant_text(kwargs["variant"])))
+        return make(task, **kwargs)
+
+    class Noting(Observer):
+        def paused(self, run):
+            begun.append(run.env_steps)
+
+        def evaluated(self, run, evaluation):
+            evaluated.append((run.env_steps, variant_text(run.evaluator.variants)))
+
+    monkeypatch.setattr(evaluator, "make", noting)
+    monkeypatch.setattr(
+        "symsteer.bench.runs.run.observers_of", lambda *args: [*observers_of(*args), Noting()]
+    )
+    config = tiny_config(
+        variant="action_gain:1@0.25..0.75+wind:0.5@0.5", env_steps=320, checkpoint_every=28
+    )
+    record = read_record(execute(config, folder.parent, progress=False) / "record.json")
+    # 28 steps of 4 environments, and the ends of the ramp at 80 and 240, and the step at 160.
+    assert begun == [80, 160, 240, 320]
+    training = [text for count, text in made if count == config.num_envs]
+    half, whole = "action_gain:0.5+wind:0.5", "action_gain:1+wind:0.5"
+    assert list(dict.fromkeys(training)) == ["none", half, whole]
+    assert evaluated == [(0, "none"), (160, "none"), (320, whole)]
+    assert record.config["variant"] == config.variant
+    assert record.config["evaluation_variant"] == whole
+
+
+def test_an_obstacle_cannot_be_drawn_for_each_episode(tmp_path):
+    config = tiny_config(variant="obstacle:0..1")
+    with pytest.raises(UserError, match="built with the scene"):
+        execute(config, tmp_path, progress=False)
+    assert not list(tmp_path.iterdir())

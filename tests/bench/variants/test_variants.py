@@ -10,7 +10,7 @@ from symsteer.bench.tasks import EMBODIMENTS, TASKS, make
 from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.variants import VARIANTS, build, evaluation_variants, highest_cost, parse, read
 from symsteer.errors import UserError
-from symsteer.variant import VariantSpec, variant_text
+from symsteer.variant import VariantSpec, specs_at, variant_text
 from tests.bench.variants.scenes import act, scene
 
 NAMES = sorted(VARIANTS)
@@ -33,6 +33,13 @@ NAMES = sorted(VARIANTS)
         ("action_gain:0.1+action_gain:0.2", "named twice"),
         ("action_gain:0.1+", "there is no variant ''"),
         ("none+action_gain:0.1", "there is no variant 'none'"),
+        ("wind:0.5..0.2", r"must be a range such as 0.2..0.8 within \[0, 1\]; they are 0.5..0.2"),
+        ("wind:0.5..", "no strength can be read"),
+        ("wind:0..1.5", r"must lie in \[0, 1\]"),
+        ("wind:1@", "no strength can be read"),
+        ("wind:1@0", "must begin within the budget"),
+        ("wind:1@0.8..0.2", "must begin within the budget"),
+        ("wind:1@2", "must begin within the budget"),
     ],
 )
 def test_bad_text_is_explained(text, part):
@@ -75,6 +82,30 @@ def test_text_becomes_data_and_objects():
         parse("action_gain", "a lot")
     with pytest.raises(UserError, match=r"2 strengths .* for 3 environments"):
         make("PickCube-v1", num_envs=3, variant="action_gain", strength=[0.5, 0.2])
+
+
+def test_the_strength_may_grow_during_a_run_or_be_drawn_for_each_episode():
+    text = "wind:0.1..0.5+obstacle:1@0.5+action_gain:0.8@0.25..0.75+frame_offset:0..1@1"
+    specs = read(text)
+    assert variant_text(specs) == text
+    assert specs[0] == VariantSpec("wind", 0.5, low=0.1)
+    assert specs[1] == VariantSpec("obstacle", 1.0, rise=(0.5, 0.5))
+    expected = {
+        0: "wind:0.1..0.5",
+        0.25: "wind:0.1..0.5",
+        0.375: "wind:0.1..0.5+action_gain:0.2",
+        0.5: "wind:0.1..0.5+obstacle:1+action_gain:0.4",
+        0.75: "wind:0.1..0.5+obstacle:1+action_gain:0.8",
+        1: "wind:0.1..0.5+obstacle:1+action_gain:0.8+frame_offset:0..1",
+    }
+    for share, present in expected.items():
+        assert variant_text(specs_at(specs, share)) == present
+    assert variant_text(specs_at(read("wind:0.5..1@0.25..0.75"), 0.5)) == "wind:0.25..0.5"
+    assert [spec.is_constant for spec in (*specs, *read("wind:1"))] == [False] * 4 + [True]
+    with pytest.raises(UserError, match=r"in the course of a run.*give obstacle:1, or use it with"):
+        build(specs)
+    with pytest.raises(UserError, match=r"built with the scene.*one number, e.g. obstacle:0.5"):
+        parse("obstacle:0..1")
 
 
 def test_evaluation_leaves_out_what_is_for_training_alone():
@@ -177,6 +208,42 @@ def test_strength_one_shows(name):
     """The two local ones have tests of their own where they act."""
     pairs = zip(unbroken("floating"), one_of_three(name, "floating"), strict=True)
     assert not all(torch.equal(plain[1], broken[1]) for plain, broken in pairs)
+
+
+# ---------------------------------------------------------------- drawn strengths
+
+
+@pytest.mark.parametrize("embodiment", ["floating", pytest.param("panda", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "obstacle"])
+def test_an_episode_that_draws_a_strength_is_one_of_that_strength(name, embodiment):
+    actions = script(embodiment)
+
+    def episodes(variant, strength=None):
+        """Two episodes of three environments; of the last one the first episode goes on."""
+        env = make(
+            "PushCube-v1", num_envs=3, embodiment=embodiment, variant=variant, strength=strength
+        )
+        shown, strengths = [], []
+        for seeds in ([1, 2, 3], [4, 5]):
+            rows = torch.arange(len(seeds))
+            shown.append(env.reset(seed=seeds, options={"env_idx": rows})[0].clone())
+            strengths.append(env.variants[0].amount.clone())
+            for action in actions:
+                obs, reward, *_ = env.step(action)
+                shown.extend([obs.clone(), reward.clone()])
+        env.close()
+        return shown, strengths
+
+    drawn, (first, second) = episodes(f"{name}:0.2..0.9")
+    assert 0.2 < torch.cat([first, second]).min() < torch.cat([first, second]).max() < 0.9
+    assert len(torch.cat([first, second]).unique()) == 5
+    assert first[2] == second[2]
+    half = len(drawn) // 2
+    for strengths, part in ((first, slice(0, half)), (second, slice(half, None))):
+        constant, _ = episodes(name, strengths)
+        same = slice(None) if part.start == 0 else slice(0, 2)
+        for one, other in zip(drawn[part], constant[part], strict=True):
+            assert torch.equal(one[same], other[same])
 
 
 # -------------------------------------------------------------------- together
