@@ -25,6 +25,15 @@ def test_agents_share_a_space_and_have_their_own_options(tmp_path):
     assert plan.defaults("equivariant") == {"lr": 6e-4, "batch_size": 64, "critics": 2}
 
 
+def test_a_shared_option_is_for_those_who_have_it_and_can_be_taken_from_one(tmp_path):
+    text = TEXT.replace('"standard", ', '"standard", "best-of-n-kernel", ')
+    text += "[space.standard]\nbatch_size = []\n[space.best-of-n-kernel]\ncandidates = [4, 8]\n"
+    plan = read_plan(write_plan(tmp_path, text))
+    assert list(plan.spaces["standard"]) == ["lr"]
+    assert list(plan.spaces["best-of-n-kernel"]) == ["candidates"]
+    assert list(plan.spaces["equivariant"]) == ["lr", "batch_size", "critics"]
+
+
 def test_cells_are_runs_with_the_options(tmp_path):
     plan = read_plan(write_plan(tmp_path, TEXT + "[run.agent]\ntau = 0.1\n"))
     cells = plan.cells("equivariant", {"lr": 0.01, "critics": 3})
