@@ -441,7 +441,7 @@ def audit(
 
 
 def detect(
-    folder: Annotated[Path, tyro.conf.arg(metavar="RUN")],
+    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]")],
     /,
     detector: tuple[str, ...] = (),
     count: int = 64,
@@ -450,18 +450,20 @@ def detect(
     out: Path | None = None,
     json: bool = False,
 ) -> int:
-    """Score detectors of broken symmetry on a run's decisions (docs/detect.md).
+    """Score detectors of broken symmetry on the decisions of runs (docs/detect.md).
 
-    The run is one in a broken world, with keep_replay.
+    The runs are in a broken world, with keep_replay. Several runs give a table with the means over
+    those in the same world.
 
     Args:
-        folder: Folder of the run.
+        runs: Folders of runs.
         detector: Detectors; default: all. `symsteer list` names them.
         count: States of the scripted expert and of the base policy, each; all their turned copies
             are simulated.
         group: Symmetry group.
         seed: Seed of states, detectors and intervals.
-        out: Folder for detect.json and detect.png.
+        out: Folder for detect.json and detect.png; of several runs, each has its own folder there,
+            beside summary.json and summary.md.
         json: Print only JSON.
     """
     from json import dumps
@@ -469,16 +471,30 @@ def detect(
     from symsteer.agents.detectors import DETECTORS
     from symsteer.bench.detect import report
     from symsteer.bench.detect.study import detect
+    from symsteer.bench.runs.folder import write_json
+    from symsteer.files import write_atomically
+
+    if not runs:
+        raise UserError("name the folder of a run, e.g. symsteer detect runs/PushCube-v1-...")
 
     def progress(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    about, truth, found = detect(folder, detector or tuple(DETECTORS), count, group, seed, progress)
-    print(dumps(report.to_json(about, found)) if json else f"\n{report.text(about, found)}")
-    if out is not None:
-        report.write(out, about, truth, found)
-        if not json:
-            print(f"\nwrote {out}")
+    found = []
+    for run in runs:
+        if len(runs) > 1:
+            progress(str(run))
+        found.append(detect(run, detector or tuple(DETECTORS), count, group, seed, progress))
+        if out is not None:
+            report.write(out if len(runs) == 1 else out / run.resolve().name, found[-1])
+    rows = report.summary(found)
+    shown = report.text(found[0]) if len(runs) == 1 else report.summary_text(rows)
+    if out is not None and len(runs) > 1:
+        write_json(out / "summary.json", rows)
+        write_atomically(out / "summary.md", f"{shown}\n".encode())
+    print(dumps(report.to_json(found[0]) if len(runs) == 1 else rows) if json else f"\n{shown}")
+    if out is not None and not json:
+        print(f"\nwrote {out}")
     return 0
 
 

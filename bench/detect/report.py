@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,66 +12,118 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from symsteer.bench.audit.result import BIN
-from symsteer.bench.detect.study import Detection, Measure
-from symsteer.bench.detect.truth import BODIES, Truth
+from symsteer.bench.detect.study import Detection, Found, mean_of_runs
+from symsteer.bench.detect.truth import BODIES
 from symsteer.bench.runs.folder import write_json
 
 LEAST_COPIES = 3
 """A square with fewer copies is left out of a map."""
 
 
-def to_json(about: dict[str, Any], found: Sequence[Detection]) -> dict[str, Any]:
-    """Plain data."""
+WORLD = ("task", "embodiment", "variant", "group")
+MEASURES = ("auroc", "place_auroc", "correlation")
 
-    def plain(measure: Measure | None) -> dict[str, float] | None:
-        return None if measure is None else dataclasses.asdict(measure)
 
+def to_json(found: Found) -> dict[str, Any]:
+    """Plain data of one run."""
+    return {**found.about, "detections": [_plain(d) for d in found.detections]}
+
+
+def _plain(detection: Detection) -> dict[str, Any]:
+    measures = {name: getattr(detection, name) for name in MEASURES}
     return {
-        **about,
-        "detections": [
-            {
-                "detector": d.detector,
-                "score": d.score,
-                "auroc": plain(d.auroc),
-                "place_auroc": plain(d.place_auroc),
-                "correlation": plain(d.correlation),
-            }
-            for d in found
-        ],
+        "detector": detection.detector,
+        "score": detection.score,
+        **{name: m and m.to_json() for name, m in measures.items()},
     }
 
 
-def text(about: dict[str, Any], found: Sequence[Detection]) -> str:
-    """A table for the terminal."""
-    settings = about["settings"]
+def summary(runs: Sequence[Found]) -> list[dict[str, Any]]:
+    """One row for each world and score: means over the runs in this world."""
+    worlds: dict[tuple[str, ...], list[Found]] = {}
+    for found in runs:
+        worlds.setdefault(tuple(_world(found.about).values()), []).append(found)
+    rows = []
+    for own in worlds.values():
+        shared = {
+            **_world(own[0].about),
+            "runs": [found.about["run"] for found in own],
+            "decisions": [found.about["decisions"] for found in own],
+            "broken": [found.about["broken"] / found.about["copies"] for found in own],
+        }
+        for same in zip(*(found.detections for found in own), strict=True):
+            means = {name: mean_of_runs([getattr(d, name) for d in same]) for name in MEASURES}
+            names = {"detector": same[0].detector, "score": same[0].score}
+            plain = {name: m and m.to_json() for name, m in means.items()}
+            rows.append({**shared, **names, **plain})
+    return rows
+
+
+def _world(about: dict[str, Any]) -> dict[str, str]:
+    return {name: about["settings"][name] for name in WORLD}
+
+
+def text(found: Found) -> str:
+    """A table of one run for the terminal."""
+    about = found.about
     lines = [
-        f"{settings['task']}, {settings['embodiment']}, {settings['variant']}, "
-        f"{settings['group']}: {about['broken']} of {about['copies']} simulated decisions end more "
-        f"than {about['limit_mm']:.1f} mm from the majority of their orbit.",
+        f"{', '.join(_world(about).values())}: {about['broken']} of {about['copies']} simulated "
+        f"decisions end more than {about['limit_mm']:.1f} mm from the majority of their orbit.",
         f"Detectors saw {about['decisions']} decisions of {about['run']}.",
         "",
-        f"{'detector':12s} {'score':14s} {'AUROC':>18s} {'AUROC of places':>18s} "
-        f"{'correlation':>20s}",
+        _line("detector", "score", "AUROC", "AUROC of places", "correlation"),
     ]
-    lines += [
-        f"{d.detector:12s} {d.score:14s} {_text(d.auroc):>18s} {_text(d.place_auroc):>18s} "
-        f"{_text(d.correlation):>20s}"
-        for d in found
-    ]
+    for row in to_json(found)["detections"]:
+        lines.append(_line(row["detector"], row["score"], *(interval(row[m]) for m in MEASURES)))
     return "\n".join(lines)
 
 
-def write(folder: Path, about: dict[str, Any], truth: Truth, found: Sequence[Detection]) -> None:
+def _line(*cells: str) -> str:
+    return "{:12s} {:14s} {:>18s} {:>18s} {:>20s}".format(*cells)
+
+
+def summary_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Tables of several runs, in markdown; one for each world."""
+    parts = []
+    for world in dict.fromkeys(
+        (r["task"], r["embodiment"], r["variant"], r["group"]) for r in rows
+    ):
+        own = [r for r in rows if (r["task"], r["embodiment"], r["variant"], r["group"]) == world]
+        task, embodiment, variant, group = world
+        decisions, broken = own[0]["decisions"], own[0]["broken"]
+        parts.append(
+            f"### {task}, {embodiment}, `{variant}`, {group}\n\n{len(decisions)} replay buffers of "
+            f"{_range(decisions, '{:,.0f}')} decisions; of the simulated copies "
+            f"{_range([100 * share for share in broken], '{:.0f}')} % are broken."
+        )
+        table = [
+            "| detector | score | AUROC | AUROC of places | correlation |",
+            "|---|---|--:|--:|--:|",
+        ]
+        for row in own:
+            cells = [interval(row[measure], len(decisions)) for measure in MEASURES]
+            table.append(f"| `{row['detector']}` | `{row['score']}` | {' | '.join(cells)} |")
+        parts.append("\n".join(table))
+    return "\n\n".join(parts)
+
+
+def _range(values: Sequence[float], form: str) -> str:
+    low, high = (form.format(end) for end in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def write(folder: Path, found: Found) -> None:
     """Write ``detect.json`` and ``detect.png``."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "detect.json", to_json(about, found))
-    maps(about, truth, found).savefig(folder / "detect.png", dpi=120)
+    write_json(folder / "detect.json", to_json(found))
+    maps(found).savefig(folder / "detect.png", dpi=120)
 
 
-def maps(about: dict[str, Any], truth: Truth, found: Sequence[Detection]) -> Figure:
+def maps(found: Found) -> Figure:
     """The workspace: departures that were simulated, and the mean rank of each score."""
+    truth = found.truth
     columns = {"simulated: mm from the majority": 1e3 * truth.departure}
-    for d in found:
+    for d in found.detections:
         ranks = d.scores.flatten().argsort().argsort().double() / (d.scores.numel() - 1)
         columns[d.score] = ranks.view_as(d.scores)
     figure = Figure(figsize=(2.6 * len(columns), 5.6), layout="constrained")
@@ -95,10 +146,7 @@ def maps(about: dict[str, Any], truth: Truth, found: Sequence[Detection]) -> Fig
         row[0].set_ylabel(f"{body}: y, mm", fontsize=8)
     for ax in axes[-1]:
         ax.set_xlabel("x, mm", fontsize=8)
-    settings = about["settings"]
-    figure.suptitle(
-        f"{settings['task']}, {settings['embodiment']}, {settings['variant']}", fontsize=10
-    )
+    figure.suptitle(", ".join(_world(found.about).values()), fontsize=10)
     return figure
 
 
@@ -114,7 +162,9 @@ def _squares(place: torch.Tensor, values: torch.Tensor) -> dict[tuple[int, int],
     }
 
 
-def _text(measure: Measure | None) -> str:
+def interval(measure: dict[str, float] | None, runs: int = 1) -> str:
+    """A measure of :func:`to_json` as text; how many of the runs have it, if not all do."""
     if measure is None:
         return "-"
-    return f"{measure.value:.2f} [{measure.low:.2f}, {measure.high:.2f}]"
+    some = f" ({measure['runs']:.0f} of {runs} runs)" if measure["runs"] < runs else ""
+    return f"{measure['value']:.2f} [{measure['low']:.2f}, {measure['high']:.2f}]{some}"

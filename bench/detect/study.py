@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,44 @@ RESAMPLES = 1_000
 
 @dataclass(frozen=True)
 class Measure:
-    """An estimate with its 95 % interval over orbits."""
+    """An estimate with its 95 % interval.
+
+    Attributes:
+        draws: the estimate in resampled data.
+        runs: that it is the mean of.
+    """
 
     value: float
     low: float
     high: float
+    draws: np.ndarray = field(repr=False, compare=False)
+    runs: int = 1
+
+    @classmethod
+    def of(cls, value: float, draws: np.ndarray, runs: int = 1) -> Measure:
+        """An estimate with the interval that its draws give; draws may be nan."""
+        draws = draws[~np.isnan(draws)]
+        low, high = np.quantile(draws, [0.025, 0.975])
+        return cls(value, float(low), float(high), draws, runs)
+
+    def to_json(self) -> dict[str, float]:
+        """Plain data."""
+        return {name: getattr(self, name) for name in ("value", "low", "high", "runs")}
+
+
+def mean_of_runs(measures: Sequence[Measure | None], seed: int = 0) -> Measure | None:
+    """Mean over runs, with an interval over resampled runs and the data of each; None for none."""
+    present = [measure for measure in measures if measure is not None]
+    if not present:
+        return None
+    rng = np.random.default_rng(seed)
+    draws = [
+        np.mean(
+            [rng.choice(present[i].draws) for i in rng.integers(len(present), size=len(present))]
+        )
+        for _ in range(RESAMPLES)
+    ]
+    return Measure.of(float(np.mean([m.value for m in present])), np.array(draws), len(present))
 
 
 @dataclass(frozen=True)
@@ -57,6 +90,21 @@ class Detection:
     scores: torch.Tensor
 
 
+@dataclass(frozen=True)
+class Found:
+    """What detectors say of one run's decisions.
+
+    Attributes:
+        about: the run, the settings and counts, as plain data.
+        truth: what was simulated.
+        detections: one for each score.
+    """
+
+    about: dict[str, Any]
+    truth: Truth
+    detections: list[Detection]
+
+
 def detect(
     folder: Path,
     detectors: Sequence[str],
@@ -64,7 +112,7 @@ def detect(
     group: str,
     seed: int = 0,
     report: Callable[[str], None] = lambda text: None,
-) -> tuple[dict[str, Any], Truth, list[Detection]]:
+) -> Found:
     """Fit detectors to a run's decisions and score them.
 
     Args:
@@ -74,9 +122,6 @@ def detect(
         group: the symmetry.
         seed: of states, detectors and intervals.
         report: receives a line for each part.
-
-    Returns:
-        What was measured as plain data, the truth, and a detection for each score.
 
     Raises:
         UserError: if the folder has no replay or policy, or a name is unknown.
@@ -118,7 +163,7 @@ def detect(
         "broken": int(truth.broken.sum()),
         "limit_mm": 1e3 * truth.limit,
     }
-    return about, truth, found
+    return Found(about, truth, found)
 
 
 def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
@@ -167,8 +212,7 @@ def _detection(
         value = statistic(range(len(orbits)))
         if np.isnan(value):
             return None
-        low, high = np.nanquantile([statistic(chosen) for chosen in draws], [0.025, 0.975])
-        return Measure(value, float(low), float(high))
+        return Measure.of(value, np.array([statistic(chosen) for chosen in draws]))
 
     return Detection(
         detector,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -12,8 +13,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from symsteer.bench.audit.result import AuditSettings
-from symsteer.bench.detect.study import _detection, auroc
+from symsteer.bench.detect.page import main as write_page
+from symsteer.bench.detect.report import interval
+from symsteer.bench.detect.study import Measure, _detection, auroc, mean_of_runs
 from symsteer.bench.detect.truth import Truth, measure_truth
+from symsteer.bench.pages import BEGIN, END
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.stored import stored_config, stored_policy
@@ -83,6 +87,51 @@ def test_the_command_prints_a_table_and_writes_data_and_maps(run, tmp_path, monk
     assert json.loads(again.out) == data
 
 
+def test_several_runs_give_means_over_those_in_the_same_world(run, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "found"
+    elsewhere = dataclasses.replace(BROKEN, variant="obstacle:1")
+    twin = shutil.copytree(run, tmp_path / run_id(elsewhere, {}))
+    path = twin / "config.json"
+    path.write_text(path.read_text().replace("friction_patch:1", "obstacle:1"))
+    options = ("--detector", "neighbours", "--count", 8, "--group", "C4", "--out", out)
+    code, printed = call(monkeypatch, capsys, run, twin, run, *options)
+    assert code == 0
+    first, second = json.loads((out / "summary.json").read_text())
+    alone = json.loads((out / run.name / "detect.json").read_text())
+    assert (first["variant"], second["variant"]) == ("friction_patch:1", "obstacle:1")
+    assert first["runs"] == [run.name] * 2
+    assert first["broken"] == [alone["broken"] / alone["copies"]] * 2
+    correlation = alone["detections"][0]["correlation"]
+    assert first["correlation"]["value"] == pytest.approx(correlation["value"])
+    assert first["correlation"]["runs"] == 2
+    assert "### PushCube-v1, floating, `obstacle:1`, C4" in printed.out
+    assert (out / "summary.md").read_text().strip() in printed.out
+    page = tmp_path / "detect.md"
+    page.write_text(f"before\n{BEGIN}old\n{END}after\n")
+    monkeypatch.setattr("symsteer.bench.detect.page.PAGE", page)
+    monkeypatch.setattr("symsteer.bench.detect.page.SUMMARY", tmp_path / "kept.json")
+    assert write_page([str(out / "summary.json")]) == 0
+    assert (out / "summary.md").read_text() in page.read_text()
+    assert "old" not in page.read_text()
+    assert write_page([]) == 0
+    assert write_page([str(out / "summary.md")]) == 2
+
+
+def test_the_mean_of_runs_has_the_spread_of_runs_and_of_their_data():
+    rng = np.random.default_rng(0)
+    runs = [Measure.of(mean, mean + 0.1 * rng.standard_normal(1000)) for mean in (0.0, 3.0)]
+    mean = mean_of_runs([runs[0], None, runs[1]])
+    assert (mean.value, mean.runs) == (1.5, 2)
+    # Both resampled runs are the first one in a quarter of the draws.
+    assert mean.low == pytest.approx(-0.1, abs=0.06)
+    assert mean.high == pytest.approx(3.1, abs=0.06)
+    same = mean_of_runs([runs[0]] * 4)
+    assert same.high - same.low == pytest.approx(2 * 1.96 * 0.1 / 2, rel=0.15)
+    assert mean_of_runs([None, None]) is None
+    assert interval(mean.to_json(), 3).endswith("(2 of 3 runs)")
+    assert Measure.of(0.5, np.array([np.nan, 0.2, 0.4])).low >= 0.2
+
+
 def test_areas_under_roc_curves():
     scores, labels = np.array([0.1, 0.4, 0.4, 0.9]), np.array([False, False, True, True])
     assert auroc(scores, labels) == pytest.approx(3.5 / 4)
@@ -109,6 +158,9 @@ def test_scores_of_copies_and_of_orbits():
 
 
 def test_mistakes(run, tmp_path, monkeypatch, capsys):
+    code, printed = call(monkeypatch, capsys)
+    assert (code, printed.out) == (2, "")
+    assert "symsteer detect" in printed.err
     code, printed = call(monkeypatch, capsys, run, "--detector", "gates")
     assert (code, printed.out) == (2, "")
     assert "did you mean 'gate'" in printed.err
