@@ -20,6 +20,8 @@ POLICIES: Registry[type[ChunkPolicy]] = Registry(
     "symsteer.policies",
     {
         "edp": "symsteer.policies.symmetry.lifted:EquivariantDiffusionPolicy",
+        "frame-averaged": "symsteer.policies.symmetry.averaged:FrameAveragedDiffusionPolicy",
+        "canonical": "symsteer.policies.symmetry.canonical:CanonicalDiffusionPolicy",
         "plain": "symsteer.policies.symmetry.unconstrained:PlainDiffusionPolicy",
         "plain-augmented": "symsteer.policies.symmetry.augmented:AugmentedDiffusionPolicy",
     },

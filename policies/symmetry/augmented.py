@@ -30,11 +30,16 @@ class AugmentedDiffusionPolicy(PlainDiffusionPolicy):
     Options = AugmentedOptions
     options: AugmentedOptions
 
+    @property
+    def data_group(self) -> Group:
+        """That of the augmentation."""
+        return Group.parse(self.options.augmentation)
+
     def augment(
         self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Turn each pair of observation and chunk by its own random symmetry."""
-        augmentation = Augmentation(Group.parse(self.options.augmentation))
+        augmentation = Augmentation(self.data_group)
         drawn = augmentation.draw(len(obs), generator).to(obs.device)
         return (
             augmentation.apply(drawn, obs, self.obs_layout),

@@ -152,7 +152,7 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
     def make_denoiser(self) -> LiftedDenoiser:
         """The lifted network over the options' group."""
         return lifted_denoiser(
-            self.options, self.obs_layout, self.act_layout, Group.parse(self.options.group)
+            self.options, self.obs_layout, self.chunk_layout, Group.parse(self.options.group)
         )
 
 

@@ -21,7 +21,7 @@ from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPoli
 TRIVIAL = "C1"
 
 
-P = TypeVar("P", bound="PlainOptions")
+P = TypeVar("P", bound=DenoisingOptions)
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ class PlainDiffusionPolicy(DiffusionPolicy):
 
     def make_denoiser(self) -> LiftedDenoiser:
         """The same network over the trivial group."""
-        return lifted_denoiser(self.options, self.obs_layout, self.act_layout, Group.parse(TRIVIAL))
+        group = Group.parse(TRIVIAL)
+        return lifted_denoiser(self.options, self.obs_layout, self.chunk_layout, group)
 
 
 def matched_size(options: P, obs_layout: Layout, act_layout: Layout, group: Group) -> P:
@@ -73,7 +74,7 @@ def matched_size(options: P, obs_layout: Layout, act_layout: Layout, group: Grou
     Channels and width grow together, in steps of 4 features; depth and horizon stay.
     """
 
-    def count(options: PlainOptions, group: Group) -> int:
+    def count(options: DenoisingOptions, group: Group) -> int:
         with torch.device("meta"):
             return parameter_count(lifted_denoiser(options, obs_layout, act_layout, group))
 

@@ -1,7 +1,11 @@
 """Training by denoising, decoding by DDIM: what all diffusion policies share.
 
 A subclass says in :meth:`DiffusionPolicy.make_denoiser` which network predicts the clean chunk,
-and may change the training batches in :meth:`DiffusionPolicy.augment`.
+and may change the training batches in :meth:`DiffusionPolicy.augment`. Options of all of them:
+
+- ``process``: diffusion or flow matching (:mod:`~symsteer.policies.training.diffusion`);
+- ``orbit_targets`` (:mod:`~symsteer.policies.training.orbit`);
+- ``action_frame``: noise and chunk are seen from a frame that the observation has.
 """
 
 from __future__ import annotations
@@ -15,12 +19,14 @@ import torch
 
 from symsteer.errors import UserError
 from symsteer.names import unknown
-from symsteer.policies.geometry import Layout
+from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.normalizer import Normalizer, clip_blocks
-from symsteer.policies.training.diffusion import Diffusion, Prediction
+from symsteer.policies.training.diffusion import Diffusion, Prediction, Process
+from symsteer.policies.training.frames import Frame
 from symsteer.policies.training.gradient import GradientPolicy
 from symsteer.policies.training.optimizer import GradientOptions
+from symsteer.policies.training.orbit import orbit_targets
 
 Network = Literal["mlp", "unet"]
 
@@ -37,6 +43,9 @@ DECODE_FIELDS = (
     "prediction",
 )
 """Options that a trained policy's behaviour depends on."""
+
+LATER_FIELDS = {"process": "diffusion", "action_frame": ""}
+"""The same, of policies that have another value than this one, which earlier versions had."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +64,22 @@ class DenoisingOptions(GradientOptions):
     """K: noise levels in training."""
     sampling_steps: int = 2
     """DDIM steps of the sampler."""
+    process: Process = "diffusion"
+    """How chunks become noise: diffusion, or the straight paths of flow matching (flow)."""
     prediction: Prediction = "sample"
-    """What the network predicts: the clean chunk (sample) or the noise (epsilon)."""
+    """What the network predicts: the clean chunk (sample), the noise (epsilon; diffusion only) or
+    noise minus chunk (velocity; flow only)."""
     snr_cap: float = 5.0
     """Largest weight of a noise level in the loss of sample prediction (Min-SNR); larger values
     spread the actions more over the noise, values of 0.05 or less weigh all levels alike."""
+    observation_noise: float = 0.0
+    """Standard deviation of the noise on normalised observations in training."""
+    orbit_targets: bool = False
+    """Train towards the mean of what a noisy chunk may come from: all turned copies of observation
+    and chunk, weighted by their probability. Needs a group and observation_noise."""
+    action_frame: str = ""
+    """A vector of the observation, e.g. tcp_x_axis: noise and chunk are turned into the frame where
+    it points along x (relative actions). Default: the world's frame."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,9 +90,21 @@ class DenoisingOptions(GradientOptions):
             raise UserError(
                 f"the unet halves the chunk; choose an even horizon, not {self.horizon}"
             )
-        Diffusion(self.diffusion_steps, self.prediction, self.snr_cap).timesteps(
-            self.sampling_steps
-        )
+        if self.observation_noise < 0:
+            raise UserError(
+                f"observation_noise is {self.observation_noise}; it must not be negative"
+            )
+        if self.orbit_targets and not self.observation_noise:
+            raise UserError(
+                "orbit_targets need observation_noise above 0, e.g. 0.1: an observation that is "
+                "known exactly tells which turned copy it belongs to"
+            )
+        self.diffusion.timesteps(self.sampling_steps)
+
+    @property
+    def diffusion(self) -> Diffusion:
+        """The process that these options describe."""
+        return Diffusion(self.diffusion_steps, self.prediction, self.snr_cap, self.process)
 
     def resolved(self, obs_layout: Layout, act_layout: Layout) -> Self:
         """Options in which everything that depends on the layouts is filled in."""
@@ -102,15 +134,31 @@ class DiffusionPolicy(GradientPolicy):
     ):
         options = options.resolved(obs_layout, act_layout)
         super().__init__(options, obs_layout, act_layout, obs_normalizer, act_normalizer)
-        self.diffusion = Diffusion(options.diffusion_steps, options.prediction, options.snr_cap)
+        self.diffusion = options.diffusion
+        self.frame = Frame(options.action_frame, obs_layout, act_layout)
         self.denoiser = self.make_denoiser()
         self.group = self.denoiser.group
+        if options.orbit_targets and self.data_group.order == 1:
+            raise UserError(
+                f"orbit_targets need a group, and the network of {self.name} has none; leave them "
+                "out, or choose another policy"
+            )
         self._expanded: tuple[Denoiser, Sequence[torch.Tensor]] | None = None
         self.freeze()
 
     @abc.abstractmethod
     def make_denoiser(self) -> Denoiser:
         """The network, untrained; it may read ``self.options`` and the layouts."""
+
+    @property
+    def chunk_layout(self) -> Layout:
+        """Geometry of an action as the network sees it."""
+        return self.frame.layout
+
+    @property
+    def data_group(self) -> Group:
+        """Symmetry of the data that training may use; by default the policy's own."""
+        return self.group
 
     def augment(
         self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
@@ -128,22 +176,36 @@ class DiffusionPolicy(GradientPolicy):
         levels, noise = levels.to(device), noise.to(device)
         obs, clean = self.augment(obs, chunks, generator)
         noisy = self.diffusion.add_noise(clean, noise, levels)
-        context = self.denoiser.encode(self.normalized_observation(obs))
-        output = self.denoiser(noisy, context, self.denoiser.encode_time(levels))
-        return self.diffusion.loss(output, clean, noise, levels)
+        seen = known = self.normalized_observation(obs)
+        if deviation := self.options.observation_noise:
+            seen = known + deviation * torch.randn(known.shape, generator=generator).to(device)
+        if self.options.orbit_targets:
+            keep, spread = self.diffusion.mixture(levels, clean)
+            pairs = ((known, seen, 1.0, deviation), (clean, noisy, keep, spread))
+            layouts = (self.obs_layout, self.act_layout)
+            clean = orbit_targets(pairs, layouts, self.data_group)
+            noise = (noisy - keep * clean) / spread
+        turn = self.frame.angle(seen)
+        context = self.denoiser.encode(seen)
+        output = self.denoiser(
+            self.frame.enter(noisy, turn), context, self.denoiser.encode_time(levels)
+        )
+        return self.diffusion.loss(self.frame.leave(output, turn), clean, noise, levels)
 
     def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Follow the deterministic sampler from ``noise``; see :meth:`ChunkPolicy.decode`."""
         denoiser, times = self._inference()
-        context = denoiser.encode(self.normalized_observation(obs))
+        seen = self.normalized_observation(obs)
+        context, turn = denoiser.encode(seen), self.frame.angle(seen)
         clean = self.diffusion.sample(
             lambda x, t: denoiser(x, context, times[t]),
-            noise,
+            self.frame.enter(noise, turn),
             self.options.sampling_steps,
             # Normalised demonstrations lie within radius 1, block by block.
             bound=lambda x: clip_blocks(x, self.act_layout, 1.0),
         )
-        return clip_blocks(self.act_normalizer.unnormalize(clean), self.act_layout, 1.0)
+        actions = self.act_normalizer.unnormalize(self.frame.leave(clean, turn))
+        return clip_blocks(actions, self.act_layout, 1.0)
 
     def freeze(self) -> Self:
         """Evaluation mode, no gradients; drops cached matrices after a change of weights."""
@@ -152,7 +214,8 @@ class DiffusionPolicy(GradientPolicy):
 
     def decode_settings(self) -> dict[str, Any]:
         """The options that decoding uses."""
-        return {key: getattr(self.options, key) for key in DECODE_FIELDS}
+        values = {key: getattr(self.options, key) for key in (*DECODE_FIELDS, *LATER_FIELDS)}
+        return {key: x for key, x in values.items() if LATER_FIELDS.get(key) != x}
 
     def _inference(self) -> tuple[Denoiser, Sequence[torch.Tensor]]:
         """The denoiser with dense matrices, and what it sees of each noise level."""

@@ -1,10 +1,15 @@
-"""The diffusion process of the base policies: schedule, training loss, deterministic sampler.
+"""How chunks become noise, the training loss, and the deterministic way back.
 
-Forward process q(x_t | x_0) = N(sqrt(a_t) x_0, (1 - a_t) I) with the squared-cosine schedule
-(Nichol & Dhariwal, arXiv 2102.09672); sampling by DDIM with eta = 0 (Song et al., arXiv
-2010.02502), so that the initial noise alone decides which action chunk comes out. Schedule,
-time steps ("trailing") and step agree with diffusers' ``DDIMScheduler``
-(``tests/policies/test_diffusion.py``); diffusers is not needed at run time.
+Level t mixes a clean chunk with noise, x_t = k_t x_0 + s_t noise:
+
+- ``diffusion``: k_t^2 = a_t, s_t^2 = 1 - a_t with the squared-cosine schedule (Nichol & Dhariwal,
+  arXiv 2102.09672). Schedule, time steps ("trailing") and step agree with diffusers'
+  ``DDIMScheduler`` (``tests/policies/test_diffusion.py``); diffusers is not needed at run time.
+- ``flow``: k_t = 1 - s_t, straight paths with the constant velocity noise - x_0 (flow matching,
+  Lipman et al., arXiv 2210.02747).
+
+Back it goes by DDIM with eta = 0 (Song et al., arXiv 2010.02502), so that the initial noise alone
+decides which chunk comes out. On straight paths a step of DDIM is an Euler step along the velocity.
 """
 
 from __future__ import annotations
@@ -18,7 +23,8 @@ import torch
 from symsteer.errors import UserError
 from symsteer.names import unknown
 
-Prediction = Literal["sample", "epsilon"]
+Process = Literal["diffusion", "flow"]
+Prediction = Literal["sample", "epsilon", "velocity"]
 Bound = Callable[[torch.Tensor], torch.Tensor]
 
 MOST_STEPS = 10_000
@@ -34,36 +40,48 @@ class Diffusion:
 
     Args:
         steps: K, the number of noise levels in training.
-        prediction: what the network outputs: ``sample`` (the clean chunk x_0) or ``epsilon``
-            (the noise). ``epsilon`` recovers x_0 by dividing by sqrt(a_t), which is about 5e-4
-            at the first sampling step: rounding errors grow by 1/sqrt(a_t).
+        prediction: what the network outputs: ``sample`` (the clean chunk x_0), ``epsilon`` (the
+            noise; diffusion only) or ``velocity`` (noise - x_0; flow only). ``epsilon`` recovers
+            x_0 by dividing by k_t, which is about 5e-4 at the first sampling step: rounding errors
+            grow by 1/k_t.
         snr_cap: with ``sample``, noise level t weighs min(SNR_t, snr_cap) in the loss, SNR_t =
-            a_t / (1 - a_t) (Min-SNR, Hang et al., arXiv 2303.09556), at least
+            k_t^2 / s_t^2 (Min-SNR, Hang et al., arXiv 2303.09556), at least
             ``MINIMUM_WEIGHT``, then scaled to a mean of 1. With equal weights the chunk depends
             less on the noise.
+        process: ``diffusion`` or ``flow``.
+
+    Attributes:
+        keep, spread: k_t and s_t of every level.
 
     Raises:
         UserError: if an argument is out of range.
     """
 
-    def __init__(self, steps: int = 100, prediction: Prediction = "sample", snr_cap: float = 5.0):
+    def __init__(
+        self,
+        steps: int = 100,
+        prediction: Prediction = "sample",
+        snr_cap: float = 5.0,
+        process: Process = "diffusion",
+    ):
         if not 2 <= steps <= MOST_STEPS:
             raise UserError(f"diffusion needs 2 to {MOST_STEPS} noise levels, not {steps}")
         if prediction not in get_args(Prediction):
             raise unknown("prediction", prediction, get_args(Prediction))
+        if process not in get_args(Process):
+            raise unknown("process", process, get_args(Process))
+        if (prediction, process) in (("epsilon", "flow"), ("velocity", "diffusion")):
+            own = "epsilon" if process == "diffusion" else "velocity"
+            raise UserError(f"{process} predicts sample or {own}, not {prediction}; choose one")
         if not snr_cap > 0:
             raise UserError(f"snr_cap must be positive, not {snr_cap}")
         self.steps = steps
         self.prediction = prediction
-        product = 1.0
-        self.signal: list[float] = []
-        for t in range(steps):
-            beta = min(1 - _squared_cosine((t + 1) / steps) / _squared_cosine(t / steps), 0.999)
-            product *= 1 - beta
-            self.signal.append(product)
+        self.keep, self.spread = _cosine(steps) if process == "diffusion" else _straight(steps)
         weights = [1.0] * steps
         if prediction == "sample":
-            weights = [max(min(a / (1 - a), snr_cap), MINIMUM_WEIGHT) for a in self.signal]
+            ratios = [(k / s) ** 2 for k, s in zip(self.keep, self.spread, strict=True)]
+            weights = [max(min(ratio, snr_cap), MINIMUM_WEIGHT) for ratio in ratios]
         self.weights = [weight * steps / sum(weights) for weight in weights]
 
     def timesteps(self, sampling_steps: int) -> list[int]:
@@ -80,18 +98,24 @@ class Diffusion:
         return [round(self.steps * (1 - i / sampling_steps)) - 1 for i in range(sampling_steps)]
 
     def add_noise(self, x0: torch.Tensor, noise: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        """Draw x_t given x_0; shapes ``x0, noise [B, ...]``, ``t [B]`` int64."""
-        signal = torch.tensor(self.signal, dtype=torch.float64)
-        shape = (-1,) + (1,) * (x0.dim() - 1)
-        keep = signal.sqrt().to(x0)[t].view(shape)
-        spread = (1 - signal).sqrt().to(x0)[t].view(shape)
+        """x_t of x_0; shapes ``x0, noise [B, ...]``, ``t [B]`` int64."""
+        keep, spread = self.mixture(t, x0)
         return keep * x0 + spread * noise
+
+    def mixture(self, t: torch.Tensor, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """k_t and s_t of levels ``t [B]``, with as many dimensions as ``like [B, ...]``."""
+        shape = (-1,) + (1,) * (like.dim() - 1)
+        keep, spread = (
+            torch.tensor(values, dtype=torch.float64).to(like)[t].view(shape)
+            for values in (self.keep, self.spread)
+        )
+        return keep, spread
 
     def loss(
         self, output: torch.Tensor, x0: torch.Tensor, noise: torch.Tensor, t: torch.Tensor
     ) -> torch.Tensor:
         """Weighted mean squared error of the network's output at levels ``t [B]``, a scalar."""
-        target = x0 if self.prediction == "sample" else noise
+        target = {"sample": x0, "epsilon": noise, "velocity": noise - x0}[self.prediction]
         weights = torch.tensor(self.weights, dtype=output.dtype, device=output.device)[t]
         return (weights * (output - target).square().flatten(1).mean(dim=1)).mean()
 
@@ -111,15 +135,18 @@ class Diffusion:
             bound: applied to the predicted clean chunk; must commute with the symmetry. The
                 noise direction is the one that belongs to the bounded prediction.
         """
-        keep, spread = math.sqrt(self.signal[t]), math.sqrt(1 - self.signal[t])
-        clean = output if self.prediction == "sample" else (x - spread * output) / keep
+        keep, spread = self.keep[t], self.spread[t]
+        clean = output
+        if self.prediction == "epsilon":
+            clean = (x - spread * output) / keep
+        elif self.prediction == "velocity":
+            clean = x - spread * output
         if bound is not None:
             clean = bound(clean)
         if t_next < 0:
             return clean
         noise = (x - keep * clean) / spread
-        signal = self.signal[t_next]
-        return math.sqrt(signal) * clean + math.sqrt(1 - signal) * noise
+        return self.keep[t_next] * clean + self.spread[t_next] * noise
 
     def sample(
         self,
@@ -134,6 +161,19 @@ class Diffusion:
         for t, t_next in zip(levels, [*levels[1:], -1], strict=True):
             x = self.ddim_step(network(x, t), t, t_next, x, bound)
         return x
+
+
+def _cosine(steps: int) -> tuple[list[float], list[float]]:
+    product, signal = 1.0, []
+    for t in range(steps):
+        beta = min(1 - _squared_cosine((t + 1) / steps) / _squared_cosine(t / steps), 0.999)
+        product *= 1 - beta
+        signal.append(product)
+    return [math.sqrt(a) for a in signal], [math.sqrt(1 - a) for a in signal]
+
+
+def _straight(steps: int) -> tuple[list[float], list[float]]:
+    return [1 - (t + 1) / steps for t in range(steps)], [(t + 1) / steps for t in range(steps)]
 
 
 def _squared_cosine(time: float) -> float:

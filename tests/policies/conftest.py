@@ -92,7 +92,7 @@ def small_options(name: str = "edp", **fields):
 
 def fit(name: str = "edp", seed: int = 0, progress=None, episodes=None, **fields):
     """A policy trained for a few steps."""
-    if name != "edp":
+    if hasattr(POLICIES.get(name).Options, "match_compute"):
         fields.setdefault("match_compute", False)
     episodes = make_episodes(6, noise=0.2) if episodes is None else episodes
     options = small_options(name, **{"steps": 30, "batch_size": 32, **fields})

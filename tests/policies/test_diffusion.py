@@ -21,8 +21,10 @@ def reference(prediction, clip=False):
 
 def test_schedule_and_forward_process():
     ours, theirs = Diffusion(100), reference("sample")
-    assert torch.allclose(torch.tensor(ours.signal).float(), theirs.alphas_cumprod, rtol=2e-4)
-    assert torch.allclose(torch.tensor(ours.signal).float(), theirs.alphas_cumprod, atol=1e-6)
+    signal = torch.tensor(ours.keep).square()
+    assert torch.allclose(signal, theirs.alphas_cumprod, rtol=2e-4)
+    assert torch.allclose(signal, theirs.alphas_cumprod, atol=1e-6)
+    assert torch.allclose(torch.tensor(ours.spread).square(), 1 - signal, atol=1e-6)
     x0, noise = torch.randn(2, 100, 8, 7, generator=torch.Generator().manual_seed(0))
     t = torch.arange(100)
     assert torch.allclose(ours.add_noise(x0, noise, t), theirs.add_noise(x0, noise, t), atol=1e-5)
@@ -84,7 +86,7 @@ def test_loss_targets():
 
 def test_loss_weights_follow_the_signal_to_noise_ratio():
     process = Diffusion(100, snr_cap=5.0)
-    snr = torch.tensor([a / (1 - a) for a in process.signal])
+    snr = torch.tensor([(k / s) ** 2 for k, s in zip(process.keep, process.spread, strict=True)])
     weights = torch.tensor(process.weights)
     assert weights.mean().item() == pytest.approx(1.0)
     assert torch.allclose(weights / weights[0], snr.clamp(0.05, 5.0) / 5.0)
@@ -94,11 +96,39 @@ def test_loss_weights_follow_the_signal_to_noise_ratio():
     assert loss.item() == pytest.approx(float(weights[[10, 80]].mean()), rel=1e-5)
 
 
+@pytest.mark.parametrize("prediction", ["sample", "velocity"])
+def test_a_step_of_flow_is_an_euler_step_along_the_velocity(prediction):
+    flow = Diffusion(100, prediction, process="flow")
+    assert flow.keep[-1] == 0
+    assert flow.timesteps(4) == [99, 74, 49, 24]
+    x, output = torch.randn(2, 16, 8, 7, generator=torch.Generator().manual_seed(0)).double()
+    for t, t_next in ((99, 49), (49, 24), (24, -1)):
+        time, later = (t + 1) / 100, (t_next + 1) / 100
+        velocity = output if prediction == "velocity" else (x - output) / time
+        expected = x + (later - time) * velocity
+        assert torch.allclose(flow.ddim_step(output, t, t_next, x), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("prediction", ["sample", "velocity"])
+def test_flow_starts_at_the_noise_and_learns_straight_paths(prediction):
+    flow = Diffusion(100, prediction, process="flow")
+    x0, noise = torch.randn(2, 3, 8, 7, generator=torch.Generator().manual_seed(0))
+    ends = flow.add_noise(x0, noise, torch.tensor([99, 49, 0]))
+    assert torch.equal(ends[0], noise[0])
+    assert torch.allclose(ends[1], (x0[1] + noise[1]) / 2)
+    target = {"sample": x0, "velocity": noise - x0}[prediction]
+    levels = torch.tensor([99, 49, 0])
+    assert flow.loss(target, x0, noise, levels) == 0
+    assert flow.loss(-target, x0, noise, levels) > 0
+
+
 @pytest.mark.parametrize(
     "mistake",
     [
         lambda: Diffusion(1),
         lambda: Diffusion(100, "velocity"),
+        lambda: Diffusion(100, "epsilon", process="flow"),
+        lambda: Diffusion(100, process="flows"),
         lambda: Diffusion(100, snr_cap=0.0),
         lambda: Diffusion(100).timesteps(0),
         lambda: Diffusion(100).timesteps(101),

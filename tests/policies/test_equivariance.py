@@ -8,6 +8,7 @@ import torch
 from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
 from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy
+from tests.policies.conftest import OBS
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
@@ -47,6 +48,60 @@ class TestEquivariance:
         finally:
             policy.float()
         assert error <= TOLERANCE[dtype]
+
+
+WAYS = {
+    "frame-averaged": {"policy": "frame-averaged", "group": "C8"},
+    "frame-averaged, D4": {"policy": "frame-averaged", "group": "D4"},
+    "frame-averaged, U-Net": {"policy": "frame-averaged", "group": "C4", "network": "unet"},
+    "canonical": {"policy": "canonical"},
+    "canonical, anchor": {"policy": "canonical", "anchor": "tcp"},
+    "C16": {"group": "C16"},
+    "D8": {"group": "D8"},
+    "relative actions": {"group": "D4", "action_frame": "goal"},
+    "averaged, relative actions": {"policy": "frame-averaged", "action_frame": "tcp"},
+    "flow": {"group": "C8", "process": "flow"},
+    "velocity": {"group": "C8", "process": "flow", "prediction": "velocity"},
+    "orbit": {"group": "D4", "orbit_targets": True, "observation_noise": 0.1},
+}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("way", WAYS)
+def test_every_way_to_be_symmetric_is_exact(trained, world, way, dtype):
+    """Before and after training."""
+    fields = {**WAYS[way]}
+    name = fields.pop("policy", "edp")
+    for policy in (world.untrained(name, **fields), trained(name, **fields)):
+        policy.to(dtype)
+        try:
+            assert policy.group.order > 1
+            assert decode_error(policy, world, policy.group, dtype) <= TOLERANCE[dtype]
+            if name == "canonical":
+                assert decode_error(policy, world, Group.parse("C5"), dtype) <= TOLERANCE[dtype]
+        finally:
+            policy.float()
+
+
+def test_the_frame_of_a_chunk_is_needed(trained, world, monkeypatch):
+    """Relative actions in the world's frame would not be symmetric."""
+    policy = trained(group="D4", action_frame="goal")
+    monkeypatch.setattr(policy.frame, "leave", lambda chunk, angle: chunk)
+    assert decode_error(policy, world, policy.group, torch.float32) > 1e-2
+
+
+def test_a_frame_may_be_an_odd_vector(world):
+    """Columns of a mirrored rotation change sign; the frame then turns by half a turn."""
+    odd = Layout([Field(f.name, f.frequency, f.multiplicity, f.name == "goal") for f in OBS.fields])
+    torch.manual_seed(0)
+    options = world.options(group="D4", action_frame="goal")
+    policy = EquivariantDiffusionPolicy(options, odd, world.act_layout)
+    policy.denoiser.project.weight.mul_(5)
+    policy.freeze()
+    error = decode_error(policy, world, policy.group, torch.float32, obs_layout=odd)
+    assert error <= 1e-5
+    even = world.obs_layout
+    assert decode_error(policy, world, policy.group, torch.float32, obs_layout=even) > 1e-2
 
 
 @pytest.mark.parametrize("network", ["mlp", "unet"])

@@ -31,6 +31,9 @@ def decode(policy, world):
         {"group": "D4", "network": "unet"},
         {"name": "plain", "network": "unet"},
         {"name": "plain-augmented", "augmentation": "SO2", "hold": ("gripper", "z")},
+        {"name": "frame-averaged", "group": "C4"},
+        {"name": "canonical"},
+        {"process": "flow", "prediction": "velocity", "action_frame": "goal"},
     ],
 )
 def test_round_trip_is_bit_equal(trained, world, tmp_path, fields):

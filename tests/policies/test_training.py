@@ -8,7 +8,7 @@ import torch
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.geometry import Group
+from symsteer.policies.geometry import Group, group_average
 from symsteer.policies.symmetry.augmented import Augmentation
 from symsteer.policies.training.demonstrations import make_chunks
 
@@ -73,12 +73,64 @@ def test_augmented_training_sees_turned_pairs(world):
     assert errors["edp"] < 0.5
 
 
-@pytest.mark.parametrize("name", ["edp", "plain", "plain-augmented"])
+@pytest.mark.parametrize("name", list(POLICIES.builtin))
 def test_the_same_seed_gives_the_same_policy(world, name):
     first, second, other = (world.fit(name, seed) for seed in (3, 3, 4))
     assert first.content_hash() == second.content_hash()
     assert first.training_record["losses"] == second.training_record["losses"]
     assert first.content_hash() != other.content_hash()
+
+
+def test_a_frame_must_be_a_vector_of_the_observation(world):
+    for fields in ({"name": "canonical", "anchor": "goall"}, {"action_frame": "goall"}):
+        with pytest.raises(UserError, match="no planar vector 'goall'; did you mean 'goal'"):
+            world.untrained(**fields)
+    with pytest.raises(UserError, match="valid: tcp, goal"):
+        world.untrained(action_frame="rod")
+
+
+def test_the_anchor_is_the_vector_that_stays_away_from_zero(world):
+    episodes = world.episodes(6)
+    vectors = {name: world.obs_layout.slice(name) for name in ("tcp", "goal")}
+    for steady, other in (("tcp", "goal"), ("goal", "tcp")):
+        changed = []
+        for obs, actions in episodes:
+            obs = obs.clone()
+            obs[:, vectors[steady]] /= obs[:, vectors[steady]].norm(dim=-1, keepdim=True)
+            obs[0, vectors[other]] = 0
+            changed.append((obs, actions))
+        assert world.fit("canonical", steps=2, episodes=changed).options.anchor == steady
+    assert world.fit("canonical", steps=2, anchor="goal").options.anchor == "goal"
+
+
+def test_the_canonical_policy_jumps_where_its_anchor_vanishes_and_only_there(trained, world):
+    policy = trained("canonical", anchor="goal")
+    obs, noise = world.observations(16), torch.randn(16, 8, 7)
+    for name, jumps in (("goal", True), ("tcp", False)):
+        sides = []
+        for sign in (-1, 1):
+            near = obs.clone()
+            near[:, world.obs_layout.slice(name)] = sign * torch.tensor([1e-4, 0.0])
+            sides.append(policy.decode(near, noise))
+        assert ((sides[0] - sides[1]).abs().max() > 0.1) == jumps
+
+
+def test_the_averaged_network_is_the_mean_over_the_group(trained, world):
+    policy = trained("frame-averaged", group="D4")
+    inner, time = policy.denoiser.inner, policy.denoiser.encode_time(torch.tensor([30]))
+    x, obs = torch.randn(4, 8, 7), world.observations(4)
+    expected = group_average(
+        lambda x, obs: inner(x, inner.encode(obs), time),
+        (x, obs),
+        (world.act_layout, world.obs_layout),
+        world.act_layout,
+        policy.group,
+    )
+    found = policy.denoiser(x, policy.denoiser.encode(obs), time)
+    assert torch.allclose(found, expected, atol=1e-5)
+    assert not torch.allclose(found, inner(x, inner.encode(obs), time), atol=1e-2)
+    sizes = [p.parameter_count() for p in (policy, world.untrained(group="D4"))]
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
 
 
 def test_the_policy_keeps_averaged_weights(world):
@@ -160,6 +212,13 @@ def test_plain_policies_have_matched_parameters_and_no_group(world, name, networ
         {"group": "SO2"},
         {"name": "plain", "group": "SO2"},
         {"name": "plain-augmented", "augmentation": "everything"},
+        {"name": "canonical", "symmetry": "D4"},
+        {"name": "canonical", "symmetry": "SO2"},
+        {"name": "frame-averaged", "group": "SO2"},
+        {"process": "diffuse"},
+        {"process": "flow", "prediction": "epsilon"},
+        {"observation_noise": -0.1},
+        {"orbit_targets": True},
         {"snr_cap": 0.0},
         {"horizon": 0},
         {"execute": 9},

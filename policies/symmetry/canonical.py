@@ -1,0 +1,125 @@
+"""Symmetry by a canonical frame (after CanonFlow, arXiv 2602.15022, with a condition).
+
+    angle of an observed vector (the anchor) -> observation and noise turned back by it
+    -> plain policy -> chunk turned forward
+
+The policy commutes with every rotation of the plane, not with those of a finite group alone, and
+with no reflection. Where the anchor vanishes its angle jumps, and the policy with it: no continuous
+choice of a frame exists there. By default the anchor is the vector that stays longest in the
+demonstrations. CanonFlow has no condition and takes its frame from the data; the frame from the
+observation is our choice.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import torch
+
+from symsteer.errors import UserError
+from symsteer.policies.contract import Episode, Progress
+from symsteer.policies.geometry import Group, Layout
+from symsteer.policies.normalizer import Normalizer
+from symsteer.policies.symmetry.unconstrained import PlainDiffusionPolicy, PlainOptions
+from symsteer.policies.training.demonstrations import check_episodes
+from symsteer.policies.training.frames import Frame, planar_vectors
+
+SHORT = 0.01
+"""An anchor is judged by this quantile of its length in the demonstrations."""
+
+
+@dataclass(frozen=True)
+class CanonicalOptions(PlainOptions):
+    """Options of the canonical diffusion policy."""
+
+    anchor: str = ""
+    """A vector of the observation; its angle defines the frame. Default: the vector whose shortest
+    demonstrated lengths are largest, relative to its longest one."""
+    symmetry: str = "C8"
+    """The group that steering agents may use: a finite group of rotations, C_n."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if Group.parse(self.symmetry).reflections or not Group.parse(self.symmetry).rotations:
+            raise UserError(
+                "the canonical policy commutes with rotations alone; its symmetry must be C_n, "
+                f"e.g. C8, not {self.symmetry}"
+            )
+
+
+class CanonicalDiffusionPolicy(PlainDiffusionPolicy):
+    """Plain diffusion policy in a frame that turns with the observation."""
+
+    name = "canonical"
+    Options = CanonicalOptions
+    options: CanonicalOptions
+
+    def __init__(
+        self,
+        options: CanonicalOptions,
+        obs_layout: Layout,
+        act_layout: Layout,
+        obs_normalizer: Normalizer | None = None,
+        act_normalizer: Normalizer | None = None,
+    ):
+        if not options.anchor:
+            options = dataclasses.replace(options, anchor=planar_vectors(obs_layout)[0].name)
+        super().__init__(options, obs_layout, act_layout, obs_normalizer, act_normalizer)
+        self.anchor = Frame(options.anchor, obs_layout, act_layout)
+        self.group = Group.parse(options.symmetry)
+
+    @classmethod
+    def fit(
+        cls,
+        options: Any,
+        episodes: Sequence[Episode],
+        obs_layout: Layout,
+        act_layout: Layout,
+        seed: int = 0,
+        progress: Progress | None = None,
+        device: torch.device | str = "cpu",
+    ) -> Self:
+        """Train in the frame of the anchor; see :meth:`ChunkPolicy.fit`."""
+        check_episodes(episodes, obs_layout, act_layout)
+        if not options.anchor:
+            seen = torch.cat([obs for obs, _ in episodes])
+            options = dataclasses.replace(options, anchor=steadiest_vector(seen, obs_layout))
+        return super().fit(options, episodes, obs_layout, act_layout, seed, progress, device)
+
+    def augment(
+        self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Turn each pair of observation and chunk into its frame."""
+        angle = self._angle(obs)
+        return self.obs_layout.rotate(obs, -angle), self.act_layout.rotate(chunks, -angle)
+
+    def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Decode in the frame of the anchor; see :meth:`ChunkPolicy.decode`."""
+        angle = self._angle(obs)
+        turned = self.obs_layout.rotate(obs, -angle), self.act_layout.rotate(noise, -angle)
+        return self.act_layout.rotate(super().decode(*turned), angle)
+
+    def decode_settings(self) -> dict[str, Any]:
+        """Also the anchor."""
+        return {**super().decode_settings(), "anchor": self.options.anchor}
+
+    def _angle(self, obs: torch.Tensor) -> torch.Tensor:
+        angle = self.anchor.angle(obs)
+        assert angle is not None
+        return angle
+
+
+def steadiest_vector(obs: torch.Tensor, layout: Layout) -> str:
+    """The planar vector of ``obs [M, obs_dim]`` that stays away from 0, by name.
+
+    Raises:
+        UserError: if the layout has no planar vector.
+    """
+    shortest: dict[str, float] = {}
+    for field in planar_vectors(layout):
+        length = obs[:, layout.slice(field.name)].float().norm(dim=-1)
+        shortest[field.name] = (length.quantile(SHORT) / length.max().clamp(min=1e-12)).item()
+    return max(shortest, key=lambda name: shortest[name])
