@@ -20,6 +20,7 @@ POLICIES: Registry[type[ChunkPolicy]] = Registry(
     "symsteer.policies",
     {
         "edp": "symsteer.policies.symmetry.lifted:EquivariantDiffusionPolicy",
+        "escnn": "symsteer.policies.symmetry.with_escnn:EscnnDiffusionPolicy",
         "frame-averaged": "symsteer.policies.symmetry.averaged:FrameAveragedDiffusionPolicy",
         "canonical": "symsteer.policies.symmetry.canonical:CanonicalDiffusionPolicy",
         "plain": "symsteer.policies.symmetry.unconstrained:PlainDiffusionPolicy",

@@ -403,6 +403,15 @@ def group_average(
     return torch.stack(outputs).mean(0)
 
 
+def escnn_modules() -> Any:
+    """The module ``escnn.nn``.
+
+    Raises:
+        UserError: if escnn is not installed.
+    """
+    return _escnn().nn
+
+
 def _escnn() -> Any:
     try:
         import escnn.gspaces

@@ -15,6 +15,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
@@ -22,7 +23,7 @@ from torch.nn import functional
 
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
-from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
+from symsteer.policies.networks.equivariant import EquivariantLayer, Lift, Project, RegularLinear
 from symsteer.policies.networks.slices import ResidualMLP, TemporalUNet
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
 
@@ -59,19 +60,27 @@ class LiftedDenoiser(Denoiser):
         # The MLP sees the chunk as one long vector, the U-Net as a sequence of actions.
         self.flat = network == "mlp"
         layout = act_layout.repeat(horizon) if self.flat else act_layout
-        self.obs_lift = Lift(obs_layout, group, channels)
-        self.obs_mix = RegularLinear(group, channels, channels)
-        self.chunk_lift = Lift(layout, group, width)
+        make = self.make_layer
+        self.obs_lift = make(Lift(obs_layout, group, channels))
+        self.obs_mix = make(RegularLinear(group, channels, channels))
+        self.chunk_lift = make(Lift(layout, group, width))
         self.slice_network = ResidualMLP(width, depth) if self.flat else TemporalUNet(width)
-        self.project = Project(group, width, layout)
+        self.project = make(Project(group, width, layout))
         self.condition = nn.Linear(channels, self.slice_network.condition_dim)
         self.time_in = nn.Linear(TIME_FEATURES, TIME_FEATURES)
         self.time_out = nn.Linear(TIME_FEATURES, self.slice_network.condition_dim, bias=False)
 
+    def make_layer(self, layer: EquivariantLayer) -> nn.Module:
+        """The layer that is used; a subclass may put its own in the place of this one."""
+        return layer
+
+    def embed(self, obs: torch.Tensor) -> torch.Tensor:
+        """Embedding of an observation; ``[B, obs_dim] -> [B, order, channels]``."""
+        return self.obs_mix(functional.silu(self.obs_lift(obs)))
+
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         """What the network sees of it; ``[B, obs_dim] -> [B, order, condition]``."""
-        embedding = functional.silu(self.obs_mix(functional.silu(self.obs_lift(obs))))
-        return self.condition(embedding)
+        return self.condition(functional.silu(self.embed(obs)))
 
     def encode_time(self, t: torch.Tensor) -> torch.Tensor:
         """What the network sees of the noise level; ``[B] -> [B, 1, condition]``."""
@@ -97,12 +106,12 @@ class LiftedDenoiser(Denoiser):
         """A copy for inference whose equivariant layers hold their dense matrices ready."""
         fast = super().expanded()
         order = self.group.order
-        fast.register_module("obs_lift", _Dense(self.obs_lift, 1, (order, self.obs_lift.channels)))
-        fast.register_module("obs_mix", _Dense(self.obs_mix, 2, (order, self.obs_mix.out_channels)))
-        fast.register_module(
-            "chunk_lift", _Dense(self.chunk_lift, 1, (order, self.chunk_lift.channels))
-        )
-        fast.register_module("project", _Dense(self.project, 2, (self.project.layout.dim,)))
+        for name, inputs in (("obs_lift", 1), ("obs_mix", 2), ("chunk_lift", 1), ("project", 2)):
+            layer = getattr(self, name)
+            if not hasattr(layer, "dense"):
+                continue
+            outputs = (layer.layout.dim,) if name == "project" else (order, -1)
+            fast.register_module(name, _Dense(layer, inputs, outputs))
         return fast
 
 
@@ -115,9 +124,7 @@ class _Dense(nn.Module):
     weight: torch.Tensor
     bias: torch.Tensor
 
-    def __init__(
-        self, layer: Lift | RegularLinear | Project, in_rank: int, out_shape: tuple[int, ...]
-    ):
+    def __init__(self, layer: Any, in_rank: int, out_shape: tuple[int, ...]):
         super().__init__()
         self.in_rank, self.out_shape = in_rank, out_shape
         with torch.no_grad():

@@ -33,6 +33,7 @@ def decode(policy, world):
         {"name": "plain-augmented", "augmentation": "SO2", "hold": ("gripper", "z")},
         {"name": "frame-averaged", "group": "C4"},
         {"name": "canonical"},
+        {"name": "escnn", "group": "D4"},
         {"process": "flow", "prediction": "velocity", "action_frame": "goal"},
     ],
 )

@@ -1,0 +1,83 @@
+"""The policy with escnn's layers, and escnn's networks as its encoder."""
+
+import pytest
+import torch
+
+from symsteer.policies.files import load_policy, save_policy
+from symsteer.policies.geometry import Group
+from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
+from tests.policies.conftest import small_options
+from tests.policies.test_equivariance import decode_error
+
+nn = pytest.importorskip("escnn.nn")
+
+from symsteer.policies.symmetry.with_escnn import (  # noqa: E402
+    EscnnDiffusionPolicy,
+    EscnnLayer,
+    regular_fields,
+)
+
+
+class Encoded(EscnnDiffusionPolicy):
+    """An escnn network with norms of vectors in between, which our layers do not have."""
+
+    name = "encoded"
+
+    def make_encoder(self, seen, embedding):
+        space = seen.gspace
+        hidden = nn.FieldType(space, [space.irrep(1)] * 6 + [space.trivial_repr] * 6)
+        return nn.SequentialModule(
+            nn.Linear(seen, hidden), nn.NormNonLinearity(hidden), nn.Linear(hidden, embedding)
+        )
+
+
+@pytest.mark.parametrize("name", ["C4", "C8", "D4"])
+def test_it_has_the_parameters_and_the_functions_of_edp(world, name):
+    """Every matrix of ours is one of escnn's."""
+    ours, theirs = (world.untrained(policy, group=name) for policy in ("edp", "escnn"))
+    group = Group.parse(name)
+    # Ours also has biases of what turns, which have no effect.
+    turning = ~world.act_layout.repeat(8).invariant_mask(reflections=group.reflections)
+    assert theirs.parameter_count() == ours.parameter_count() - turning.sum()
+    for layer in (
+        Lift(world.obs_layout, group, 2),
+        RegularLinear(group, 2, 3),
+        Project(group, 2, world.act_layout),
+    ):
+        other = EscnnLayer(layer)
+        columns = []
+        for i in range(other.weight.numel()):
+            other.weight.data = torch.eye(other.weight.numel())[i].double()
+            columns.append(other.double().dense()[0].flatten())
+        basis, wanted = torch.stack(columns, 1), layer.double().dense()[0].flatten()
+        found = torch.linalg.lstsq(basis, wanted[:, None]).solution
+        assert torch.allclose((basis @ found).squeeze(1), wanted, atol=1e-5)
+
+
+def test_fields_are_ordered_as_ours(world):
+    """The same coefficients on inputs that are permuted by the group give permuted outputs."""
+    group = Group.parse("D4")
+    layer = EscnnLayer(RegularLinear(group, 3, 5)).double()
+    x = torch.randn(2, group.order, 3, dtype=torch.float64)
+    for g in range(group.order):
+        before = group.multiplication[group.inverse[g]]
+        assert torch.allclose(layer(x[:, before]), layer(x)[:, before], atol=1e-5)
+
+
+def test_an_escnn_network_may_encode_the_observation(world, tmp_path):
+    options = small_options("escnn", steps=30, batch_size=32)
+    episodes = world.episodes(6, noise=0.2)
+    policy = Encoded.fit(options, episodes, world.obs_layout, world.act_layout)
+    assert decode_error(policy, world, policy.group, torch.float32) <= 1e-5
+    obs, noise = world.observations(4), torch.randn(4, policy.horizon, 7)
+    far = policy.decode(obs.flip(0), noise)
+    assert not torch.allclose(policy.decode(obs, noise), far, atol=1e-2)
+    again = load_policy(save_policy(policy, tmp_path / "policy.safetensors"))
+    assert torch.equal(again.decode(obs, noise), policy.decode(obs, noise))
+    losses = [loss for _, loss in policy.training_record["losses"]]
+    assert losses[-1] < losses[0]
+
+
+def test_regular_fields(world):
+    seen = world.obs_layout.field_type(Group.parse("C4"))
+    assert regular_fields(seen, 3).size == 12
