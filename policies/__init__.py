@@ -22,6 +22,8 @@ POLICIES: Registry[type[ChunkPolicy]] = Registry(
         "edp": "symsteer.policies.symmetry.lifted:EquivariantDiffusionPolicy",
         "escnn": "symsteer.policies.symmetry.with_escnn:EscnnDiffusionPolicy",
         "frame-averaged": "symsteer.policies.symmetry.averaged:FrameAveragedDiffusionPolicy",
+        "so2": "symsteer.policies.symmetry.steerable:PlanarSteerablePolicy",
+        "spherical": "symsteer.policies.symmetry.steerable:SphericalPolicy",
         "canonical": "symsteer.policies.symmetry.canonical:CanonicalDiffusionPolicy",
         "plain": "symsteer.policies.symmetry.unconstrained:PlainDiffusionPolicy",
         "plain-augmented": "symsteer.policies.symmetry.augmented:AugmentedDiffusionPolicy",

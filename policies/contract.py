@@ -174,6 +174,15 @@ class ChunkPolicy(nn.Module, abc.ABC):
             ``[B, Tp, act_dim]``, environment actions: every irrep block of norm at most 1.
         """
 
+    @classmethod
+    def bounded_layout(cls, layout: Layout) -> Layout:
+        """Says what has one norm and one scale in a vector of this layout: its irrep blocks."""
+        return layout
+
+    def bounded(self, actions: torch.Tensor) -> torch.Tensor:
+        """Actions ``[..., act_dim]``, every block shortened to norm 1 at most."""
+        return clip_blocks(actions, self.bounded_layout(self.act_layout), 1.0)
+
     @property
     def horizon(self) -> int:
         """Tp: actions in a chunk."""
@@ -196,7 +205,8 @@ class ChunkPolicy(nn.Module, abc.ABC):
 
     def normalized_observation(self, obs: torch.Tensor) -> torch.Tensor:
         """What networks see of ``obs [..., obs_dim]``: unit size, blocks of bounded length."""
-        return clip_blocks(self.obs_normalizer.normalize(obs), self.obs_layout, OBSERVATION_RADIUS)
+        layout = self.bounded_layout(self.obs_layout)
+        return clip_blocks(self.obs_normalizer.normalize(obs), layout, OBSERVATION_RADIUS)
 
     def freeze(self) -> Self:
         """Evaluation mode, no gradients. To be called after every change of the weights."""

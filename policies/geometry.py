@@ -13,6 +13,7 @@ reflections (yaw, axial vectors, mirrored rotation columns).
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -122,6 +123,28 @@ class Layout:
         """The index of each number's irrep block, ``[dim]`` int64."""
         sizes = torch.tensor([block.stop - block.start for block in self.blocks])
         return torch.repeat_interleave(torch.arange(len(self.blocks)), sizes)
+
+    def spatial_vectors(self) -> list[tuple[str, str]]:
+        """The pairs of fields that are vectors in space: horizontal part, then vertical part.
+
+        They follow each other and are named ``NAME_xy`` and ``NAME_z`` (or ``xy`` and ``z``), or
+        ``tilt`` and ``yaw``, the parts of a rotation.
+        """
+        found = []
+        for first, second in itertools.pairwise(self.fields):
+            stem, _, end = first.name.rpartition("[")
+            name, instant = (stem, f"[{end}") if stem else (first.name, "")
+            other = "yaw" if name == "tilt" else f"{name.removesuffix('xy')}z"
+            named = name == "tilt" or name == "xy" or name.endswith(("_xy", ".xy"))
+            kinds = (first.frequency, second.frequency, first.multiplicity, second.multiplicity)
+            if named and second.name == other + instant and kinds == (1, 0, 1, 1):
+                found.append((first.name, second.name))
+        return found
+
+    @property
+    def spatial(self) -> Layout:
+        """The same fields, with one block for each vector in space."""
+        return _SpatialLayout(self.fields)
 
     def invariant_mask(self, reflections: bool = False) -> torch.Tensor:
         """Which numbers are invariant under rotations (and reflections), ``[dim]`` bool."""
@@ -244,6 +267,30 @@ class Layout:
                 "{name, frequency, multiplicity, odd}"
             ) from error
         return cls(fields)
+
+
+class _SpatialLayout(Layout):
+    """A layout whose vectors in space are one block each."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _SpatialLayout) and super().__eq__(other)
+
+    def __hash__(self) -> int:
+        return hash((type(self), self.fields))
+
+    @functools.cached_property
+    def block_index(self) -> torch.Tensor:
+        index = super().block_index.clone()
+        for horizontal, vertical in self.spatial_vectors():
+            index[self.slice(vertical)] = index[self.slice(horizontal)][0]
+        # Numbers without gaps.
+        return index.unique(return_inverse=True)[1]
+
+    def invariant_mask(self, reflections: bool = False) -> torch.Tensor:
+        mask = super().invariant_mask(reflections)
+        for _, vertical in self.spatial_vectors():
+            mask[self.slice(vertical)] = False
+        return mask
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ in the middle. With the trivial group C1 there is one slice: an ordinary diffusi
 from __future__ import annotations
 
 import copy
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,9 +24,8 @@ from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift, Project, RegularLinear
 from symsteer.policies.networks.slices import ResidualMLP, TemporalUNet
+from symsteer.policies.networks.times import TIME_FEATURES, time_features
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
-
-TIME_FEATURES = 64
 
 
 class LiftedDenoiser(Denoiser):
@@ -84,12 +82,7 @@ class LiftedDenoiser(Denoiser):
 
     def encode_time(self, t: torch.Tensor) -> torch.Tensor:
         """What the network sees of the noise level; ``[B] -> [B, 1, condition]``."""
-        half = TIME_FEATURES // 2
-        rates = torch.exp(
-            torch.arange(half, device=t.device, dtype=torch.float64) * (-math.log(1e4) / half)
-        )
-        phases = t[:, None].double() * rates
-        features = torch.cat([phases.sin(), phases.cos()], dim=-1).to(self.time_in.weight.dtype)
+        features = time_features(t, self.time_in.weight.dtype)
         return self.time_out(functional.silu(self.time_in(features)))[:, None]
 
     def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:

@@ -21,7 +21,7 @@ from symsteer.errors import UserError
 from symsteer.names import unknown
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
-from symsteer.policies.normalizer import Normalizer, clip_blocks
+from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.training.diffusion import Diffusion, Prediction, Process
 from symsteer.policies.training.frames import Frame
 from symsteer.policies.training.gradient import GradientPolicy
@@ -202,10 +202,9 @@ class DiffusionPolicy(GradientPolicy):
             self.frame.enter(noise, turn),
             self.options.sampling_steps,
             # Normalised demonstrations lie within radius 1, block by block.
-            bound=lambda x: clip_blocks(x, self.act_layout, 1.0),
+            bound=self.bounded,
         )
-        actions = self.act_normalizer.unnormalize(self.frame.leave(clean, turn))
-        return clip_blocks(actions, self.act_layout, 1.0)
+        return self.bounded(self.act_normalizer.unnormalize(self.frame.leave(clean, turn)))
 
     def freeze(self) -> Self:
         """Evaluation mode, no gradients; drops cached matrices after a change of weights."""
@@ -214,7 +213,8 @@ class DiffusionPolicy(GradientPolicy):
 
     def decode_settings(self) -> dict[str, Any]:
         """The options that decoding uses."""
-        values = {key: getattr(self.options, key) for key in (*DECODE_FIELDS, *LATER_FIELDS)}
+        options = vars(self.options)
+        values = {k: options[k] for k in (*DECODE_FIELDS, *LATER_FIELDS) if k in options}
         return {key: x for key, x in values.items() if LATER_FIELDS.get(key) != x}
 
     def _inference(self) -> tuple[Denoiser, Sequence[torch.Tensor]]:

@@ -60,7 +60,8 @@ class GradientPolicy(ChunkPolicy):
         start = time.perf_counter()
         obs, chunks = make_chunks(episodes, act_layout, options.horizon, options.hold)
         # The environment bounds actions block by block: train on what it executes.
-        chunks = clip_blocks(chunks, act_layout, 1.0)
+        blocks = cls.bounded_layout(act_layout)
+        chunks = clip_blocks(chunks, blocks, 1.0)
         generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -68,8 +69,8 @@ class GradientPolicy(ChunkPolicy):
                 options,
                 obs_layout,
                 act_layout,
-                Normalizer.fit(obs_layout, obs),
-                Normalizer.fit(act_layout, chunks),
+                Normalizer.fit(cls.bounded_layout(obs_layout), obs),
+                Normalizer.fit(blocks, chunks),
             )
         options = policy.options
         policy.to(device)

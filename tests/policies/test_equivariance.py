@@ -59,6 +59,8 @@ WAYS = {
     "escnn": {"policy": "escnn", "group": "C8"},
     "escnn, D4": {"policy": "escnn", "group": "D4"},
     "escnn, U-Net": {"policy": "escnn", "group": "C4", "network": "unet"},
+    "so2": {"policy": "so2", "channels": 8, "width": 8, "depth": 1},
+    "spherical": {"policy": "spherical", "channels": 8, "width": 8, "depth": 1},
     "C16": {"group": "C16"},
     "D8": {"group": "D8"},
     "relative actions": {"group": "D4", "action_frame": "goal"},
@@ -80,7 +82,7 @@ def test_every_way_to_be_symmetric_is_exact(trained, world, way, dtype):
         try:
             assert policy.group.order > 1
             assert decode_error(policy, world, policy.group, dtype) <= TOLERANCE[dtype]
-            if name == "canonical":
+            if name in ("canonical", "so2", "spherical"):
                 assert decode_error(policy, world, Group.parse("C5"), dtype) <= TOLERANCE[dtype]
         finally:
             policy.float()
@@ -191,7 +193,7 @@ def test_a_wrong_layout_shows(world, mistake):
 
 def test_a_per_axis_bound_shows(trained, world, monkeypatch):
     policy = trained(group="C8")
-    per_axis = "symsteer.policies.training.denoising.clip_blocks"
+    per_axis = "symsteer.policies.contract.clip_blocks"
     monkeypatch.setattr(per_axis, lambda x, layout, r: x.clamp(-r, r))
     assert decode_error(policy, world, policy.group, torch.float32) > 1e-2
 

@@ -1,0 +1,228 @@
+"""Symmetry under every rotation: features that are irreps, in the plane or in space.
+
+- ``so2``: frequencies of SO(2). The limit of the lifted network for finer and finer groups.
+- ``spherical``: degrees 0 to 2 of SO(3), for scenes that have no fixed vertical (after SDP, arXiv
+  2507.01723, which samples its features on a sphere; here they are coupled without sampling, so
+  that the network is exact for every rotation).
+
+    observation -> features, coupled with each other -> vectors and tensors, invariants
+    noisy chunk -> features + those of the observation
+    blocks: norm, linear, FiLM by the invariants and the noise level, coupling, gate, linear
+    features -> chunk
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from symsteer.errors import UserError
+from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.policies.networks.denoiser import Denoiser
+from symsteer.policies.networks.irreps import (
+    Coupling,
+    Enter,
+    EquivariantMap,
+    Film,
+    Gate,
+    Irreps,
+    Leave,
+    Norm,
+    PlanarIrreps,
+    SpatialIrreps,
+)
+from symsteer.policies.networks.times import TIME_FEATURES, time_features
+from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
+
+NORMAL = ("normal_xy", "normal_z")
+"""The table's normal in an observation."""
+
+
+class Mixing(nn.Module):
+    """h <- h + W gate(film(u) x V film(u)), u = U norm(h); x couples channel by channel."""
+
+    def __init__(self, irreps: Irreps, channels: int):
+        super().__init__()
+        self.norm = Norm(irreps, channels)
+        self.inner = EquivariantMap(irreps, channels, channels)
+        self.film = Film(irreps, channels)
+        self.other = EquivariantMap(irreps, channels, channels)
+        self.coupling = Coupling(irreps, channels)
+        self.gate = Gate(irreps, channels)
+        self.outer = EquivariantMap(irreps, channels, channels)
+
+    def forward(self, h: torch.Tensor, condition: torch.Tensor | None = None) -> torch.Tensor:
+        """``h [B, channels, dim]``, ``condition [B, film]``."""
+        u = self.inner(self.norm(h))
+        if condition is not None:
+            u = self.film(u, condition)
+        return h + self.outer(self.gate(u + self.coupling(u, self.other(u))))
+
+
+class IrrepDenoiser(Denoiser):
+    """A denoiser that commutes with every rotation.
+
+    Args:
+        irreps: of the features.
+        obs_layout: geometry of one (normalised) observation.
+        act_layout: geometry of one (normalised) action.
+        horizon: actions in a chunk, Tp.
+        group: the finite group that is announced to agents.
+        channels: irreps of each degree, for the observation.
+        width: the same for the chunk.
+        depth: blocks for the chunk; the observation has two.
+    """
+
+    def __init__(
+        self,
+        irreps: Irreps,
+        obs_layout: Layout,
+        act_layout: Layout,
+        horizon: int,
+        group: Group,
+        channels: int,
+        width: int,
+        depth: int,
+    ):
+        super().__init__()
+        self.irreps, self.group, self.channels = irreps, group, channels
+        layout = act_layout.repeat(horizon)
+        self.obs_in = Enter(irreps, obs_layout, channels)
+        self.obs_blocks = nn.ModuleList(Mixing(irreps, channels) for _ in range(2))
+        self.obs_out = EquivariantMap(irreps, channels, width)
+        self.chunk_in = Enter(irreps, layout, width)
+        self.blocks = nn.ModuleList(Mixing(irreps, width) for _ in range(depth))
+        self.out_norm = Norm(irreps, width)
+        self.chunk_out = Leave(irreps, layout, width)
+        films = depth * Film(irreps, width).condition_dim
+        self.condition = nn.Linear(channels, films)
+        self.time_in = nn.Linear(TIME_FEATURES, TIME_FEATURES)
+        self.time_out = nn.Linear(TIME_FEATURES, films, bias=False)
+
+    def encode(self, obs: torch.Tensor) -> torch.Tensor:
+        """Features for the chunk and FiLM of the invariants, ``[B, width * dim + films]``."""
+        h = self.obs_in(obs)
+        for block in self.obs_blocks:
+            h = block(h)
+        films = self.condition(functional.silu(h[..., 0]))
+        return torch.cat([self.obs_out(h).flatten(1), films], dim=-1)
+
+    def encode_time(self, t: torch.Tensor) -> torch.Tensor:
+        """FiLM of the noise level, ``[B, films]``."""
+        features = time_features(t, self.time_in.weight.dtype)
+        return self.time_out(functional.silu(self.time_in(features)))
+
+    def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        """Predict; see :meth:`Denoiser.forward`."""
+        films = len(self.time_out.weight)
+        features, condition = context.split([context.shape[1] - films, films], dim=-1)
+        h = self.chunk_in(x.flatten(1)) + features.unflatten(-1, (-1, self.irreps.dim))
+        conditions = (condition + time).chunk(len(self.blocks), dim=-1)
+        for block, part in zip(self.blocks, conditions, strict=True):
+            h = block(h, part)
+        return self.chunk_out(self.out_norm(h)).view_as(x)
+
+
+@dataclass(frozen=True)
+class SteerableOptions(DenoisingOptions):
+    """Options of the policies with irreps."""
+
+    channels: int = 32
+    """Irreps of each degree for the observation."""
+    width: int = 32
+    """Irreps of each degree for the chunk."""
+    depth: int = 2
+    """Blocks for the chunk."""
+    symmetry: str = "C8"
+    """The group that steering agents may use: a finite group of rotations, C_n."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        group = Group.parse(self.symmetry)
+        if group.reflections or not group.rotations:
+            raise UserError(
+                "this policy commutes with rotations alone; its symmetry must be C_n, e.g. C8, not "
+                f"{self.symmetry}"
+            )
+        if self.network != "mlp":
+            raise UserError("a policy with irreps has a network of its own; leave network as it is")
+
+
+@dataclass(frozen=True)
+class PlanarOptions(SteerableOptions):
+    """Options of the policy with frequencies of SO(2)."""
+
+    max_frequency: int = 4
+    """Highest frequency of the features; a cube's yaw has frequency 4."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_positive("max_frequency")
+
+
+class PlanarSteerablePolicy(DiffusionPolicy):
+    """Diffusion policy with frequencies of SO(2): commutes with every rotation of the plane."""
+
+    name = "so2"
+    Options = PlanarOptions
+    options: PlanarOptions
+
+    def make_denoiser(self) -> IrrepDenoiser:
+        """The network with planar irreps."""
+        irreps = PlanarIrreps(self.options.max_frequency)
+        return _denoiser(self, irreps, self.obs_layout, IrrepDenoiser)
+
+
+class SphericalPolicy(DiffusionPolicy):
+    """Diffusion policy with irreps of SO(3): commutes with every rotation of space.
+
+    Vectors in space (:meth:`Layout.spatial_vectors`) have one scale and one bound. An observation
+    without the table's normal (``normal_xy``, ``normal_z``) is one above a level table: the network
+    sees the vertical beside it, so that it commutes with the rotations about the vertical.
+    """
+
+    name = "spherical"
+    Options = SteerableOptions
+    options: SteerableOptions
+
+    @classmethod
+    def bounded_layout(cls, layout: Layout) -> Layout:
+        """Vectors in space have one norm."""
+        return layout.spatial
+
+    def make_denoiser(self) -> IrrepDenoiser:
+        """The network with spatial irreps."""
+        if self.options.action_frame:
+            raise UserError("an action_frame turns in the plane; the spherical policy has none")
+        layout, kind = self.obs_layout, IrrepDenoiser
+        if not any(pair == NORMAL for pair in layout.spatial_vectors()):
+            layout = Layout([*layout.fields, Field(NORMAL[0], 1), Field(NORMAL[1], 0)])
+            kind = LevelDenoiser
+        return _denoiser(self, SpatialIrreps(), layout, kind)
+
+
+class LevelDenoiser(IrrepDenoiser):
+    """Adds the vertical to an observation above a level table."""
+
+    def encode(self, obs: torch.Tensor) -> torch.Tensor:
+        vertical = obs.new_tensor([0.0, 0.0, 1.0]).expand(len(obs), 3)
+        return super().encode(torch.cat([obs, vertical], dim=-1))
+
+
+def _denoiser(
+    policy: DiffusionPolicy, irreps: Irreps, obs_layout: Layout, kind: type[IrrepDenoiser]
+) -> IrrepDenoiser:
+    options = policy.options
+    return kind(
+        irreps,
+        obs_layout,
+        policy.chunk_layout,
+        options.horizon,
+        Group.parse(options.symmetry),
+        options.channels,
+        options.width,
+        options.depth,
+    )

@@ -1,0 +1,27 @@
+"""Every base policy can be steered on a task."""
+
+import dataclasses
+
+import pytest
+
+from symsteer.bench.runs.run import execute
+from symsteer.leaderboard.records import read_record
+from symsteer.policies import POLICIES
+from tests.bench.tiny_run import tiny_config
+
+QUICK = ("canonical", "spherical")
+NAMES = [
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+    for name in POLICIES.builtin
+    if name != "edp"
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_trained_and_steered(name, tmp_path):
+    evaluation = dataclasses.replace(tiny_config().evaluation, every=160)
+    config = tiny_config(policy_name=name, env_steps=160, evaluation=evaluation)
+    record = read_record(execute(config, tmp_path, progress=False) / "record.json")
+    assert record.status == "finished"
+    assert record.base_policy.name == name
+    assert record.budget.updates > 0
