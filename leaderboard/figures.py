@@ -153,7 +153,7 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
             color, marker, line = style
             _draw_success(ax, row, style, table.key.env_steps)
             handles.setdefault(
-                _ascii(row.label),
+                plain(row.label),
                 Line2D([], [], color=color, marker=marker, linestyle=line, markersize=5),
             )
     _legend(figure, handles)
@@ -242,7 +242,7 @@ def q_values(tables: Sequence[Table]) -> Figure:
             ax.plot(*returns, linestyle="none", markerfacecolor="white", **style)
             extremes += returns[1]
             handles.setdefault(
-                _ascii(row.label),
+                plain(row.label),
                 Line2D([], [], color=color, marker=marker, linestyle=line, markersize=5),
             )
             if returns[1]:
@@ -314,9 +314,9 @@ def advantage_map(found: DefectMap, embodiment: str) -> Figure:
             ax.set_title(f"{panel.agent}, {names[panel.measure]}")
         axes[0].set_ylabel(f"advantage over {STANDARD}")
     for ax in grid[-1]:
-        ax.set_xlabel(f"audited defect of a decision, {_ascii(embodiment, 26)}")
+        ax.set_xlabel(f"audited defect of a decision, {plain(embodiment, 26)}")
     handles: dict[str, Line2D | Patch] = {
-        _ascii(task, 26): Line2D([], [], color="#555555", marker=marker, linestyle="none")
+        plain(task, 26): Line2D([], [], color="#555555", marker=marker, linestyle="none")
         for task, marker in markers.items()
     }
     parts = {point.defect.part for point in points}
@@ -381,9 +381,9 @@ def performance_profiles(found: Comparisons) -> Figure:
                 ax.fill_between(THRESHOLDS, profile.low, profile.high, **band)
             ax.plot(THRESHOLDS, profile.share, color=color, linestyle=line, linewidth=1.7)
             if profile.cells < found.cells[group]:
-                ax.plot([], [], " ", label=f"{_ascii(profile.agent)}: {_coverage(profile.cells)}")
+                ax.plot([], [], " ", label=f"{plain(profile.agent)}: {_coverage(profile.cells)}")
             handles.setdefault(
-                _ascii(profile.agent), Line2D([], [], color=color, linestyle=line, linewidth=1.7)
+                plain(profile.agent), Line2D([], [], color=color, linestyle=line, linewidth=1.7)
             )
         if ax.get_legend_handles_labels()[1]:
             ax.legend(loc="lower left", fontsize=7.5, frameon=False, handlelength=0)
@@ -423,7 +423,7 @@ def improvement_chart(found: Comparisons) -> Figure:
                 ax.text(0.0, height - 0.1, _coverage(pair.cells), color="#555555", **beside)
         ax.set_xlim(-0.02, 1.02)
         ax.set_xlabel("P(X > Y)")
-    axes[0].set_yticks(range(len(rows)), [f"{_ascii(x, 24)} > {_ascii(y, 24)}" for x, y in rows])
+    axes[0].set_yticks(range(len(rows)), [f"{plain(x, 24)} > {plain(y, 24)}" for x, y in rows])
     axes[0].set_ylim(len(rows) - 0.5, -0.5)
     return figure
 
@@ -459,7 +459,7 @@ def _panels(tables: Sequence[Table], ylabel: str) -> tuple[Figure, list[Axes]]:
         if index % columns == 0:
             ax.set_ylabel(ylabel)
     key = tables[0].key
-    figure.suptitle(_ascii(f"{key.task}, {key.embodiment}"), fontsize=11, fontweight="bold")
+    figure.suptitle(plain(f"{key.task}, {key.embodiment}"), fontsize=11, fontweight="bold")
     return figure, flat[: len(tables)]
 
 
@@ -470,7 +470,7 @@ def _title(table: Table, tables: Sequence[Table]) -> str:
         parts.append(f"{key.base} {key.group}".strip())
     if len({(other.mode, other.demonstrations) for other in keys}) > 1:
         parts.append(f"{key.demonstrations} {key.mode} demonstrations")
-    return _ascii(", ".join(parts), 60)
+    return plain(", ".join(parts), 60)
 
 
 def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int = 7) -> None:
@@ -533,7 +533,7 @@ def _thousands(value: float, _position: int | None = None) -> str:
     return f"{value / 1e3:g}k" if abs(value) >= 1e3 else f"{value:g}"
 
 
-def _ascii(text: str, limit: int = 40) -> str:
+def plain(text: str, limit: int = 40) -> str:
     """Text for a figure: printable ASCII, no `$` (matplotlib would read it as mathematics)."""
     clean = "".join(c if c.isascii() and c.isprintable() and c != "$" else "?" for c in text)
     return clean if len(clean) <= limit else clean[: limit - 3] + "..."

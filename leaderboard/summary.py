@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
@@ -151,6 +151,11 @@ class Run:
     def success(self) -> float:
         """Share of successful episodes in the final window; the run must be finished."""
         return float(np.mean(list(self.window.values())))
+
+    @property
+    def area(self) -> float:
+        """Area under the success curve over the budget; the run must be finished."""
+        return area_under_curve(*_points(self), self.record.settings.env_steps)
 
     @property
     def diverged(self) -> bool | None:
@@ -320,7 +325,7 @@ class Table:
 
     key: Key
     rows: list[Row]
-    threshold: float | None
+    threshold: float | None = None
     best_reference: Row | None = None
 
     @property
@@ -422,6 +427,14 @@ def _is_seed(key: str) -> bool:
 
 def summarize(runs: Sequence[Run]) -> Summary:
     """Group runs into tables and compute every row; independent of the order of `runs`."""
+    tables, set_aside = grouped(runs)
+    for table in tables:
+        _complete(table)
+    return Summary(tables, set_aside)
+
+
+def grouped(runs: Sequence[Run]) -> tuple[list[Table], list[Run]]:
+    """Tables whose rows have runs and names but no numbers yet, and the runs that are set aside."""
     chosen, set_aside = _one_per_cell(runs)
     tables: dict[Key, dict[tuple[str, str], list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in chosen:
@@ -430,8 +443,7 @@ def summarize(runs: Sequence[Run]) -> Summary:
     by_age = sorted(chosen, key=lambda run: (run.record.started, run.record.run_id))
     roles = {run.agent: run.record.role for run in by_age}
     usual = _usual_settings(chosen)
-    built = [_table(key, rows, roles, usual) for key, rows in sorted(tables.items())]
-    return Summary(built, set_aside)
+    return [_table(key, rows, roles, usual) for key, rows in sorted(tables.items())], set_aside
 
 
 def _usual_settings(runs: Iterable[Run]) -> dict[str, dict[str, str]]:
@@ -484,9 +496,15 @@ def _table(
     for agent in {row.agent for row in rows}:
         _label([row for row in rows if row.agent == agent], usual.get(agent))
     rows.sort(key=lambda row: (row_place(row.agent, row.role), not row.usual, row.label))
+    return Table(key, rows)
+
+
+def _complete(table: Table) -> None:
+    """Compute every number of a table."""
+    rows = table.rows
     for row in rows:
-        _fill(row, key.env_steps)
-    table = Table(key, rows, _threshold(rows))
+        _fill(row)
+    table.threshold = _threshold(rows)
     base = table.row_of(BASE)
     for row in rows:
         if base and row.agent != BASE:
@@ -505,7 +523,6 @@ def _table(
             row.pairs_with_best = len(pairs)
             row.against_best = crossed_bootstrap(list(pairs.values())) if pairs else None
     _rank(rows)
-    return table
 
 
 def _label(twins: Sequence[Row], common: Mapping[str, str] | None) -> None:
@@ -535,24 +552,31 @@ def _label(twins: Sequence[Row], common: Mapping[str, str] | None) -> None:
         row.label = row.agent + (f" ({', '.join(texts)})" if texts else "")
 
 
-def _settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     """The settings that define a row as texts; those of the agent without a prefix."""
-    found: dict[str, str] = {}
+    return {
+        key.removeprefix("agent_options."): value
+        for key, value in flat(config)
+        if not any(part in CELL or _is_seed(part) for part in key.split("."))
+    }
+
+
+def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """All settings but those of the machine as texts, keys of nested tables joined by dots."""
     for key, value in config.items():
-        if key in MACHINE or key in CELL or _is_seed(key):
+        if key in MACHINE:
             continue
         if isinstance(value, Mapping):
-            found |= _settings(value, "" if key == "agent_options" else f"{prefix}{key}.")
+            yield from flat(value, f"{prefix}{key}.")
         else:
-            found[prefix + key] = value if isinstance(value, str) else json.dumps(value)
-    return found
+            yield prefix + key, value if isinstance(value, str) else json.dumps(value)
 
 
 def _points(run: Run) -> tuple[list[int], list[float]]:
     return list(run.curve), [evaluation.success_once for evaluation in run.curve.values()]
 
 
-def _fill(row: Row, budget: int) -> None:
+def _fill(row: Row) -> None:
     """Compute the numbers of a row that need no other row."""
     if not row.finished:
         return
@@ -567,8 +591,7 @@ def _fill(row: Row, budget: int) -> None:
     ]
     row.rise = crossed_bootstrap(rises) if rises else None
     if row.search_steps is None:
-        areas = [area_under_curve(*_points(run), budget) for run in row.finished]
-        row.area = float(np.mean(areas))
+        row.area = float(np.mean([run.area for run in row.finished]))
 
 
 def success_sample(run: Run) -> Sample:
@@ -654,17 +677,21 @@ def area_pairs(first: Row, second: Row, budget: int) -> dict[Pair, Sample]:
     pairs = {}
     for run in first.finished:
         partner = _partner(run, second)
-        if partner is None:
-            continue
-        blocks: dict[int, Block] = {}
-        for step, twin in aligned(run, partner).items():
-            mine, theirs = run.curve[step], partner.curve[twin]
-            if found := paired_differences(episode_success(mine), episode_success(theirs)):
-                blocks[step] = Sample.pooled(found.items()).blocks[0]
-        if blocks:
-            weights = area_weights(list(blocks), budget)
-            pairs[run.pair] = Sample(tuple(blocks.values()), weights, run.policy)
+        if partner and (sample := area_difference(run, partner, budget)):
+            pairs[run.pair] = sample
     return pairs
+
+
+def area_difference(run: Run, partner: Run, budget: int) -> Sample | None:
+    """Difference of the area under the curve, first minus second; None without a common episode."""
+    blocks: dict[int, Block] = {}
+    for step, twin in aligned(run, partner).items():
+        mine, theirs = run.curve[step], partner.curve[twin]
+        if found := paired_differences(episode_success(mine), episode_success(theirs)):
+            blocks[step] = Sample.pooled(found.items()).blocks[0]
+    if not blocks:
+        return None
+    return Sample(tuple(blocks.values()), area_weights(list(blocks), budget), run.policy)
 
 
 def aligned(run: Run, other: Run) -> dict[int, int]:
