@@ -1,12 +1,14 @@
-"""`symsteer report`: generate the leaderboard from records, verify it, or check records."""
+"""The verbs that read records: `symsteer report` writes, verifies and checks the leaderboard,
+`symsteer compare` compares two sets of runs."""
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TextIO
+from typing import Annotated, TextIO
 
 import tyro
 
@@ -47,10 +49,7 @@ def report(
     """
     if verify and check:
         raise UserError("--verify and --check cannot be given together; give one of them")
-    # A path may hold bytes that are not text.
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
+    _accept_any_text()
     if not records and not RECORDS.is_dir():
         raise UserError(
             "the committed records exist only in a checkout of the repository; name run folders: "
@@ -71,6 +70,69 @@ def report(
     page = next(file for file in files if file.name == "LEADERBOARD.md")
     _say(f"wrote {page} and {len(files) - 1} files beside it")
     return 0
+
+
+def compare(
+    a: Annotated[str, tyro.conf.arg(metavar="A")],
+    b: Annotated[str, tyro.conf.arg(metavar="B")],
+    /,
+    runs: Path = Path("runs"),
+    margin: float = 0.0,
+    json: bool = False,
+    picture: Path | None = None,
+) -> int:
+    """Compare two sets of finished runs on the same base policies and episodes.
+
+    Differences are B minus A. Exit code 1 if B is clearly worse: a test for changes of code.
+
+    Args:
+        a: A run folder, a folder of runs, an agent, or the beginning of a commit.
+        b: The same; what is compared with A.
+        runs: Folder with the records of agents and commits, at any depth.
+        margin: How much success or area under the success curve B may lose.
+        json: Print only JSON, with every pair of runs.
+        picture: Draw the differences into this file, .png or .svg.
+
+    Returns:
+        0: B is not clearly worse, or there are too few runs to say so; 1: it is.
+
+    Raises:
+        UserError: for a wrong name, records that are not valid, runs without a partner, a wrong
+            margin, or a picture that cannot be written.
+    """
+    if not (math.isfinite(margin) and margin >= 0):
+        raise UserError(f"--margin is {margin}; it must be a number of at least 0, such as 0.05")
+    if picture is not None and picture.suffix.lower() not in (".png", ".svg"):
+        raise UserError(f"--picture is {picture}; its name must end with .png or .svg")
+    _accept_any_text()
+    from json import dumps
+
+    from symsteer.leaderboard.compare.changes import find_changes
+    from symsteer.leaderboard.compare.output import to_data, to_text
+    from symsteer.leaderboard.compare.pairing import pair_runs
+    from symsteer.leaderboard.compare.sides import read_sides
+
+    first, second = read_sides(a, b, runs)
+    changes = find_changes(pair_runs(first, second), margin)
+    if picture is not None:
+        from symsteer.files import write_atomically
+        from symsteer.leaderboard.compare import figure
+
+        write_atomically(picture, figure.picture(first, second, changes, picture))
+    if json:
+        print(dumps(to_data(first, second, changes), allow_nan=False))
+    else:
+        print(to_text(first, second, changes))
+        if picture is not None:
+            _say(f"wrote {picture}")
+    return 1 if changes.verdict == "worse" else 0
+
+
+def _accept_any_text() -> None:
+    """Print what the encoding of the terminal does not have: a path may hold any bytes."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _folder_for(records: Sequence[Path]) -> Path:

@@ -64,6 +64,11 @@ VERBS = {
         "Write the leaderboard from run records, or check records.",
         computes=False,
     ),
+    "compare": Verb(
+        "symsteer.leaderboard.command:compare",
+        "Compare two sets of runs in pairs; fail if the second is clearly worse.",
+        computes=False,
+    ),
     "list": Verb(
         f"{BENCH}:list_names",
         "Name the tasks, embodiments, variants, agents, policies, detectors, suites and plans.",

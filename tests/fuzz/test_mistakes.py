@@ -53,6 +53,15 @@ report x.json
 report x.json --out file
 report nowhere --check
 report folder --verify
+compare folder
+compare nowhere folder
+compare folder folder
+compare file folder
+compare x.json x.json
+compare standard equivariant
+compare standard equivariant --runs folder
+compare folder folder --margin much
+compare folder folder --picture file
 audit --task Nothing
 audit --count -3
 audit --group E8

@@ -1,0 +1,202 @@
+"""Differences, intervals and the verdict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from symsteer.leaderboard.statistics import Sample, crossed_bootstrap, stratified_bootstrap
+from tests.leaderboard.compare.runs import changed, runs_of, save
+from tests.leaderboard.record_factory import make_cell
+
+EPISODES = 40
+
+
+def curves(rate: float, runs: int = 5, flat: bool = True, salt: int = 0) -> list[list[list[int]]]:
+    """Three evaluations for each run; exactly `rate` of the episodes succeed, others in each."""
+    found = []
+    for seed in range(runs):
+        generator = np.random.default_rng((salt, seed))
+        found.append(
+            [
+                (generator.permutation(EPISODES) < round(share * EPISODES)).astype(int).tolist()
+                for share in ((rate if flat else 0.0), rate, rate)
+            ]
+        )
+    return found
+
+
+def sides(tmp_path: Path, a, b, **options):
+    return save(tmp_path / "a", a), save(tmp_path / "b", b)
+
+
+def test_differences_are_b_minus_a(tmp_path: Path):
+    a, b = sides(tmp_path, runs_of(*curves(0.5)), runs_of(*curves(0.75, flat=False, salt=1)))
+    found = changed(a, b)
+    success, auc = found.overall["success"], found.overall["auc"]
+    assert (success.a, success.b) == pytest.approx((0.5, 0.75))
+    assert success.difference.value == pytest.approx(0.25)
+    # B's curve rises from 0 in the first half of the budget.
+    assert (auc.a, auc.b) == pytest.approx((0.5, 0.75 * 0.75))
+    assert auc.difference.value == pytest.approx(0.75 * 0.75 - 0.5)
+    back = changed(b, a).overall["success"].difference
+    assert (back.value, back.low, back.high) == pytest.approx(
+        (-success.difference.value, -success.difference.high, -success.difference.low)
+    )
+
+
+@pytest.mark.parametrize("policies", [False, True])
+def test_intervals_are_those_of_the_leaderboard_on_shared_episodes(tmp_path: Path, policies):
+    mine, theirs = curves(0.5), curves(0.6, salt=1)
+    a, b = sides(tmp_path, runs_of(*mine, policies=policies), runs_of(*theirs, policies=policies))
+    found = changed(a, b).overall["success"].difference
+    records = runs_of(*mine, policies=policies)
+    samples = [
+        Sample.pooled(
+            (
+                (10_000 + i, float(y - x))
+                for i, (x, y) in enumerate(zip(one[-1], two[-1], strict=True))
+            ),
+            record.base_policy.content_hash,
+        )
+        for one, two, record in zip(mine, theirs, records, strict=True)
+    ]
+    assert found == crossed_bootstrap(samples)
+    assert found.low < found.value < found.high
+
+
+def test_the_mean_over_cells_is_over_those_with_enough_pairs(tmp_path: Path):
+    a = runs_of(*curves(0.5)) + runs_of(*curves(0.5), variant="wind:1")
+    b = runs_of(*curves(0.6, salt=1)) + runs_of(*curves(0.3, salt=1), variant="wind:1")
+    few = {"variant": "wind:0.5"}
+    a += runs_of(*curves(0.5, 4), **few)
+    b += runs_of(*curves(1.0, 4), **few)
+    found = changed(*sides(tmp_path, a, b))
+    by_variant = {cell.cell.key.variant: cell.measures["success"] for cell in found.cells}
+    assert {name: round(c.difference.value, 9) for name, c in by_variant.items()} == {
+        "none": 0.1,
+        "wind:0.5": 0.5,
+        "wind:1": -0.2,
+    }
+    assert {name: c.counts for name, c in by_variant.items()} == {
+        "none": True,
+        "wind:0.5": False,
+        "wind:1": True,
+    }
+    overall = found.overall["success"]
+    assert overall.difference.value == pytest.approx(-0.05)
+    assert (overall.a, overall.b, overall.pairs) == (pytest.approx(0.5), pytest.approx(0.45), 10)
+    assert overall.counts
+
+
+def test_the_mean_over_cells_draws_shared_policies_together(tmp_path: Path):
+    settings = ({"variant": "none"}, {"variant": "wind:1"})
+    a = [r for s in settings for r in runs_of(*curves(0.5), policies=True, **s)]
+    b = [r for s in settings for r in runs_of(*curves(0.6, salt=1), policies=True, **s)]
+    found = changed(*sides(tmp_path, a, b))
+    samples = [
+        [
+            Sample.pooled(
+                (
+                    (seed, y - x)
+                    for (seed, x), y in zip(
+                        pair.a.final_success.items(), pair.b.final_success.values(), strict=True
+                    )
+                ),
+                pair.a.policy,
+            )
+            for pair in cell.cell.pairs
+        ]
+        for cell in found.cells
+    ]
+    assert found.overall["success"].difference == stratified_bootstrap(samples)
+
+
+def test_the_bias_of_q_is_compared_by_its_size(tmp_path: Path):
+    a, b = runs_of(*curves(0.5)), runs_of(*curves(0.5, salt=1))
+    for index, record in enumerate(b):
+        record.evaluations[-1].diagnostics = {"q_bias": 0.5} if index else {}
+    found = changed(*sides(tmp_path, a, b)).overall["q_bias"]
+    # A's are -1 to -5; the first run of B has none.
+    assert found.pairs == 4
+    assert (found.a, found.b, found.difference.value) == pytest.approx((3.5, 0.5, -3.0))
+
+
+def test_references_have_no_curve(tmp_path: Path):
+    a, b = (make_cell({"base": rate}, episodes=EPISODES) for rate in (0.5, 0.75))
+    found = changed(*sides(tmp_path, a, b))
+    assert "auc" not in found.overall
+    assert found.overall["success"].difference.value == pytest.approx(0.25)
+    assert found.verdict == "better"
+
+
+def test_wall_clock_is_information(tmp_path: Path):
+    a, b = runs_of(*curves(0.5)), runs_of(*curves(0.5))
+    for record in b:
+        record.wall_clock.total = 100_000
+    found = changed(*sides(tmp_path, a, b))
+    assert found.seconds == (250, 100_000)
+    assert found.cells[0].seconds == (250, 100_000)
+    assert found.verdict == "identical"
+
+
+@pytest.mark.parametrize(
+    ("rate", "margin", "verdict"),
+    [
+        (0.1, 0.0, "worse"),
+        (0.1, 0.9, "not worse"),
+        (0.9, 0.0, "better"),
+        (0.5, 0.0, "not worse"),
+    ],
+)
+def test_the_verdict(tmp_path: Path, rate, margin, verdict):
+    a, b = sides(tmp_path, runs_of(*curves(0.5)), runs_of(*curves(rate, salt=1)))
+    assert changed(a, b, margin=margin).verdict == verdict
+
+
+def test_the_margin_is_where_the_interval_must_end_below(tmp_path: Path):
+    a, b = sides(tmp_path, runs_of(*curves(0.9)), runs_of(*curves(0.3, salt=1)))
+    highest = max(c.difference.high for c in changed(a, b).overall.values() if c.b < 1)
+    tightest = min(c.difference.high for n, c in changed(a, b).overall.items() if n != "q_bias")
+    assert highest < 0
+    assert changed(a, b, margin=-tightest - 1e-6).verdict == "worse"
+    assert changed(a, b, margin=-tightest).verdict == "not worse"
+
+
+def test_success_alone_or_the_area_alone_is_enough(tmp_path: Path):
+    late = [[[0] * EPISODES, [0] * EPISODES, run[-1]] for run in curves(0.8)]
+    a, b = sides(tmp_path, runs_of(*curves(0.8)), runs_of(*late))
+    found = changed(a, b)
+    assert found.overall["success"].difference.sign == 0
+    assert found.verdict == "worse"
+    end = [[*run[:2], [0] * EPISODES] for run in curves(0.02)]
+    start = [[*run[:2], [1] * 4 + [0] * (EPISODES - 4)] for run in curves(0.02)]
+    a, b = save(tmp_path / "c", runs_of(*start)), save(tmp_path / "d", runs_of(*end))
+    assert changed(a, b).overall["success"].difference.high < 0
+    assert changed(a, b).verdict == "worse"
+
+
+def test_better_in_one_and_worse_in_the_other_within_the_margin_is_not_better(tmp_path: Path):
+    late = [[[0] * EPISODES, [0] * EPISODES, [1] * EPISODES] for _ in range(5)]
+    a, b = sides(tmp_path, runs_of(*curves(0.8)), runs_of(*late))
+    assert changed(a, b).verdict == "worse"
+    assert changed(a, b, margin=1.0).verdict == "not worse"
+
+
+def test_too_few_pairs_have_no_verdict(tmp_path: Path):
+    a, b = sides(tmp_path, runs_of(*curves(1, 4)), runs_of(*curves(0, 4)))
+    found = changed(a, b)
+    assert found.overall["success"].difference.high < 0
+    assert found.verdict == "none"
+
+
+@pytest.mark.parametrize("runs", [1, 5])
+def test_identical_episodes(tmp_path: Path, runs):
+    a, b = runs_of(*curves(0.5, runs)), runs_of(*curves(0.5, runs))
+    assert changed(*sides(tmp_path, a, b)).verdict == "identical"
+    b[-1].evaluations[0].episodes.episode_len = [99] * EPISODES
+    assert changed(a := tmp_path / "a", save(tmp_path / "c", b)).verdict == (
+        "none" if runs == 1 else "not worse"
+    )
