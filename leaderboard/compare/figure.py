@@ -49,7 +49,7 @@ def draw(a: Side, b: Side, changes: Changes) -> Figure:
     if len(rows) > 1:
         labels.append("mean over cells")
         rows.append(changes.overall)
-    figure = Figure(figsize=(9.0, 1.7 + 0.3 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(9.0, 1.9 + 0.3 * len(rows)), layout="constrained")
     axes = list(figure.subplots(1, len(measures), squeeze=False, sharey=True).flat)
     for ax, measure in zip(axes, measures, strict=True):
         ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
@@ -63,16 +63,18 @@ def draw(a: Side, b: Side, changes: Changes) -> Figure:
         ax.set_title(TITLES[measure])
         ax.set_xlabel("B - A, 95 % interval")
         ax.margins(x=0.08)
-        ax.xaxis.set_major_locator(MaxNLocator(5))
+        ax.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     axes[0].set_yticks(range(len(rows)), labels)
     axes[0].set_ylim(len(rows) - 0.5, -0.5)
-    figure.suptitle(
-        f"A: {plain(a.name, 44)}    B: {plain(b.name, 44)}",
-        fontsize=10,
-        fontweight="bold",
-    )
+    title = f"A: {_end(a.name)}\nB: {_end(b.name)}"
+    figure.suptitle(title, fontsize=10, fontweight="bold")
     figure.legend(handles=_legend(changes), loc="outside lower center", ncols=4, frameon=False)
     return figure
+
+
+def _end(name: str, limit: int = 90) -> str:
+    """The end of a name, which tells paths apart."""
+    return plain(name if len(name) <= limit else f"...{name[3 - limit :]}", limit)
 
 
 def _draw_change(ax: Axes, height: int, change: Change) -> None:

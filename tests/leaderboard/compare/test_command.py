@@ -93,13 +93,25 @@ def test_runs_without_a_partner_are_counted(place, symsteer):
 
 
 def test_too_few_pairs(place, symsteer):
-    save(place / "a", runs_of([[0, 0]], [[0, 0]]))
-    save(place / "b", runs_of([[1, 1]], [[0, 1]]))
+    save(place / "a", runs_of([[0, 0]]))
+    save(place / "b", runs_of([[1, 1]]))
     code, out, _ = symsteer("b", "a")
     assert code == 0
     assert "verdict: none. A verdict needs 5 pairs" in out
-    # Where there is no verdict nothing is marked as clear.
+    # All episodes are worse, but where there is no verdict nothing is marked as clear.
+    assert "\N{MINUS SIGN}1.000 [\N{MINUS SIGN}1.000, \N{MINUS SIGN}1.000]" in out
     assert "▼" not in out
+
+
+def test_the_verdict_names_what_is_worse(place, symsteer):
+    a, b = make_cell({"standard": 0.5}), make_cell({"zero": 0, "standard": [0, 0, 0.5]})[5:]
+    save(place / "a", a), save(place / "b", b)
+    code, out, _ = symsteer("a", "b")
+    assert code == 1
+    assert "success" in out
+    verdict = out.split("verdict: ")[1]
+    assert verdict.startswith("B is clearly worse: AUC \N{MINUS SIGN}0.375")
+    assert "success" not in verdict
 
 
 def test_json_is_all_that_is_printed(place, symsteer):
@@ -141,6 +153,17 @@ def test_the_picture_has_a_row_for_each_cell(place):
         ):
             assert bar == [[change.difference.low, height], [change.difference.high, height]]
             assert point == [[change.difference.value, height]]
+
+
+def test_long_paths_are_told_apart_by_their_ends(place):
+    sides = [save(place / ("folder" * 9) / name, runs_of([[1, 0]])) for name in ("old", "new")]
+    a, b = (str(side) for side in sides)
+    title = draw(*read_sides(a, b, Path("runs")), changed(a, b)).get_suptitle()
+    first, second = title.split("\n")
+    assert first.startswith("A: ...")
+    assert first.endswith("/old")
+    assert second.endswith("/new")
+    assert max(map(len, (first, second))) <= 93
 
 
 @pytest.mark.parametrize("name", ["a.png", "folder/b.svg", "C.PNG"])

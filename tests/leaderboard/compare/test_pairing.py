@@ -148,10 +148,12 @@ def test_a_run_has_one_partner(tmp_path: Path):
     ]
     a = save(tmp_path / "a", runs_of(*CURVES, agent_options=NESTED) + zero)
     b = save(tmp_path / "b", twice + zero)
-    found = paired(a, b)
-    paths = [run.path for pair in found.pairs for run in (pair.a, pair.b)]
-    assert len(paths) == len(set(paths)) == 12
-    assert [left.reason for left in found.alone[1]] == ["its run of A has another partner"] * 3
+    for first, second, side in ((a, b, 1), (b, a, 0)):
+        found = paired(first, second)
+        paths = [run.path for pair in found.pairs for run in (pair.a, pair.b)]
+        assert len(paths) == len(set(paths)) == 12
+        reason = f"its run of {'BA'[side]} has another partner"
+        assert [left.reason for left in found.alone[side]] == [reason] * 3
 
 
 @pytest.mark.parametrize(
