@@ -96,7 +96,8 @@ def _legend(changes: Changes) -> list[Line2D]:
         Line2D([], [], color=color, marker=marker, markersize=6.5, label=meaning)
         for color, marker, meaning in LOOKS.values()
     ]
-    if any(not change.counts for found in changes.cells for change in found.measures.values()):
+    drawn = [found.measures.get(name) for found in changes.cells for name in DECISIVE]
+    if any(change and not change.counts for change in drawn):
         hollow: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "linestyle": "none"}
         label = f"hollow: fewer than {MIN_SEEDS} pairs"
         handles.append(Line2D([], [], color="#555555", markersize=6.5, label=label, **hollow))

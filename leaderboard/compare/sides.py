@@ -118,7 +118,11 @@ def _built(name: str, kind: Kind, place: Path, runs: Sequence[Run]) -> Side:
             if kind == "agent" and row is not table.row_of(name):
                 leftovers += [Leftover(run, f"other settings: {row.label}") for run in row.runs]
                 continue
-            leftovers += [Leftover(run, "not finished") for run in row.runs if not run.finished]
+            leftovers += [
+                Leftover(run, f"not finished: {run.record.status}")
+                for run in row.runs
+                if not run.finished
+            ]
             if row.finished:
                 rows.append((table.key, row))
     if not rows:

@@ -51,20 +51,27 @@ def test_differences_are_b_minus_a(tmp_path: Path):
 def test_intervals_are_those_of_the_leaderboard_on_shared_episodes(tmp_path: Path, policies):
     mine, theirs = curves(0.5), curves(0.6, salt=1)
     a, b = sides(tmp_path, runs_of(*mine, policies=policies), runs_of(*theirs, policies=policies))
-    found = changed(a, b).overall["success"].difference
+    found = changed(a, b).overall
+    success, auc = [], []
     records = runs_of(*mine, policies=policies)
-    samples = [
-        Sample.pooled(
-            (
-                (10_000 + i, float(y - x))
-                for i, (x, y) in enumerate(zip(one[-1], two[-1], strict=True))
-            ),
-            record.base_policy.content_hash,
+    for one, two, record in zip(mine, theirs, records, strict=True):
+        blocks = [
+            Sample.pooled(
+                (10_000 + index, float(y - x))
+                for index, (x, y) in enumerate(zip(first, second, strict=True))
+            ).blocks[0]
+            for first, second in zip(one, two, strict=True)
+        ]
+        policy = record.base_policy.content_hash
+        success.append(Sample((blocks[-1],), policy=policy))
+        # The trapezoidal rule, of evaluations at 0, a half and all of the budget.
+        auc.append(Sample(tuple(blocks), (0.25, 0.5, 0.25), policy))
+    for name, samples in (("success", success), ("auc", auc)):
+        interval, wanted = found[name].difference, crossed_bootstrap(samples)
+        assert (interval.value, interval.low, interval.high) == pytest.approx(
+            (wanted.value, wanted.low, wanted.high), abs=1e-9
         )
-        for one, two, record in zip(mine, theirs, records, strict=True)
-    ]
-    assert found == crossed_bootstrap(samples)
-    assert found.low < found.value < found.high
+        assert interval.low < interval.value < interval.high
 
 
 def test_the_mean_over_cells_is_over_those_with_enough_pairs(tmp_path: Path):

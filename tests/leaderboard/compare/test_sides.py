@@ -107,7 +107,7 @@ def test_unfinished_and_older_runs_are_left_over(place):
     a, _ = read_sides(str(folder), "standard", Path("runs"))
     assert [run.record for run in a.runs] == [newer]
     reasons = {found.run.seed: found.reason for found in a.leftovers}
-    assert reasons == {0: "a newer record of the same run", 1: "not finished"}
+    assert reasons == {0: "a newer record of the same run", 1: "not finished: interrupted"}
 
 
 def test_only_unfinished_runs(place):
