@@ -21,19 +21,12 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
+from symsteer.leaderboard.curves import mean_series, series, success_curve
 from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import BASE, STANDARD
-from symsteer.leaderboard.statistics import Interval, Sample, success_interval
-from symsteer.leaderboard.summary import (
-    MIN_SEEDS,
-    Row,
-    Run,
-    Summary,
-    Table,
-    aligned,
-    episode_success,
-)
+from symsteer.leaderboard.statistics import Interval
+from symsteer.leaderboard.summary import MIN_SEEDS, Row, Summary, Table
 
 Style = tuple[str, str, Any]
 """Color, marker and line style of an agent."""
@@ -69,7 +62,6 @@ WIDEST = 125
 """Characters of a line of the legend."""
 
 MAX_MARKERS = 15
-BAND_RESAMPLES = 1000
 
 RC: dict[str, Any] = {
     "svg.hashsalt": "symsteer",
@@ -162,8 +154,6 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
 
 def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
     color, marker, line = style
-    points = _common(row.finished)
-    steps = _places(points)
     for run in row.runs:
         values = [evaluation.success_once for evaluation in run.curve.values()]
         if run.finished and (row.is_reference or not 1 < len(row.finished) < MIN_SEEDS):
@@ -172,36 +162,26 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
         ax.plot(list(run.curve), values, color=color, linewidth=0.7, alpha=0.35, **dotted)
         if not run.finished and values:
             ax.plot(list(run.curve)[-1], values[-1], "x", color=color, markersize=5)
-    if not steps:
+    curve = success_curve(row)
+    if not curve.steps:
         return
-    bands = [
-        success_interval(
-            [
-                Sample.pooled(episode_success(run.curve[step]).items(), run.policy)
-                for run, step in zip(row.finished, point, strict=True)
-            ],
-            BAND_RESAMPLES,
-        )
-        for point in points
-    ]
-    low, high = [band.low for band in bands], [band.high for band in bands]
-    if len(steps) == 1 and row.is_reference:
+    if len(curve.steps) == 1 and row.is_reference:
         # From where the search ended; a reference without a search starts at 0.
         start = min(row.search_steps or 0, budget)
-        value = bands[0].value
+        value = curve.values[0]
         ax.hlines(value, start, budget, color=color, linestyle=line, linewidth=1.4, zorder=1.5)
         if row.agent == BASE:
-            ax.axhspan(low[0], high[0], color=color, alpha=0.10, linewidth=0)
+            ax.axhspan(curve.low[0], curve.high[0], color=color, alpha=0.10, linewidth=0)
         return
-    ax.fill_between(steps, low, high, color=color, alpha=0.14, linewidth=0)
+    ax.fill_between(curve.steps, curve.low, curve.high, color=color, alpha=0.14, linewidth=0)
     ax.plot(
-        steps,
-        [band.value for band in bands],
+        curve.steps,
+        curve.values,
         color=color,
         linestyle=line,
         marker=marker,
         markersize=4,
-        markevery=max(1, len(steps) // MAX_MARKERS),
+        markevery=max(1, len(curve.steps) // MAX_MARKERS),
         linewidth=1.7,
     )
 
@@ -224,12 +204,12 @@ def q_values(tables: Sequence[Table]) -> Figure:
                 continue
             color, marker, line = _style(row.agent)
             for run in runs:
-                steps, values = _series(run, "q_mean")
+                steps, values = series(run, "q_mean")
                 ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
                 extremes += values
                 if run.record.nonfinite_q:
                     ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7)
-            places, means = _mean_series(runs, "q_mean")
+            places, means = mean_series(runs, "q_mean")
             every = max(1, len(places) // MAX_MARKERS)
             style: dict[str, Any] = {
                 "color": color,
@@ -238,7 +218,7 @@ def q_values(tables: Sequence[Table]) -> Figure:
                 "markevery": every,
             }
             ax.plot(places, means, linestyle=line, linewidth=1.7, **style)
-            returns = _mean_series(runs, "return_mean")
+            returns = mean_series(runs, "return_mean")
             ax.plot(*returns, linestyle="none", markerfacecolor="white", **style)
             extremes += returns[1]
             handles.setdefault(
@@ -487,44 +467,6 @@ def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int 
 
 def _style(agent: str) -> Style:
     return STYLES.get(agent) or OTHERS[sum(map(ord, agent)) % len(OTHERS)]
-
-
-def _common(runs: Sequence[Run]) -> list[tuple[int, ...]]:
-    """The points of the curve at which all runs were evaluated: env_steps of each run there."""
-    if not runs:
-        return []
-    twins = [aligned(runs[0], run) for run in runs]
-    steps = [step for step in runs[0].curve if all(step in twin for twin in twins)]
-    return [tuple(twin[step] for twin in twins) for step in steps]
-
-
-def _places(points: Sequence[tuple[int, ...]]) -> list[float]:
-    """Where points of several runs are drawn: at the median of their steps."""
-    return [float(np.median(point)) for point in points]
-
-
-def _series(run: Run, name: str) -> tuple[list[int], list[float]]:
-    pairs = [
-        (step, value)
-        for step, evaluation in run.curve.items()
-        if (value := evaluation.diagnostics.get(name)) is not None
-    ]
-    return [step for step, _ in pairs], [value for _, value in pairs]
-
-
-def _mean_series(runs: Sequence[Run], name: str) -> tuple[list[float], list[float]]:
-    """Mean of a diagnostic over runs, where all have measured it."""
-    series = [dict(zip(*_series(run, name), strict=True)) for run in runs]
-    points = [
-        point
-        for point in _common(runs)
-        if all(step in one for step, one in zip(point, series, strict=True))
-    ]
-    means = [
-        float(np.mean([one[step] for step, one in zip(point, series, strict=True)]))
-        for point in points
-    ]
-    return _places(points), means
 
 
 def _thousands(value: float, _position: int | None = None) -> str:

@@ -1,0 +1,83 @@
+"""Curves over environment steps: what the figures and the site draw of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from symsteer.leaderboard.statistics import Sample, success_interval
+from symsteer.leaderboard.summary import Row, Run, aligned, episode_success
+
+BAND_RESAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values over environment steps with the ends of their 95 % intervals."""
+
+    steps: list[float]
+    values: list[float]
+    low: list[float]
+    high: list[float]
+
+
+def success_curve(row: Row) -> Curve:
+    """The IQM of success over the finished runs of a row, where all of them were evaluated."""
+    points = _common(row.finished)
+    bands = [
+        success_interval(
+            [
+                Sample.pooled(episode_success(run.curve[step]).items(), run.policy)
+                for run, step in zip(row.finished, point, strict=True)
+            ],
+            BAND_RESAMPLES,
+        )
+        for point in points
+    ]
+    return Curve(
+        _places(points),
+        [band.value for band in bands],
+        [band.low for band in bands],
+        [band.high for band in bands],
+    )
+
+
+def series(run: Run, name: str) -> tuple[list[int], list[float]]:
+    """Steps and finite values of a diagnostic of one run."""
+    pairs = [
+        (step, value)
+        for step, evaluation in run.curve.items()
+        if (value := evaluation.diagnostics.get(name)) is not None
+    ]
+    return [step for step, _ in pairs], [value for _, value in pairs]
+
+
+def mean_series(runs: Sequence[Run], name: str) -> tuple[list[float], list[float]]:
+    """Steps and mean of a diagnostic over runs, where all have measured it."""
+    found = [dict(zip(*series(run, name), strict=True)) for run in runs]
+    points = [
+        point
+        for point in _common(runs)
+        if all(step in one for step, one in zip(point, found, strict=True))
+    ]
+    means = [
+        float(np.mean([one[step] for step, one in zip(point, found, strict=True)]))
+        for point in points
+    ]
+    return _places(points), means
+
+
+def _common(runs: Sequence[Run]) -> list[tuple[int, ...]]:
+    """The points of the curve at which all runs were evaluated: env_steps of each run there."""
+    if not runs:
+        return []
+    twins = [aligned(runs[0], run) for run in runs]
+    steps = [step for step in runs[0].curve if all(step in twin for twin in twins)]
+    return [tuple(twin[step] for twin in twins) for step in steps]
+
+
+def _places(points: Sequence[tuple[int, ...]]) -> list[float]:
+    """Where points of several runs are drawn: at the median of their steps."""
+    return [float(np.median(point)) for point in points]
