@@ -13,7 +13,7 @@ from typing import Annotated, TextIO
 import tyro
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.paths import PAGE_FOLDER, RECORDS, STUDY
+from symsteer.leaderboard.paths import PAGE_FOLDER, RECORDS, STUDY, chosen_records
 from symsteer.leaderboard.verification import Verification, other_versions
 
 FEW = 10
@@ -50,12 +50,7 @@ def report(
     if verify and check:
         raise UserError("--verify and --check cannot be given together; give one of them")
     _accept_any_text()
-    if not records and not RECORDS.is_dir():
-        raise UserError(
-            "the committed records exist only in a checkout of the repository; name run folders: "
-            "symsteer report RUNS"
-        )
-    paths = records or (RECORDS,)
+    paths = chosen_records(records, "report")
     if check:
         return _show_verdicts(paths)
     # Here, so that the help of all commands does not wait for matplotlib and scipy.

@@ -141,7 +141,7 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
         for row in table.rows:
             if not row.runs:
                 continue
-            style = _style(row.agent)
+            style = style_of(row.agent)
             color, marker, line = style
             _draw_success(ax, row, style, table.key.env_steps)
             handles.setdefault(
@@ -202,7 +202,7 @@ def q_values(tables: Sequence[Table]) -> Figure:
             runs = [run for run in row.runs if run.record.has_critic]
             if not runs:
                 continue
-            color, marker, line = _style(row.agent)
+            color, marker, line = style_of(row.agent)
             for run in runs:
                 steps, values = series(run, "q_mean")
                 ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
@@ -355,7 +355,7 @@ def performance_profiles(found: Comparisons) -> Figure:
     for ax, group in zip(axes, groups, strict=True):
         ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
         for profile in found.profiles[group]:
-            color, _, line = _style(profile.agent)
+            color, _, line = style_of(profile.agent)
             if profile.role != "reference":
                 band: dict[str, Any] = {"color": color, "alpha": 0.13, "linewidth": 0}
                 ax.fill_between(THRESHOLDS, profile.low, profile.high, **band)
@@ -394,7 +394,7 @@ def improvement_chart(found: Comparisons) -> Figure:
         ax.axvline(0.5, color="#333333", linewidth=0.9, zorder=1)
         for pair in found.improvements[group]:
             height, p = rows.index((pair.first, pair.second)), pair.probability
-            color = _style(pair.first)[0]
+            color = style_of(pair.first)[0]
             bar: dict[str, Any] = {"linewidth": 6, "alpha": 0.35, "solid_capstyle": "butt"}
             ax.plot([p.low, p.high], [height] * 2, color=color, **bar)
             ax.plot(p.value, height, "o", color=color, markersize=5, clip_on=False)
@@ -465,7 +465,8 @@ def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int 
         )
 
 
-def _style(agent: str) -> Style:
+def style_of(agent: str) -> Style:
+    """Colour, marker and line style of an agent, the same in every figure."""
     return STYLES.get(agent) or OTHERS[sum(map(ord, agent)) % len(OTHERS)]
 
 

@@ -12,7 +12,7 @@ from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
 from symsteer.leaderboard.soundness import MAX_BIAS, MAX_FALL, MIN_CORRELATION, soundness
 from symsteer.leaderboard.statistics import Spread
 from symsteer.leaderboard.study import Claim
-from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary
+from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary, Table
 from symsteer.leaderboard.tables import Links, cell_name, section, status
 from symsteer.leaderboard.text import (
     MARKS,
@@ -103,20 +103,20 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     ]
     parts += [findings.study.notice] if findings.study.notice else []
     parts += ["## How to read it", READING.strip()]
-    if notice := _seed_notice(summary):
+    if notice := seed_notice(summary):
         parts.append(notice)
     parts += ["## At a glance", _overview(summary)]
     if beaten := _beaten(summary):
         parts.append(beaten)
     if findings.spreads:
-        parts += ["## How much is the base policy's", *_spreads(summary, findings.spreads)]
-    if sound := _soundness(summary):
+        parts += ["## How much is the base policy's", *spreads_section(summary, findings.spreads)]
+    if sound := soundness_table(summary):
         parts += ["## Are the learners sound", SOUND.strip(), sound]
-    parts += ["## Claims", CLAIMS.strip(), *_claims(findings)]
+    parts += ["## Claims", CLAIMS.strip(), *claims_section(findings)]
     heading = "## The advantage of symmetry against the defect"
     parts += [heading, *map_section(summary, findings.map, figures)]
     if findings.comparisons.cells:
-        parts += ["## All cells together", *_comparisons(findings.comparisons, overall)]
+        parts += ["## All cells together", *comparisons_section(findings.comparisons, overall)]
     place = None
     for table in summary.tables:
         key = table.key
@@ -130,7 +130,8 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     return "\n\n".join(parts) + "\n"
 
 
-def _seed_notice(summary: Summary) -> str:
+def seed_notice(summary: Summary) -> str:
+    """A quotation in markdown that says who is not ranked; empty where all are."""
     ranked = [row for table in summary.tables for row in table.rows if row.role == "learner"]
     few = [row for row in ranked if len(row.finished) < MIN_SEEDS]
     if not few:
@@ -149,11 +150,16 @@ def _overview(summary: Summary) -> str:
     for table in summary.tables:
         cells = []
         for agent in summary.agents:
-            rows_of = [row for row in table.rows if row.agent == agent]
-            shown = [row for row in rows_of if row.usual] or rows_of
+            shown = at_a_glance(table, agent)
             cells.append("<br>".join(_glance(row) for row in shown) or NOTHING)
         rows.append([cell_name(table, summary), *cells])
     return grid(header, rows, left=1)
+
+
+def at_a_glance(table: Table, agent: str) -> list[Row]:
+    """The rows that stand for an agent in a table: those with its usual settings, or all."""
+    rows = [row for row in table.rows if row.agent == agent]
+    return [row for row in rows if row.usual] or rows
 
 
 def _glance(row: Row) -> str:
@@ -164,23 +170,34 @@ def _glance(row: Row) -> str:
     return stacked(row.success, marks=f"{mark}{dagger}")
 
 
-def _beaten(summary: Summary) -> str:
-    """In how many cells with enough pairs each learner clearly beats the best reference."""
-    texts = []
+def against_references(summary: Summary) -> dict[str, tuple[int, int, int]]:
+    """In how many cells each learner is clearly above and clearly below the best reference.
+
+    The third number counts the cells with enough pairs; agents without such a cell are left out.
+    """
+    found = {}
     for agent in summary.agents:
         rows = [t.row_of(agent) for t in summary.tables if t.best_reference]
         enough = [row for row in rows if row and row.pairs_with_best >= MIN_SEEDS]
         signs = [row.against_best.sign for row in enough if row.against_best]
         if signs:
-            above, below = signs.count(1), signs.count(-1)
-            text = f"{code(agent)} clearly above in {above}, clearly below in {below}"
-            texts.append(f"{text} of {len(signs)}")
+            found[agent] = signs.count(1), signs.count(-1), len(signs)
+    return found
+
+
+def _beaten(summary: Summary) -> str:
+    """`against_references` as a sentence."""
+    texts = [
+        f"{code(agent)} clearly above in {above}, clearly below in {below} of {cells}"
+        for agent, (above, below, cells) in against_references(summary).items()
+    ]
     if not texts:
         return ""
     return f"Against the best reference of each cell, the frozen policy alone: {'; '.join(texts)}."
 
 
-def _spreads(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
+def spreads_section(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
+    """How results vary between base policies, runs and episodes, as blocks of markdown."""
     parts = [
         "Standard deviations of a run's success in the final window, pooled over cells, due to "
         "base policy, run, and the sample of episodes."
@@ -214,7 +231,8 @@ def _share(spread: Spread) -> str:
     return f"{100 * spread.policies**2 / total:.0f}{SPACE}%" if total else NOTHING
 
 
-def _soundness(summary: Summary) -> str:
+def soundness_table(summary: Summary) -> str:
+    """Whether each learner is sound in each cell, as a table in markdown."""
     rows = []
     for table in summary.tables:
         for row in table.learners:
@@ -246,7 +264,8 @@ MEASURE_WORDS = {
 }
 
 
-def _claims(findings: Findings) -> list[str]:
+def claims_section(findings: Findings) -> list[str]:
+    """The study's claims and their verdicts, as blocks of markdown."""
     study = findings.study
     origin = f"They are declared in {code(study.source)} (sha256 {code(study.sha256[:12])}"
     if study.declared:
@@ -315,7 +334,8 @@ def _p(value: float) -> str:
     return "< 0.001".replace(" ", SPACE) if value < 0.001 else number(value, 3)
 
 
-def _comparisons(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> list[str]:
+def comparisons_section(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Profiles and probabilities of improvement, as blocks of markdown."""
     parts = []
     if "profiles" in figures:
         parts += [image(*figures["profiles"]), PROFILES]
@@ -337,7 +357,8 @@ def _comparisons(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> 
     return parts
 
 
-def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
+def provenance_facts(summary: Summary, audit: str) -> str:
+    """Where the runs were made, as a list in markdown."""
     runs = summary.runs
     records = [run.record for run in runs]
     places = [place for run in runs for place in run.provenances]
@@ -357,11 +378,15 @@ def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
         f"Packages: {_values(packages)}",
         f"Audit of the defects: {code(audit)}",
     ]
+    return "\n".join(f"- {fact}" for fact in facts)
+
+
+def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
     parts = [
         "Regenerate with `symsteer report`, or `symsteer report RECORDS --out FOLDER`: the same "
         "records and audit give the same bytes. Each record holds the whole configuration and "
         "every evaluation episode with its seed.",
-        "\n".join(f"- {fact}" for fact in facts),
+        provenance_facts(summary, audit),
     ]
     rows = [
         [

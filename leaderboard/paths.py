@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from symsteer.errors import UserError
@@ -23,6 +23,20 @@ RECORD = "record.json"
 """The record's name in a run folder; committed records are called by their run_id."""
 
 _BEGINNING = re.compile(rb'\s*\{\s*"schema_version"\s*:\s*\d+\s*,\s*"run_id"')
+
+
+def chosen_records(records: Sequence[Path], verb: str) -> Sequence[Path]:
+    """The records that a verb was given; else the committed ones.
+
+    Raises:
+        UserError: none were given, and there are no committed ones.
+    """
+    if not records and not RECORDS.is_dir():
+        raise UserError(
+            "the committed records exist only in a checkout of the repository; name run folders: "
+            f"symsteer {verb} RUNS"
+        )
+    return records or (RECORDS,)
 
 
 def record_files(paths: Iterable[Path]) -> list[Path]:

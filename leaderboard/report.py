@@ -87,11 +87,11 @@ def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[s
     return files
 
 
-def slug(*texts: str) -> str:
+def slug(*texts: str, digits: int = 6) -> str:
     """A file name of lower-case letters, digits and dashes; it ends with a hash of the texts."""
     words = "-".join(re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") for text in texts)
     digest = hashlib.sha256("\0".join(texts).encode()).hexdigest()
-    return f"{words[:60].strip('-') or 'run'}-{digest[:6]}"
+    return f"{words[:60].strip('-') or 'run'}-{digest[:digits]}"
 
 
 def _folder(out: Path) -> Path:

@@ -158,6 +158,15 @@ class Run:
         return area_under_curve(*_points(self), self.record.settings.env_steps)
 
     @property
+    def feasible(self) -> tuple[float, float] | None:
+        """Feasible Q bounds, entropy allowance included."""
+        bound = self.record.feasible_q
+        if bound is None:
+            return None
+        allowance = max([0.0, *self.diagnostics("q_allowance")])
+        return bound.low - allowance, bound.high + allowance
+
+    @property
     def diverged(self) -> bool | None:
         """Whether Q diverged; None without a critic and while an unfinished run may still do so."""
         verdict = self.record.diverged
@@ -348,15 +357,10 @@ class Table:
     @property
     def feasible(self) -> tuple[float, float] | None:
         """The widest feasible Q bounds of the runs, entropy allowance included."""
-        bounds = [
-            (bound, max([0.0, *run.diagnostics("q_allowance")]))
-            for run in self.runs
-            if (bound := run.record.feasible_q)
-        ]
+        bounds = [found for run in self.runs if (found := run.feasible)]
         if not bounds:
             return None
-        low = min(bound.low - allowance for bound, allowance in bounds)
-        return low, max(bound.high + allowance for bound, allowance in bounds)
+        return min(low for low, _ in bounds), max(high for _, high in bounds)
 
     @property
     def is_ranked(self) -> bool:

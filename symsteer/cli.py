@@ -69,6 +69,11 @@ VERBS = {
         "Compare two sets of runs in pairs; fail if the second is clearly worse.",
         computes=False,
     ),
+    "site": Verb(
+        "symsteer.leaderboard.site.command:site",
+        "Write results and documentation as a folder of static pages.",
+        computes=False,
+    ),
     "list": Verb(
         f"{BENCH}:list_names",
         "Name the tasks, embodiments, variants, agents, policies, detectors, suites and plans.",

@@ -1,0 +1,153 @@
+"""What the pages show, and where each thing has its page."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from symsteer.errors import UserError
+from symsteer.leaderboard.defects import Audit
+from symsteer.leaderboard.findings import Findings
+from symsteer.leaderboard.report import slug
+from symsteer.leaderboard.site.docs import Documentation
+from symsteer.leaderboard.statistics import Interval
+from symsteer.leaderboard.summary import ARM, SYMMETRIC_EMBODIMENT, Key, Row, Run, Summary, Table
+from symsteer.leaderboard.tables import cell_name
+from symsteer.variant import UNBROKEN, VariantSpec, parse_variant
+
+DIGITS = 10
+"""Hexadecimal digits at the end of a page's name: names that are cut or written alike differ."""
+
+
+def parts_of(variant: str) -> tuple[VariantSpec, ...] | None:
+    """The parts of a variant; None for a text that is none."""
+    try:
+        return parse_variant(variant)
+    except UserError:
+        return None
+
+
+def dials(variant: str) -> list[str]:
+    """The names of what a variant is made of; a text that is no variant stands for itself."""
+    parts = parts_of(variant)
+    return [variant] if parts is None else [part.name for part in parts]
+
+
+def strengths(variant: str) -> list[str]:
+    """The strengths of a variant's parts, as they are written."""
+    return [part.text.removeprefix(f"{part.name}:") for part in parts_of(variant) or ()]
+
+
+def strength_of(variant: str, dial: str) -> float | None:
+    """The strength of a variant that is this dial alone, at a constant strength."""
+    parts = parts_of(variant)
+    if not parts or len(parts) > 1 or parts[0].name != dial or not parts[0].is_constant:
+        return None
+    return parts[0].strength if isinstance(parts[0].strength, float | int) else None
+
+
+def breaks(key: Key) -> list[str]:
+    """What breaks the symmetry of a cell, without strengths; `unbroken` if nothing does."""
+    arm = [] if key.embodiment == SYMMETRIC_EMBODIMENT else [ARM]
+    return arm + dials(key.variant) or ["unbroken"]
+
+
+@dataclass(frozen=True)
+class MapPicture:
+    """The audit's map of a cell: where in the workspace copies of a decision differ."""
+
+    task: str
+    embodiment: str
+    variant: str
+    path: Path
+
+    @property
+    def address(self) -> str:
+        return f"media/{slug('map', self.task, self.embodiment, self.variant, digits=DIGITS)}.png"
+
+
+@dataclass(frozen=True)
+class Board:
+    """All results of a site.
+
+    Attributes:
+        study: name of the study or of its file.
+        maps: pictures of an audit's folder.
+    """
+
+    summary: Summary
+    findings: Findings
+    audit: Audit
+    study: str
+    docs: Documentation
+    maps: Sequence[MapPicture] = ()
+    _names: dict[Path, str] = field(default_factory=dict)
+
+    @cached_property
+    def names(self) -> dict[Key, str]:
+        """Cells as text: task, embodiment, what breaks the symmetry, and what tells them apart."""
+        return {t.key: cell_name(t, self.summary).replace("`", "") for t in self.summary.tables}
+
+    @cached_property
+    def runs(self) -> list[Run]:
+        """Runs that count, then those that are set aside."""
+        return [*self.summary.runs, *self.summary.set_aside]
+
+    @cached_property
+    def rows(self) -> list[tuple[Table, Row]]:
+        """All rows with runs."""
+        return [(table, row) for table in self.summary.tables for row in table.rows if row.runs]
+
+    @cached_property
+    def row_of(self) -> Mapping[Path, tuple[Table, Row]]:
+        """Table and row of every run that counts, by the path of its record."""
+        return {run.path: (table, row) for table, row in self.rows for run in row.runs}
+
+    @cached_property
+    def dials(self) -> list[str]:
+        """Variants of the audit and of the runs, by name."""
+        used = {name for table in self.summary.tables for name in dials(table.key.variant)}
+        audited = {name for _, _, variant, _ in self.audit for name in dials(variant)}
+        return sorted(used | audited)
+
+    def cell(self, key: Key) -> str:
+        """Address of a cell's page."""
+        words = (key.task, key.embodiment, key.variant, key.base, key.group, key.mode)
+        numbers = (str(key.demonstrations), str(key.env_steps))
+        return f"cells/{slug(*words, *numbers, digits=DIGITS)}.html"
+
+    def agent(self, name: str) -> str:
+        """Address of an agent's page."""
+        return f"agents/{slug(name, digits=DIGITS)}.html"
+
+    def variant(self, name: str) -> str:
+        """Address of a variant's page."""
+        return f"variants/{slug(name, digits=DIGITS)}.html"
+
+    def run(self, run: Run) -> str:
+        """Address of a run's page; records with the same bytes share one."""
+        if run.path not in self._names:
+            digest = hashlib.sha256(run.path.read_bytes()).hexdigest()
+            self._names[run.path] = slug(run.record.run_id, digest, digits=DIGITS)
+        return f"runs/{self._names[run.path]}.html"
+
+    def audited(self, dial: str) -> list[tuple[str, str, str, float, Interval, str]]:
+        """Task, embodiment, group, strength, defect and its part, where this variant acts alone.
+
+        With the unbroken controls, at strength 0; empty if the variant was not audited.
+        """
+        found = [
+            (task, embodiment, group, strength, defect.interval, defect.part)
+            for (task, embodiment, variant, group), defect in self.audit.items()
+            if (strength := strength_of(variant, dial)) is not None
+        ]
+        places = {cell[:3] for cell in found}
+        controls = [
+            (task, embodiment, group, 0.0, defect.interval, defect.part)
+            for (task, embodiment, variant, group), defect in self.audit.items()
+            if variant == UNBROKEN and (task, embodiment, group) in places
+        ]
+        return sorted(controls + found, key=lambda cell: cell[:4])

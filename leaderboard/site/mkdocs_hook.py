@@ -1,0 +1,126 @@
+"""What MkDocs does with the documentation's links: GitHub shows the same pages from the same files.
+
+README.md and CHANGELOG.md become pages. Links to other files outside of `docs/` lead to the site's
+results, or become plain code text, as no host of the repository is known to a folder of pages.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from markdown import Extension
+
+if TYPE_CHECKING:
+    from markdown import Markdown
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[2]
+
+SHARED = Path(__file__).resolve().parent / "static"
+"""Scripts and styles that the documentation has in common with the results."""
+
+PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md"}
+"""Files of the repository's root that are pages, too."""
+
+RESULTS = "leaderboard/LEADERBOARD.md"
+"""The committed leaderboard; of the site these are the results."""
+
+LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
+
+
+CODE = re.compile(r"((?:^|\n)[^\s\-*\d][^\n]*\n)\n((?: {4}[^\n]*\n(?:\n(?= {4}))*)+)")
+"""A paragraph outside of lists, and the block of code that follows it, indented by four spaces."""
+
+
+class TwoSpaces(Extension):
+    """Lists as GitHub reads them: what belongs to an item is indented as its text is."""
+
+    def extendMarkdown(self, md: Markdown) -> None:  # noqa: N802 (markdown's name)
+        """Python-Markdown's own lists need four spaces."""
+        md.tab_length = 2
+        md.build_parser()
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Put `TwoSpaces` before the extensions that add to the parser that it builds anew."""
+    config.markdown_extensions.insert(0, TwoSpaces())  # type: ignore[arg-type]
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages of the repository's root, and what both parts of the site share."""
+    from mkdocs.structure.files import File
+
+    for name, page in PAGES.items():
+        files.append(File.generated(config, page, content=(ROOT / name).read_text()))
+    for path in sorted(SHARED.iterdir()):
+        if path.name in ("theme.js", "header.css", "icon.svg"):
+            files.append(File.generated(config, f"assets/{path.name}", abs_src_path=str(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Let links lead to pages of the site, outside of blocks of code."""
+    source = page.file.src_uri
+    origins = {page: name for name, page in PAGES.items()}
+    markdown = CODE.sub(_fenced, markdown)
+    parts = re.split(r"(^ *```.*?^ *```|`[^`\n]+`(?!\]))", markdown, flags=re.M | re.S)
+    place = origins.get(source, f"docs/{source}")
+    text = "".join(
+        part if index % 2 else relinked(part, place, source) for index, part in enumerate(parts)
+    )
+    return text
+
+
+def _fenced(match: re.Match[str]) -> str:
+    """Code between fences: these mean the same at any indentation."""
+    return f"{match[1]}\n```text\n{textwrap.dedent(match[2]).rstrip()}\n```\n\n"
+
+
+def relinked(text: str, place: str, source: str) -> str:
+    """Markdown whose links are those of the site.
+
+    Args:
+        text: markdown without code.
+        place: path of the file in the repository.
+        source: path of the page below `docs/`.
+    """
+
+    def replace(match: re.Match[str]) -> str:
+        mark, label, href = match.groups()
+        parts = urlsplit(href)
+        if parts.scheme or parts.netloc or not parts.path:
+            return match[0]
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(place), parts.path))
+        anchor = f"#{parts.fragment}" if parts.fragment else ""
+        found = site_address(target)
+        if found is not None:
+            return f"{mark}[{label}]({_relative(found, source)}{anchor})"
+        if target == RESULTS:
+            # One folder up from the documentation; MkDocs leaves HTML as it is.
+            up = "../" * (source.count("/") + 1)
+            return f'<a href="{up}index.html">{label}</a>'
+        return label if label.startswith("`") else f"{label} (`{target}`)"
+
+    return LINK.sub(replace, text)
+
+
+def site_address(target: str) -> str | None:
+    """The documentation's file that stands for a file of the repository; None if none does."""
+    if target in PAGES:
+        return PAGES[target]
+    path = ROOT / target
+    if target.startswith("docs/") and path.is_file():
+        return target.removeprefix("docs/")
+    return None
+
+
+def _relative(target: str, source: str) -> str:
+    return posixpath.relpath(target, posixpath.dirname(source) or ".")

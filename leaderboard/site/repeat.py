@@ -1,0 +1,85 @@
+"""The `symsteer run` command that repeats a run, from the configuration in its record."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+DERIVED = ("evaluation_variant", "files")
+"""Keys that the run adds to its configuration."""
+
+KEYS = frozenset(
+    {
+        *("task", "embodiment", "variant", "agent", "seed", "env_steps", "num_envs"),
+        *("checkpoint_every", "keep_replay", "sim", "device", "demonstrations", "policy"),
+        *("policy_seed", "agent_options", "evaluation"),
+    }
+)
+"""The keys of a run's configuration that are options of `symsteer run`. Others that this verb has,
+such as `--out`, are no part of a configuration, and a record must not bring them in."""
+
+PREFIXES = {"agent_options": "agent"}
+"""Tables whose options have another name on the command line."""
+
+FILES = {"demonstrations": ("--demos", "FILE.h5"), "policy": ("--base-policy", "FILE.safetensors")}
+"""Options and placeholders of the files from which a run may have started."""
+
+OPTION = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
+VALUE = re.compile(r"(-?\d[\w.+-]*|\w[\w.:+,=@/-]*)?", re.ASCII)
+
+
+def repeat_command(config: Mapping[str, Any]) -> str | None:
+    """Every option of a run as a command that `symsteer run` reads back to the same configuration.
+
+    All options are given, so that it does not depend on defaults. Of a run that started from files,
+    these have placeholders: a record knows their contents' hashes alone.
+
+    Returns:
+        The command, or None where there is none: for configurations of other versions, such as 0.1,
+        and for texts that no option has, because a reader may copy the command into a shell.
+    """
+    tables = config.get("agent_options"), config.get("policy")
+    if not all(isinstance(table, Mapping) for table in tables):
+        return None
+    words = ["symsteer", "run"]
+    own = {key: value for key, value in config.items() if key not in DERIVED}
+    if not own.keys() <= KEYS:
+        return None
+    for key, value in _flat(own):
+        if not OPTION.fullmatch(key):
+            return None
+        option = _option(key, value)
+        if not all(VALUE.fullmatch(word) for word in option[1:]):
+            return None
+        words += option
+    files = config.get("files")
+    for key in files if isinstance(files, Mapping) else ():
+        if key not in FILES:
+            return None
+        words += FILES[key]
+    return shlex.join(words)
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys joined by dots, with the names that they have on the command line."""
+    for key, value in table.items():
+        name = prefix + PREFIXES.get(key, key)
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{name}.")
+        else:
+            yield name, value
+
+
+def _option(key: str, value: Any) -> list[str]:
+    """An option as words: flags say themselves which value they have, lists have several."""
+    *tables, name = key.replace("_", "-").split(".")
+    if isinstance(value, bool):
+        return ["--" + ".".join([*tables, name if value else f"no-{name}"])]
+    values = value if isinstance(value, list) else [value]
+    return ["--" + ".".join([*tables, name]), *map(_text, values)]
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else repr(value)

@@ -1,0 +1,159 @@
+"""What the page of a run shows."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from symsteer.leaderboard.paths import RECORD
+from symsteer.leaderboard.records import Evaluation
+from symsteer.leaderboard.site import charts
+from symsteer.leaderboard.site.board import DIGITS, Board, dials
+from symsteer.leaderboard.site.pages import flat
+from symsteer.leaderboard.site.repeat import repeat_command
+from symsteer.leaderboard.summary import Run
+from symsteer.leaderboard.text import NOTHING, compact, count, number
+
+MEDIA = {"film-*.mp4": "video/mp4", "paths-*.png": "image/png"}
+"""What `symsteer film` writes into a run's folder."""
+
+BEGINNINGS = {"video/mp4": (4, b"ftyp"), "image/png": (0, b"\x89PNG\r\n\x1a\n")}
+"""Where such a file says what it is. Others are not copied into the site."""
+
+
+def media(run: Run) -> Iterator[tuple[str, str, str, Path]]:
+    """Address, type, name and path of the clips and pictures in a run's folder."""
+    if run.path.name != RECORD:
+        return
+    for pattern, kind in MEDIA.items():
+        for path in sorted(run.path.parent.glob(pattern)):
+            start, mark = BEGINNINGS[kind]
+            if path.is_symlink() or not path.is_file():
+                continue
+            with open(path, "rb") as file:
+                if file.read(32)[start : start + len(mark)] != mark:
+                    continue
+                file.seek(0)
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            stem, suffix = path.name.split("-")[0], path.suffix
+            yield f"media/{stem}-{digest[:DIGITS]}{suffix}", kind, path.stem, path
+
+
+def run_values(board: Board, run: Run) -> dict[str, Any]:
+    """The values of the template."""
+    record, where = run.record, board.row_of.get(run.path)
+    settings, policy = record.settings, record.base_policy
+    table, row = where or (None, None)
+    provenance = record.provenance
+    commit = provenance.commit and provenance.commit + (" with changes" * bool(provenance.dirty))
+    facts = {
+        "status": record.status,
+        "failure": record.failure,
+        "seed": str(run.seed),
+        "success, final window": number(run.success) if run.finished else None,
+        "success, last checkpoint": number(record.final.success_once) if record.final else None,
+        "Q diverged": None if run.diverged is None else ("yes" if run.diverged else "no"),
+        "environment steps": f"{count(record.budget.env_steps)} of {count(settings.env_steps)}",
+        "decisions, updates": f"{count(record.budget.decisions)}, {count(record.budget.updates)}",
+        "parameters (actor, critics)": f"{count(record.parameters.actor)}, "
+        f"{count(record.parameters.critic)}"
+        if record.parameters.total
+        else None,
+        "started": f"{record.started:%Y-%m-%d %H:%M} UTC",
+        "minutes": number(record.wall_clock.total / 60, 1),
+        "continued": f"{record.wall_clock.resumed} times" if record.wall_clock.resumed else None,
+        "base policy": f"{policy.name} {policy.group or ''}, {policy.content_hash[:12]}",
+        "base policy's success": number(policy.base_success),
+        "warning": policy.warning,
+    }
+    made = {
+        "commit": commit,
+        "version": provenance.version,
+        "sha256 of the code": provenance.sha256,
+        "device": provenance.device,
+        "platform": f"{provenance.platform}, Python {provenance.python}",
+        "packages": ", ".join(f"{name} {v}" for name, v in sorted(provenance.packages.items())),
+        "extensions": ", ".join(
+            f"{e.kind} {e.target} ({e.distribution or 'not installed'} {e.version or ''})"
+            for e in provenance.extensions
+        ),
+        "configuration": record.config_hash,
+    }
+    command = repeat_command(record.config)
+    return {
+        "name": record.run_id,
+        "agent": run.agent,
+        "agent_page": f"../{board.agent(run.agent)}" if run.agent in board.summary.roles else None,
+        "label": row.label if row else run.agent,
+        "role": record.role,
+        "cell": table and (board.names[table.key], f"../{board.cell(table.key)}"),
+        "dials": [(name, f"../{board.variant(name)}") for name in dials(settings.variant)]
+        if table
+        else [],
+        "facts": {key: text for key, text in facts.items() if text},
+        "made": {key: text for key, text in made.items() if text},
+        "command": command and re.split(" (?=--)", command),
+        "config": flat(record.config),
+        "charts": charts.run_charts(record, run, run.feasible) if run.curve else [],
+        "episodes": charts.episodes_chart(run) if run.curve else None,
+        "evaluations": [_evaluation(evaluation) for evaluation in run.curve.values()],
+        "last": _episodes(record.evaluations[-1]) if record.evaluations else [],
+        "diagnostics": [
+            (name, compact(value))
+            for name, value in sorted(record.evaluations[-1].diagnostics.items())
+            if value is not None
+        ]
+        if record.evaluations
+        else [],
+        "media": [(f"../{address}", kind, name) for address, kind, name, _ in media(run)],
+    }
+
+
+def _mean(values: list[Any]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _evaluation(evaluation: Evaluation) -> list[str]:
+    """A row of the table of evaluations."""
+    episodes, diagnostics = evaluation.episodes, evaluation.diagnostics
+    bias = diagnostics.get("q_bias", diagnostics.get("q_bias_successful"))
+    return [
+        f"{evaluation.env_steps:,}".replace(",", "\u202f"),
+        str(len(episodes.seed)),
+        number(evaluation.success_once),
+        number(_mean(list(episodes.success_at_end))),
+        number(_mean(list(episodes.return_)), 1),
+        number(_mean(list(episodes.episode_len)), 1),
+        compact(diagnostics.get("q_mean")),
+        compact(bias),
+        compact(diagnostics.get("td_error")),
+        compact(diagnostics.get("equivariance_actor")),
+        compact(diagnostics.get("equivariance_critic")),
+    ]
+
+
+def _episodes(evaluation: Evaluation) -> list[list[str]]:
+    """Rows of the table of the last evaluation's episodes."""
+    columns = evaluation.episodes
+    rows = zip(
+        columns.seed,
+        columns.success_once,
+        columns.success_at_end,
+        columns.return_,
+        columns.episode_len,
+        strict=True,
+    )
+    return [
+        [
+            str(seed),
+            "yes" if once else "no",
+            "yes" if end else "no",
+            NOTHING if ret is None else number(ret, 1),
+            str(length),
+        ]
+        for seed, once, end, ret, length in rows
+    ]

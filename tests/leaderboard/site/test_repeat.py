@@ -1,0 +1,88 @@
+"""The command that repeats a run gives its configuration again."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+
+import pytest
+
+from symsteer.agents import AGENTS
+from symsteer.bench.runs.arguments import parse_run
+from symsteer.bench.runs.config import RunConfig, build_config
+from symsteer.leaderboard.paths import PAGE_FOLDER
+from symsteer.leaderboard.records import config_hash, read_record
+from symsteer.leaderboard.site.repeat import DERIVED, FILES, KEYS, repeat_command
+from tests.bench.tiny_run import tiny_config
+
+LEARNERS = PAGE_FOLDER / "results" / "learners"
+
+
+def again(command: str | None) -> RunConfig:
+    assert command is not None
+    program, verb, *arguments = shlex.split(command)
+    assert (program, verb) == ("symsteer", "run")
+    return parse_run(arguments)[0]
+
+
+@pytest.mark.parametrize("agent", list(AGENTS.builtin))
+def test_the_command_gives_the_configuration_again(agent: str) -> None:
+    config = tiny_config(
+        agent=agent, variant="wind:0.2..0.8+action_gain:1@0.25..0.75", seed=3, keep_replay=True
+    )
+    resolved = config.to_json() | {"evaluation_variant": "wind:0.2..0.8", "files": {}}
+    found = again(repeat_command(resolved))
+    assert config_hash(found.to_json()) == config_hash(config.to_json())
+
+
+def test_the_command_holds_every_option() -> None:
+    """Also those that have their defaults: these may change."""
+    config = RunConfig(policy_seed=7)
+    words = shlex.split(repeat_command(config.to_json()) or "")
+    for option in ("--policy-seed", "--agent.layer-norm", "--policy.hold", "--evaluation.every"):
+        assert option in words
+    assert again(shlex.join(words)) == config
+    assert config.to_json().keys() == KEYS
+
+
+@pytest.mark.parametrize("path", sorted(LEARNERS.glob("*-s10-*.json")), ids=lambda path: path.stem)
+def test_committed_records(path) -> None:
+    config = read_record(path).config
+    if config["agent"] == "approximate":
+        pytest.skip("SymSteer has this agent no more")
+    expected = {key: value for key, value in config.items() if key not in DERIVED}
+    found = again(repeat_command(config)).to_json()
+    # Options that were added since the run have their defaults.
+    assert build_config(expected, "record").to_json() == found
+
+
+def test_files_have_placeholders() -> None:
+    resolved = RunConfig().to_json() | {"files": {"demonstrations": "0" * 64}}
+    command = repeat_command(resolved)
+    assert command is not None
+    assert command.endswith(" ".join(FILES["demonstrations"]))
+    assert repeat_command(resolved | {"files": {"else": "0"}}) is None
+
+
+def test_no_command_for_what_no_option_takes() -> None:
+    config = RunConfig().to_json()
+    assert repeat_command(config) is not None
+    for change in (
+        {"task": "PickCube-v1; rm -rf ~"},
+        {"task": "PickCube-v1\n"},
+        {"task": "\x03rm"},
+        {"task": "--out=/tmp/elsewhere"},
+        {"out": "/tmp/elsewhere"},
+        {"sac": {"width": 3}},
+        {"agent_options": {"--x": 1}},
+        {"agent_options": {"x": {"y z": 1}}},
+        {"agent_options": {"x": ["a b"]}},
+        {"agent_options": None},
+        {"policy": "edp"},
+    ):
+        assert repeat_command(config | change) is None, change
+
+
+def test_every_field_of_a_run_is_an_option() -> None:
+    fields = {field.name for field in dataclasses.fields(RunConfig)} - {"policy_name"}
+    assert fields == KEYS
