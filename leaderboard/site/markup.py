@@ -25,6 +25,9 @@ Link = Callable[[str], str | None]
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 
+SPACES = "\n\t\u00a0\u202f"
+"""Characters that are not printable in Python's sense, and do no harm."""
+
 FOLDED = re.compile(r"<details>\n<summary>(.*?)</summary>\n\n(.*)\n\n</details>", re.DOTALL)
 """A block of the leaderboard's page that is folded."""
 
@@ -34,7 +37,7 @@ def shown(value: Any) -> Any:
     if value is None:
         return ""
     if isinstance(value, str) and not hasattr(value, "__html__"):
-        return "".join(c if c.isprintable() or c in "\n\t" else " " for c in value)
+        return "".join(c if c.isprintable() or c in SPACES else " " for c in value)
     return value
 
 

@@ -6,6 +6,7 @@ results, or become plain code text, as no host of the repository is known to a f
 
 from __future__ import annotations
 
+import logging
 import posixpath
 import re
 import textwrap
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
+
+log = logging.getLogger("mkdocs.hooks.symsteer")
+"""MkDocs counts what it says: with `strict`, a warning is an error."""
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -107,6 +111,8 @@ def relinked(text: str, place: str, source: str) -> str:
             # One folder up from the documentation; MkDocs leaves HTML as it is.
             up = "../" * (source.count("/") + 1)
             return f'<a href="{up}index.html">{label}</a>'
+        if not (ROOT / target).exists():
+            log.warning("%s links to %s, which does not exist", place, target)
         return label if label.startswith("`") else f"{label} (`{target}`)"
 
     return LINK.sub(replace, text)
@@ -116,10 +122,7 @@ def site_address(target: str) -> str | None:
     """The documentation's file that stands for a file of the repository; None if none does."""
     if target in PAGES:
         return PAGES[target]
-    path = ROOT / target
-    if target.startswith("docs/") and path.is_file():
-        return target.removeprefix("docs/")
-    return None
+    return target.removeprefix("docs/") if target.startswith("docs/") else None
 
 
 def _relative(target: str, source: str) -> str:

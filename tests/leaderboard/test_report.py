@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from symsteer.leaderboard import command
+from symsteer.leaderboard import command, paths
 from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.paths import RECORDS
@@ -303,7 +303,8 @@ def test_the_page_goes_beside_the_runs_unless_another_folder_is_named(
     monkeypatch.chdir(tmp_path)
     committed = tmp_path / "leaderboard"
     monkeypatch.setattr(command, "PAGE_FOLDER", committed)
-    monkeypatch.setattr(command, "RECORDS", committed / "results" / "records")
+    for module in (command, paths):
+        monkeypatch.setattr(module, "RECORDS", committed / "results" / "records")
     for arguments, folder in (
         (["runs"], "runs"),
         (["more", "runs"], "more"),

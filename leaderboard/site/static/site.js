@@ -4,7 +4,6 @@
   "use strict";
   const MINUS = "\u2212";
   const root = document.documentElement;
-  root.classList.add("scripted");
 
   // ---------------------------------------------------------------- tables
 
@@ -72,12 +71,12 @@
     }
     const bar = document.querySelector(`.filters[data-for="${table.id}"]`);
     if (!bar || !table.id) return;
-    const values = new Map([...table.tBodies[0].rows].map((row) => [row, JSON.parse(row.dataset.facets)]));
-    const rows = made.rows().nodes().toArray().map((row) => values.get(row));
+    // Of all rows, not of those alone that the present page shows.
+    const rows = made.rows({ order: "index" }).nodes().toArray().map((row) => JSON.parse(row.dataset.facets));
     const matches = (index) => facetsOf(bar).every((s) => !s.value || rows[index][s.name].includes(s.value));
     made.search.fixed("facets", (_text, _data, index) => matches(index));
     readAddress(bar);
-    made.draw();
+    if (facetsOf(bar).some((select) => select.value)) made.draw();
     bar.addEventListener("change", () => { made.draw(); writeAddress(bar); });
     bar.querySelector("button")?.addEventListener("click", () => {
       for (const select of facetsOf(bar)) select.value = "";

@@ -22,6 +22,8 @@
     }
     document.dispatchEvent(new CustomEvent("themechange", { detail: theme }));
   };
+  // What only scripts can use is shown, and long tables wait until they have pages.
+  document.documentElement.classList.add("scripted");
   apply();
   system.addEventListener("change", apply);
   addEventListener("storage", (event) => { if (event.key === KEY) apply(); });

@@ -1,0 +1,285 @@
+"""The pages of results: what they show, where they lead, what they refuse and escape."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from symsteer.errors import UserError
+from symsteer.leaderboard.page import render_page
+from symsteer.leaderboard.site import assets, build
+from symsteer.leaderboard.site.assets import as_script
+from symsteer.leaderboard.site.build import generate
+from symsteer.leaderboard.site.command import site as verb
+from symsteer.leaderboard.study import PAPER
+from symsteer.leaderboard.summary import load_runs, summarize
+from symsteer.leaderboard.tables import cell_name, render_csv
+from symsteer.leaderboard.text import compact, interval, number
+from tests.leaderboard.site.conftest import EVIL, picture
+from tests.leaderboard.site.pages import Page, dead_links, read_pages
+
+TAGS = frozenset(
+    {
+        *("html", "head", "meta", "title", "link", "script", "body", "header", "nav", "main"),
+        *("section", "footer", "h1", "h2", "h3", "p", "a", "span", "strong", "em", "small", "i"),
+        *("br", "code", "pre", "blockquote", "ul", "ol", "li", "dl", "dt", "dd", "div", "details"),
+        *("summary", "table", "caption", "thead", "tbody", "tr", "th", "td", "figure", "video"),
+        *("figcaption", "img", "svg", "path", "circle", "button", "label", "select", "option"),
+    }
+)
+STYLES = re.compile(r"flex:\d+|text-align:(left|right)")
+
+
+def page_of(folder: Path, kind: str, text: str) -> Page:
+    """The page of a kind whose heading has a text."""
+    for path in sorted((folder / kind).glob("*.html")):
+        found = re.search(r"<h1>(.*?)</h1>\s*(<p class=\"lede\">.*?</p>)?", path.read_text(), re.S)
+        if found and text in found[0]:
+            return Page(path)
+    raise AssertionError(f"no page of {text!r}")
+
+
+def test_every_cell_agent_variant_and_run_has_a_page(site: Path) -> None:
+    runs = load_runs([site.parent / "runs"])
+    summary = summarize(runs)
+    count = {kind: len(list((site / kind).glob("*.html"))) for kind in build.FOLDERS}
+    assert count["cells"] == len(summary.tables) == 4
+    assert count["agents"] == len(summary.agents) == 4
+    assert count["runs"] == len(runs)
+    assert {"action-gain", "wind"} <= {p.stem[:-11] for p in (site / "variants").iterdir()}
+    for name in ("index", "findings", "agents", "variants", "runs"):
+        assert (site / f"{name}.html").is_file()
+
+
+@pytest.mark.parametrize("kind", ["site", "hostile"])
+def test_every_address_leads_to_a_file_of_the_site(
+    kind: str, request: pytest.FixtureRequest
+) -> None:
+    pages = read_pages(request.getfixturevalue(kind))
+    assert not dead_links(pages)
+
+
+@pytest.mark.parametrize("kind", ["site", "hostile"])
+def test_nothing_of_a_record_becomes_markup(kind: str, request: pytest.FixtureRequest) -> None:
+    for path, page in read_pages(request.getfixturevalue(kind)).items():
+        assert {tag for tag, _ in page.elements} <= TAGS, path
+        for tag, attrs in page.elements:
+            assert not [name for name in attrs if name.startswith("on")], (path, tag, attrs)
+            assert STYLES.fullmatch(attrs.get("style", "flex:1")), (path, tag, attrs)
+            # Scripts are files or data; nothing runs that stands in a page.
+            assert tag != "script" or attrs.get("src") or attrs == {"type": "application/json"}
+        policy = next(a for t, a in page.elements if "http-equiv" in a)["content"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in re.search(r"script-src ([^;]*)", policy)[1]  # type: ignore[index]
+        assert not set(path.read_text()) & set(map(chr, [*range(9), *range(11, 32), 0x202E]))
+
+
+def test_hostile_texts_are_shown_as_they_are(hostile: Path) -> None:
+    index = Page(hostile / "index.html")
+    for text in (EVIL, "../../../../etc/passwd", "x" * 120, "{{ 7 * 7 }}%{y}&lt;b&gt;", "a-b"):
+        assert text in index.text
+    run = page_of(hostile, "runs", EVIL.replace("<", "&lt;")[:20])
+    assert run.text.count(EVIL) >= 12
+    assert "No command" in run.text
+    failed = page_of(hostile, "runs", "standard-99")
+    assert failed.text.count('<img src=x onerror="window.evil=1">') == 3
+
+
+def test_names_stay_in_their_folders_and_do_not_collide(hostile: Path) -> None:
+    expected = {"site", "assets", *build.FOLDERS} - {"site", "media"}
+    assert {path.name for path in hostile.iterdir() if path.is_dir()} == expected
+    assert {path.name for path in hostile.parent.iterdir()} == {"runs", "site"}
+    for kind in ("agents", "cells", "variants", "runs"):
+        for path in (hostile / kind).iterdir():
+            assert build.OWN.fullmatch(path.name), path
+            assert len(path.name) < 90
+    alike = [path.name for path in (hostile / "agents").glob("a-b-*.html")]
+    assert len(alike) == 2
+    headings = {Page(hostile / "agents" / name).text.split("agent")[1][:40] for name in alike}
+    assert len(headings) == 2
+
+
+def test_numbers_are_those_of_the_leaderboard(site: Path) -> None:
+    summary = summarize(load_runs([site.parent / "runs"]))
+    rows = {
+        (r["task"], r["variant"], r["agent"]): r
+        for r in csv.DictReader(render_csv(summary).splitlines())
+    }
+    index, shown = Page(site / "index.html").text, 0
+    cells = list(read_pages(site / "cells").values())
+    for table in summary.tables:
+        title = f"{cell_name(table, summary)} \u00b7 SymSteer".replace("`", "")
+        (cell,) = [page for page in cells if title in page.text]
+        for row in table.rows:
+            if row.success is None:
+                continue
+            shown += 1
+            line = rows[table.key.task, table.key.variant, row.agent]
+            assert f"{row.success.value:.6g}" == line["success_iqm"]
+            assert interval(row.success) in index
+            assert number(row.success.value) in cell.text
+            # Charts hold the same curve as the table's last checkpoint.
+            (curve,) = [s for s in cell.data[0]["series"] if s["name"] == row.agent]
+            assert row.last
+            assert curve["y"][-1] == pytest.approx(row.last.value, rel=1e-3)
+    assert shown == 14
+
+
+def test_the_findings_are_those_of_the_page(site: Path) -> None:
+    from symsteer.leaderboard.defects import read_audit
+    from symsteer.leaderboard.findings import analyse
+    from symsteer.leaderboard.study import read_study
+
+    summary = summarize(load_runs([site.parent / "runs"]))
+    found = analyse(summary, read_audit(), read_study(PAPER))
+    markdown = render_page(summary, found, {}, {})
+    text = Page(site / "findings.html").text
+    for outcome in found.claims:
+        assert outcome.claim.name in text
+        if outcome.effect:
+            assert interval(outcome.effect.interval(), sign=True, digits=3) in text
+    for cell in re.findall(r"\d\.\d\d \(worst \d\.\d\d\)", markdown):
+        assert cell in text
+    assert "verdict" not in text
+
+
+def test_a_run_page_has_all_of_its_record(site: Path) -> None:
+    run = next(r for r in load_runs([site.parent / "runs"]) if r.record.status == "failed")
+    record = run.record
+    page = page_of(site, "runs", record.run_id)
+    assert record.failure
+    for text in (
+        record.failure,
+        record.config_hash,
+        "learning_rate",
+        "0.0003",
+        "demonstrations.count",
+    ):
+        assert text in page.text
+    episodes = next(data for data in page.data if data["kind"] == "episodes")
+    seeds = record.evaluations[0].episodes.seed
+    assert episodes["seeds"] == seeds
+    assert len(episodes["rows"]) == len(record.evaluations) == 3
+    for row, evaluation in zip(episodes["rows"], record.evaluations, strict=True):
+        assert [bool(cell[0]) for cell in row["cells"]] == evaluation.episodes.success_once
+        assert [cell[1] for cell in row["cells"]] == evaluation.episodes.return_
+    for name, value in record.evaluations[-1].diagnostics.items():
+        assert name in page.text
+        assert compact(value) in page.text
+
+
+def test_a_record_that_is_set_aside_says_so(site: Path) -> None:
+    aside = summarize(load_runs([site.parent / "runs"])).set_aside
+    assert len(aside) == 1
+    texts = [page.text for page in read_pages(site / "runs").values()]
+    assert sum("This record is set aside" in text for text in texts) == 1
+    assert "set aside" in Page(site / "runs.html").text
+    assert aside[0].record.run_id in Page(site / "findings.html").text
+
+
+def test_clips_and_paths_of_a_run_folder_are_copied(site: Path) -> None:
+    media = sorted(path.suffix for path in (site / "media").iterdir())
+    # Neither what only is called a film, nor a link, which may lead anywhere.
+    assert media == [".mp4", ".png"]
+    shown = [
+        attrs["src"]
+        for page in read_pages(site / "runs").values()
+        for tag, attrs in page.elements
+        if tag in ("img", "video")
+    ]
+    assert len(shown) == 2
+
+
+def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
+    site: Path, tmp_path: Path
+) -> None:
+    def snapshot() -> dict[str, bytes]:
+        files = (path for path in out.rglob("*") if path.is_file())
+        return {str(path.relative_to(out)): path.read_bytes() for path in files}
+
+    out, runs = tmp_path / "site", tmp_path / "runs"
+    generate([site.parent / "runs"], out, PAPER, docs=False)
+    first = snapshot()
+    assert first == {
+        str(path.relative_to(site)): path.read_bytes() for path in site.rglob("*") if path.is_file()
+    }
+    (out / "runs" / "mine.txt").write_text("kept")
+    shutil.copytree(site.parent / "runs", runs)
+    for path in sorted(runs.iterdir())[3:]:
+        shutil.rmtree(path)
+    generate([runs], out, PAPER, docs=False)
+    assert len(list((out / "runs").glob("*.html"))) == 3
+    assert (out / "runs" / "mine.txt").read_text() == "kept"
+    assert not dead_links(read_pages(out))
+
+
+def test_mistakes_are_named(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = (site.parent / "runs",)
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "index.html").write_text("<h1>My page</h1>")
+    (tmp_path / "empty").mkdir()
+    for arguments, said in (
+        ({"records": (tmp_path / "nothing",)}, "does not exist"),
+        ({"records": runs, "out": full}, "holds something else than a site"),
+        ({"records": runs, "out": full / "index.html"}, "holds something else than a site"),
+        ({"records": runs, "study": "papers"}, "did you mean 'paper'"),
+        ({"records": runs, "audit": tmp_path / "empty"}, "holds no map.png"),
+    ):
+        with pytest.raises(UserError, match=re.escape(said)):
+            verb(**{"out": tmp_path / "site", "docs": False} | arguments)  # type: ignore[arg-type]
+    assert (full / "index.html").read_text() == "<h1>My page</h1>"
+    assert not (tmp_path / "site").exists()
+    monkeypatch.setattr(assets.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=re.escape('pip install "symsteer[site]"')):
+        verb(runs, tmp_path / "site", docs=False)
+
+
+def test_the_verb_says_what_it_wrote(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert verb((site.parent / "runs" / "0",), tmp_path / "site", docs=False) == 0
+    said = capsys.readouterr().out
+    assert f"wrote {tmp_path / 'site' / 'index.html'}: " in said
+    assert "1 records" in said
+
+
+def test_maps_of_an_audit_folder(site: Path, tmp_path: Path) -> None:
+    for strength in ("0.5", "1"):
+        folder = tmp_path / "audit" / strength
+        folder.mkdir(parents=True)
+        settings = {"task": "PushCube-v1", "embodiment": "floating", "variant": f"wind:{strength}"}
+        (folder / "audit.json").write_text(json.dumps({"settings": settings}))
+        (folder / "map.png").write_bytes(picture())
+    runs, out = [site.parent / "runs" / "0"], tmp_path / "site"
+    generate(runs, out, PAPER, tmp_path / "audit", docs=False)
+    page = page_of(out, "variants", "wind")
+    pictures = [attrs["alt"] for tag, attrs in page.elements if tag == "img"]
+    assert pictures == [
+        "Map of the defect in PushCube-v1, floating, wind:1",
+        "Map of the defect in PushCube-v1, floating, wind:0.5",
+    ]
+    assert not dead_links(read_pages(out))
+    # The committed audit's numbers, with the unbroken control at strength 0.
+    series = page.data[0]["series"]
+    assert {one["name"] for one in series} >= {"PushCube-v1", "StackCube-v1"}
+    assert all(one["x"][0] == 0 and one["x"][-1] == 1 for one in series)
+    (tmp_path / "audit" / "1" / "audit.json").write_text("[]")
+    with pytest.raises(UserError, match="no result of an audit"):
+        generate(runs, out, PAPER, tmp_path / "audit", docs=False)
+
+
+def test_a_module_becomes_a_script() -> None:
+    module = "var a=1;export{a as default,b};\n/* licence */"
+    assert as_script(module) == (
+        '(()=>{"use strict";var a=1;globalThis.SymSteerTables={"default":a,"b":b};\n'
+        "/* licence */\n})();\n"
+    )
+    for damaged in ("var a=1;", module * 2):
+        with pytest.raises(UserError, match="another form"):
+            as_script(damaged)
