@@ -69,12 +69,12 @@ def generate(
             cannot be written, or documentation with an error.
     """
     out = Path(os.path.realpath(out))
-    needs("jinja2", "markdown_it", *(["mkdocs", "material"] if docs else []))
+    reading = Documentation.of_checkout(docs)
+    needs("jinja2", "markdown_it", *(["mkdocs", "material"] if reading.built else []))
     _check_folder(out)
     summary = summarize(load_runs(records))
     defects = read_audit(_summary_of(audit))
     found = analyse(summary, defects, read_study(study))
-    reading = Documentation.of_checkout(docs)
     board = Board(summary, found, defects, Path(study).stem, reading, tuple(_maps(audit)))
     files = {out / name: data for name, data in render(board).items()}
     copies = {out / address: path for run in board.runs for address, _, _, path in media(run)} | {

@@ -47,6 +47,9 @@ def sweep_and_report(installed, folder: Path, suite: str) -> list[dict]:
     page = folder / "runs" / "leaderboard" / "LEADERBOARD.md"
     assert "PickCube-v1" in page.read_text()
     assert list((page.parent / "figures").glob("*.svg"))
+    said = installed.run(folder, "symsteer", "site", "runs")
+    assert "without the documentation" in said
+    assert (folder / "site" / "index.html").is_file()
     return [json.loads(file.read_text()) for file in folder.glob("runs/*/record.json")]
 
 
