@@ -10,6 +10,7 @@ import pytest
 
 from symsteer.leaderboard.site.docs import build_documentation
 from tests.leaderboard.site.browser import Visit, chromium, opened
+from tests.leaderboard.site.conftest import EVIL
 
 pytestmark = [
     pytest.mark.browser,
@@ -128,6 +129,16 @@ def test_points_tell_what_they_are(site: Path, context: Any) -> None:
     assert "steps: \u2212" in hover_text(visit, q)
     assert "0.31" in hover_text(visit, equivariance)
     assert not visit.troubles
+
+
+def test_plotly_shows_names_as_they_are(hostile: Path, context: Any) -> None:
+    """It reads markup, entities and %{...} in texts."""
+    for page, name in (("img-src", EVIL[:12]), ("7-7-y", "{{ 7 * 7 }}%{y}&lt;b&gt;")):
+        visit = Visit(context, sorted((hostile / "cells").glob(f"{page}*"))[0])
+        figure = visit.page.locator("figure.chart").first
+        assert name in figure.locator(".legend").inner_text()
+        assert name in hover_text(visit, figure)
+        assert not visit.troubles
 
 
 def test_lines_can_be_left_out(site: Path, context: Any) -> None:
