@@ -13,13 +13,16 @@ from symsteer.leaderboard.text import NOTHING, code, difference, grid, image, in
 Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
 """By place, (task, embodiment), (embodiment,) or (), then by kind: description and address."""
 
+COLOUR = "The colour says which."
+"""What the figure's colours mean; other charts of the map have other ones."""
+
 MAP = f"""\
 Each point is a cell: the advantage over `{STANDARD}`, paired by base policy and seed, against the
 *audited defect* of a decision. The defect is measured in simulation, over the steps of an action
 chunk that are executed between two decisions: how differently the world answers to turned copies of
 the same decision. It is the largest of four parts: horizontal motion of the tool and of the object
 (each as a share of its own), cost (as a share of a step's usual cost) and observation (as a share
-of the tool's motion). The colour says which. Broken initial states are no part of a decision; they
+of the tool's motion). {COLOUR} Broken initial states are no part of a decision; they
 are in the table below. Bars are 95 % intervals, hollow points have fewer than {MIN_SEEDS} paired
 runs.
 

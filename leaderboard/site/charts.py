@@ -137,6 +137,7 @@ def success_chart(table: Table) -> Chart:
                 "name": _run_name(run),
                 "x": list(run.curve),
                 "y": plain(evaluation.success_once for evaluation in run.curve.values()),
+                "open": not run.finished,
             }
             for run in row.runs
             if not (run.finished and row.is_reference)
@@ -169,7 +170,8 @@ def q_chart(table: Table) -> Chart | None:
         for run in runs:
             x, y = series(run, "q_mean")
             name = _run_name(run) + (", Q not finite" if run.record.nonfinite_q else "")
-            one["runs"].append({"name": name, "x": x, "y": plain(y)})
+            cross = not run.finished or run.record.nonfinite_q
+            one["runs"].append({"name": name, "x": x, "y": plain(y), "open": cross})
         found.append(one)
     if not found:
         return None

@@ -9,7 +9,7 @@ from typing import Any
 
 from symsteer.leaderboard import page
 from symsteer.leaderboard.defects import MEASURES, defect_of
-from symsteer.leaderboard.map_page import map_section
+from symsteer.leaderboard.map_page import COLOUR, map_section
 from symsteer.leaderboard.site import charts, markup
 from symsteer.leaderboard.site.board import Board, breaks, dials, strengths
 from symsteer.leaderboard.statistics import Interval
@@ -196,6 +196,8 @@ def findings(board: Board) -> Values:
     by_embodiment: dict[str, list[charts.Chart]] = {}
     for (embodiment, _), chart in maps.items():
         by_embodiment.setdefault(embodiment, []).append(chart)
+    explained, *blocks = map_section(summary, found.map, {})
+    explained = explained.replace(COLOUR, "The text at a point says which.")
     spreads = page.spreads_section(summary, found.spreads) if found.spreads else []
     return {
         "notice": _notice(board),
@@ -206,7 +208,7 @@ def findings(board: Board) -> Values:
         else "",
         "spreads": markup.html(spreads),
         "maps": by_embodiment,
-        "map": markup.html(map_section(summary, found.map, {})),
+        "map": markup.html([explained, *blocks]),
         "profiles": charts.profile_charts(found.comparisons),
         "profiles_text": page.PROFILES,
         "improvement_text": page.IMPROVEMENT,

@@ -127,14 +127,18 @@
       if (one.low && !one.bars && (one.band ?? !one.flat)) {
         traces.push({
           x: [...one.x, ...[...one.x].reverse()], y: [...one.high, ...[...one.low].reverse()],
-          fill: "toself", fillcolor: faint(color, 0.13), line: { width: 0 }, mode: "lines", hoverinfo: "skip",
+          fill: "toself", fillcolor: faint(color, 0.11), line: { width: 0 }, mode: "lines", hoverinfo: "skip",
         });
       }
-      if (state.runs) {
-        for (const run of one.runs || []) {
+      for (const run of one.runs || []) {
+        // Of unfinished runs nothing else is shown; they end in a cross.
+        if (state.runs || run.open) {
           traces.push({
-            x: run.x, y: run.y, mode: "lines+markers", opacity: 0.5,
-            line: { color, width: 1, dash: "solid" }, marker: { color, size: 3 },
+            x: run.x, y: run.y, mode: "lines+markers", opacity: run.open ? 0.8 : 0.5,
+            line: { color, width: run.open ? 1.4 : 1, dash: run.open ? "dot" : "solid" },
+            marker: run.open
+              ? { color, size: run.y.map((_, k) => (k + 1 < run.y.length ? 3 : 8)), symbol: run.y.map((_, k) => (k + 1 < run.y.length ? "circle" : "x-thin-open")), line: { color, width: 1.6 } }
+              : { color, size: 3 },
             text: run.y.map((y, k) => `<b>${name}</b>, ${safe(run.name)}<br>${where(run.x[k])} steps: ${shown(y)}`),
             hovertemplate: "%{text}<extra></extra>",
           });

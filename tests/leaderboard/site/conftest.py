@@ -49,6 +49,7 @@ def ordinary_records() -> list[RunRecord]:
     for agent in ("standard", "equivariant"):
         curve = make_curve(generator, np.linspace(0.2, 0.8, 5))
         found.append(make_record(curve, agent=agent, seed=7, variant="wind:0.2..0.8"))
+    curve = make_curve(generator, np.linspace(0.6, 0.1, 5))
     found.append(
         make_record(curve[:3], "failed", agent="standard", seed=8, variant="wind:0.2..0.8")
     )

@@ -130,6 +130,13 @@ def test_numbers_are_those_of_the_leaderboard(site: Path) -> None:
     assert shown == 14
 
 
+def test_unfinished_runs_are_drawn_apart(site: Path) -> None:
+    cell = page_of(site, "cells", "wind:0.2..0.8")
+    for chart in cell.data[:2]:
+        runs = {run["name"]: run["open"] for one in chart["series"] for run in one["runs"]}
+        assert runs == {"seed 7": False, "seed 8, failed": True}
+
+
 def test_the_findings_are_those_of_the_page(site: Path) -> None:
     from symsteer.leaderboard.defects import read_audit
     from symsteer.leaderboard.findings import analyse
