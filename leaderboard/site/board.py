@@ -131,7 +131,8 @@ class Board:
         """Address of a run's page; records with the same bytes share one."""
         if run.path not in self._names:
             digest = hashlib.sha256(run.path.read_bytes()).hexdigest()
-            self._names[run.path] = slug(run.record.run_id, digest, digits=DIGITS)
+            stem = slug(run.record.run_id, digits=DIGITS)[:-DIGITS]
+            self._names[run.path] = stem + digest[:DIGITS]
         return f"runs/{self._names[run.path]}.html"
 
     def audited(self, dial: str) -> list[tuple[str, str, str, float, Interval, str]]:

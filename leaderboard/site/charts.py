@@ -39,8 +39,14 @@ SYMBOLS = {
 
 MARKERS = tuple(symbol for symbol in SYMBOLS.values() if symbol)
 
-DASHES = {"-": "solid", 5: "dash", 1: "dot", 3: "dash"}
-"""Plotly's names of line styles, by the length of their first dash."""
+DASHES: dict[Any, str] = {
+    "-": "solid",
+    (0, (5, 2)): "dash",
+    (0, (3, 1.5)): "dash",
+    (0, (1, 1.5)): "dot",
+    (0, (5, 1.5, 1, 1.5)): "dashdot",
+}
+"""Plotly's names of matplotlib's line styles."""
 
 TWINS = ("solid", "dot", "dash", "longdash", "dashdot")
 """Line styles of the rows of one agent with different settings."""
@@ -53,13 +59,8 @@ CONTRAST = 4.5
 
 LONGEST_NAME = 48
 
-NEUTRAL = ("#555555", "#9AA4B2")
-TASKS = (
-    *(("#0072B2", "#3E9BD6"), ("#D55E00", "#E8833A"), ("#009E73", "#2FBF95")),
-    *(("#CC79A7", "#DB9BBF"), ("#A8860B", "#D0AC2C"), ("#332288", "#8F84E0")),
-    *(("#56B4E9", "#7CC6EF"), ("#882255", "#CF6FA0"), NEUTRAL),
-)
-"""Colours of tasks, on light and on dark pages."""
+TASKS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#A8860B", "#332288", "#56B4E9", "#882255")
+"""Colours of tasks."""
 
 
 def short(text: str, limit: int = LONGEST_NAME) -> str:
@@ -95,13 +96,13 @@ def _luminance(parts: Sequence[int]) -> float:
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
+NEUTRAL = colors("#555555")
+
+
 def look(agent: str) -> dict[str, Any]:
     """Colours, line and marker of an agent, as in the leaderboard's figures."""
     color, marker, line = style_of(agent)
-    dash = DASHES[line if isinstance(line, str) else line[1][0]]
-    if line == (0, (5, 1.5, 1, 1.5)):
-        dash = "dashdot"
-    return {"color": colors(color), "dash": dash, "symbol": SYMBOLS[marker]}
+    return {"color": colors(color), "dash": DASHES[line], "symbol": SYMBOLS[marker]}
 
 
 def _looks(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -355,7 +356,7 @@ def audit_chart(cells: Sequence[tuple[str, str, str, float, Interval]]) -> Chart
         label = short(task if embodiment == "floating" else f"{task}, {embodiment}")
         one: dict[str, Any] = {
             "name": label + ("" if group == "C8" else f", {short(group)}"),
-            "color": TASKS[tasks.index(task) % len(TASKS)],
+            "color": colors(TASKS[tasks.index(task) % len(TASKS)]),
             "dash": "solid" if embodiment == "floating" else "dash",
             "symbol": MARKERS[tasks.index(task) % len(MARKERS)],
             "x": plain(strength for strength, _ in own),

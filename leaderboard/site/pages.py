@@ -336,7 +336,6 @@ def variants(board: Board) -> Values:
                 "audited": len({cell[:3] for cell in board.audited(name)}),
             }
             for name in board.dials
-            if name != "none"
         ],
         "page": board.docs.page("variants.md", ""),
     }

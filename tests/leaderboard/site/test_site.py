@@ -20,7 +20,8 @@ from symsteer.leaderboard.study import PAPER
 from symsteer.leaderboard.summary import load_runs, summarize
 from symsteer.leaderboard.tables import cell_name, render_csv
 from symsteer.leaderboard.text import compact, interval, number
-from tests.leaderboard.site.conftest import EVIL, picture
+from tests.leaderboard.record_factory import make_evaluation, make_record
+from tests.leaderboard.site.conftest import EVIL, picture, write_all
 from tests.leaderboard.site.pages import Page, dead_links, read_pages
 
 TAGS = frozenset(
@@ -223,6 +224,20 @@ def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
     assert len(list((out / "runs").glob("*.html"))) == 3
     assert (out / "runs" / "mine.txt").read_text() == "kept"
     assert not dead_links(read_pages(out))
+
+
+def test_runs_that_have_not_ended_have_pages(tmp_path: Path) -> None:
+    begun = make_evaluation([1, 0], env_steps=0)
+    write_all(
+        [make_record([], "running"), make_record([begun], "interrupted", agent="base", seed=2)],
+        tmp_path / "runs",
+    )
+    generate([tmp_path / "runs"], tmp_path / "site", PAPER, docs=False)
+    assert not dead_links(read_pages(tmp_path / "site"))
+    text = page_of(tmp_path / "site", "runs", "standard-0").text
+    assert "running" in text
+    assert "Every held-out episode" not in text
+    assert "1\u00a0running" in Page(tmp_path / "site" / "index.html").text
 
 
 def test_mistakes_are_named(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
