@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -356,6 +356,129 @@ def base(
     return 0
 
 
+def export(
+    run: Annotated[Path | None, tyro.conf.arg(metavar="[RUN]")] = None,
+    /,
+    *,
+    out: Path,
+    format: Literal["bundle", "lerobot"] = "bundle",
+    contents: Literal["all", "demonstrations", "policy"] = "all",
+    task: str | None = None,
+    embodiment: str | None = None,
+    count: int | None = None,
+    mode: Literal["clean", "diverse"] | None = None,
+    seed: int | None = None,
+    policy: str | None = None,
+    runs: Path = Path("runs"),
+    videos: Literal["auto", "on", "off"] = "auto",
+) -> int:
+    """Write a base policy and its demonstrations to one file, or demonstrations for LeRobot.
+
+    They are those of a run, or of the settings --task, --embodiment, ..., as a run would make them;
+    what RUNS/base has of these is taken from there (docs/bundles.md).
+
+    Args:
+        run: Folder of a run; without it, the settings below.
+        out: The file to write (.zip); for --format lerobot a new folder.
+        format: bundle: one file for `symsteer fetch-bundle`; lerobot: demonstrations as a LeRobot
+            dataset, version 3.0.
+        contents: What goes into a bundle.
+        task: Task; `symsteer list` names them.
+        embodiment: floating (default) or panda.
+        count: Number of demonstrations (default 50).
+        mode: Kind of demonstrations (default diverse).
+        seed: Seed of demonstrations and policy (default 0).
+        policy: Base policy (default edp); `symsteer list` names them.
+        runs: Folder of runs; demonstrations and policies of settings are kept in RUNS/base.
+        videos: Whether a LeRobot dataset has a video; auto: where a Vulkan driver works.
+    """
+    from symsteer.bench.bundles.bundle import check_path, write_bundle
+    from symsteer.bench.bundles.contents import contents_of_run, contents_of_settings
+    from symsteer.bench.runs.config import build_config
+
+    given = {"task": task, "embodiment": embodiment, "seed": seed, "count": count, "mode": mode}
+    settings = {k: v for k, v in {**given, "policy": policy}.items() if v is not None}
+    if run is not None and settings:
+        raise UserError(
+            f"a run has its own settings: leave out {run}, or --{' and --'.join(settings)}"
+        )
+    if run is None and task is None:
+        raise UserError("name the folder of a run, or a task with --task")
+    if format == "bundle":
+        check_path(out)
+        wanted = contents
+    else:
+        write_dataset = _lerobot(out)
+        wanted = "demonstrations"
+    if run is not None:
+        found = contents_of_run(run, wanted)
+    else:
+        tables: dict[str, Any] = {
+            "demonstrations": {k: settings.pop(k) for k in ("count", "mode") if k in settings},
+            "policy": {"name": settings.pop("policy")} if "policy" in settings else {},
+        }
+        config = build_config({**settings, **tables}, "symsteer export")
+        found = contents_of_settings(config, runs, wanted)
+    if format == "lerobot":
+        print(write_dataset(found, out, videos))
+        return 0
+    manifest = write_bundle(found, out)
+    if found.left_out:
+        print(f"the bundle has no demonstrations: {found.left_out}", file=sys.stderr)
+    held = [file.path for file in manifest.files]
+    print(f"wrote {out} ({out.stat().st_size / 2**20:.1f} MiB): {', '.join(held)}")
+    print(f"unpack it anywhere with: symsteer fetch-bundle {out}")
+    return 0
+
+
+def _lerobot(out: Path) -> Callable[..., str]:
+    """The function that writes datasets, once its package and its folder are as it needs them."""
+    try:
+        from symsteer.bench.bundles.lerobot import check_folder, write_dataset
+    except ModuleNotFoundError as error:
+        if error.name != "pyarrow":
+            raise
+        raise UserError(
+            'a LeRobot dataset needs pyarrow; install it with: pip install "symsteer[lerobot]"'
+        ) from error
+    check_folder(out)
+    return write_dataset
+
+
+def fetch_bundle(
+    file: Annotated[Path, tyro.conf.arg(metavar="FILE")],
+    /,
+    out: Path = Path("runs/base"),
+) -> int:
+    """Check a bundle and unpack it to where runs find its demonstrations and base policy.
+
+    Nothing is written unless every file has the hash in the bundle's manifest.
+
+    Args:
+        file: The bundle, which `symsteer export` wrote.
+        out: Folder to unpack to: RUNS/base.
+    """
+    from symsteer.bench.bundles.fetch import fetch_bundle
+    from symsteer.bench.bundles.manifest import next_commands
+
+    manifest, places = fetch_bundle(file, out)
+    card, policy = manifest.path("card"), manifest.path("policy")
+    demonstrations = manifest.path("demonstrations", ".h5")
+    for kind, name in {"card": card, "policy": policy, "demonstrations": demonstrations}.items():
+        if name:
+            print(f"{kind + ':':16s}{places[name]}")
+    commands = next_commands(
+        manifest.task,
+        manifest.embodiment,
+        places[policy] if policy else None,
+        places[demonstrations] if demonstrations else None,
+        manifest.demonstrations.count,
+    )
+    for command in commands:
+        print(f"{'next:':16s}{command}")
+    return 0
+
+
 def audit(
     task: tuple[str, ...] = ("PickCube-v1",),
     embodiment: tuple[str, ...] = ("floating",),
@@ -598,4 +721,3 @@ def _print_names(title: str, names: Iterable[tuple[str, str]]) -> None:
     for name, text in names:
         head = f"  {name:18s} "
         print(textwrap.fill(text, columns, initial_indent=head, subsequent_indent=" " * len(head)))
-    print()

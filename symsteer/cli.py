@@ -81,6 +81,8 @@ VERBS = {
     ),
     "demos": Verb(f"{BENCH}:demos", "Write demonstrations of the scripted expert."),
     "base": Verb(f"{BENCH}:base", "Train base policies and compare their success."),
+    "export": Verb(f"{BENCH}:export", "Write a base policy and demonstrations to one file."),
+    "fetch-bundle": Verb(f"{BENCH}:fetch_bundle", "Unpack such a file.", computes=False),
     "audit": Verb(f"{BENCH}:audit", "Measure how broken the symmetry of a task is."),
     "detect": Verb(f"{BENCH}:detect", "Score detectors of broken symmetry on a run's decisions."),
     "throughput": Verb(f"{BENCH}:throughput", "Measure the speed of the simulation."),

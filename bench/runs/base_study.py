@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from symsteer.agents.episodes import Rollout
 from symsteer.bench.demos import load
 from symsteer.bench.runs.base_policy import demonstration_file
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
@@ -24,6 +25,7 @@ from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
+from symsteer.policies.contract import ChunkPolicy
 
 EVALUATION_ENVS = 100
 
@@ -117,6 +119,28 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def held_out_episodes(config: RunConfig, policy: ChunkPolicy, seed: int, episodes: int) -> Rollout:
+    """Held-out episodes of a base policy with noise from N(0, I), in the unbroken task.
+
+    Args:
+        config: task and embodiment.
+        policy: the base policy, on the CPU.
+        seed: of the noise.
+        episodes: how many.
+    """
+    env = make(config.task, num_envs=min(EVALUATION_ENVS, episodes), embodiment=config.embodiment)
+    generator = torch.Generator().manual_seed(seed)
+
+    def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        return torch.randn(len(obs), policy.horizon, policy.act_layout.dim, generator=generator)
+
+    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
+    try:
+        return rollout(latent, act, held_out_seeds(episodes))
+    finally:
+        latent.close()
+
+
 def _play(config: RunConfig, cell: BaseCell, demos: Path, episodes: int) -> dict[str, Any]:
     torch.set_num_threads(1)
     data = load(demos, config.task, config.embodiment, cell.count)
@@ -133,15 +157,7 @@ def _play(config: RunConfig, cell: BaseCell, demos: Path, episodes: int) -> dict
         data.action_layout,
         cell.seed,
     )
-    env = make(config.task, num_envs=min(EVALUATION_ENVS, episodes), embodiment=config.embodiment)
-    generator = torch.Generator().manual_seed(cell.seed)
-
-    def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-        return torch.randn(len(obs), policy.horizon, policy.act_layout.dim, generator=generator)
-
-    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
-    result = rollout(latent, act, held_out_seeds(episodes))
-    latent.close()
+    result = held_out_episodes(config, policy, cell.seed, episodes)
     successes = int(result.episodes["success_once"].sum())
     return {
         **dataclasses.asdict(cell),

@@ -8,6 +8,8 @@ from unittest.mock import patch
 
 import pytest
 
+from symsteer.bench.bundles.bundle import write_bundle
+from symsteer.bench.bundles.contents import contents_of_run
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig, flat
 from symsteer.bench.runs.run import execute
@@ -69,6 +71,7 @@ def workshop(tmp_path_factory) -> Workshop:
     folder = stop_after(CONFIG, out, checkpoints=2)
     other = stop_after(OTHER, out, checkpoints=1)
     h5 = next((out / "base").glob("*.h5"))
+    write_bundle(contents_of_run(folder, "all"), out / "bundle.zip")
     state = load_checkpoint(folder)
     assert state is not None
     write_manifest(make_plan(Suite("two", "", (CONFIG, OTHER)), out), 1, {other.name: "it broke"})
@@ -87,6 +90,7 @@ def workshop(tmp_path_factory) -> Workshop:
         sweeps=out / "sweeps",
         base=out / "base",
         demos=(h5.read_bytes(), h5.with_suffix(".json").read_bytes()),
+        bundle=(out / "bundle.zip").read_bytes(),
         records={name: dump_record(record) for name, record in records.items()},
         other=(other / "checkpoint.pt").read_bytes(),
     )

@@ -21,6 +21,7 @@ import shutil
 import struct
 import tomllib
 import typing
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
@@ -72,6 +73,7 @@ class Workshop:
         sweeps: folder of the bookkeeping of a sweep.
         base: folder of its demonstrations and base policy.
         demos: its demonstrations, .h5 and .json.
+        bundle: its demonstrations and base policy as one file.
         records: of other runs.
         other: the checkpoint of another run.
     """
@@ -85,6 +87,7 @@ class Workshop:
     sweeps: Path
     base: Path
     demos: tuple[bytes, bytes]
+    bundle: bytes
     records: dict[str, str]
     other: bytes
 
@@ -703,16 +706,56 @@ def _alike(a: Any, b: Any) -> bool:
     return same(a, b)
 
 
+# Bundles.
+
+
+def bundle(workshop: Workshop, number: int, folder: Path) -> Ending:
+    """A bundle, read by ``symsteer fetch-bundle``."""
+    random = Random(f"bundle {number}")
+    path, out = folder / "mutant.zip", folder / "base"
+    with zipfile.ZipFile(io.BytesIO(workshop.bundle)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    whole = set(members.values())
+    kind = random.randrange(6)
+    if kind == 0:
+        path.write_bytes(poison_bytes(workshop.bundle, random))
+    elif kind == 1:
+        path.write_bytes(flip_bits(workshop.bundle, random))
+    else:
+        if kind in (2, 3):
+            text = poison_json(members["manifest.json"].decode(), random)
+            members["manifest.json"] = text.encode("utf-8", "surrogatepass")
+        elif kind == 4:
+            old = random.choice(sorted(members))
+            new = random.choice(("../x", "/x", "a/../../x", ".x", "a/b/c", "x\\y", "x\n", " ", old))
+            members[new if random.random() < 0.8 else "more"] = members.pop(old)
+        else:
+            name = random.choice(sorted(members))
+            members[name] = poison_bytes(members[name], random)
+        with zipfile.ZipFile(path, "w", random.choice((0, 0, 0, zipfile.ZIP_DEFLATED))) as archive:
+            for name, data in members.items():
+                archive.writestr(name, data)
+    ending = end_of(["fetch-bundle", path, "--out", out], ["mutant.zip"])
+    written = [file for file in folder.rglob("*") if file.is_file() and file != path]
+    if ending.kind == "refused":
+        _require(not written, f"{written} were written")
+    for file in written:
+        known = file.name == "manifest.json" or file.read_bytes() in whole
+        _require(known and out in file.parents, f"{file} was written")
+    return ending
+
+
 Runner = Callable[[Workshop, int, Path], Ending]
 
 KINDS: dict[str, tuple[Runner, int]] = {
-    "suite": (suite, 200),
+    "suite": (suite, 170),
     "config": (config_file, 100),
     "command": (command, 110),
-    "record": (record, 200),
+    "record": (record, 170),
     "demonstrations": (demonstrations, 150),
     "policy": (policy, 90),
     "checkpoint": (checkpoint, 90),
     "status": (status, 60),
+    "bundle": (bundle, 60),
 }
 """How each kind is tried, and how many times in the whole test."""

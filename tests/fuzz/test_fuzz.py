@@ -18,6 +18,7 @@ WAYS = {
     "demonstrations": ("demos", 8),
     "policy": ("policy", 6),
     "checkpoint": ("checkpoint", 8),
+    "bundle": ("bundle", 6),
 }
 """Prefix of the seeds, and number of ways to damage: the first draw chooses the way."""
 

@@ -89,6 +89,27 @@ base --task Nothing
 base --demonstrations -5
 base --out file
 base --policies none
+export
+export --out a.zip
+export nowhere --out a.zip
+export file --out a.zip
+export folder --out a.zip
+export folder --task PickCube-v1 --out a.zip
+export --task Nothing --out a.zip
+export --task PickCube-v1 --embodiment hand --out a.zip
+export --task PickCube-v1 --count 0 --out a.zip
+export --task PickCube-v1 --policy none --out a.zip
+export --task PickCube-v1 --out a.tar
+export --task PickCube-v1 --out folder
+export --task PickCube-v1 --contents nothing --out a.zip
+export --task PickCube-v1 --format lerobot --out file
+export --task PickCube-v1 --format rlds --out new
+fetch-bundle
+fetch-bundle nowhere
+fetch-bundle folder
+fetch-bundle file
+fetch-bundle x.json
+fetch-bundle https://example.org/a.zip
 doctor extra
 doctor --nothing
 demo extra

@@ -1,0 +1,105 @@
+"""Pictures of demonstrations: their stored states, rendered one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import imageio.v2 as imageio
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.film import FRAMES_PER_SECOND
+from symsteer.bench.tasks import make
+from symsteer.bench.tasks.picture import CAMERA
+
+PIXELS = 128
+"""Width and height of the pictures."""
+
+RENDERING: dict[str, Any] = {
+    "render": True,
+    "render_mode": "rgb_array",
+    "human_render_camera_configs": {**CAMERA, "fov": 0.65, "width": PIXELS, "height": PIXELS},
+}
+"""Options of :func:`symsteer.make` for environments whose ``render()`` gives these pictures."""
+
+CODEC = "h264"
+ENCODING = ("-g", "2", "-bf", "0", "-crf", "20")
+"""A key frame in every second frame and none that depends on later ones: readers jump about."""
+
+STRIDE = 4
+"""Statistics use every fourth row and column of a picture."""
+
+
+def film_demonstrations(
+    config: RunConfig, demonstrations: Path, lengths: list[int], out: Path
+) -> list[np.ndarray]:
+    """Write one video of all episodes: a frame for each action, of the state before it.
+
+    Args:
+        config: task and embodiment.
+        demonstrations: the .h5 file.
+        lengths: actions of each episode.
+        out: the .mp4 file.
+
+    Returns:
+        A part of the pixels of each episode, ``[T, height, width, 3]`` uint8.
+
+    Raises:
+        UserError: if there is no Vulkan driver.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    writer = imageio.get_writer(
+        out,
+        fps=FRAMES_PER_SECOND,
+        codec="libx264",
+        pixelformat="yuv420p",
+        quality=None,
+        macro_block_size=1,
+        output_params=list(ENCODING),
+    )
+    pixels: list[list[np.ndarray]] = [[] for _ in lengths]
+    with writer, tqdm(total=sum(lengths), desc="video", disable=None) as bar:
+        for episode, frame in _frames(config, demonstrations, lengths):
+            writer.append_data(frame)
+            pixels[episode].append(frame[::STRIDE, ::STRIDE])
+            bar.update()
+    return [np.stack(frames) for frames in pixels]
+
+
+def _frames(
+    config: RunConfig, demonstrations: Path, lengths: list[int]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Number of the episode and picture ``[height, width, 3]`` uint8, for every frame."""
+    env = make(config.task, num_envs=1, embodiment=config.embodiment, **RENDERING)
+    try:
+        env.reset(seed=0)
+        with h5py.File(demonstrations, "r") as file:
+            for episode, length in enumerate(lengths):
+                states = _arrays(file[f"traj_{episode}/env_states"])
+                for step in range(length):
+                    env.set_state_dict(_row(states, step))
+                    yield episode, env.render()[0].cpu().numpy()[..., :3]
+    finally:
+        env.close()
+
+
+def _arrays(group: h5py.Group) -> dict[str, Any]:
+    return {
+        key: _arrays(value) if isinstance(value, h5py.Group) else np.asarray(value)
+        for key, value in group.items()
+    }
+
+
+def _row(states: dict[str, Any], step: int) -> dict[str, Any]:
+    """The state of one environment at one step."""
+    return {
+        key: _row(value, step)
+        if isinstance(value, dict)
+        else torch.from_numpy(value[step : step + 1])
+        for key, value in states.items()
+    }

@@ -1,0 +1,103 @@
+"""The manifest of a bundle; imports neither torch nor ManiSkill."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from symsteer.leaderboard.records import Provenance
+
+FORMAT: Final = "symsteer-bundle"
+VERSION: Final = 1
+MANIFEST, CARD = "manifest.json", "CARD.md"
+
+_WORD = r"[A-Za-z0-9_][A-Za-z0-9_.:=+-]*"
+Word = Annotated[str, Field(pattern=rf"^{_WORD}$", max_length=200)]
+Role = Literal["card", "demonstrations", "policy"]
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class _Block(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class BundledFile(_Block):
+    """A file of a bundle; ``path`` has at most one folder, and no name begins with a dot."""
+
+    path: Annotated[str, Field(pattern=rf"^{_WORD}(/{_WORD})?$", max_length=400)]
+    role: Role
+    size: Annotated[int, Field(ge=0)]
+    sha256: Digest
+
+
+class Code(_Block):
+    """The SymSteer that wrote a bundle, as in a record's provenance."""
+
+    version: str | None
+    commit: str | None
+    dirty: bool | None
+    sha256: str | None
+
+    @classmethod
+    def here(cls) -> Code:
+        """The one that runs."""
+        found = Provenance.collect("cpu", 1).model_dump()
+        return cls(**{key: found[key] for key in cls.model_fields})
+
+    def __str__(self) -> str:
+        which = f"commit `{self.commit}`" if self.commit else f"code with SHA-256 `{self.sha256}`"
+        return f"SymSteer {self.version} ({which}{', changed' if self.dirty else ''})"
+
+
+class BundledDemonstrations(_Block):
+    """Settings of the demonstrations that are in a bundle, or that its policy was trained on."""
+
+    mode: Literal["clean", "diverse"]
+    count: Annotated[int, Field(ge=1)]
+    seed: int
+
+
+class Manifest(_Block):
+    """``manifest.json``: what a bundle holds, and where it came from.
+
+    ``measured`` is null without a policy; ``origin`` has the hashes of files of the user that the
+    run began with.
+    """
+
+    format: Literal["symsteer-bundle"]
+    version: Literal[1]
+    name: Word
+    task: Word
+    embodiment: Word
+    code: Code
+    licence: str
+    observation_layout: list[dict[str, Any]]
+    action_layout: list[dict[str, Any]]
+    demonstrations: BundledDemonstrations
+    policy: dict[str, Any]
+    policy_seed: int
+    origin: dict[str, str]
+    measured: dict[str, Any] | None
+    files: list[BundledFile]
+
+    def path(self, role: str, suffix: str = "") -> str | None:
+        """The first file with a role whose name ends so; None if there is none."""
+        found = (f.path for f in self.files if f.role == role and f.path.endswith(suffix))
+        return next(found, None)
+
+
+def next_commands(
+    task: str, embodiment: str, policy: Path | None, demonstrations: Path | None, count: int
+) -> list[str]:
+    """Commands that use an unpacked base policy, and ``count`` unpacked demonstrations."""
+    run = f"symsteer run --task {shlex.quote(task)} --embodiment {embodiment}"
+    commands = []
+    if policy is not None:
+        commands.append(f"{run} --base-policy {shlex.quote(str(policy))}")
+    if demonstrations is not None:
+        file = shlex.quote(str(demonstrations))
+        commands.append(f"{run} --demos {file} --demonstrations.count {count}")
+    return commands

@@ -1,0 +1,24 @@
+"""A finished run, and what is taken away of it."""
+
+from pathlib import Path
+
+import pytest
+
+from symsteer.bench.bundles.bundle import write_bundle
+from symsteer.bench.bundles.contents import contents_of_run
+from symsteer.bench.runs.run import execute
+from tests.bench.tiny_run import tiny_config
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory) -> Path:
+    """The folder of a finished run."""
+    return execute(tiny_config(agent="zero"), tmp_path_factory.mktemp("runs"), progress=False)
+
+
+@pytest.fixture(scope="session")
+def bundle(run, tmp_path_factory) -> Path:
+    """Its base policy and demonstrations as a bundle."""
+    path = tmp_path_factory.mktemp("bundle") / "all.zip"
+    write_bundle(contents_of_run(run, "all"), path)
+    return path
