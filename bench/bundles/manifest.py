@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -42,6 +43,7 @@ class Code(_Block):
     sha256: str | None
 
     @classmethod
+    @functools.cache
     def here(cls) -> Code:
         """The one that runs."""
         found = Provenance.collect("cpu", 1).model_dump()
