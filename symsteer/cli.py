@@ -82,7 +82,9 @@ VERBS = {
     "demos": Verb(f"{BENCH}:demos", "Write demonstrations of the scripted expert."),
     "base": Verb(f"{BENCH}:base", "Train base policies and compare their success."),
     "export": Verb(f"{BENCH}:export", "Write a base policy and demonstrations to one file."),
-    "fetch-bundle": Verb(f"{BENCH}:fetch_bundle", "Unpack such a file.", computes=False),
+    "fetch-bundle": Verb(
+        f"{BENCH}:fetch_bundle", "Check such a file and unpack it.", computes=False
+    ),
     "audit": Verb(f"{BENCH}:audit", "Measure how broken the symmetry of a task is."),
     "detect": Verb(f"{BENCH}:detect", "Score detectors of broken symmetry on a run's decisions."),
     "throughput": Verb(f"{BENCH}:throughput", "Measure the speed of the simulation."),

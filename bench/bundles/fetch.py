@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import stat
 import struct
 import zipfile
@@ -71,7 +72,7 @@ def read_bundle(path: Path) -> tuple[Manifest, dict[str, bytes]]:
     Raises:
         UserError: one sentence on why the file cannot be used.
     """
-    if "://" in str(path):
+    if re.match(r"\w{2,}:/", str(path)):
         raise UserError(f"{path} is an address; download it and give the path of the file")
     if not path.is_file():
         raise UserError(f"there is no file {path}; name a bundle that `symsteer export` wrote")

@@ -104,6 +104,7 @@ export --task PickCube-v1 --out folder
 export --task PickCube-v1 --contents nothing --out a.zip
 export --task PickCube-v1 --format lerobot --out file
 export --task PickCube-v1 --format rlds --out new
+export --task PickCube-v1 --format lerobot --contents policy --out new
 fetch-bundle
 fetch-bundle nowhere
 fetch-bundle folder

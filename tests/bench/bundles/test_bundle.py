@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import pytest
 import torch
@@ -298,7 +299,7 @@ def test_foreign_files_are_refused(tmp_path):
         (tmp_path / "theirs.zip", "not a bundle of SymSteer"),
         (tmp_path / "nowhere.zip", "there is no file"),
         (tmp_path, "there is no file"),
-        ("https://example.org/a.zip", "download it"),
+        (Path("https://example.org/a.zip"), "download it"),
     ):
         with pytest.raises(UserError, match=words):
             fetch_bundle(path, tmp_path / "base")
