@@ -100,7 +100,7 @@ def how_made(contents: Contents) -> str:
         return f"The run that it was taken from began with files of its user: {files}."
     defaults = flat(type(config.policy)().to_json())
     options = [
-        f" --policy.{key.replace('_', '-')} {_typed(value)}"
+        f" {_typed(key.replace('_', '-'), value)}"
         for key, value in flat(config.policy.to_json()).items()
         if value != defaults[key]
     ]
@@ -113,9 +113,12 @@ def how_made(contents: Contents) -> str:
     return f"`symsteer run` trains this policy before it steers it:\n\n```sh\n{command}\n```"
 
 
-def _typed(value: Any) -> str:
-    """The value of an option on a command line; the parts of a list are separated by spaces."""
-    return " ".join(shlex.quote(str(v)) for v in (value if isinstance(value, list) else [value]))
+def _typed(name: str, value: Any) -> str:
+    """An option of a policy as it is typed: flags have no value, lists have several."""
+    if isinstance(value, bool):
+        return f"--policy.{'' if value else 'no-'}{name}"
+    values = value if isinstance(value, list) else [value]
+    return f"--policy.{name} {' '.join(shlex.quote(str(v)) for v in values)}"
 
 
 def _measured_table(measured: Measured) -> str:

@@ -34,7 +34,8 @@ class Contents:
         demonstrations: the .h5 file, its .json next to it; None if they are not taken.
         policy: the base policy, on the CPU; None if it is not taken.
         policy_file: of the policy.
-        origin: content hashes of files of the user that the policy came from.
+        origin: content hashes of files of the user that the policy came from; empty if it is the
+            one in RUNS/base.
         left_out: why the demonstrations are not here though they were wanted; None otherwise.
     """
 
@@ -68,7 +69,7 @@ def contents_of_run(folder: Path, wanted: Wanted) -> Contents:
         if wanted == "demonstrations":
             return _demonstrations_alone(config, demonstrations)
         taken = demonstrations if wanted == "all" else None
-        return Contents(base.name, config, taken, policy, policy_path(folder), origin)
+        return Contents(base.name, config, taken, policy, policy_path(folder), {})
     absent = (
         f"{folder.parent / 'base'} does not have the demonstrations that the base policy of "
         f"{folder.name} was trained on"

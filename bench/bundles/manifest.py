@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
+import re
 import shlex
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from symsteer.leaderboard.records import Provenance
 
@@ -18,6 +19,13 @@ MANIFEST, CARD = "manifest.json", "CARD.md"
 _WORD = r"[A-Za-z0-9_][A-Za-z0-9_.:=+-]*"
 Word = Annotated[str, Field(pattern=rf"^{_WORD}$", max_length=200)]
 Role = Literal["card", "demonstrations", "policy"]
+PATHS: dict[Role, str] = {
+    "card": r"CARD\.md",
+    "demonstrations": rf"{_WORD}\.(h5|json)",
+    "policy": rf"{_WORD}/policy\.safetensors",
+}
+"""The form of paths: none is absolute, leaves its folder, or begins with a dot."""
+
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -26,12 +34,18 @@ class _Block(BaseModel):
 
 
 class BundledFile(_Block):
-    """A file of a bundle; ``path`` has at most one folder, and no name begins with a dot."""
+    """A file of a bundle; what it is decides the form of its path."""
 
-    path: Annotated[str, Field(pattern=rf"^{_WORD}(/{_WORD})?$", max_length=400)]
+    path: Annotated[str, Field(max_length=400)]
     role: Role
     size: Annotated[int, Field(ge=0)]
     sha256: Digest
+
+    @model_validator(mode="after")
+    def _named_as_its_role(self) -> BundledFile:
+        if not re.fullmatch(PATHS[self.role], self.path):
+            raise ValueError(f"no {self.role} may have this path")
+        return self
 
 
 class Code(_Block):

@@ -15,7 +15,8 @@ import torch
 
 import symsteer
 from symsteer.bench.bundles.bundle import write_bundle
-from symsteer.bench.bundles.contents import contents_of_run, contents_of_settings
+from symsteer.bench.bundles.card import how_made
+from symsteer.bench.bundles.contents import Contents, contents_of_run, contents_of_settings
 from symsteer.bench.bundles.fetch import fetch_bundle, read_bundle
 from symsteer.bench.bundles.measure import measure
 from symsteer.bench.demos import load
@@ -25,6 +26,7 @@ from symsteer.bench.runs.run import execute
 from symsteer.bench.tasks import task_class
 from symsteer.cli import main
 from symsteer.errors import UserError
+from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy, save_policy
 from tests.bench.tiny_run import tiny_config, without_clock
 
@@ -146,6 +148,18 @@ def test_the_command_of_the_card_asks_for_the_same_policy(run, bundle):
     assert find_base(config, run.parent) == find_base(tiny_config(), run.parent)
 
 
+def test_flags_and_lists_of_the_command_are_as_they_are_typed():
+    options = POLICIES.get("plain").Options(match_parameters=False, hold=("gripper", "yaw"))
+    config = tiny_config(policy_name="plain", policy=options, seed=3)
+    task = task_class(config.task)
+    policy = POLICIES.get("plain")(options, task.observation_layout, task.action_layout)
+    made = how_made(Contents("name", config, None, policy, None, {}))
+    (line,) = re.findall(r"^symsteer run (.*)$", made, flags=re.MULTILINE)
+    found, _ = parse_run(line.split())
+    assert (found.policy, found.policy_seed) == (options, 3)
+    assert found.demonstrations == config.demonstrations
+
+
 def test_a_policy_without_symmetry_has_a_large_error(tmp_path):
     config = tiny_config(policy_name="plain")
     plain = measure(config, prepare_base(config, tmp_path, progress=False))
@@ -246,6 +260,11 @@ def larger(files):
         (edited(name="a/b"), "wrong in name"),
         (edited(surprise=1), "wrong in surprise"),
         (edited(files=[{"path": "x"}]), "wrong in files.0"),
+        *((renamed(name), "wrong in files") for name in ("x.sh", "CARD.md/policy.safetensors/x")),
+        *(
+            (renamed(name), "wrong in files")
+            for name in ("../policy.safetensors", "policy.safetensors")
+        ),
         *((renamed(name), "wrong in files") for name in ("../x", "/x", "a/../x", "a/b/c", ".x")),
         *((renamed(name), "wrong in files") for name in ("a/.x", "x\n", " ", "..", "a\\b", "~/x")),
     ],
