@@ -405,7 +405,9 @@ def export(
     if run is None and task is None:
         raise UserError("name the folder of a run, or a task with --task")
     if format == "lerobot" and contents == "policy":
-        raise UserError("a LeRobot dataset has demonstrations only: leave --contents out")
+        raise UserError(
+            "a LeRobot dataset holds demonstrations only; use --format bundle for a policy"
+        )
     if format == "bundle":
         check_path(out)
         wanted = contents
