@@ -36,8 +36,10 @@ PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md"}
 RESULTS = "leaderboard/LEADERBOARD.md"
 """The committed leaderboard; of the site these are the results."""
 
-LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
-
+LINK = re.compile(
+    r"^ *```.*?^ *```|`[^`\n]+`|(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)", re.M | re.S
+)
+"""A link, or code, in which nothing is a link; a link whose text is code is a link."""
 
 CODE = re.compile(r"((?:^|\n)[^\s\-*\d][^\n]*\n)\n((?: {4}[^\n]*\n(?:\n(?= {4}))*)+)")
 """A paragraph outside of lists, and the block of code that follows it, indented by four spaces."""
@@ -71,16 +73,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Let links lead to pages of the site, outside of blocks of code."""
+    """Let links lead to pages of the site, outside of code."""
     source = page.file.src_uri
     origins = {page: name for name, page in PAGES.items()}
-    markdown = CODE.sub(_fenced, markdown)
-    parts = re.split(r"(^ *```.*?^ *```|`[^`\n]+`(?!\]))", markdown, flags=re.M | re.S)
-    place = origins.get(source, f"docs/{source}")
-    text = "".join(
-        part if index % 2 else relinked(part, place, source) for index, part in enumerate(parts)
-    )
-    return text
+    return relinked(CODE.sub(_fenced, markdown), origins.get(source, f"docs/{source}"), source)
 
 
 def _fenced(match: re.Match[str]) -> str:
@@ -92,13 +88,15 @@ def relinked(text: str, place: str, source: str) -> str:
     """Markdown whose links are those of the site.
 
     Args:
-        text: markdown without code.
+        text: markdown.
         place: path of the file in the repository.
         source: path of the page below `docs/`.
     """
 
     def replace(match: re.Match[str]) -> str:
         mark, label, href = match.groups()
+        if href is None:
+            return match[0]
         parts = urlsplit(href)
         if parts.scheme or parts.netloc or not parts.path:
             return match[0]

@@ -140,6 +140,8 @@ def test_links_of_pages() -> None:
     assert relinked(text, "docs/api.md", "api.md") == (
         "[a](changelog.md) [b](metrics.md#x) c (`examples/leashed.py`) [d](https://e.org)"
     )
+    code = "`[x](gone.md)` and [`a`](../bench/cli.py), `b`"
+    assert relinked(code, "docs/api.md", "api.md") == "`[x](gone.md)` and `a`, `b`"
     assert relinked("[`x`](../../bench/cli.py)", "docs/agents/partial.md", "agents/partial.md") == (
         "`x`"
     )
