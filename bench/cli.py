@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from symsteer.errors import UserError
-from symsteer.terminal import complain, printable
+from symsteer.terminal import BOARD, complain, printable
 
 if TYPE_CHECKING:
     from symsteer.registry import Registry
@@ -30,6 +30,7 @@ def run(arguments: list[str]) -> int:
     """
     from symsteer.bench.runs.arguments import parse_run
     from symsteer.bench.runs.run import execute
+    from symsteer.bench.runs.tracking import checked
 
     config, options = parse_run(arguments)
     folder = execute(
@@ -39,12 +40,19 @@ def run(arguments: list[str]) -> int:
         options.base_policy,
         progress=not options.quiet,
         workers=options.workers,
+        tracking=checked(options.track),
     )
     _print_places(folder)
     return 0
 
 
-def resume(folder: Path, /, workers: int = 1, quiet: bool = False) -> int:
+def resume(
+    folder: Path,
+    /,
+    workers: int = 1,
+    track: Literal["wandb"] | None = None,
+    quiet: bool = False,
+) -> int:
     """Continue a run that was stopped, from its last checkpoint.
 
     On the CPU the record is that of a run that was never stopped, except for times.
@@ -52,11 +60,13 @@ def resume(folder: Path, /, workers: int = 1, quiet: bool = False) -> int:
     Args:
         folder: The run's folder (it holds config.json).
         workers: Processes that share the simulation; they change nothing in the record but times.
+        track: Show the run in Weights & Biases, too; it continues there as well.
         quiet: No progress bars.
     """
     from symsteer.bench.runs.run import resume
+    from symsteer.bench.runs.tracking import checked
 
-    _print_places(resume(folder, progress=not quiet, workers=workers))
+    _print_places(resume(folder, not quiet, workers, checked(track)))
     return 0
 
 
@@ -139,6 +149,7 @@ def sweep(
     workers: int = 0,
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
     together: int = 1,
+    track: Literal["wandb"] | None = None,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> int:
     """Run all runs of a suite; the same command continues a sweep that was stopped.
@@ -153,8 +164,12 @@ def sweep(
         ray: Address of a Ray cluster to run on: auto, or host:port of its head.
         together: Learners that share a process and are trained as one, which is faster, if they
             differ in seeds and variants alone.
+        track: Show the runs in Weights & Biases, too, in a group with the name of the suite.
         dry_run: Only show which runs are left and how long they may take.
     """
+    from dataclasses import replace
+
+    from symsteer.bench.runs.tracking import checked
     from symsteer.bench.sweep.command import preview, run_plan
     from symsteer.bench.sweep.plan import make_plan, manifest_path
     from symsteer.bench.sweep.suite import load_suite
@@ -163,6 +178,7 @@ def sweep(
     if dry_run:
         print(preview(plan, workers, ray))
         return 0
+    plan = replace(plan, tracking=checked(track, plan.name))
     outcomes = run_plan(plan, workers, ray, together)
     failed = [outcome for outcome in outcomes if outcome.status == "failed"]
     for outcome in failed:
@@ -710,7 +726,7 @@ def _print_places(folder: Path) -> None:
     """Print where the results of a finished run are."""
     out = folder.parent
     print(f"record:      {folder / 'record.json'}")
-    print(f"TensorBoard: tensorboard --logdir {out}")
+    print(f"TensorBoard: tensorboard --logdir {out}  then {BOARD}")
     print(f"leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
 
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
 from symsteer.names import unknown
-from symsteer.terminal import complain
+from symsteer.terminal import BOARD, complain
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
@@ -150,7 +150,7 @@ def demo(out: Path = Path("runs/demo")) -> int:
     print(
         f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
         f"\nSee the runs:          {_script('tensorboard')} --logdir {out}"
-        "  then http://localhost:6006"
+        f"  then {BOARD}"
     )
     return exit_code
 

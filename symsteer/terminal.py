@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import sys
 
+BOARD = "http://localhost:6006/#custom_scalars&_smoothingWeight=0"
+"""Where `tensorboard` shows the charts of runs, without smoothing."""
+
 LONGEST_LINE = 900
 """Characters of an error message; the middle of a longer one is left out."""
 

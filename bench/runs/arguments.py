@@ -17,6 +17,7 @@ import tyro
 from symsteer.agents import AGENTS
 from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
+from symsteer.bench.runs.tracking import Service
 
 ABOUT = """Steer a base policy with one agent on one task, and record the results.
 
@@ -39,6 +40,8 @@ class Execution:
     settings and those of its demonstrations."""
     workers: int = 1
     """Processes that share the simulation; they only change the times in the record."""
+    track: Service | None = None
+    """Show the run in Weights & Biases, too; WANDB_MODE=offline needs no network and no login."""
     quiet: bool = False
     """No progress bars."""
 

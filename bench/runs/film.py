@@ -10,7 +10,7 @@ import imageio.v2 as imageio
 import numpy as np
 
 from symsteer.bench.runs.evaluator import Evaluator
-from symsteer.bench.runs.pictures import draw_paths, episode_frames
+from symsteer.bench.runs.pictures import FRAMES_PER_SECOND, draw_paths, episode_frames
 from symsteer.bench.runs.stored import Restored, restored
 from symsteer.bench.runs.trainer import feasible_return
 from symsteer.bench.sim.headless import rendering_works
@@ -18,9 +18,6 @@ from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.variants import evaluation_variants, read
 from symsteer.errors import UserError
 from symsteer.variant import VariantSpec, file_name, variant_text
-
-FRAMES_PER_SECOND = 20
-"""ManiSkill's control frequency: videos run in real time."""
 
 
 def film(folder: Path, variant: str | None = None, episodes: int = 3) -> Path:

@@ -1,4 +1,4 @@
-"""Observers that write the results of a run: record, TensorBoard, progress, pictures.
+"""Observers that write the results of a run: record, pictures, progress.
 
 The record comes first; the others show what it holds.
 """
@@ -20,8 +20,14 @@ from symsteer.bench.runs.base_policy import describe_base
 from symsteer.bench.runs.config import RunConfig, content_key
 from symsteer.bench.runs.extensions import extensions_of
 from symsteer.bench.runs.folder import CHECKPOINT, PROGRESS, RECORD
-from symsteer.bench.runs.pictures import draw_paths, frames_of
-from symsteer.bench.runs.tensorboard import RunLog
+from symsteer.bench.runs.pictures import (
+    FRAMES_PER_SECOND,
+    contact_sheet,
+    draw_paths,
+    first_episode,
+)
+from symsteer.bench.runs.scalars import Means, Scalars
+from symsteer.bench.runs.tracking import Tracking
 from symsteer.bench.runs.trainer import Observer, Trainer
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import HELD_OUT_SEED
@@ -40,8 +46,8 @@ from symsteer.leaderboard.records import (
     write_record,
 )
 
-LOG_EVERY = 10
-"""Decisions (of all environments together) between two writes of training scalars."""
+SHOW_EVERY = 10
+"""Decisions (of all environments together) between two changes of the numbers beside the bar."""
 
 PROGRESS_SECONDS = 2.0
 """Shortest time between two writes of progress.json within a phase."""
@@ -146,80 +152,16 @@ class RecordWriter(Observer):
         write_record(self.record, run.folder / RECORD)
 
 
-class TensorBoard(Observer):
-    """Writes the events of a run: what the record holds, and scalars of training between.
-
-    Args:
-        records: the observer that writes the record.
-    """
-
-    log: RunLog
-
-    def __init__(self, records: RecordWriter):
-        self.records = records
-        self.means = _Means()
-
-    def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
-        # Even without a checkpoint, an earlier process may have written events.
-        purge = run.env_steps + 1 if checkpoint else 0
-        self.log = RunLog(run.folder, self.records.record, purge)
-        self.rounds = 0
-
-    def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None:
-        for values in scalars:
-            self.means.add(values)
-        self.rounds += 1
-        if self.rounds % LOG_EVERY == 0:
-            self._write_means(run)
-
-    def paused(self, run: Trainer) -> None:
-        self._write_means(run)
-        self.rounds = 0
-
-    def evaluated(self, run: Trainer, evaluation: Evaluation) -> None:
-        columns = evaluation.episodes.model_dump(by_alias=True)
-        values = {
-            f"eval/{name}": sum(columns[name]) / len(columns[name])
-            for name in ("success_once", "success_at_end", "return", "episode_len")
-            if None not in columns[name]
-        }
-        for name, value in evaluation.diagnostics.items():
-            # The record holds null for a number that is not finite, and says which.
-            kind = evaluation.nonfinite.get(f"diagnostics/{name}")
-            values[f"diag/{name}"] = float(kind) if kind else value
-        if "diag/q_magnitude" in values:
-            values["limits/q_magnitude"] = 1.0
-        self.log.scalars(values, run.env_steps)
-
-    def saving(self, run: Trainer) -> Mapping[str, Any]:
-        # A continued run does not repeat the events before its checkpoint.
-        self.log.flush()
-        return {}
-
-    def finished(self, run: Trainer) -> None:
-        self.log.finish()
-
-    def failed(self, run: Trainer, error: BaseException) -> None:
-        self.log.close()
-
-    def _write_means(self, run: Trainer) -> None:
-        seconds = run.seconds
-        total = seconds.pop("total")
-        rate = {"time/env_steps_per_second": run.env_steps / total}
-        times = {f"time/{part}": value for part, value in seconds.items()}
-        self.log.scalars({**self.means.take(), **rate, **times}, run.env_steps)
-
-
 class Pictures(Observer):
-    """Pictures of the last evaluation in TensorBoard; the record is closed by then.
+    """Pictures of the last evaluation beside the scalars; the record is closed by then.
 
     Args:
-        tensorboard: writes them.
+        scalars: writes them.
         quiet: do not print why a picture is missing.
     """
 
-    def __init__(self, tensorboard: TensorBoard, quiet: bool):
-        self.tensorboard, self.quiet = tensorboard, quiet
+    def __init__(self, scalars: Scalars, quiet: bool):
+        self.scalars, self.quiet = scalars, quiet
 
     def finished(self, run: Trainer) -> None:
         played = run.evaluator.played
@@ -227,10 +169,12 @@ class Pictures(Observer):
             return
         try:
             paths = draw_paths(played, run.base.obs_layout, run.title)
-            self.tensorboard.log.picture("eval/paths", paths, run.env_steps)
+            self.scalars.picture("eval/paths", paths, run.env_steps)
             if rendering_works():
-                frames = frames_of(run.config, run.base, run.agent)
-                self.tensorboard.log.picture("eval/frames", frames, run.env_steps)
+                frames = first_episode(run.config, run.base, run.agent)
+                rate = FRAMES_PER_SECOND / run.base.execute
+                self.scalars.picture("eval/frames", contact_sheet(frames), run.env_steps)
+                self.scalars.film("eval/film", frames, rate, run.env_steps)
         except Exception as error:
             if not self.quiet:
                 tqdm.write(f"no picture of the evaluation: {type(error).__name__}: {error}")
@@ -246,7 +190,7 @@ class Progress(Observer):
     def __init__(self, quiet: bool):
         self.quiet = quiet
         self.bar: tqdm | None = None
-        self.means = _Means()
+        self.means = Means()
         self.rounds = 0
         self.success: float | None = None
 
@@ -264,7 +208,7 @@ class Progress(Observer):
         self.bar.update(min(run.env_steps, budget) - self.bar.n)
         self.means.add({k: v for k, v in scalars[0].items() if k == "train/success_once"})
         self.rounds += 1
-        if self.rounds % LOG_EVERY == 0:
+        if self.rounds % SHOW_EVERY == 0:
             shown = {"success": self.means.take().get("train/success_once")}
             shown["held_out"] = self.success
             self.bar.set_postfix({k: f"{v:.2f}" for k, v in shown.items() if v is not None})
@@ -326,40 +270,22 @@ class ProgressFile:
             write_atomically(self._path, json.dumps(data).encode(), durable=False)
 
 
-class _Means:
-    """Means of named tensors since the last call of ``take``. Only ``take`` reads the device."""
-
-    def __init__(self) -> None:
-        self._sums: dict[str, torch.Tensor] = {}
-        self._counts: dict[str, int] = {}
-
-    def add(self, values: Mapping[str, torch.Tensor]) -> None:
-        for name, value in values.items():
-            if value.numel():
-                total = value.detach().double().sum()
-                self._sums[name] = self._sums.get(name, 0.0) + total
-                self._counts[name] = self._counts.get(name, 0) + value.numel()
-
-    def take(self) -> dict[str, float]:
-        means = {name: (total / self._counts[name]).item() for name, total in self._sums.items()}
-        self._sums.clear()
-        self._counts.clear()
-        return means
-
-
-def observers_of(config: RunConfig, resolved: dict[str, Any], progress: bool) -> list[Observer]:
+def observers_of(
+    config: RunConfig, resolved: dict[str, Any], progress: bool, tracking: Tracking | None = None
+) -> list[Observer]:
     """The observers of a run, in the order in which they are told.
 
     Args:
         config: of the run.
         resolved: the configuration as in the record.
         progress: whether to show progress.
+        tracking: a service that shows the run, too.
     """
     records = RecordWriter(resolved)
-    tensorboard = TensorBoard(records)
-    pictures = Pictures(tensorboard, quiet=not progress)
+    scalars = Scalars(records, tracking)
+    pictures = Pictures(scalars, quiet=not progress)
     # The record is closed before the pictures are drawn, TensorBoard after them.
-    return [records, Progress(quiet=not progress), pictures, tensorboard]
+    return [records, Progress(quiet=not progress), pictures, scalars]
 
 
 def _history(record: RunRecord) -> str:

@@ -6,6 +6,7 @@ One episode is simulated again for them.
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -17,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from PIL import Image
 
 from symsteer.agents.agent import Agent
 from symsteer.agents.episodes import Rollout
@@ -39,6 +41,9 @@ SECTORS = 12
 
 FRAMES = 6
 """Frames of an episode, in two rows."""
+
+FRAMES_PER_SECOND = 20
+"""ManiSkill's control frequency: films with a frame for each control step run in real time."""
 
 # Colours that colour-blind readers can distinguish, from Okabe and Ito.
 SUCCESS, FAILURE, TOOL = "#0072B2", "#D55E00", "#999999"
@@ -157,7 +162,7 @@ def _draw_rose(axes: Axes, direction: np.ndarray, success: np.ndarray) -> None:
     axes.set_yticks(range(0, counts.max() + 1, max(1, math.ceil(counts.max() / 5))))
 
 
-def frames_of(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> np.ndarray:
+def first_episode(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> list[np.ndarray]:
     """Frames of the first held-out episode, from its start to its first success or time limit.
 
     Args:
@@ -166,16 +171,35 @@ def frames_of(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> np.ndarra
         agent: plays deterministically.
 
     Returns:
-        Six frames in two rows, evenly spaced in time, ``[height, width, 3]`` uint8.
+        One frame at the start and one after each decision, ``[height, width, 3]`` uint8.
 
     Raises:
         UserError: if there is no Vulkan driver.
     """
     variants, seed = evaluation_variants(config.variants), held_out_seeds(1)[0]
-    frames = list(episode_frames(config, policy, agent, variants, seed, every_step=False))
+    return list(episode_frames(config, policy, agent, variants, seed, every_step=False))
+
+
+def contact_sheet(frames: Sequence[np.ndarray]) -> np.ndarray:
+    """Six frames in two rows, evenly spaced in time, ``[height, width, 3]`` uint8."""
     chosen = np.linspace(0, len(frames) - 1, FRAMES).round().astype(int)
     rows = np.split(np.stack([frames[i] for i in chosen]), 2)
     return np.concatenate([np.concatenate(row, axis=1) for row in rows])
+
+
+def to_gif(frames: Sequence[np.ndarray], rate: float) -> bytes:
+    """An animated GIF that repeats for ever.
+
+    Args:
+        frames: ``[height, width, 3]`` uint8.
+        rate: frames per second.
+    """
+    first, *others = map(Image.fromarray, frames)
+    file = io.BytesIO()
+    first.save(
+        file, "GIF", save_all=True, append_images=others, duration=round(1000 / rate), loop=0
+    )
+    return file.getvalue()
 
 
 def episode_frames(

@@ -40,6 +40,7 @@ from symsteer.bench.runs.stored import (
     stored_demonstrations,
     stored_policy,
 )
+from symsteer.bench.runs.tracking import Tracking
 from symsteer.bench.runs.trainer import Trainer, budget_of, feasible_return
 from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import build, evaluation_variants, read
@@ -81,6 +82,7 @@ def execute(
     policy: Path | None = None,
     progress: bool = True,
     workers: int = 1,
+    tracking: Tracking | None = None,
 ) -> Path:
     """Run one configuration from demonstrations to the final evaluation.
 
@@ -94,6 +96,7 @@ def execute(
         progress: whether to show progress bars.
         workers: processes that share the environments. They are not part of the configuration:
             the record is the same except for times.
+        tracking: a service that shows the run; it changes nothing in the record.
 
     Returns:
         The run's folder.
@@ -121,19 +124,24 @@ def execute(
         return demonstrated_decisions(config, out, demonstrations, progress)
 
     folder = out / run_id(config, files)
-    with _opened(config, folder, files, prepare, demonstrated, progress, workers) as trainer:
+    with _opened(
+        config, folder, files, prepare, demonstrated, progress, workers, tracking
+    ) as trainer:
         trainer.play()
     return folder
 
 
 @contextlib.contextmanager
-def opened(config: RunConfig, out: Path, together: int) -> Iterator[Trainer]:
+def opened(
+    config: RunConfig, out: Path, together: int, tracking: Tracking | None = None
+) -> Iterator[Trainer]:
     """The trainer of a run that shares this process with others; see :func:`execute`.
 
     Args:
         config: what to run.
         out: folder of the runs.
         together: number of runs in this process.
+        tracking: a service that shows the run.
     """
     _check_all(config, workers=1)
 
@@ -145,17 +153,19 @@ def opened(config: RunConfig, out: Path, together: int) -> Iterator[Trainer]:
 
     folder = out / run_id(config, {})
     with _opened(
-        config, folder, {}, prepare, demonstrated, progress=False, together=together
+        config, folder, {}, prepare, demonstrated, False, tracking=tracking, together=together
     ) as trainer:
         yield trainer
 
 
-def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
+def resume(
+    folder: Path, progress: bool = True, workers: int = 1, tracking: Tracking | None = None
+) -> Path:
     """Continue an unfinished run from its last checkpoint.
 
     Args:
         folder: of the run.
-        progress, workers: as for :func:`execute`.
+        progress, workers, tracking: as for :func:`execute`.
 
     Raises:
         UserError: if the folder is not a run's, the run is finished, its checkpoint is damaged, or
@@ -180,7 +190,9 @@ def resume(folder: Path, progress: bool = True, workers: int = 1) -> Path:
         check_own()
         return demonstrated_decisions(config, folder.parent, None, progress)
 
-    with _opened(config, folder, files, prepare, demonstrated, progress, workers) as trainer:
+    with _opened(
+        config, folder, files, prepare, demonstrated, progress, workers, tracking
+    ) as trainer:
         trainer.play()
     return folder
 
@@ -279,6 +291,7 @@ def _opened(
     demonstrated: Callable[[], Transition],
     progress: bool,
     workers: int = 1,
+    tracking: Tracking | None = None,
     together: int = 1,
 ) -> Iterator[Trainer]:
     """The trainer of a run that this process alone works on; it is told of errors."""
@@ -304,7 +317,7 @@ def _opened(
         except BaseException:
             discard_empty(folder)
             raise
-        observers = observers_of(config, resolved, progress)
+        observers = observers_of(config, resolved, progress, tracking)
         checkpoint = load_checkpoint(folder)
         trainer = Trainer(config, folder, base, checkpoint, observers, workers, together)
         if decisions is not None:

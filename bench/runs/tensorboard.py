@@ -6,40 +6,26 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.compat.proto.summary_pb2 import DATA_CLASS_SCALAR, Summary, SummaryMetadata
+from tensorboard.compat.proto.tensor_pb2 import TensorProto
+from tensorboard.compat.proto.tensor_shape_pb2 import TensorShapeProto
+from tensorboard.plugins.custom_scalar import metadata as custom_scalars
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
+from tensorboard.plugins.scalar import metadata as scalar
 from torch.utils.tensorboard import SummaryWriter
 
 from symsteer.agents import AGENTS
+from symsteer.bench.runs.charts import DESCRIPTIONS, LAYOUT
 from symsteer.bench.runs.config import RunConfig, flat
+from symsteer.bench.runs.pictures import to_gif
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Provenance, RunRecord
 from symsteer.policies import POLICIES
-
-# The tags of a Multiline chart are regular expressions; a Margin chart takes value, low, high.
-LAYOUT = {
-    "SymSteer": {
-        "Success on held-out episodes": ["Multiline", ["^eval/success_once$"]],
-        "Q against its feasible band": ["Margin", ["diag/q_mean", "diag/q_low", "diag/q_high"]],
-        "Largest |Q|, where 1 is feasible": ["Multiline", ["^(diag|limits)/q_magnitude$"]],
-        "Q bias, on- and off-policy": ["Multiline", ["^diag/q_(off_)?bias$"]],
-        "Correlation of Q with the return": ["Multiline", ["^diag/q_(off_)?correlation$"]],
-        "Temporal-difference error": ["Multiline", ["^diag/td_error$"]],
-        "Equivariance errors": ["Multiline", ["^diag/equivariance_(decode|actor|critic)$"]],
-        "Temperature alpha": ["Multiline", ["^diag/alpha$"]],
-    },
-    "Training": {
-        "Success of training episodes": ["Multiline", ["^train/success_once$"]],
-        "Loss of the critics": ["Multiline", ["^losses/critic$"]],
-        "Loss of the actor": ["Multiline", ["^losses/actor$"]],
-        "Control steps per second": ["Multiline", ["^time/env_steps_per_second$"]],
-    },
-}
 
 IDENTITY = frozenset({"task", "embodiment", "variant", "agent", "seed"})
 """Settings that the HParams tab shows first; the others can be selected."""
@@ -66,8 +52,8 @@ class RunLog:
     """TensorBoard's view of one run: scalars against control steps, settings, pictures.
 
     Namespaces: ``eval/`` held-out episodes, ``train/`` training episodes and batches, ``losses/``,
-    ``time/`` seconds and rates, ``diag/`` Q and equivariance diagnostics, ``limits/`` lines to
-    compare them with. docs/metrics.md has the formulas.
+    ``time/`` seconds and rates, ``diag/`` Q and equivariance diagnostics, ``log10/`` the same as
+    powers of ten, ``reference/`` level lines. docs/metrics.md has the formulas.
 
     Args:
         folder: the run's folder.
@@ -80,11 +66,12 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, record: RunRecord, purge_step: int = 0):
-        self.folder = folder
+        self.folder, self._purge_step = folder, purge_step
+        self._described: set[str] = set()
         _silence_writing_thread()
         with self._reported():
             self.writer = SummaryWriter(str(folder), purge_step=purge_step)
-            self.writer.add_custom_scalars(LAYOUT)
+            self._add(_layout())
             # A continued run may use another commit: its text is added to the first one.
             self.writer.add_text("config", config_text(record), purge_step)
             settings = _settings(record.config)
@@ -97,15 +84,39 @@ class RunLog:
 
     def scalars(self, values: Mapping[str, float | None], step: int) -> None:
         """Write all values that are not None, by tag (``eval/success_once``)."""
+        summary = Summary()
+        for tag, value in values.items():
+            if value is not None:
+                summary.value.add(tag=tag, simple_value=value, metadata=self._description(tag))
         with self._reported():
-            for tag, value in values.items():
-                if value is not None:
-                    self.writer.add_scalar(tag, value, step)
+            self._add(summary, step)
+
+    def level(self, values: Mapping[str, float | None], budget: int) -> None:
+        """Draw level lines from step 0 to the budget."""
+        for step in (0, budget):
+            if step >= self._purge_step:
+                self.scalars(values, step)
 
     def picture(self, tag: str, picture: np.ndarray, step: int) -> None:
         """Write a picture ``[height, width, 3]`` uint8."""
         with self._reported():
             self.writer.add_image(tag, picture, step, dataformats="HWC")
+
+    def film(self, tag: str, frames: Sequence[np.ndarray], rate: float, step: int) -> None:
+        """Write an animated picture.
+
+        Args:
+            tag: of the film.
+            frames: ``[height, width, 3]`` uint8.
+            rate: frames per second.
+            step: of the run.
+        """
+        height, width, _ = frames[0].shape
+        image = Summary.Image(
+            height=height, width=width, colorspace=3, encoded_image_string=to_gif(frames, rate)
+        )
+        with self._reported():
+            self._add(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
 
     def finish(self) -> None:
         """Mark the run as finished in the HParams tab, and close."""
@@ -146,8 +157,32 @@ class RunLog:
             tag=tag, metadata=metadata.create_summary_metadata(data), tensor=metadata.NULL_TENSOR
         )
         # SummaryWriter's own add_hparams opens a second event file and renames the metrics.
+        self._add(summary)
+
+    def _add(self, summary: Summary, step: int | None = None) -> None:
         assert self.writer.file_writer is not None
-        self.writer.file_writer.add_summary(summary)
+        self.writer.file_writer.add_summary(summary, step)
+
+    def _description(self, tag: str) -> SummaryMetadata | None:
+        """What TensorBoard says of a tag; it reads it at the first point."""
+        if tag in self._described or tag not in DESCRIPTIONS:
+            return None
+        self._described.add(tag)
+        described = scalar.create_summary_metadata(tag, DESCRIPTIONS[tag])
+        described.data_class = DATA_CLASS_SCALAR  # TensorBoard's fast reader needs it
+        return described
+
+
+def _layout() -> Summary:
+    tensor = TensorProto(
+        dtype="DT_STRING", string_val=[LAYOUT.SerializeToString()], tensor_shape=TensorShapeProto()
+    )
+    value = Summary.Value(
+        tag=custom_scalars.CONFIG_SUMMARY_TAG,
+        tensor=tensor,
+        metadata=custom_scalars.create_summary_metadata(),
+    )
+    return Summary(value=[value])
 
 
 @functools.cache

@@ -20,6 +20,7 @@ from symsteer.agents.team import Team, can_join
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import is_finished, run_id
 from symsteer.bench.runs.run import opened
+from symsteer.bench.runs.tracking import Tracking
 from symsteer.bench.runs.trainer import Trainer, Updates, next_batch
 
 
@@ -38,13 +39,16 @@ class _Member:
         return self.trainer.agent
 
 
-def execute_together(configs: Sequence[RunConfig], out: Path) -> list[Exception | None]:
+def execute_together(
+    configs: Sequence[RunConfig], out: Path, tracking: Tracking | None = None
+) -> list[Exception | None]:
     """Execute several runs to their ends; those that are finished are left alone.
 
     Args:
         configs: what to run. A team needs equal settings except for seeds, variants and tasks
             with equal layouts.
         out: folder of the runs.
+        tracking: a service that shows the runs.
 
     Returns:
         For each run None, or the error that ended it. An error of one run does not stop the others.
@@ -57,7 +61,7 @@ def execute_together(configs: Sequence[RunConfig], out: Path) -> list[Exception 
                 continue
             stack = everything.enter_context(contextlib.ExitStack())
             try:
-                trainer = stack.enter_context(opened(config, out, len(configs)))
+                trainer = stack.enter_context(opened(config, out, len(configs), tracking))
             except Exception as error:
                 errors[index] = error
                 continue

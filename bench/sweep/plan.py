@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 from symsteer.bench.runs.config import RunConfig, flat
 from symsteer.bench.runs.folder import run_id, write_json
 from symsteer.bench.runs.run import check
+from symsteer.bench.runs.tracking import Tracking
 from symsteer.bench.sweep.suite import Suite
 from symsteer.errors import UserError
 
@@ -86,6 +87,8 @@ class Plan:
     description: str
     out: Path
     configs: dict[PlannedRun, RunConfig]
+    tracking: Tracking | None = None
+    """A service that shows the runs."""
 
     @property
     def title(self) -> str:

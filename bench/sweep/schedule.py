@@ -134,7 +134,8 @@ def tasks_of(
 
 def _run_task(plan: Plan, team: tuple[PlannedRun, ...], patience: float) -> Task:
     configs = tuple(plan.configs[run] for run in team)
-    return Task("run", team[0].label, play, (configs, plan.out, patience), team)
+    args = (configs, plan.out, patience, plan.tracking)
+    return Task("run", team[0].label, play, args, team)
 
 
 def _teams(plan: Plan, todo: list[PlannedRun], together: int) -> list[tuple[PlannedRun, ...]]:

@@ -21,6 +21,7 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import RunBusyError, is_finished, run_id
 from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.together import execute_together
+from symsteer.bench.runs.tracking import Tracking
 from symsteer.errors import UserError
 
 POLL_SECONDS = 0.5
@@ -62,7 +63,9 @@ def build_base(config: RunConfig, out: Path) -> Result:
     return _guarded(lambda: prepare_base(config, out, progress=False))
 
 
-def play(configs: tuple[RunConfig, ...], out: Path, patience: float) -> Result:
+def play(
+    configs: tuple[RunConfig, ...], out: Path, patience: float, tracking: Tracking | None
+) -> Result:
     """Execute runs, or continue them; several are trained together.
 
     Args:
@@ -70,17 +73,18 @@ def play(configs: tuple[RunConfig, ...], out: Path, patience: float) -> Result:
         out: folder of the runs.
         patience: seconds to wait until files of another machine are visible here: the base policies
             that it has trained, or the released lock of a run.
+        tracking: a service that shows the runs.
     """
     deadline = time.monotonic() + patience
     while any(find_base(c, out) is None for c in configs) and time.monotonic() < deadline:
         time.sleep(POLL_SECONDS)
     if len(configs) == 1:
-        return _play(configs[0], out, deadline)
+        return _play(configs[0], out, deadline, tracking)
     one_thread()
     parts = []
-    for config, error in zip(configs, execute_together(configs, out), strict=True):
+    for config, error in zip(configs, execute_together(configs, out, tracking), strict=True):
         if isinstance(error, RunBusyError):
-            parts.append(_play(config, out, deadline))
+            parts.append(_play(config, out, deadline, tracking))
         else:
             parts.append(_result(error))
     gc.collect()
@@ -89,13 +93,13 @@ def play(configs: tuple[RunConfig, ...], out: Path, patience: float) -> Result:
     )
 
 
-def _play(config: RunConfig, out: Path, deadline: float) -> Result:
+def _play(config: RunConfig, out: Path, deadline: float, tracking: Tracking | None) -> Result:
     folder = out / run_id(config, {})
     while True:
         if is_finished(folder):
             return Result("done")
         try:
-            return _guarded(lambda: execute(config, out, progress=False))
+            return _guarded(lambda: execute(config, out, progress=False, tracking=tracking))
         except RunBusyError as error:
             if time.monotonic() > deadline:
                 return Result("busy", str(error))

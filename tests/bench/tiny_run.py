@@ -3,8 +3,13 @@
 import dataclasses
 import json
 
+import pytest
+
 from symsteer.agents import AGENTS
 from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
+from symsteer.bench.runs.folder import run_id, state_of
+from symsteer.bench.runs.run import execute
+from symsteer.bench.runs.trainer import Trainer
 from symsteer.policies import POLICIES
 
 AGENT = {
@@ -39,6 +44,40 @@ def tiny_config(agent="equivariant", policy_name="edp", options=None, **changes)
         ),
     }
     return RunConfig(**{**values, **changes})
+
+
+def stop(config, out, env_steps, tracking=None):
+    """Execute a run until after the evaluation at a step or later, which is in no checkpoint."""
+    evaluate = Trainer.evaluate
+
+    def evaluate_and_stop(self, final=False):
+        evaluate(self, final)
+        if self.env_steps >= env_steps:
+            raise RuntimeError("stopped")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "evaluate", evaluate_and_stop)
+        with pytest.raises(RuntimeError, match="stopped"):
+            execute(config, out, progress=False, tracking=tracking)
+    folder = out / run_id(config, {})
+    assert state_of(folder) == "failed"
+    return folder
+
+
+def write_suite(tmp_path, config: RunConfig, grid: str) -> str:
+    """A suite file of which every run is ``config`` but for the grid."""
+    lines = [f"[grid]\n{grid}\n[run]"]
+    settings = config.to_json()
+    settings["agent"] = {"name": settings["agent"], **settings.pop("agent_options")}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            items = {name: item for name, item in value.items() if item is not None}
+            lines += [f"{key}.{name} = {json.dumps(item)}" for name, item in items.items()]
+        elif key not in grid:
+            lines.append(f"{key} = {json.dumps(value)}")
+    path = tmp_path / "tiny.toml"
+    path.write_text("\n".join(lines))
+    return str(path)
 
 
 def without_clock(folder):

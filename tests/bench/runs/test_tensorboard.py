@@ -2,8 +2,10 @@
 
 import errno
 import io
+import math
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +15,21 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from symsteer.bench.runs import observers
-from symsteer.bench.runs.folder import run_id, state_of
+from symsteer.bench.runs import observers, scalars
+from symsteer.bench.runs.charts import DESCRIPTIONS
+from symsteer.bench.runs.observers import observers_of
 from symsteer.bench.runs.run import execute, resume
+from symsteer.bench.runs.scalars import DETAILS
 from symsteer.bench.runs.tensorboard import FINAL_METRICS, IDENTITY, RunLog
-from symsteer.bench.runs.trainer import Trainer
+from symsteer.bench.runs.trainer import Observer
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import stop, tiny_config
 
 DOCUMENTATION = Path(__file__).parents[3] / "docs" / "metrics.md"
-NAMESPACES = {"eval", "train", "losses", "time", "diag", "limits"}
-CORRELATIONS = {f"diag/q_{kind}correlation" for kind in ("", "rank_", "off_", "off_rank_")}
+NAMESPACES = {"eval", "train", "losses", "time", "diag", "log10", "reference"}
+CORRELATIONS = {"diag/q_correlation", "diag/q_rank_correlation"}
 """Not measured in tiny runs: all of their episodes fail, so that returns have no variance."""
 
 
@@ -51,25 +55,19 @@ def documented_tags():
     return tags
 
 
+def points(folder, tag):
+    return [(event.step, event.value) for event in load(folder).Scalars(tag)]
+
+
+LONGER = tiny_config(env_steps=480, checkpoint_every=60)
+
+
 @pytest.fixture(scope="module")
 def continued(finished):
     """A run that was stopped after an evaluation that is in no checkpoint, and continued."""
     _, folder = finished
-    evaluate = Trainer.evaluate
-
-    def evaluate_and_stop(self, final=False):
-        evaluate(self, final)
-        if self.env_steps >= 320:
-            raise RuntimeError("stopped")
-
-    config = tiny_config(env_steps=480, checkpoint_every=60)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "evaluate", evaluate_and_stop)
-        with pytest.raises(RuntimeError, match="stopped"):
-            execute(config, folder.parent, progress=False)
-    stopped = folder.parent / run_id(config, {})
-    assert state_of(stopped) == "failed"
-    written = load(stopped).Scalars("eval/success_once")[-1].step
+    stopped = stop(LONGER, folder.parent, 320)
+    written = points(stopped, "eval/success_once")[-1][0]
     assert resume(stopped, progress=False) == stopped
     return stopped, written
 
@@ -77,13 +75,16 @@ def continued(finished):
 def test_every_tag_is_documented_and_every_documented_tag_written(broken):
     written = set().union(*map(scalar_tags, broken.values()))
     assert not written & CORRELATIONS
-    assert written | CORRELATIONS == documented_tags()
+    documented = documented_tags()
+    details = {tag for tag in documented if DETAILS.fullmatch(tag.removeprefix("diag/"))}
+    assert written | CORRELATIONS == documented - details
     assert {tag.partition("/")[0] for tag in written} == NAMESPACES
 
 
 def assert_equals_record(folder):
     """Points of eval/ and diag/ are the record's evaluations: all of them, once, no others."""
     events, record = load(folder), read_record(folder / "record.json")
+    budget = record.config["env_steps"]
     wanted: dict[str, list[tuple[int, float]]] = {}
     for evaluation in record.evaluations:
         episodes = evaluation.episodes.model_dump(by_alias=True)
@@ -94,22 +95,55 @@ def assert_equals_record(folder):
         }
         for name, value in evaluation.diagnostics.items():
             kind = evaluation.nonfinite.get(f"diagnostics/{name}")
-            if value is not None or kind is not None:
+            if DETAILS.fullmatch(name) is None and (value is not None or kind is not None):
                 values[f"diag/{name}"] = float(kind) if value is None else value
         for tag, value in values.items():
             wanted.setdefault(tag, []).append((evaluation.env_steps, value))
+            if tag.startswith("eval/") and evaluation.final and evaluation.env_steps < budget:
+                # A reference: its success is a line to the end of the axis.
+                wanted[tag].append((budget, value))
     tags = {tag for tag in events.Tags()["scalars"] if tag.startswith(("eval/", "diag/"))}
     assert tags == set(wanted)
-    for tag, points in wanted.items():
-        found = [(point.step, point.value) for point in events.Scalars(tag)]
-        assert [step for step, _ in found] == [step for step, _ in points]
-        for (_, shown), (_, stored) in zip(found, points, strict=True):
-            assert shown == pytest.approx(stored, rel=1e-6, nan_ok=True)
+    for tag, stored in wanted.items():
+        shown = points(folder, tag)
+        assert [step for step, _ in shown] == [step for step, _ in stored]
+        assert [v for _, v in shown] == pytest.approx([v for _, v in stored], rel=1e-6, nan_ok=True)
 
 
 def test_evaluations_are_those_of_the_record(broken):
     for folder in broken.values():
         assert_equals_record(folder)
+
+
+def test_references_are_lines_over_the_whole_axis(broken, continued):
+    for folder in (*broken.values(), continued[0]):
+        record = read_record(folder / "record.json")
+        budget = record.config["env_steps"]
+        lines = {tag for tag in scalar_tags(folder) if tag.startswith("reference/")}
+        if record.role == "reference":
+            assert not lines
+            steps = [step for step, _ in points(folder, "eval/success_once")]
+            assert steps == [record.budget.env_steps, budget]
+            continue
+        values = {"reference/base_success": record.base_policy.base_success}
+        if feasible := record.feasible_q:
+            values |= {"reference/q_low": feasible.low, "reference/q_high": feasible.high}
+            values["reference/q_magnitude"] = 1
+        assert lines == set(values)
+        for tag, value in values.items():
+            line = [(0, pytest.approx(value)), (budget, pytest.approx(value))]
+            assert points(folder, tag) == line, tag
+
+
+def test_errors_of_equivariance_are_shown_as_powers_of_ten(broken):
+    for folder in broken.values():
+        tags = scalar_tags(folder)
+        for kind in ("actor", "critic"):
+            shown, error = f"log10/equivariance_{kind}", f"diag/equivariance_{kind}"
+            assert (shown in tags) == (error in tags)
+            if shown in tags:
+                wanted = [max(math.log10(max(v, 1e-30)), -8) for _, v in points(folder, error)]
+                assert [v for _, v in points(folder, shown)] == pytest.approx(wanted, abs=1e-4)
 
 
 def test_a_continued_run_shows_every_point_once(continued):
@@ -119,26 +153,88 @@ def test_a_continued_run_shows_every_point_once(continued):
     assert written in steps[:-1]
     assert len(list(folder.glob("events.*"))) == 2
     assert_equals_record(folder)
-    events = load(folder)
-    for tag in events.Tags()["scalars"]:
-        points = [point.step for point in events.Scalars(tag)]
-        assert points == sorted(set(points)), tag
+    for tag in scalar_tags(folder):
+        found = [step for step, _ in points(folder, tag)]
+        assert found == sorted(set(found)), tag
 
 
-def test_the_charts_show_tags_that_exist(broken):
-    tags = scalar_tags(broken["equivariant"]) | CORRELATIONS
-    [event] = load(broken["equivariant"]).Tensors("custom_scalars__config__")
+def test_a_continued_run_shows_what_one_shows_that_was_not_stopped(continued, tmp_path):
+    folder, _ = continued
+    shutil.copytree(folder.parent / "base", tmp_path / "base")
+    other = execute(LONGER, tmp_path, progress=False)
+    tags = scalar_tags(other)
+    assert tags == scalar_tags(folder)
+    assert "train/return" in tags
+    for tag in tags:
+        mine, theirs = points(folder, tag), points(other, tag)
+        if tag.startswith("time/"):
+            mine, theirs = ([step for step, _ in found] for found in (mine, theirs))
+        assert mine == theirs, tag
+
+
+def test_training_is_shown_at_some_steps_as_means_of_the_last_episodes(
+    finished, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(scalars, "POINTS", 10)
+    monkeypatch.setattr(scalars, "RECENT", 3)
+    returns: list[float] = []
+    wanted: dict[int, list[float]] = {}
+
+    class Noting(Observer):
+        def stepped(self, run, scalars):
+            returns.extend(scalars[0]["train/return"].tolist())
+            wanted[run.env_steps] = returns[-3:]
+
+    monkeypatch.setattr(
+        "symsteer.bench.runs.run.observers_of", lambda *args: [*observers_of(*args), Noting()]
+    )
+    shutil.copytree(finished[1].parent / "base", tmp_path / "base")
+    folder = execute(LONGER, tmp_path, progress=False)
+    assert len(returns) > 3
+    # At a tenth of the budget each, and before each of the two fresh starts.
+    assert 8 <= len(points(folder, "losses/critic")) <= 12
+    shown = points(folder, "train/return")
+    assert shown == [
+        (step, pytest.approx(sum(wanted[step]) / len(wanted[step]))) for step, _ in shown
+    ]
+    assert len({value for _, value in shown}) > 1
+
+
+def charts_of(folder):
+    """The charts of the custom scalars, by title, and the regular expressions of their tags."""
+    [event] = load(folder).Tensors("custom_scalars__config__")
     layout = layout_pb2.Layout.FromString(event.tensor_proto.string_val[0])
-    charts = {chart.title: chart for category in layout.category for chart in category.chart}
-    for chart in charts.values():
-        for pattern in chart.multiline.tag:
-            assert any(re.search(pattern, tag) for tag in tags), pattern
-    [margin] = charts["Q against its feasible band"].margin.series
-    shown = [margin.value, margin.lower, margin.upper]
-    assert shown == ["diag/q_mean", "diag/q_low", "diag/q_high"]
-    assert set(shown) <= tags
-    [errors] = charts["Equivariance errors"].multiline.tag
-    assert sum(bool(re.search(errors, tag)) for tag in tags) == 3
+    charts = {}
+    for category in layout.category:
+        for chart in category.chart:
+            patterns = list(chart.multiline.tag)
+            for series in chart.margin.series:
+                # A margin would cover the lines of other runs.
+                assert series.value == series.lower == series.upper
+                patterns.append(re.escape(series.value) + "$")
+            charts[category.title, chart.title] = patterns
+    return charts
+
+
+def test_a_chart_shows_few_tags_and_all_of_them_are_written_and_described(broken):
+    tags = scalar_tags(broken["equivariant"]) | CORRELATIONS
+    charts = charts_of(broken["equivariant"])
+    shown = set()
+    for patterns in charts.values():
+        matches = [tag for tag in tags if any(re.match(pattern, tag) for pattern in patterns)]
+        # One line a run, and its level lines.
+        assert len([tag for tag in matches if not tag.startswith("reference/")]) == 1
+        assert len(matches) <= 3
+        for pattern in patterns:
+            assert any(re.match(pattern, tag) for tag in tags), pattern
+        shown |= set(matches)
+    assert {tag for tag in tags if tag.startswith(("reference/", "log10/"))} <= shown
+    assert shown <= set(DESCRIPTIONS) <= set().union(*map(scalar_tags, broken.values())) | shown
+    events = load(broken["equivariant"])
+    for tag in set(DESCRIPTIONS) & scalar_tags(broken["equivariant"]):
+        assert events.SummaryMetadata(tag).summary_description == DESCRIPTIONS[tag]
+    # TensorBoard shows the charts of all runs: they must be the same ones.
+    assert all(charts_of(folder) == charts for folder in broken.values())
 
 
 def test_hyperparameters_can_be_compared_across_runs(broken):
@@ -201,7 +297,19 @@ def test_the_final_evaluation_has_a_picture(broken):
         pixels = np.asarray(Image.open(io.BytesIO(event.encoded_image_string)))
         assert pixels.shape[2] == 3
         assert pixels.std() > 10
-        assert ("eval/frames" in load(folder).Tags()["images"]) == rendering_works()
+        others = {"eval/frames", "eval/film"} if rendering_works() else set()
+        assert set(load(folder).Tags()["images"]) == {"eval/paths"} | others
+
+
+def test_a_film_is_an_animated_picture(finished, tmp_path):
+    log = RunLog(tmp_path, read_record(finished[1] / "record.json"))
+    frames = [np.full((40, 60, 3), level, np.uint8) for level in (0, 120, 240)]
+    log.film("eval/film", frames, 5, 320)
+    log.finish()
+    [event] = load(tmp_path).Images("eval/film")
+    assert (event.step, event.width, event.height) == (320, 60, 40)
+    film = Image.open(io.BytesIO(event.encoded_image_string))
+    assert (film.format, film.n_frames) == ("GIF", 3)
 
 
 def test_a_picture_that_fails_does_not_harm_the_run(finished, monkeypatch, capsys):

@@ -1,7 +1,6 @@
 """Sweeps with real runs: failures, workers that are killed, Ctrl-C, skipped runs."""
 
 import contextlib
-import json
 import multiprocessing
 import os
 import re
@@ -15,7 +14,7 @@ import psutil
 import pytest
 
 from symsteer.bench.runs.base_policy import demonstration_path
-from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+from symsteer.bench.runs.config import DemonstrationConfig
 from symsteer.bench.runs.folder import CHECKPOINT, state_of
 from symsteer.bench.sweep.plan import Plan, make_plan
 from symsteer.bench.sweep.pool import LocalPool
@@ -26,7 +25,7 @@ from symsteer.bench.sweep.work import Result
 from symsteer.cli import main
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG, wait_for
-from tests.bench.tiny_run import tiny_config, without_clock
+from tests.bench.tiny_run import tiny_config, without_clock, write_suite
 
 
 class Witness:
@@ -147,22 +146,6 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
     assert [kind for kind, _ in witness.again] == ["demonstrations", "run", "run"]
     assert "killed by SIGKILL" in witness.again[1][1]
     assert workers() == []
-
-
-def write_suite(tmp_path, config: RunConfig, grid: str) -> str:
-    """A suite file of which every run is ``config`` but for the grid."""
-    lines = [f"[grid]\n{grid}\n[run]"]
-    settings = config.to_json()
-    settings["agent"] = {"name": settings["agent"], **settings.pop("agent_options")}
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            items = {name: item for name, item in value.items() if item is not None}
-            lines += [f"{key}.{name} = {json.dumps(item)}" for name, item in items.items()]
-        elif key not in grid:
-            lines.append(f"{key} = {json.dumps(value)}")
-    path = tmp_path / "tiny.toml"
-    path.write_text("\n".join(lines))
-    return str(path)
 
 
 def symsteer(monkeypatch, *arguments) -> int:
