@@ -88,8 +88,9 @@ class RunLog:
         for tag, value in values.items():
             if value is not None:
                 summary.value.add(tag=tag, simple_value=value, metadata=self._description(tag))
-        with self._reported():
-            self._add(summary, step)
+        if summary.value:
+            with self._reported():
+                self._add(summary, step)
 
     def level(self, values: Mapping[str, float | None], budget: int) -> None:
         """Draw level lines from step 0 to the budget."""

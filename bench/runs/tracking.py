@@ -114,9 +114,9 @@ class WandbLog:
                 reinit="create_new",  # runs that are trained together share a process
                 settings=wandb.Settings(console="off", silent=True, finish_timeout=FINISH_SECONDS),
             )
-            files = Path(self._run.dir).parent
-            place = f"wandb sync {files} uploads it" if self._run.offline else self._run.url
-            tqdm.write(f"{record.run_id} in Weights & Biases: {place}")
+            offline = f"`wandb sync {Path(self._run.dir).parent}` uploads it"
+            place = offline if self._run.offline else self._run.url
+            tqdm.write(f"{record.run_id} in Weights & Biases: {place or 'disabled'}")
 
     def scalars(self, values: Mapping[str, float | None], step: int) -> None:
         """Log all values that are not None, by tag."""
@@ -130,17 +130,19 @@ class WandbLog:
     def picture(self, tag: str, picture: np.ndarray, step: int) -> None:
         """Log a picture ``[height, width, 3]`` uint8."""
         with self._tolerant():
-            from wandb import Image
+            if self._run is not None:
+                from wandb import Image
 
-            self._log({tag: Image(picture)}, max(step, self._state["step"]))
+                self._log({tag: Image(picture)}, max(step, self._state["step"]))
 
     def film(self, tag: str, frames: Sequence[np.ndarray], rate: float, step: int) -> None:
         """Log a film of pictures, ``rate`` of them per second."""
         with self._tolerant():
-            from wandb import Video
+            if self._run is not None:
+                from wandb import Video
 
-            film = Video(io.BytesIO(to_gif(frames, rate)), format="gif")
-            self._log({tag: film}, max(step, self._state["step"]))
+                film = Video(io.BytesIO(to_gif(frames, rate)), format="gif")
+                self._log({tag: film}, max(step, self._state["step"]))
 
     def flush(self) -> None:
         """Nothing to do: another process writes what was logged."""
@@ -186,7 +188,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         state = json.loads(path.read_text())
         return {"id": str(state["id"]), "group": state["group"], "step": int(state["step"])}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}
 
 

@@ -146,6 +146,14 @@ def test_errors_of_equivariance_are_shown_as_powers_of_ten(broken):
                 assert [v for _, v in points(folder, shown)] == pytest.approx(wanted, abs=1e-4)
 
 
+def test_errors_without_a_logarithm_are_shown_too(finished):
+    evaluation = read_record(finished[1] / "record.json").evaluations[-1]
+    evaluation.diagnostics |= {"equivariance_actor": 0.0, "equivariance_critic": float("inf")}
+    values = scalars.evaluation_scalars(evaluation)
+    assert values["log10/equivariance_actor"] == -8
+    assert values["log10/equivariance_critic"] == math.inf
+
+
 def test_a_continued_run_shows_every_point_once(continued):
     folder, written = continued
     steps = [e.env_steps for e in read_record(folder / "record.json").evaluations]

@@ -6,14 +6,16 @@ import struct
 import sys
 from importlib.machinery import PathFinder
 
+import numpy as np
 import pytest
+from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from symsteer.bench.cli import run, sweep
 from symsteer.bench.runs.arguments import parse_run
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.run import execute, resume
-from symsteer.bench.runs.tracking import Tracking, checked
+from symsteer.bench.runs.tracking import Tracking, WandbLog, checked
 from symsteer.bench.sweep.work import play
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
@@ -167,12 +169,27 @@ def test_a_sweep_tracks_its_runs_as_a_group(out):
     assert_mirrored(points, folder)
 
 
+def test_a_film_is_in_wandb(finished, tmp_path):
+    record = read_record(finished[1] / "record.json")
+    log = WandbLog(tmp_path, record, Tracking())
+    log.scalars({"eval/return": -1.0}, 320)
+    # Pictures of a reference belong to step 0, and its line goes to the end of the budget.
+    log.film("eval/film", [np.full((40, 60, 3), 80 * i, np.uint8) for i in range(3)], 5, 0)
+    log.finish()
+    [(_, points)] = read(tmp_path)
+    assert points["eval/film/_type"] == {320: "video-file"}
+    [film] = tmp_path.glob("wandb/offline-run-*/files/media/videos/eval/*.gif")
+    assert Image.open(film).n_frames == 3
+
+
 @pytest.mark.parametrize("method", ["init", "log", "finish"])
 def test_a_run_does_not_end_with_the_tracking(method, out, monkeypatch, capsys):
     def fail(*args, **options):
         raise wandb.errors.CommError("the network\nis down")
 
     monkeypatch.setattr(wandb if method == "init" else wandb.Run, method, fail)
+    if method != "finish":
+        monkeypatch.setattr(wandb, "Image", fail)  # is not even asked for
     folder = execute(tiny_config("zero"), out, progress=False, tracking=Tracking())
     assert read_record(folder / "record.json").status == "finished"
     assert scalars(folder)
