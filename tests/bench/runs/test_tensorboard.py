@@ -148,7 +148,8 @@ def test_errors_of_equivariance_are_shown_as_powers_of_ten(broken):
 
 def test_errors_without_a_logarithm_are_shown_too(finished):
     evaluation = read_record(finished[1] / "record.json").evaluations[-1]
-    evaluation.diagnostics |= {"equivariance_actor": 0.0, "equivariance_critic": float("inf")}
+    evaluation.diagnostics.update(equivariance_actor=0.0, equivariance_critic=None)
+    evaluation.nonfinite["diagnostics/equivariance_critic"] = "inf"
     values = scalars.evaluation_scalars(evaluation)
     assert values["log10/equivariance_actor"] == -8
     assert values["log10/equivariance_critic"] == math.inf

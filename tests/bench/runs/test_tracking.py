@@ -70,6 +70,7 @@ def records_of(path):
 
 def read(folder):
     """What each process has written for a run: its facts, and its points by tag."""
+    wandb.teardown()  # its service may still be writing when a run has finished
     found = []
     for path in sorted(folder.glob("wandb/offline-run-*/*.wandb")):
         points: dict[str, dict[int, float]] = {}
