@@ -1,7 +1,8 @@
-"""Curves over environment steps: what the figures and the site draw of runs."""
+"""Curves over environment steps and over directions: what the figures and the site draw of runs."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,10 +13,13 @@ from symsteer.leaderboard.summary import Row, Run, aligned, episode_success
 
 BAND_RESAMPLES = 1000
 
+SECTORS = 8
+"""Sectors in which successes are counted by direction."""
+
 
 @dataclass(frozen=True)
 class Curve:
-    """Values over environment steps with the ends of their 95 % intervals."""
+    """Values over environment steps, or degrees, with the ends of their 95 % intervals."""
 
     steps: list[float]
     values: list[float]
@@ -38,6 +42,40 @@ def success_curve(row: Row) -> Curve:
     ]
     return Curve(
         _places(points),
+        [band.value for band in bands],
+        [band.low for band in bands],
+        [band.high for band in bands],
+    )
+
+
+def direction_curve(row: Row) -> Curve | None:
+    """The IQM of success at the end by the direction in which an episode has to go.
+
+    Steps are the middles of the sectors in degrees, -180 to 180; the first one is the last one
+    again. Sectors without an episode are left out. None if no finished run has directions.
+    """
+    sectors: list[list[Sample]] = [[] for _ in range(SECTORS)]
+    for run in row.finished:
+        final = run.record.final
+        if final is None or final.episodes.direction is None:
+            continue
+        success = episode_success(final)
+        found: list[list[tuple[int, float]]] = [[] for _ in range(SECTORS)]
+        for seed, angle in zip(final.episodes.seed, final.episodes.direction, strict=True):
+            if angle is not None:
+                sector = round(angle * SECTORS / (2 * math.pi)) % SECTORS
+                found[sector].append((seed, success[seed]))
+        for sector, values in enumerate(found):
+            if values:
+                sectors[sector].append(Sample.pooled(values, run.policy))
+    # Sector 4 of 8 is at 180 degrees, and at -180.
+    turned = [(k - SECTORS // 2, sectors[(k - SECTORS // 2) % SECTORS]) for k in range(SECTORS + 1)]
+    shown = [(k * 360 / SECTORS, runs) for k, runs in turned if runs]
+    if not shown:
+        return None
+    bands = [success_interval(runs, BAND_RESAMPLES) for _, runs in shown]
+    return Curve(
+        [degrees for degrees, _ in shown],
         [band.value for band in bands],
         [band.low for band in bands],
         [band.high for band in bands],

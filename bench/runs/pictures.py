@@ -23,6 +23,7 @@ from PIL import Image
 from symsteer.agents.agent import Agent
 from symsteer.agents.episodes import Rollout
 from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.steering.directions import directions, positions
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA, SIZE
@@ -47,15 +48,6 @@ FRAMES_PER_SECOND = 20
 
 # Colours that colour-blind readers can distinguish, from Okabe and Ito.
 SUCCESS, FAILURE, TOOL = "#0072B2", "#D55E00", "#999999"
-
-
-def positions(layout: Layout) -> list[str]:
-    """Fields with horizontal positions in the workspace: first the tool, last the goal."""
-    return [
-        field.name
-        for field in layout.fields
-        if field.name.endswith("_xy") and "_to_" not in field.name
-    ]
 
 
 def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
@@ -83,8 +75,9 @@ def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
     paths *= 100  # [names, T + 1, N, 2] in cm
     lengths = rollout.running.sum(dim=0).cpu().numpy() + 1
     success = rollout.episodes["success_once"].cpu().numpy().astype(bool)
-    way = paths[-1, 0] - paths[-2, 0]
-    direction = np.arctan2(way[:, 1], way[:, 0])
+    found = directions(rollout.obs[0], layout)
+    assert found is not None  # a picture needs two positions
+    direction = found.cpu().numpy()
 
     source, target = (name.removesuffix("_xy").replace("_", " ") for name in names[-2:])
     drawn = min(EPISODES, len(success))

@@ -159,13 +159,18 @@ class FeasibleQ(Block):
 
 
 class Episodes(Measured):
-    """Evaluation episodes as columns of equal length; ManiSkill's metric names."""
+    """Evaluation episodes as columns of equal length; ManiSkill's metric names.
+
+    `direction` is the angle, in radians, from the object to its goal in the first observation; null
+    for tasks without two positions, and in older records.
+    """
 
     seed: list[Count]
     success_once: Flags
     success_at_end: Flags
     return_: list[Finite | None] = Field(alias="return")
     episode_len: list[Annotated[Count, Field(ge=1)]]
+    direction: list[Finite | None] | None = None
 
     @model_validator(mode="after")
     def _columns_agree(self) -> Self:
@@ -174,6 +179,7 @@ class Episodes(Measured):
             self.success_at_end,
             self.return_,
             self.episode_len,
+            self.seed if self.direction is None else self.direction,
         )
         if not self.seed or any(len(column) != len(self.seed) for column in columns):
             raise ValueError("the columns must be equally long and not empty")

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons
-from symsteer.leaderboard.curves import mean_series, series, success_curve
+from symsteer.leaderboard.curves import direction_curve, mean_series, series, success_curve
 from symsteer.leaderboard.defects import DefectMap, Panel
 from symsteer.leaderboard.figures import style_of
 from symsteer.leaderboard.paper import BASE, STANDARD
@@ -224,6 +224,23 @@ def equivariance_chart(table: Table) -> Chart | None:
         return None
     axis = {"title": "relative equivariance error", "log": True}
     x = _steps_axis(table.key.env_steps)
+    return {"kind": "curves", "x": x, "y": axis, "series": found}
+
+
+def direction_chart(table: Table) -> Chart | None:
+    """Success by the direction in which an episode has to go; None where records have none."""
+    found = []
+    rows = [row for row in table.rows if row.finished]
+    for row, style in zip(rows, _looks(rows), strict=True):
+        curve = direction_curve(row)
+        if curve is not None:
+            one: dict[str, Any] = {"name": short(row.label), **style}
+            one |= {"x": curve.steps, "y": plain(curve.values)}
+            found.append(one | {"low": plain(curve.low), "high": plain(curve.high)})
+    if not found:
+        return None
+    x = {"title": "direction (degrees)", "range": [-190, 190], "every": 45}
+    axis = {"title": "success at the end of the budget", "range": [-0.02, 1.03]}
     return {"kind": "curves", "x": x, "y": axis, "series": found}
 
 

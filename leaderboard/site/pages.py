@@ -237,6 +237,7 @@ def cell(board: Board, table: Table, before: Table | None, after: Table | None) 
         "success": charts.success_chart(table),
         "q": charts.q_chart(table),
         "equivariance": charts.equivariance_chart(table),
+        "directions": charts.direction_chart(table),
         "runs": [
             (row.label, [(run, f"../{board.run(run)}") for run in row.runs])
             for row in table.rows

@@ -173,6 +173,13 @@ def test_arrays_and_tensors_are_stored_as_numbers(tmp_path: Path) -> None:
     assert episodes.success_once == [True, False, True]
     assert episodes.success_at_end == [True, False, False]
     assert episodes.return_ == [0.0, -1.0, -2.0]
+    assert episodes.direction is None
+    columns["direction"] = torch.tensor([0.5, -3.0, math.nan])
+    episodes = Evaluation.model_validate(data).episodes
+    assert episodes.direction == [0.5, -3.0, None]
+    columns["direction"] = [0.5, 1.0]
+    with pytest.raises(ValueError, match="equally long"):
+        Evaluation.model_validate(data)
 
 
 def test_numbers_that_are_not_finite_become_flagged_nulls(tmp_path: Path) -> None:

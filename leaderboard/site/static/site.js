@@ -109,7 +109,7 @@
     tickfont: { size: 12, color: css("--muted") },
     tickformat: spec.si ? "~s" : undefined,
     exponentformat: spec.log ? "power" : "e",
-    dtick: spec.log ? 1 : undefined,
+    dtick: spec.log ? 1 : spec.every,
     nticks: 7,
     automargin: true,
     fixedrange: false,

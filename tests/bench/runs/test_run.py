@@ -40,6 +40,7 @@ def test_the_record_tells_the_whole_run(finished):
     final = record.evaluations[-1]
     assert final.final
     assert final.episodes.seed == held_out_seeds(5)
+    assert len(set(final.episodes.direction)) == 5
     low, high = task_class(config.task).feasible_return(
         config.agent_options.gamma, config.policy.execute
     )

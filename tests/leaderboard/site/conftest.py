@@ -48,6 +48,7 @@ def ordinary_records() -> list[RunRecord]:
     generator = np.random.default_rng(0)
     for agent in ("standard", "equivariant"):
         curve = make_curve(generator, np.linspace(0.2, 0.8, 5))
+        curve[-1].episodes.direction = np.linspace(-3.1, 3.1, 100).tolist()
         found.append(make_record(curve, agent=agent, seed=7, variant="wind:0.2..0.8"))
     curve = make_curve(generator, np.linspace(0.6, 0.1, 5))
     found.append(

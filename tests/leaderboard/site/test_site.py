@@ -138,6 +138,13 @@ def test_unfinished_runs_are_drawn_apart(site: Path) -> None:
         assert runs == {"seed 7": False, "seed 8, failed": True}
 
 
+def test_success_by_direction_is_shown_where_records_have_directions(site: Path) -> None:
+    chart = page_of(site, "cells", "wind:0.2..0.8").data[-1]
+    assert [one["name"] for one in chart["series"]] == ["standard", "equivariant"]
+    assert chart["series"][0]["x"] == list(range(-180, 181, 45))
+    assert "before records held the directions" in page_of(site, "cells", "action_gain:0.5").text
+
+
 def test_the_findings_are_those_of_the_page(site: Path) -> None:
     from symsteer.leaderboard.defects import read_audit
     from symsteer.leaderboard.findings import analyse
