@@ -1,4 +1,4 @@
-"""Writes the tables of docs/audit.md and of the tasks' pages from the committed summary.
+"""Writes the tables of docs/audit.md, docs/variants.md and the tasks' pages from the summary.
 
 python -m symsteer.bench.audit.page                     # from the committed summary
 python -m symsteer.bench.audit.page OUT/summary.json    # replaces the committed summary first
@@ -25,10 +25,12 @@ from symsteer.bench.audit.report import (
 )
 from symsteer.bench.audit.result import VERSION, old_version
 from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
+from symsteer.bench.variants.levels import table
 from symsteer.errors import UserError
 from symsteer.files import write_together
 
 PAGE = CHECKOUT / "docs" / "audit.md"
+VARIANTS_PAGE = CHECKOUT / "docs" / "variants.md"
 SUMMARY = CHECKOUT / "leaderboard" / "results" / "audit" / "summary.json"
 TASK_PAGES = CHECKOUT / "docs" / "tasks"
 MARK = "<!-- audit:{} -->\n"
@@ -143,11 +145,14 @@ def read_summary(path: Path) -> list[dict[str, Any]]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write docs/audit.md and the tasks' pages; returns the exit code."""
+    """Write the tables of the pages; returns the exit code."""
     try:
         check_checkout(PAGE)
         rows = [row for path in arguments or [str(SUMMARY)] for row in read_summary(Path(path))]
         pages = {PAGE: generate(PAGE.read_text(), rows)}
+        pages[VARIANTS_PAGE] = with_tables(
+            VARIANTS_PAGE.read_text(), table(rows), "docs/variants.md"
+        )
         for task in dict.fromkeys(row["task"] for row in rows):
             pages[task_page(task)] = generate_task(task_page(task).read_text(), task, rows)
         if arguments:

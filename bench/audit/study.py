@@ -15,6 +15,7 @@ from symsteer.bench.runs.base_policy import prepare_base
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, task_class
 from symsteer.bench.variants import VARIANTS, read
+from symsteer.bench.variants.levels import with_numbers
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy
@@ -197,10 +198,9 @@ def grid(
     Raises:
         UserError: see :func:`variant_texts`.
     """
-    texts = variant_texts(variants, strengths)
     return [
         dataclasses.replace(template, task=task, embodiment=body, variant=text)
         for task in expand(tasks, TASKS.names())
         for body in expand(bodies, list(EMBODIMENTS))
-        for text in texts
+        for text in variant_texts([with_numbers(v, task, body) for v in variants], strengths)
     ]

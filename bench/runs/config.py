@@ -15,6 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentOptions
+from symsteer.bench.variants.levels import with_numbers
 from symsteer.errors import UserError
 from symsteer.names import unknown
 from symsteer.policies import POLICIES
@@ -149,8 +150,14 @@ class RunConfig:
                 f"the variant {self.variant[:40]!r}... has {len(self.variant)} characters; it must "
                 f"not have more than {LONGEST_VARIANT}, so join fewer of them"
             )
+        object.__setattr__(self, "variant", with_numbers(self.variant, *self.place))
         # The variant is a part of the run's identity: each strength in its shortest form.
         object.__setattr__(self, "variant", variant_text(self.variants))
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """Task and embodiment, for which levels of variants are defined."""
+        return self.task, self.embodiment
 
     @functools.cached_property
     def variants(self) -> tuple[VariantSpec, ...]:

@@ -39,7 +39,7 @@ def film(folder: Path, variant: str | None = None, episodes: int = 3) -> Path:
         raise UserError(f"--episodes is {episodes}; it must be at least 1")
     run = restored(folder)
     own = evaluation_variants(run.config.variants)
-    variants = own if variant is None else read(variant)
+    variants = own if variant is None else read(variant, place=run.config.place)
     name = file_name(variant_text(variants))
     if rendering_works():
         path = run.folder / f"film-{name}.mp4"

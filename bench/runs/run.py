@@ -243,7 +243,7 @@ def evaluate(
     _check_all(config, workers)
     share = 1.0 if run.state["final"] else run.state["env_steps"] / config.env_steps
     own = evaluation_variants(config.variants, share)
-    variants = own if variant is None else read(variant)
+    variants = own if variant is None else read(variant, place=config.place)
     count = config.evaluation.final_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}; it must be at least 1")

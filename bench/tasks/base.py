@@ -106,7 +106,7 @@ class SymmetricTask(GymEnv):
             self.task_id = task_id
         self.embodiment = embodiment
         self.body: Embodiment = BODIES[embodiment]
-        self.variants = parse(variant, strength)
+        self.variants = parse(variant, strength, (self.task_id, embodiment))
         num_envs = kwargs.get("num_envs", 1)
         for part in self.variants:
             if torch.is_tensor(part.strength) and len(part.strength) != num_envs:

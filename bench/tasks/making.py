@@ -77,7 +77,7 @@ def make(
     """
     env_class = task_class(task)
     check_embodiment(embodiment)
-    specs = read(variant, strength)
+    specs = read(variant, strength, (task_name(task), embodiment))
     kwargs.update(
         sim=sim,
         render=render,

@@ -11,8 +11,9 @@ Importing this package is cheap: classes are imported when they are first used.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+from symsteer.bench.variants.levels import with_numbers
 from symsteer.errors import UserError
 from symsteer.names import unknown
 from symsteer.registry import Registry
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from symsteer.bench.variants.base import Variant
 
 __all__ = ["VARIANTS", "build", "evaluation_variants", "highest_cost", "parse", "read"]
+
+Place: TypeAlias = tuple[str, str]
+"""Task and embodiment."""
 
 VARIANTS: Registry[type[Variant]] = Registry(
     "variant",
@@ -45,12 +49,16 @@ VARIANTS: Registry[type[Variant]] = Registry(
 """All variants by name."""
 
 
-def read(variant: str | Sequence[VariantSpec], strength: Any = None) -> tuple[VariantSpec, ...]:
+def read(
+    variant: str | Sequence[VariantSpec], strength: Any = None, place: Place | None = None
+) -> tuple[VariantSpec, ...]:
     """Variants as data, with names that exist.
 
     Args:
         variant: ``none``, ``name:strength``, several of these joined by ``+``, or data.
         strength: of a single name that is written without one; a number, or one per environment.
+        place: task and embodiment; with it the text may have levels, such as ``wind:hard``
+            (:mod:`symsteer.bench.variants.levels`).
 
     Returns:
         All of them in the given order, those of strength 0 included.
@@ -60,6 +68,7 @@ def read(variant: str | Sequence[VariantSpec], strength: Any = None) -> tuple[Va
             of [0, 1], or one without a name.
     """
     if isinstance(variant, str):
+        variant = with_numbers(variant, *place) if place else variant
         return parse_variant(variant, strength, _check)
     if strength is not None:
         raise UserError(f"strength={strength} was given besides variants that have their own")
@@ -87,9 +96,11 @@ def build(specs: Iterable[VariantSpec]) -> tuple[Variant, ...]:
     return tuple(VARIANTS.get(spec.name)(spec) for spec in specs if not spec.changes_nothing)
 
 
-def parse(variant: str | Sequence[VariantSpec], strength: Any = None) -> tuple[Variant, ...]:
+def parse(
+    variant: str | Sequence[VariantSpec], strength: Any = None, place: Place | None = None
+) -> tuple[Variant, ...]:
     """:func:`read` and :func:`build` in one."""
-    return build(read(variant, strength))
+    return build(read(variant, strength, place))
 
 
 def evaluation_variants(
