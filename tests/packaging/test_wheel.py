@@ -24,7 +24,8 @@ def test_the_wheel_is_complete_and_installs_one_name(wheel, source):
         for suffix in ("py", "toml"):
             found = (source / folder).rglob(f"*.{suffix}")
             wanted |= {inside + file.relative_to(source).as_posix() for file in found}
-    for pattern in ("leaderboard/site/templates/*.html", "leaderboard/site/static/*"):
+    site = "leaderboard/site/"
+    for pattern in (f"{site}templates/*.html", f"{site}static/*", "agents/templates/*.txt"):
         wanted |= {f"symsteer/{file.relative_to(source)}" for file in source.glob(pattern)}
     assert names == wanted
 

@@ -1,0 +1,105 @@
+"""``symsteer new``: the file of a new agent, with its test."""
+
+from __future__ import annotations
+
+import keyword
+import re
+from pathlib import Path
+from string import Template
+from typing import Annotated, Literal
+
+import tyro
+
+from symsteer.errors import UserError
+from symsteer.files import write_together
+
+TEMPLATES = Path(__file__).resolve().parent / "templates"
+
+ORIGINS = {
+    "equivariant": ("EquivariantAgent", "the equivariant agent"),
+    "standard": ("StandardAgent", "the plain agent"),
+}
+"""Class and description of the agents that a new one can begin as."""
+
+IMPORTS = (
+    "from symsteer.agents.options import SacOptions",
+    "from symsteer.agents.replay import Batch",
+)
+
+SYMMETRY = """def test_it_turns_with_the_world():
+    agent, obs = trained()
+    assert actor_equivariance_error(agent, obs, Group.parse("C8")) < 1e-5
+
+
+"""
+"""What holds for equivariant agents alone."""
+
+
+def new(
+    kind: Annotated[Literal["agent"], tyro.conf.Positional],
+    name: Annotated[str, tyro.conf.Positional],
+    like: Literal["equivariant", "standard"] = "equivariant",
+    out: Path = Path(),
+) -> int:
+    """Write a file with a new agent and a file with its tests.
+
+    Args:
+        kind: What to write.
+        name: Of the agent, for instance my-agent: the file is my_agent.py, the class MyAgent.
+        like: The agent that it begins as.
+        out: Folder for both files.
+    """
+    from symsteer.agents import AGENTS
+
+    if not re.fullmatch(r"[a-z][a-z0-9]*([_-][a-z0-9]+)*", name) or keyword.iskeyword(name):
+        raise UserError(
+            f"{name!r} cannot be the name of an agent: use small letters, digits and hyphens, "
+            "e.g. my-agent"
+        )
+    module = name.replace("-", "_")
+    if name in AGENTS:
+        raise UserError(f"there is an agent {name!r} already; choose another name")
+    words = "".join(word.capitalize() for word in module.split("_"))
+    values = {
+        "name": name,
+        "module": module,
+        "Class": words if words.endswith("Agent") else f"{words}Agent",
+        "file": f"test_{module}.py",
+        "imports": "\n".join(
+            sorted([f"from symsteer.agents.{like} import {ORIGINS[like][0]}", *IMPORTS])
+        ),
+        "Origin": ORIGINS[like][0],
+        "summary": ORIGINS[like][1],
+        "Summary": ORIGINS[like][1].capitalize(),
+        "symmetry": SYMMETRY if like == "equivariant" else "",
+    }
+    files = {out / f"{module}.py": "agent.txt", out / f"test_{module}.py": "test.txt"}
+    for path in files:
+        if path.exists():
+            raise UserError(f"{path} is there already; choose another name, or a folder with --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"no folder {out} can be made: {error.strerror}; choose another") from error
+    texts = {
+        path: Template((TEMPLATES / template).read_text()).substitute(values)
+        for path, template in files.items()
+    }
+    if like == "standard":
+        # Nothing of the group is tested.
+        unused = "from symsteer.agents.diagnostics import actor_equivariance_error\n"
+        test = out / f"test_{module}.py"
+        texts[test] = (
+            texts[test].replace(unused, "").replace("Field, Group, Layout", "Field, Layout")
+        )
+    write_together({path: text.encode() for path, text in texts.items()})
+    where = "" if out == Path() else f"cd {out}\n"
+    target = f"{module}:{values['Class']}"
+    print(
+        f"wrote {' and '.join(map(str, files))}\n\n"
+        f"{where}python -m pytest test_{module}.py\n"
+        f"symsteer run --agent {target} --env-steps 10000\n"
+        "symsteer site runs   # its page: site/index.html\n\n"
+        "docs/submit.md: what an agent can override, how to compare it with others and submit it"
+    )
+    return 0
