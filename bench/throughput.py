@@ -310,7 +310,8 @@ def stock_class(task: str) -> type[BaseEnv]:
     Raises:
         UserError: there is no such task.
     """
-    return REGISTERED_ENVS[task_class(task).task_id].cls
+    stock = {spec.cls for spec in REGISTERED_ENVS.values()}
+    return next(cls for cls in task_class(task).__mro__ if cls in stock)
 
 
 def _contenders(

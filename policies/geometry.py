@@ -209,6 +209,18 @@ class Layout:
         # x cos(k a) + J x sin(k a), where J rotates each vector by 90 degrees.
         return turn.cos() * x + turn.sin() * sign.to(x) * x[..., partner.to(x.device)]
 
+    def turn(self, x: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
+        """Turn the vectors in space of every row of ``x [N, dim]`` by ``rotation [N, 3, 3]``."""
+        turned = x.clone()
+        for horizontal, vertical in self.spatial_vectors():
+            parts = self.slice(horizontal), self.slice(vertical)
+            vector = torch.cat([x[:, part] for part in parts], dim=1)
+            # Sums of columns: a matrix product may round differently for another N.
+            columns = (rotation[:, :, i] * vector[:, i : i + 1] for i in range(3))
+            moved = next(columns) + next(columns) + next(columns)
+            turned[:, parts[0]], turned[:, parts[1]] = moved[:, :2], moved[:, 2:]
+        return turned
+
     @functools.cached_property
     def _quarter_turn(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Each number's frequency, and J as (index, sign): (J x)[i] = sign[i] x[index[i]]."""

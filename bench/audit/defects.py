@@ -37,6 +37,7 @@ from symsteer.bench.audit.states import Visited, join_trees, visit
 from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.features import is_direction
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Field, Layout
 
@@ -242,7 +243,8 @@ def _reward_defect(copies: Copies, seed: int) -> dict[str, Estimate]:
 
 def in_metres(field: Field) -> bool:
     """Whether a field of the observation is a length, by its name."""
-    return field.name.endswith(("_xy", "_z", "_width", "_height"))
+    lengths = ("_xy", "_z", "_width", "_height")
+    return field.name.endswith(lengths) and not is_direction(field.name)
 
 
 def _observation_defect(

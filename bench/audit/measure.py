@@ -216,20 +216,15 @@ class Experiment:
             there, _ = self.turner.turn(state, (1.0, False), self.centre)
             return self.turner.turn(there, (-1.0, False), self.centre)[0]
         # Only the objects: inverse kinematics would return other joint angles of the arm.
-        bodies = {"actors": state["actors"], "articulations": {}}
-        there = self.reference.transform_state(bodies, 1.0)
+        there = self.reference.transform_state({**state, "articulations": {}}, 1.0)
         back = self.reference.transform_state(there, -1.0)
-        return {**state, "actors": back["actors"]}
+        return {**back, "articulations": state["articulations"]}
 
     def _put(self, state: dict[str, Any]) -> None:
         """Set the state of all scenes; objects that a variant has added stay in place."""
         whole = self.env.get_state_dict()
-        for kind in ("actors", "articulations"):
-            for name, value in state[kind].items():
-                whole[kind][name] = value
-        if "controller" in state:
-            whole["controller"] = state["controller"]
-        self.env.set_state_dict(whole)
+        bodies = {kind: {**whole[kind], **state[kind]} for kind in ("actors", "articulations")}
+        self.env.set_state_dict({**whole, **state, **bodies})
 
     def _poses(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Positions and quaternions of tool and object in every scene."""
@@ -372,7 +367,9 @@ class Experiment:
             seeds = np.asarray(rng.integers(2**31, size=self.env.num_envs)).tolist()
             self.env.reset(seed=seeds)
             state = task_state(self.env)
-            state = {k: {n: state[k][n] for n in known[k]} for k in ("actors", "articulations")}
+            bodies = ("actors", "articulations")
+            state |= {k: {n: state[k][n] for n in known[k]} for k in bodies}
+            state.pop("controller", None)
             found.append(self._observe_unbroken(seen_from(state, self.centre)))
         return torch.cat(found)[:count].double()
 

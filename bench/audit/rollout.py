@@ -270,7 +270,8 @@ def _noise(env: SymmetricTask, start: int, count: int, steps: int) -> Callable[[
         height = env.agent.tcp_pose.p[:count, 2]
         clear = 0.18 + 0.04 * noise[step][:, layout.slice("z")]
         action[:, layout.slice("z")] = (clear - height[:, None]) / 0.03
-        return env.body.bound(action)
+        copies = env.body.bound(action).repeat(env.num_envs // count, 1)
+        return env.commanded(copies)[:count]
 
     return choose
 

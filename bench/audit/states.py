@@ -176,14 +176,11 @@ class Turner:
         matrix = planar_matrix(*element, centre)[:2, :2]
         offset = (centre - matrix @ centre).expand(count, 2)
         shifted = bool(centre.any())
-        bodies = {"actors": state["actors"], "articulations": {}}
         if self.arm is not None:
-            turned = self.env.transform_state(bodies, *element)
+            turned = self.env.transform_state({**state, "articulations": {}}, *element)
             robot = self.env.agent.robot.name
             arm, reached = self.arm.turn(state["articulations"][robot], *element, offset)
             turned["articulations"] = {**state["articulations"], robot: arm}
-            if "controller" in state:
-                turned["controller"] = state["controller"]
         else:
             turned = self.env.transform_state(state, *element)
             if shifted:

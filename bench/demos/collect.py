@@ -156,7 +156,7 @@ def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[Atte
     rewards: list[np.ndarray] = []
     length = np.zeros(count, dtype=int)
     for step in range(steps):
-        action = env.body.bound(expert.act() + noise[step])
+        action = expert.act(noise[step])
         obs, reward, _, _, info = env.step(action)
         actions.append(_numpy(action))
         rewards.append(_numpy(reward).astype(np.float32))

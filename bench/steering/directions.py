@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from symsteer.bench.tasks.features import is_direction
 from symsteer.policies.geometry import Layout
 
 
@@ -12,7 +13,10 @@ def positions(layout: Layout) -> list[str]:
     return [
         field.name
         for field in layout.fields
-        if field.name.endswith("_xy") and "_to_" not in field.name and field.dim == 2
+        if field.name.endswith("_xy")
+        and field.dim == 2
+        and "_to_" not in field.name
+        and not is_direction(field.name)
     ]
 
 

@@ -47,6 +47,8 @@ TASKS: Registry[type[SymmetricTask]] = Registry(
         "LiftPegUpright-v1": "symsteer.bench.tasks.lift_peg_upright:LiftPegUpright",
         "PokeCube-v1": "symsteer.bench.tasks.poke_cube:PokeCube",
         "PushT-v1": "symsteer.bench.tasks.push_t:PushT",
+        "TiltedPushCube-v1": "symsteer.bench.tasks.tilted:TiltedPushCube",
+        "TiltedPickCube-v1": "symsteer.bench.tasks.tilted:TiltedPickCube",
     },
     "symsteer.bench.tasks.base:SymmetricTask",
 )

@@ -49,9 +49,6 @@ GRIPPER_FIELDS = (
     Field("gripper_width", 0),
 )
 
-
-GRIPPER_LAYOUT = Layout(GRIPPER_FIELDS)
-
 LCG = (6364136223846793005, 1442695040888963407)
 """Knuth's linear congruential generator modulo 2^64: one episode's key to the next one's."""
 
@@ -74,6 +71,7 @@ class SymmetricTask(GymEnv):
     task_id: str
     """Name in the registry, from which :func:`symsteer.bench.tasks.make` makes the same task."""
     max_episode_steps: ClassVar[int]
+    gripper_fields: ClassVar[tuple[Field, ...]] = GRIPPER_FIELDS
     task_fields: ClassVar[tuple[Field, ...]]
     action_layout: ClassVar[Layout] = ACTION_LAYOUT
     workspace_center: ClassVar[tuple[float, float]] = (0.0, 0.0)
@@ -91,7 +89,7 @@ class SymmetricTask(GymEnv):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "task_fields" in cls.__dict__:
-            cls.observation_layout = Layout([*GRIPPER_FIELDS, *cls.task_fields])
+            cls.observation_layout = Layout([*cls.gripper_fields, *cls.task_fields])
 
     def __init__(
         self,
@@ -181,17 +179,32 @@ class SymmetricTask(GymEnv):
 
     def _get_obs_agent(self) -> dict[str, torch.Tensor]:
         tcp = self.seen(self.agent.tcp_pose, "tool")
-        axes = quaternion_to_matrix(tcp.q)
         width = self.agent.robot.get_qpos()[:, -2:].sum(dim=1, keepdim=True)
-        fields = {
-            "tcp_xy": tcp.p[:, :2],
-            "tcp_z": tcp.p[:, 2:],
+        fields = self._observe_gripper(tcp.p, quaternion_to_matrix(tcp.q), width)
+        return self._reported(fields, self._gripper_layout)
+
+    def _observe_gripper(
+        self, position: torch.Tensor, axes: torch.Tensor, width: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """The gripper's fields ``[N, dim]``, in the order of ``gripper_fields``.
+
+        Args:
+            position: of the tool centre point, ``[N, 3]`` metres.
+            axes: of the tool, ``[N, 3, 3]``, one in each column.
+            width: between the fingers, ``[N, 1]`` metres.
+        """
+        return {
+            "tcp_xy": position[:, :2],
+            "tcp_z": position[:, 2:],
             "tcp_x_axis": axes[:, :2, 0],
             "tcp_y_axis": axes[:, :2, 1],
             "tcp_z_axis": axes[:, :2, 2],
             "gripper_width": width,
         }
-        return self._reported(fields, GRIPPER_LAYOUT)
+
+    @functools.cached_property
+    def _gripper_layout(self) -> Layout:
+        return Layout(self.gripper_fields)
 
     def seen(self, pose: Pose, role: Role) -> Pose:
         """A true pose as the observation reports it: variants of perception distort it.
@@ -240,6 +253,10 @@ class SymmetricTask(GymEnv):
         raise NotImplementedError
 
     # ------------------------------------------------------------------- step
+
+    def commanded(self, action: torch.Tensor) -> torch.Tensor:
+        """What :meth:`step` takes, so that ``action [N, 7]`` is done in the world of the bodies."""
+        return action
 
     def step(self, action: Any) -> tuple:
         """As ManiSkill's; ``truncated`` is set after ``max_episode_steps``, reward is float32.

@@ -52,15 +52,22 @@ class Expert:
         self.env = env
         self.offset = torch.zeros(env.num_envs, 3, device=env.device)
 
-    def act(self) -> torch.Tensor:
-        """The action for the present state, ``[N, 7]``, bounded."""
+    def act(self, noise: torch.Tensor | None = None) -> torch.Tensor:
+        """The action for the present state as ``env.step`` takes it, ``[N, 7]``, bounded.
+
+        Args:
+            noise: added to the expert's bounded action, ``[N, 7]``.
+        """
         env = self.env
         intent = env.intent(self.offset)
         tool = quaternion_to_matrix(env.agent.tcp_pose.q)[:, :, 2]
         # Turning by tool x down brings the tool axis back to straight down.
         level = torch.stack([-tool[:, 1], tool[:, 0], intent.yaw], dim=1)
         command = env.body.command(intent.move, level)
-        return env.body.bound(torch.cat([command, intent.gripper[:, None]], dim=1))
+        action = env.body.bound(torch.cat([command, intent.gripper[:, None]], dim=1))
+        if noise is not None:
+            action = env.body.bound(action + noise)
+        return env.commanded(action)
 
 
 def funnel(distance: torch.Tensor, free: float, slope: float, height: float) -> torch.Tensor:

@@ -11,6 +11,11 @@ from mani_skill.utils.structs import Pose
 from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
 
 
+def is_direction(name: str) -> bool:
+    """Whether a field of this name has parts of a unit vector, such as an axis of the tool."""
+    return name.removesuffix("_xy").removesuffix("_z").endswith(("normal", "_axis"))
+
+
 def fourfold_yaw(q: torch.Tensor) -> torch.Tensor:
     """Yaw of a cube up to its symmetry, ``[N, 2]``: a frequency-4 vector.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ class MoveCube(SymmetricTask):
     axis), so the simulation state does too.
     """
 
-    task_fields = (
+    task_fields: ClassVar[tuple[Field, ...]] = (
         Field("cube_xy", 1),
         Field("cube_z", 0),
         Field("cube_yaw", 4),

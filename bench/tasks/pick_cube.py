@@ -27,7 +27,7 @@ class PickCube(SymmetricTask, PickCubeEnv):
 
     task_id = "PickCube-v1"
     max_episode_steps = 50
-    task_fields = (
+    task_fields: ClassVar[tuple[Field, ...]] = (
         Field("cube_xy", 1),
         Field("cube_z", 0),
         Field("cube_yaw", 4),

@@ -25,3 +25,13 @@ def test_it_is_trained_and_steered(name, tmp_path):
     assert record.status == "finished"
     assert record.base_policy.name == name
     assert record.budget.updates > 0
+
+
+@pytest.mark.parametrize("task", ["TiltedPickCube-v1", "TiltedPushCube-v1"])
+def test_the_spherical_policy_is_steered_on_a_tilted_table(task, tmp_path):
+    """An equivariant agent uses the turns about the laboratory's vertical, all of them exact."""
+    config = tiny_config(policy_name="spherical", task=task, env_steps=160)
+    record = read_record(execute(config, tmp_path, progress=False) / "record.json")
+    assert record.status == "finished"
+    assert (record.base_policy.name, record.base_policy.group) == ("spherical", "C8")
+    assert record.budget.updates > 0

@@ -23,6 +23,7 @@ def test_every_task_names_a_tool_and_something_to_move(task):
     names = positions(task_class(task).observation_layout)
     assert names[0] == "tcp_xy"
     assert len(names) >= 2
+    assert not any("axis" in name or "normal" in name for name in names)
 
 
 def test_the_direction_is_that_from_the_object_to_its_goal():

@@ -1,0 +1,358 @@
+"""A tilted table: the flat task's physics, in a frame that turns with the table."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from symsteer.bench.audit.defects import audit, reference_task, visit_all
+from symsteer.bench.audit.result import AuditSettings
+from symsteer.bench.demos import collect, load
+from symsteer.bench.sim.rotations import (
+    quaternion_multiply,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
+from symsteer.bench.tasks import make, task_class
+from symsteer.errors import UserError
+from symsteer.policies import POLICIES
+from symsteer.policies.geometry import Group
+
+TASKS = ["PickCube-v1", "PushCube-v1"]
+LEVEL = torch.tensor([1.0, 0.0, 0.0, 0.0])
+
+
+def turns(count, seed=0):
+    """Any rotations of space as quaternions, ``[count, 4]``."""
+    xyzw = torch.tensor(Rotation.random(count, random_state=seed).as_quat())
+    return xyzw[:, [3, 0, 1, 2]].float()
+
+
+def reframed(env, frame):
+    """Turn the worlds of all environments: the bodies stay, the frame is another."""
+    frame = torch.as_tensor(frame).expand(env.num_envs, 4)
+    env.set_state_dict({**env.get_state_dict(), "frame": frame})
+    return env.get_obs().clone()
+
+
+def random_actions(count, steps, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(steps, count, 7, generator=generator) * 2 - 1
+
+
+def same_bodies(a, b):
+    for kind in ("actors", "articulations"):
+        for name, value in a[kind].items():
+            assert torch.equal(value, b[kind][name]), name
+
+
+def close_bodies(a, b):
+    """Poses and joint angles; velocities are less smooth."""
+    for kind in ("actors", "articulations"):
+        for name, value in a[kind].items():
+            poses = slice(0, 7 if kind == "actors" else (13 + value.shape[1]) // 2)
+            assert torch.allclose(value[:, poses], b[kind][name][:, poses], atol=2e-4), name
+
+
+def vector(env, obs, name):
+    parts = [obs[:, env.observation_layout.slice(f"{name}_{end}")] for end in ("xy", "z")]
+    return torch.cat(parts, dim=1)
+
+
+@pytest.mark.parametrize("embodiment", ["floating", "panda"])
+@pytest.mark.parametrize("task", TASKS)
+def test_bodies_start_as_in_the_flat_task(task, embodiment):
+    """Also in later episodes, and where a variant draws its strength from the same key."""
+    settings = {"num_envs": 4, "embodiment": embodiment, "variant": "wind:0.2..0.8"}
+    flat, tilted = make(task, **settings), make(f"Tilted{task}", **settings)
+    for options in ({}, {"env_idx": [2, 0]}, {"reconfigure": True}):
+        for seed in (list(range(len(options.get("env_idx", range(4))))), None):
+            for env in (flat, tilted):
+                env.reset(seed=seed, options=dict(options))
+            same_bodies(flat.get_state_dict(), tilted.get_state_dict())
+            assert torch.equal(flat.variants[0].amount, tilted.variants[0].amount)
+
+
+def test_the_normal_is_uniform_on_a_cap():
+    env = make("TiltedPushCube-v1", num_envs=500)
+    obs, _ = env.reset(seed=list(range(500)))
+    normal = vector(env, obs, "normal").double()
+    assert torch.allclose(normal.norm(dim=1), torch.ones(500).double())
+    # Archimedes: the height of a uniform point of a sphere is uniform.
+    share = ((1 - normal[:, 2]) / (1 - math.cos(math.radians(30)))).sort().values
+    assert share[0] >= 0
+    assert share[-1] <= 1 + 1e-5
+    steps = torch.arange(1, 501) / 500
+    assert (share - steps).abs().max() < 1.63 / 500**0.5  # Kolmogorov and Smirnov, 1 %
+    bearing = torch.atan2(normal[:, 1], normal[:, 0])
+    for k in (1, 2, 4, 8):
+        assert torch.polar(torch.ones(500).double(), k * bearing).mean().abs() < 3 / 500**0.5
+    # The smallest rotation that leads there does not turn about the normal.
+    assert env.frame[:, 3].abs().max() == 0
+
+
+def test_each_episode_has_its_own_frame_and_a_seed_determines_it():
+    env = make("TiltedPickCube-v1", num_envs=3)
+    env.reset(seed=[1, 2, 3])
+    first = env.frame.clone()
+    env.reset(options={"env_idx": [1]})
+    assert torch.equal(env.frame[[0, 2]], first[[0, 2]])
+    assert not torch.equal(env.frame[1], first[1])
+    env.reset()
+    assert (env.frame != first).any(dim=1).all()
+    # In any place, and in other processes.
+    shared = make("TiltedPickCube-v1", num_envs=3, workers=2)
+    shared.reset(seed=[3, 2, 1])
+    assert torch.equal(shared.get_state_dict()["frame"], first.flip(0))
+    shared.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_level_table_is_the_flat_task_to_the_bit(task):
+    flat, tilted = make(task, num_envs=4), make(f"Tilted{task}", num_envs=4)
+    for env in (flat, tilted):
+        env.reset(seed=[5, 6, 7, 8])
+    reframed(tilted, LEVEL)
+    flat.set_state_dict(flat.get_state_dict())
+    for action in random_actions(4, 12):
+        theirs, reward, *_ = flat.step(action)
+        obs, again, *_ = tilted.step(action)
+        same_bodies(flat.get_state_dict(), tilted.get_state_dict())
+        assert torch.equal(reward, again)
+    seen = 0
+    for field in flat.observation_layout.fields:
+        name = field.name
+        name += "_xy" * name.endswith("_axis")
+        if field.frequency < 2:
+            seen += field.dim
+            assert torch.equal(
+                obs[:, tilted.observation_layout.slice(name)],
+                theirs[:, flat.observation_layout.slice(field.name)],
+            ), name
+    assert seen == flat.observation_layout.dim - 2
+
+
+@pytest.mark.parametrize("embodiment", ["floating", "panda"])
+@pytest.mark.parametrize("task", TASKS)
+def test_turned_actions_in_a_turned_world_do_the_same(task, embodiment):
+    """For frames of the task and for any rotation of space."""
+    flat, tilted = (make(n, num_envs=6, embodiment=embodiment) for n in (task, f"Tilted{task}"))
+    for env in (flat, tilted):
+        env.reset(seed=list(range(6)))
+    frames = tilted.frame.clone()
+    frames[3:] = turns(3)
+    reframed(tilted, frames)
+    matrix = quaternion_to_matrix(frames)
+    layout = tilted.observation_layout
+    level = make(f"Tilted{task}", num_envs=6, embodiment=embodiment)
+    for action in random_actions(6, 10, seed=1):
+        flat.step(action)
+        obs, *_ = tilted.step(tilted.action_layout.turn(action, matrix))
+        close_bodies(flat.get_state_dict(), tilted.get_state_dict())
+        level.set_state_dict({**flat.get_state_dict(), "frame": LEVEL.expand(6, 4)})
+        assert torch.allclose(obs, layout.turn(level.get_obs(), matrix), atol=2e-4)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_observation_turns_as_its_layout_says(task):
+    env = make(f"Tilted{task}", num_envs=5)
+    env.reset(seed=list(range(5)))
+    for action in random_actions(5, 6, seed=2):
+        env.step(action)
+    obs, frame, layout = env.get_obs().clone(), env.frame.clone(), env.observation_layout
+    inside = {name for pair in layout.spatial_vectors() for name in pair}
+    assert {f.name for f in layout.fields if f.name not in inside} == {
+        "gripper_width",
+        "grasp_yaw_cos",
+        "grasp_yaw_sin",
+    }
+    for turn in turns(4):
+        turn = turn.expand(5, 4)
+        moved = reframed(env, quaternion_multiply(turn, frame))
+        assert torch.allclose(moved, layout.turn(obs, quaternion_to_matrix(turn)), atol=1e-6)
+        assert (moved - obs).abs().max() > 0.1
+
+
+def test_actions_are_displacements_and_turns_in_the_laboratory():
+    env = make("TiltedPickCube-v1", num_envs=3)
+    obs, _ = env.reset(seed=[1, 2, 3])
+    obs = reframed(env, turns(3, seed=3))
+    move = torch.tensor([[0.3, -0.5, 0.2]]).expand(3, 3)
+    normal = vector(env, obs, "normal")
+    # Half a radian about the table's normal, in ten steps of a quarter of 0.2 rad.
+    action = torch.cat([move, 0.25 * normal, torch.ones(3, 1)], dim=1)
+    for _ in range(10):
+        later, *_ = env.step(action)
+        action[:, :3] = 0
+    # The hand comes to rest.
+    moved = vector(env, later, "tcp") - vector(env, obs, "tcp")
+    assert torch.allclose(moved, 0.03 * move, atol=5e-4)
+    turn = rotation_vector_to_matrix(0.5 * normal)
+    for axis in "xyz":
+        before, after = (vector(env, o, f"tcp_{axis}_axis") for o in (obs, later))
+        assert torch.allclose(after, (turn @ before[..., None])[..., 0], atol=0.02), axis
+        assert torch.allclose(after.norm(dim=1), torch.ones(3))
+
+
+def test_vectors_of_the_observation_fit_together():
+    env = make("TiltedPickCube-v1", num_envs=4)
+    obs, _ = env.reset(seed=[1, 2, 3, 4])
+    tcp, cube, goal = (vector(env, obs, name) for name in ("tcp", "cube", "goal"))
+    assert torch.allclose(vector(env, obs, "tcp_to_cube"), cube - tcp, atol=1e-6)
+    assert torch.allclose(vector(env, obs, "cube_to_goal"), goal - cube, atol=1e-6)
+    x, y, z = (vector(env, obs, f"tcp_{name}_axis") for name in "xyz")
+    assert torch.allclose(torch.linalg.cross(x, y), z, atol=1e-6)
+    normal = vector(env, obs, "normal")
+    # The tool looks at the table; the cube lies on it, 2 cm above.
+    assert torch.allclose(z, -normal, atol=1e-5)
+    assert torch.allclose((cube * normal).sum(dim=1), torch.full((4,), 0.02), atol=1e-5)
+    push = make("TiltedPushCube-v1", num_envs=4)
+    obs, _ = push.reset(seed=[1, 2, 3, 4])
+    ahead, normal = vector(push, obs, "cube_to_goal"), vector(push, obs, "normal")
+    assert torch.allclose(ahead.norm(dim=1), torch.full((4,), 0.2), atol=1e-5)
+    assert (ahead * normal).sum(dim=1).abs().max() < 1e-6
+
+
+def test_a_cubes_yaw_is_known_from_the_fingers():
+    """What stands in place of its yaw turns four times as fast, and not with the world."""
+    env = make("TiltedPushCube-v1", num_envs=1)
+    env.reset(seed=[0])
+    state = env.get_state_dict()
+    seen = []
+    for yaw in (0.0, 0.1, math.pi / 2):
+        cube = state["actors"]["cube"].clone()
+        turn = torch.tensor([[math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]])
+        cube[:, 3:7] = quaternion_multiply(turn, cube[:, 3:7])
+        env.set_state_dict({**state, "actors": {**state["actors"], "cube": cube}})
+        obs, layout = env.get_obs(), env.observation_layout
+        parts = [obs[:, layout.slice(f"grasp_yaw_{end}")].item() for end in ("cos", "sin")]
+        seen.append(math.atan2(parts[1], parts[0]))
+    assert math.remainder(seen[1] - seen[0] - 0.4, math.tau) == pytest.approx(0, abs=1e-4)
+    assert math.remainder(seen[2] - seen[0], math.tau) == pytest.approx(0, abs=1e-4)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_symmetric_policy_in_a_turned_world_takes_the_turned_path(task):
+    """Any rotation of space, whole decisions of an untrained policy."""
+    env = make(f"Tilted{task}", num_envs=8)
+    kind = POLICIES.get("spherical")
+    torch.manual_seed(0)
+    policy = kind(kind.Options(channels=8, width=8), env.observation_layout, env.action_layout)
+    noise = torch.randn(4, 1, 8, 7, generator=torch.Generator().manual_seed(0))
+    env.reset(seed=[3] * 8)
+    turn = torch.cat([LEVEL[None], turns(7)])
+    obs = reframed(env, quaternion_multiply(turn, env.frame))
+    moved = 0.0
+    for chunk in noise:
+        noises = chunk.expand(8, 8, 7).flatten(0, 1)
+        matrix = quaternion_to_matrix(turn).repeat_interleave(8, dim=0)
+        noises = env.action_layout.turn(noises, matrix).unflatten(0, (8, 8))
+        actions = policy.decode(obs, noises)
+        moved = max(moved, actions[..., :6].abs().max())
+        for step in range(4):
+            obs, *_ = env.step(actions[:, step])
+    assert moved > 0.1
+    tool = env.agent.tcp_pose.p
+    assert (tool - tool[:1]).norm(dim=1).max() < 1e-4
+    x = vector(env, obs, "tcp_x_axis")
+    assert (x - x[:1]).norm(dim=1).max() > 0.5
+
+
+def test_a_state_without_its_frame_is_refused():
+    flat, env = make("PickCube-v1", num_envs=2), make("TiltedPickCube-v1", num_envs=2)
+    for state in (flat.get_state_dict(), {**flat.get_state_dict(), "controller": {}}):
+        with pytest.raises(UserError, match="'frame'; take states from its own get_state_dict"):
+            env.set_state_dict(state)
+    with pytest.raises(UserError, match="not from flat tasks or get_state"):
+        env.set_state(env.get_state())
+
+
+def test_rows_of_a_state_bring_their_frames():
+    env = make("TiltedPickCube-v1", num_envs=3)
+    env.reset(seed=[1, 2, 3])
+    state = env.get_state_dict()
+    env.reset(seed=[4, 5, 6])
+    kept = env.frame[1].clone()
+    rows = {"actors": {}, "articulations": {}, "controller": {"root": {}}}
+    index = torch.tensor([0, 1])
+    for kind in ("actors", "articulations"):
+        rows[kind] = {name: value[index] for name, value in state[kind].items()}
+    target = state["controller"]["root"]["target_qpos"][index]
+    rows["controller"]["root"]["target_qpos"] = target
+    env.set_state_dict({**rows, "frame": state["frame"][index]}, torch.tensor([2, 0]))
+    assert torch.equal(env.frame[[2, 0]], state["frame"][index])
+    assert torch.equal(env.frame[1], kept)
+
+
+def test_turning_a_state_keeps_the_smallest_rotation():
+    """A turned episode is one that the task may draw: its frame has no heading of its own."""
+    env = make("TiltedPickCube-v1", num_envs=4)
+    env.reset(seed=[1, 2, 3, 4])
+    for element in Group.parse("D4").elements:
+        turned = env.transform_state(env.get_state_dict(), *element)["frame"]
+        assert torch.allclose(turned[:, 0], env.frame[:, 0])
+        assert turned[:, 3].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_demonstrations_are_in_the_laboratory_and_succeed_again(task, tmp_path):
+    name = f"Tilted{task}"
+    path = collect(name, "floating", 6, "diverse", 3, tmp_path / "demos.h5")
+    demos = load(path, name, "floating")
+    layout = demos.action_layout
+    lengths = torch.cat([a for _, a in demos.episodes])[:, layout.slice("xy").start : 3].norm(dim=1)
+    assert 0.9 < lengths.max() <= 1 + 1e-5
+    env = make(name, num_envs=6)
+    records = json.loads(path.with_suffix(".json").read_text())["episodes"]
+    obs, _ = env.reset(seed=[r["episode_seed"] for r in records])
+    solved = torch.zeros(6, dtype=torch.bool)
+    for step in range(max(len(a) for _, a in demos.episodes)):
+        for row, (seen, _) in enumerate(demos.episodes):
+            if step < 5:  # before contacts, which differ in the last digits
+                assert torch.allclose(obs[row], seen[step], atol=1e-3)
+        chosen = [a[step] if step < len(a) else torch.zeros(7) for _, a in demos.episodes]
+        obs, *_, info = env.step(torch.stack(chosen))
+        solved |= info["success"]
+    assert solved.all()
+
+
+def test_the_flat_tasks_demonstrations_are_refused(tmp_path):
+    path = collect("PickCube-v1", "floating", 1, "clean", 0, tmp_path / "flat.h5")
+    with pytest.raises(UserError, match="of PickCube-v1, but TiltedPickCube-v1 is wanted"):
+        load(path, "TiltedPickCube-v1", "floating")
+
+
+@pytest.mark.parametrize("embodiment", ["floating", pytest.param("panda", marks=pytest.mark.slow)])
+def test_the_audit_measures_the_flat_tasks_physics(embodiment):
+    """Turns about the laboratory's vertical turn the bodies about the normal."""
+    results = {}
+    for name in ("PickCube-v1", "TiltedPickCube-v1"):
+        settings = AuditSettings(
+            task=name, embodiment=embodiment, states="expert", count=16, resets=64
+        )
+        reference = reference_task(settings)
+        visited = visit_all(reference, settings, None)
+        for variant in ("none", "action_gain:1") if embodiment == "floating" else ("none",):
+            chosen = dataclasses.replace(settings, variant=variant)
+            results[name, variant] = audit(chosen, reference, visited)
+        reference.close()
+    flat, tilted = results["PickCube-v1", "none"], results["TiltedPickCube-v1", "none"]
+    seen = {field.name: field.value.value for field in tilted.fields}
+    assert max(seen.values()) < 0.01, seen
+    units = {field.name: field.unit for field in tilted.fields}
+    assert (units["tcp_xy"], units["normal_xy"], units["tcp_x_axis_z"]) == ("mm", "", "")
+    if embodiment == "floating":
+        assert tilted.decision.high < 0.02
+        assert results["TiltedPickCube-v1", "action_gain:1"].decision.value > 0.1
+    else:
+        assert tilted.decision.value == pytest.approx(flat.decision.value, rel=0.5)
+
+
+def test_layouts_are_known_without_an_environment():
+    layout = task_class("TiltedPickCube-v1").observation_layout
+    assert layout.spatial_vectors()[0] == ("normal_xy", "normal_z")
+    assert len(layout.spatial_vectors()) == 9
+    assert max(field.frequency for field in layout.fields) == 1
