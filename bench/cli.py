@@ -329,7 +329,7 @@ def demos(
 
 
 def base(
-    task: str = "PickCube-v1",
+    task: tuple[str, ...] = ("PickCube-v1",),
     embodiment: str = "floating",
     mode: Literal["clean", "diverse"] = "diverse",
     policies: tuple[str, ...] = ("edp", "plain", "plain-augmented"),
@@ -342,7 +342,8 @@ def base(
     """Train base policies from few demonstrations and compare their success.
 
     Args:
-        task: Task; `symsteer list` names them.
+        task: Tasks; `symsteer list` names them. Joint policies are trained on all of them together,
+            the others on each.
         embodiment: floating or panda.
         mode: Kind of demonstrations.
         policies: Policies; `symsteer list` names them.
@@ -357,16 +358,16 @@ def base(
     from symsteer.bench.runs.run import check
     from symsteer.policies import POLICIES
 
-    config = RunConfig(
-        task=task, embodiment=embodiment, demonstrations=DemonstrationConfig(mode=mode)
-    )
-    check(config)
+    demos = DemonstrationConfig(mode=mode)
+    configs = [RunConfig(task=name, embodiment=embodiment, demonstrations=demos) for name in task]
+    for config in configs:
+        check(config)
     for name in policies:
         POLICIES.get(name)
     workers = workers or os.cpu_count() or 1
-    rows = study(config, out, policies, demonstrations, seeds, episodes, workers)
-    path = out / "base" / f"study-{task}-{embodiment}-{mode}.json"
-    write_study(path, config, rows)
+    rows = study(configs, out, policies, demonstrations, seeds, episodes, workers)
+    path = out / "base" / f"study-{'+'.join(task)}-{embodiment}-{mode}.json"
+    write_study(path, configs[0], rows)
     print(table(rows))
     print(f"wrote {path}")
     return 0

@@ -27,6 +27,8 @@ POLICIES: Registry[type[ChunkPolicy]] = Registry(
         "canonical": "symsteer.policies.symmetry.canonical:CanonicalDiffusionPolicy",
         "plain": "symsteer.policies.symmetry.unconstrained:PlainDiffusionPolicy",
         "plain-augmented": "symsteer.policies.symmetry.augmented:AugmentedDiffusionPolicy",
+        "edp-joint": "symsteer.policies.symmetry.joint:JointEquivariantPolicy",
+        "plain-joint": "symsteer.policies.symmetry.joint:JointPlainPolicy",
     },
     "symsteer.policies.contract:ChunkPolicy",
 )

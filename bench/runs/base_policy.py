@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,16 +56,23 @@ def prepare_base(
     layouts = (task.observation_layout, task.action_layout)
     if policy is not None:
         return _measured(config, load_policy(policy, *layouts), progress, workers)
-    if demonstrations is None:
-        demonstrations = demonstration_file(config, out, progress)
-    demos = load(demonstrations, config.task, config.embodiment, config.demonstrations.count)
+    demos = {}
+    for name in config.policy_tasks:
+        one = dataclasses.replace(config, task=name)
+        path = demonstrations if name == config.task else None
+        path = path or demonstration_file(one, out, progress)
+        demos[name] = load(path, name, config.embodiment, config.demonstrations.count)
     folder = _policy_folder(config, out, demos)
-    if policy_path(folder).is_file():
-        return _measured(config, load_policy(folder, *layouts), progress, workers)
-    base = _train(config, demos, progress)
-    base.report["world"] = _world(config)
+    if not policy_path(folder).is_file():
+        for name, base in _train(config, demos, progress).items():
+            one = dataclasses.replace(config, task=name)
+            base.report["world"] = _world(one)
+            save_policy(base, _policy_folder(one, out, demos))
+    base = load_policy(folder, *layouts)
+    new = "steerability" not in base.report
     base = _measured(config, base, progress, workers)
-    save_policy(base, folder)
+    if new:
+        save_policy(base, folder)
     return base
 
 
@@ -123,13 +131,15 @@ def _world(config: RunConfig) -> dict[str, Any]:
 
 def find_base(config: RunConfig, out: Path) -> Path | None:
     """The folder of a run's trained base policy; None if it has not been trained yet."""
-    path = demonstration_path(config, out)
-    if not path.is_file():
-        return None
-    try:
-        demos = load(path, config.task, config.embodiment, config.demonstrations.count)
-    except UserError:  # the run that trains the policy reports what is wrong with the file
-        return None
+    demos = {}
+    for name in config.policy_tasks:
+        path = demonstration_path(dataclasses.replace(config, task=name), out)
+        if not path.is_file():
+            return None
+        try:
+            demos[name] = load(path, name, config.embodiment, config.demonstrations.count)
+        except UserError:  # the run that trains the policy reports what is wrong with the file
+            return None
     folder = _policy_folder(config, out, demos)
     return folder if policy_path(folder).is_file() else None
 
@@ -197,19 +207,22 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
     )
 
 
-def _policy_folder(config: RunConfig, out: Path, demos: Demonstrations) -> Path:
+def _policy_folder(config: RunConfig, out: Path, demos: Mapping[str, Demonstrations]) -> Path:
     name, options = config.policy_name, config.policy.to_json()
     # Code from outside SymSteer can change under the same name.
     extension = POLICIES.extension(name)
-    key = content_key(
-        demos.content_hash, name, options, extension and extension.sha256, config.policy_seed
-    )
+    hashes = [demos[task].content_hash for task in sorted(demos)]
+    data = hashes[0] if len(hashes) == 1 else hashes
+    key = content_key(data, name, options, extension and extension.sha256, config.policy_seed)
     short = name.rpartition(":")[2]
     return out / "base" / f"{config.task}-{config.embodiment}-{short}-{key}"
 
 
-def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPolicy:
-    kind = POLICIES.get(config.policy_name)
+def _train(
+    config: RunConfig, demos: Mapping[str, Demonstrations], progress: bool
+) -> dict[str, ChunkPolicy]:
+    """The policies of all tasks whose demonstrations the run's policy is trained on."""
+    kind: Any = POLICIES.get(config.policy_name)
     with tqdm(desc="base policy", disable=None if progress else True) as bar:
 
         def advance(step: int, steps: int, loss: float) -> None:
@@ -217,15 +230,13 @@ def _train(config: RunConfig, demos: Demonstrations, progress: bool) -> ChunkPol
             bar.update(step - bar.n)
             bar.set_postfix(loss=f"{loss:.4f}")
 
-        return kind.fit(
-            config.policy,
-            demos.episodes,
-            demos.observation_layout,
-            demos.action_layout,
-            config.policy_seed,
-            advance,
-            config.device,
-        )
+        own = demos[config.task]
+        how = (own.action_layout, config.policy_seed, advance, config.device)
+        if len(demos) == 1:
+            fitted = kind.fit(config.policy, own.episodes, own.observation_layout, *how)
+            return {config.task: fitted}
+        data = {name: (d.episodes, d.observation_layout) for name, d in demos.items()}
+        return kind.fit_tasks(config.policy, data, *how)
 
 
 def _measured(config: RunConfig, base: ChunkPolicy, progress: bool, workers: int) -> ChunkPolicy:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +40,7 @@ class BaseCell:
 
 
 def study(
-    config: RunConfig,
+    configs: Sequence[RunConfig],
     out: Path,
     names: Sequence[str],
     counts: Sequence[int],
@@ -54,8 +54,9 @@ def study(
     demonstrations; n demonstrations are the first n of the largest number.
 
     Args:
-        config: task, embodiment, kind of demonstrations, and options of one policy. The other
-            policies use the same values of the options that they have, too.
+        configs: embodiment, kind of demonstrations, and options of one policy; they differ in the
+            task alone. The other policies use the same values of the options that they have, too.
+            Policies for several tasks are trained on all of them together, the others on each.
         out: folder that keeps demonstrations in ``out/base``.
         names: of the policies.
         counts: numbers of demonstrations.
@@ -64,28 +65,29 @@ def study(
         workers: number of processes.
 
     Returns:
-        A plain dictionary for each policy: its cell, ``success``, ``successes``, ``episodes``,
-        ``parameters``, ``training_seconds``.
+        A plain dictionary for each policy and task: its cell, ``task``, ``success``, ``successes``,
+        ``episodes``, ``parameters``, ``training_seconds``.
 
     Raises:
         UserError: if a number is not positive or there is no such policy.
     """
-    if not counts or not names:
-        raise UserError("a study needs at least one number of demonstrations and one policy")
+    if not counts or not names or not configs:
+        raise UserError("a study needs at least one task, number of demonstrations and policy")
     if min(*counts, seeds, episodes, workers) < 1:
         raise UserError("numbers of demonstrations, seeds, episodes and workers must be positive")
     for name in names:
         POLICIES.get(name)
-    files = {}
+    files: dict[int, dict[str, Path]] = {}
     for seed in range(seeds):
-        wanted = DemonstrationConfig(config.demonstrations.mode, max(counts), seed)
-        files[seed] = demonstration_file(dataclasses.replace(config, demonstrations=wanted), out)
+        wanted = DemonstrationConfig(configs[0].demonstrations.mode, max(counts), seed)
+        mine = [dataclasses.replace(config, demonstrations=wanted) for config in configs]
+        files[seed] = {config.task: demonstration_file(config, out) for config in mine}
     cells = [BaseCell(n, c, s) for c in counts for n in names for s in range(seeds)]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = [pool.submit(_play, config, cell, files[cell.seed], episodes) for cell in cells]
-        rows = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
-    return rows
+        jobs = [pool.submit(_play, configs[0], cell, files[cell.seed], episodes) for cell in cells]
+        parts = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
+    return [row for rows in parts for row in rows]
 
 
 def write_study(path: Path, config: RunConfig, rows: Sequence[dict[str, Any]]) -> None:
@@ -93,7 +95,7 @@ def write_study(path: Path, config: RunConfig, rows: Sequence[dict[str, Any]]) -
     write_json(
         path,
         {
-            "task": config.task,
+            "tasks": list(dict.fromkeys(row["task"] for row in rows)),
             "embodiment": config.embodiment,
             "demonstrations": config.demonstrations.mode,
             "policy": config.to_json()["policy"],
@@ -105,17 +107,18 @@ def write_study(path: Path, config: RunConfig, rows: Sequence[dict[str, Any]]) -
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """A markdown table of success: mean over seeds [lowest, highest seed]."""
     names = list(dict.fromkeys(row["name"] for row in rows))
-    counts = list(dict.fromkeys(row["count"] for row in rows))
+    cells = sorted({(row["task"], row["count"]) for row in rows})
     lines = [
-        "| demonstrations | " + " | ".join(f"`{name}`" for name in names) + " |",
-        "| --: |" + " --: |" * len(names),
+        "| task | demonstrations | " + " | ".join(f"`{name}`" for name in names) + " |",
+        "| :-- | --: |" + " --: |" * len(names),
     ]
-    for count in counts:
+    for task, count in cells:
         texts = []
         for name in names:
-            found = [r["success"] for r in rows if (r["name"], r["count"]) == (name, count)]
+            wanted = (task, count, name)
+            found = [r["success"] for r in rows if (r["task"], r["count"], r["name"]) == wanted]
             texts.append(f"{statistics.mean(found):.2f} [{min(found):.2f}, {max(found):.2f}]")
-        lines.append(f"| {count} | " + " | ".join(texts) + " |")
+        lines.append(f"| `{task}` | {count} | " + " | ".join(texts) + " |")
     return "\n".join(lines)
 
 
@@ -141,26 +144,40 @@ def held_out_episodes(config: RunConfig, policy: ChunkPolicy, seed: int, episode
         latent.close()
 
 
-def _play(config: RunConfig, cell: BaseCell, demos: Path, episodes: int) -> dict[str, Any]:
+def _play(
+    config: RunConfig, cell: BaseCell, demos: Mapping[str, Path], episodes: int
+) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
-    data = load(demos, config.task, config.embodiment, cell.count)
-    kind = POLICIES.get(cell.name)
+    data = {task: load(path, task, config.embodiment, cell.count) for task, path in demos.items()}
+    kind: Any = POLICIES.get(cell.name)
     common = {
         field.name: getattr(config.policy, field.name)
         for field in dataclasses.fields(kind.Options)
         if hasattr(config.policy, field.name)
     }
-    policy = kind.fit(
-        kind.Options(**common),
-        data.episodes,
-        data.observation_layout,
-        data.action_layout,
-        cell.seed,
-    )
-    result = held_out_episodes(config, policy, cell.seed, episodes)
+    options = kind.Options(**common)
+    policies: dict[str, ChunkPolicy]
+    if len(data) > 1 and hasattr(options, "tasks"):
+        together = {task: (d.episodes, d.observation_layout) for task, d in data.items()}
+        layout = next(iter(data.values())).action_layout
+        policies = kind.fit_tasks(options, together, layout, cell.seed)
+    else:
+        policies = {
+            task: kind.fit(options, d.episodes, d.observation_layout, d.action_layout, cell.seed)
+            for task, d in data.items()
+        }
+    return [_row(config, cell, task, policy, episodes) for task, policy in policies.items()]
+
+
+def _row(
+    config: RunConfig, cell: BaseCell, task: str, policy: ChunkPolicy, episodes: int
+) -> dict[str, Any]:
+    mine = dataclasses.replace(config, task=task)
+    result = held_out_episodes(mine, policy, cell.seed, episodes)
     successes = int(result.episodes["success_once"].sum())
     return {
         **dataclasses.asdict(cell),
+        "task": task,
         "success": successes / episodes,
         "successes": successes,
         "episodes": episodes,

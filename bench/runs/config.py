@@ -121,6 +121,10 @@ class RunConfig:
                 raise UserError(
                     f"{kind} are {type(given).__name__}, but {name!r} takes {options.__name__}"
                 )
+        if len(self.policy_tasks) > 1:
+            # All of them, so that runs on each of these tasks ask for the same base policy.
+            policy = dataclasses.replace(self.policy, tasks=self.policy_tasks)  # type: ignore[call-arg]
+            object.__setattr__(self, "policy", policy)
         if self.policy_seed is None:
             object.__setattr__(self, "policy_seed", self.seed)
         if self.demonstrations.seed is None:
@@ -158,6 +162,11 @@ class RunConfig:
     def place(self) -> tuple[str, str]:
         """Task and embodiment, for which levels of variants are defined."""
         return self.task, self.embodiment
+
+    @property
+    def policy_tasks(self) -> tuple[str, ...]:
+        """The tasks whose demonstrations the base policy is trained on."""
+        return tuple(sorted({self.task, *getattr(self.policy, "tasks", ())}))
 
     @functools.cached_property
     def variants(self) -> tuple[VariantSpec, ...]:

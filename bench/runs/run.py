@@ -55,11 +55,18 @@ def check(config: RunConfig) -> None:
     """Check that a configuration can be run, before anything is built.
 
     Raises:
-        UserError: for an unknown task, embodiment or variant, a strength out of range, a budget
+        UserError: for an unknown task, embodiment or variant, tasks of a base policy that do not
+            fit together, a strength out of range, a budget
             in which nothing is learned, or a device that this machine does not have.
     """
-    task_class(config.task)
+    own = task_class(config.task)
     check_embodiment(config.embodiment)
+    for name in config.policy_tasks:
+        if task_class(name).action_layout != own.action_layout:
+            raise UserError(
+                f"the actions of {name} have another layout than those of {config.task}; one "
+                "policy cannot be trained on both, so leave it out of --policy.tasks"
+            )
     build(specs_at(read(config.variants), 1))
     if any(spec.changes_nothing for spec in config.variants):
         raise UserError(

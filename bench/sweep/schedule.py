@@ -108,7 +108,9 @@ def tasks_of(
         config = plan.configs[run]
         wanted = config.demonstrations
         demos_key = (config.task, config.embodiment, wanted)
-        base_key = (*demos_key, config.policy_name, config.policy, config.policy_seed)
+        # A policy of several tasks is trained once for the runs on all of them.
+        trained = (config.policy_tasks, *demos_key[1:])
+        base_key = (*trained, config.policy_name, config.policy, config.policy_seed)
         words = f"{config.task} {config.embodiment}, {wanted.count} {wanted.mode}"
         args = (config, plan.out)
         if base_key not in bases and find_base(*args):

@@ -157,10 +157,14 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
 
 
 def lifted_denoiser(
-    options: DenoisingOptions, obs_layout: Layout, act_layout: Layout, group: Group
+    options: DenoisingOptions,
+    obs_layout: Layout,
+    act_layout: Layout,
+    group: Group,
+    kind: type[LiftedDenoiser] = LiftedDenoiser,
 ) -> LiftedDenoiser:
     """The network that the options describe, over ``group``."""
-    return LiftedDenoiser(
+    return kind(
         obs_layout,
         act_layout,
         options.horizon,

@@ -10,7 +10,7 @@ from tests.bench.tiny_run import tiny_config
 @pytest.mark.slow
 def test_a_small_study(tmp_path):
     names, counts = ("edp", "plain-augmented"), (2,)
-    rows = study(tiny_config(), tmp_path, names, counts, seeds=1, episodes=4, workers=1)
+    rows = study([tiny_config()], tmp_path, names, counts, seeds=1, episodes=4, workers=1)
     assert [(r["name"], r["count"], r["seed"]) for r in rows] == [
         (name, count, 0) for count in counts for name in names
     ]
@@ -20,17 +20,30 @@ def test_a_small_study(tmp_path):
     assert (tmp_path / "study.json").stat().st_size > 500
 
 
+@pytest.mark.slow
+def test_joint_policies_are_trained_once_for_all_tasks(tmp_path):
+    configs = [tiny_config(task=task) for task in ("PushCube-v1", "PickCube-v1")]
+    rows = study(configs, tmp_path, ("edp", "edp-joint"), (2,), seeds=1, episodes=4, workers=1)
+    seconds = {(r["name"], r["task"]): r["training_seconds"] for r in rows}
+    assert len(seconds) == len(rows) == 4
+    assert seconds["edp-joint", "PushCube-v1"] == seconds["edp-joint", "PickCube-v1"]
+
+
 def test_the_table_gives_mean_and_range():
     rows = [
-        {"name": "edp", "count": 5, "seed": s, "success": value}
+        {"name": "edp", "count": 5, "seed": s, "success": value / shrink, "task": task}
+        for task, shrink in (("Push", 1), ("Pick", 2))
         for s, value in enumerate((0.2, 0.4, 0.9))
     ]
-    assert table(rows).splitlines()[-1] == "| 5 | 0.50 [0.20, 0.90] |"
+    assert table(rows).splitlines()[-2:] == [
+        "| `Pick` | 5 | 0.25 [0.10, 0.45] |",
+        "| `Push` | 5 | 0.50 [0.20, 0.90] |",
+    ]
 
 
 def test_impossible_numbers_are_refused(tmp_path):
     with pytest.raises(UserError, match="positive"):
-        study(tiny_config(), tmp_path, ("edp",), (0,), seeds=1, episodes=1, workers=1)
+        study([tiny_config()], tmp_path, ("edp",), (0,), seeds=1, episodes=1, workers=1)
     for names, counts in (((), (3,)), (("edp",), ())):
         with pytest.raises(UserError, match="at least one"):
-            study(tiny_config(), tmp_path, names, counts, seeds=1, episodes=1, workers=1)
+            study([tiny_config()], tmp_path, names, counts, seeds=1, episodes=1, workers=1)

@@ -23,6 +23,7 @@ from symsteer.bench.sweep.work import Result
 from symsteer.cli import main
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
+from symsteer.policies import POLICIES
 from tests.bench.sweep.long_run import LONG
 from tests.bench.tiny_run import tiny_config
 
@@ -293,6 +294,19 @@ def test_learners_that_differ_in_seeds_and_variants_alone_are_a_team(tmp_path):
     assert found == [[0, 1, 2, 3], [4, 5], [6], [7], [8], [9]]
     # Each seed has a base policy of its own; a team waits for all of them, each once.
     assert [task.waits for task in tasks] == [3, 2, 1, 1, 1, 1]
+
+
+def test_a_base_policy_of_several_tasks_is_built_once(tmp_path):
+    names = ("PickCube-v1", "PushCube-v1")
+    policy = POLICIES.get("edp-joint").Options(tasks=names)
+    configs = tuple(
+        tiny_config(task=task, policy_name="edp-joint", policy=policy, seed=seed)
+        for task in names
+        for seed in (0, 1)
+    )
+    plan = make_plan(Suite("shared", "", configs), tmp_path)
+    kinds = [task.kind for task in tasks_of(plan, plan.runs)]
+    assert kinds == ["demonstrations"] * 2 + ["base policy"] * 2 + ["run"] * 4
 
 
 def test_equal_demonstrations_and_bases_are_built_once(tmp_path):
