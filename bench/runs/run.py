@@ -56,8 +56,8 @@ def check(config: RunConfig) -> None:
 
     Raises:
         UserError: for an unknown task, embodiment or variant, tasks of a base policy that do not
-            fit together, a strength out of range, a budget
-            in which nothing is learned, or a device that this machine does not have.
+            fit together, a strength out of range, a budget in which nothing is learned, or a device
+            that this machine does not have.
     """
     own = task_class(config.task)
     check_embodiment(config.embodiment)

@@ -255,7 +255,7 @@ class SymmetricTask(GymEnv):
     # ------------------------------------------------------------------- step
 
     def commanded(self, action: torch.Tensor) -> torch.Tensor:
-        """What :meth:`step` takes, so that ``action [N, 7]`` is done in the world of the bodies."""
+        """What :meth:`step` takes to execute ``action [N, 7]``, which is in the bodies' axes."""
         return action
 
     def step(self, action: Any) -> tuple:

@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import sapien
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image
 
@@ -40,7 +41,7 @@ def snapshot(task: str, embodiment: str, seed: int, steps: int) -> np.ndarray:
         embodiment=embodiment,
         render=True,
         render_mode="rgb_array",
-        human_render_camera_configs=CAMERA,
+        human_render_camera_configs={**CAMERA, "pose": _camera_pose(task, seed)},
     )
     env.reset(seed=[seed])
     expert = Expert(env)
@@ -49,6 +50,18 @@ def snapshot(task: str, embodiment: str, seed: int, steps: int) -> np.ndarray:
     frame = env.render()[0].cpu().numpy()[..., :3]
     env.close()
     return frame
+
+
+def _camera_pose(task: str, seed: int) -> sapien.Pose:
+    """Where a camera that is level in the laboratory is in the world of the bodies."""
+    pose = CAMERA["pose"].sp
+    if not issubclass(task_class(task), Tilted):
+        return pose
+    env = make(task, num_envs=1)
+    env.reset(seed=[seed])
+    frame = sapien.Pose(q=env.frame[0].cpu().numpy())
+    env.close()
+    return frame.inv() * pose
 
 
 def task_picture(task: str, axis: int = 1, seed: int = 1, steps: int = 8) -> np.ndarray:

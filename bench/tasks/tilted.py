@@ -42,12 +42,20 @@ def in_space(fields: Sequence[Field]) -> tuple[Field, ...]:
 
     Horizontal vectors get a vertical part. Frequencies above 1 are left out: they are angles about
     the vertical, which has no meaning here.
+
+    Raises:
+        UserError: if a vector is not named ``NAME_xy``, as vectors in space are.
     """
     names = {field.name for field in fields}
     found = []
     for field in fields:
         if field.frequency < 2:
             found.append(field)
+        if field.frequency == 1 and not field.name.endswith("_xy"):
+            raise UserError(
+                f"the vector {field.name!r} has no place in space; name it {field.name}_xy, or "
+                "leave it out of a tilted task"
+            )
         vertical = field.name.removesuffix("xy") + "z"
         if field.frequency == 1 and vertical not in names:
             found.append(Field(vertical, 0, odd=field.odd))

@@ -2,6 +2,7 @@
 
 import pytest
 
+from symsteer.bench.demos import collect
 from symsteer.bench.runs.base_policy import find_base, prepare_base, with_policy_of
 from symsteer.bench.runs.config import build_config
 from symsteer.bench.runs.folder import run_id
@@ -46,6 +47,18 @@ def test_it_is_trained_once_for_the_runs_on_all_tasks(name, tmp_path, monkeypatc
     # Another seed, or other tasks, are other policies.
     assert find_base(config(TASKS[0], name=name, policy_seed=7), tmp_path) is None
     assert find_base(config(TASKS[0], TASKS[:2], name=name), tmp_path) is None
+
+
+def test_other_demonstrations_of_one_task_are_another_policy_of_all(tmp_path):
+    pair = ("PickCube-v1", "PushCube-v1")
+    own = collect("PushCube-v1", "floating", 3, "diverse", 99, tmp_path / "own.h5")
+    prepare_base(config("PushCube-v1", pair), tmp_path, own, progress=False)
+    # The runs that begin from the expert's demonstrations do not find it.
+    for task in pair:
+        prepare_base(config(task, ()), tmp_path, progress=False)
+    for task in pair:
+        assert find_base(config(task, pair), tmp_path) is None
+        assert find_base(config(task, ()), tmp_path) is not None
 
 
 def test_the_order_of_tasks_and_the_runs_own_do_not_matter():

@@ -17,9 +17,10 @@ from symsteer.bench.sim.rotations import (
     rotation_vector_to_matrix,
 )
 from symsteer.bench.tasks import make, task_class
+from symsteer.bench.tasks.tilted import in_space
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
-from symsteer.policies.geometry import Group
+from symsteer.policies.geometry import Field, Group
 
 TASKS = ["PickCube-v1", "PushCube-v1"]
 LEVEL = torch.tensor([1.0, 0.0, 0.0, 0.0])
@@ -74,6 +75,9 @@ def test_bodies_start_as_in_the_flat_task(task, embodiment):
                 env.reset(seed=seed, options=dict(options))
             same_bodies(flat.get_state_dict(), tilted.get_state_dict())
             assert torch.equal(flat.variants[0].amount, tilted.variants[0].amount)
+    strength = (tilted.variants[0].amount - 0.2) / 0.6
+    height = (2 * tilted.frame[:, 1:].square().sum(dim=1)) / (1 - math.cos(math.radians(30)))
+    assert (strength - height).abs().max() > 0.1  # from other random numbers
 
 
 def test_the_normal_is_uniform_on_a_cap():
@@ -356,3 +360,10 @@ def test_layouts_are_known_without_an_environment():
     assert layout.spatial_vectors()[0] == ("normal_xy", "normal_z")
     assert len(layout.spatial_vectors()) == 9
     assert max(field.frequency for field in layout.fields) == 1
+
+
+def test_a_vector_without_a_place_in_space_is_refused():
+    fields = (Field("goal_xy", 1), Field("bar", 2), Field("width", 0))
+    assert [field.name for field in in_space(fields)] == ["goal_xy", "goal_z", "width"]
+    with pytest.raises(UserError, match="'push' has no place in space; name it push_xy"):
+        in_space((*fields, Field("push", 1)))
