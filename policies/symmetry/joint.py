@@ -1,10 +1,11 @@
-"""One policy for several tasks: a task embedding that modulates invariants alone.
+"""One policy for several tasks, told apart by scales and shifts that are invariant.
 
 The observations of the tasks are merged: fields of the same name are one field, and those that a
 task lacks are 0. Beside them the network sees which task it is, a one-hot vector, in two places:
 it scales and shifts each regular field of the observation's embedding, and the hidden features of
-the chunk. Scales and shifts are the same for all group elements, so that the network commutes with
-the group as before (invariant FiLM, as in EquAct, arXiv 2505.21351).
+the chunk. Scales and shifts are the same for all group elements: a shift moves the invariant part
+of a field alone, a scale multiplies all its parts. So the network commutes with the group as before
+(invariant FiLM, as in EquAct, arXiv 2505.21351).
 
 For one task the embedding is constant, and so are the fields that the task lacks: both become a
 part of the weights. So what :meth:`Joint.fit_tasks` returns for a task is an ordinary policy on
