@@ -68,8 +68,8 @@ def contents_of_run(folder: Path, wanted: Wanted) -> Contents:
         demonstrations = demonstration_path(config, folder.parent)
         if wanted == "demonstrations":
             return _demonstrations_alone(config, demonstrations)
-        taken = demonstrations if wanted == "all" else None
-        return Contents(base.name, config, taken, policy, policy_path(folder), {})
+        taken, left_out = _taken(config, demonstrations, wanted)
+        return Contents(base.name, config, taken, policy, policy_path(folder), {}, left_out)
     absent = (
         f"{folder.parent / 'base'} does not have the demonstrations that the base policy of "
         f"{folder.name} was trained on"
@@ -95,8 +95,19 @@ def contents_of_settings(config: RunConfig, runs: Path, wanted: Wanted) -> Conte
     policy = prepare_base(config, runs)
     folder = find_base(config, runs)
     assert folder is not None, "prepare_base keeps it there"
-    taken = demonstrations if wanted == "all" else None
-    return Contents(folder.name, config, taken, policy, policy_path(folder), {})
+    taken, left_out = _taken(config, demonstrations, wanted)
+    return Contents(folder.name, config, taken, policy, policy_path(folder), {}, left_out)
+
+
+def _taken(config: RunConfig, path: Path, wanted: Wanted) -> tuple[Path | None, str | None]:
+    """The demonstrations that go with a policy, or why they do not."""
+    if wanted != "all" or len(config.policy_tasks) == 1:
+        return (path if wanted == "all" else None), None
+    tasks = ", ".join(config.policy_tasks)
+    return None, (
+        f"the policy was trained on demonstrations of {tasks}; export them one task at a time, "
+        "with --contents demonstrations"
+    )
 
 
 def _demonstrations_alone(config: RunConfig, path: Path) -> Contents:

@@ -29,10 +29,9 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.film import FRAMES_PER_SECOND
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import TASKS, task_class
-from symsteer.bench.tasks.base import GRIPPER_LAYOUT
 from symsteer.bench.tasks.embodiments import BODIES
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Field
+from symsteer.policies.geometry import Field, Layout
 
 VERSION = "v3.0"
 IMAGE = "observation.image"
@@ -41,13 +40,14 @@ CHUNK = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
-def split(obs: Any) -> tuple[Any, Any]:
-    """The parts of an observation ``[..., obs_dim]`` that LeRobot keeps apart.
+def split(obs: Any, task: str) -> tuple[Any, Any]:
+    """The parts of an observation ``[..., obs_dim]`` of a task that LeRobot keeps apart.
 
     Returns:
         The gripper's fields and the task's fields.
     """
-    return obs[..., : GRIPPER_LAYOUT.dim], obs[..., GRIPPER_LAYOUT.dim :]
+    width = Layout(task_class(task).gripper_fields).dim
+    return obs[..., :width], obs[..., width:]
 
 
 def check_folder(out: Path) -> None:
@@ -88,7 +88,7 @@ def write_dataset(
         if film:
             file = partial / "videos" / IMAGE / f"{FIRST}.mp4"
             pixels = film_demonstrations(config, path, lengths, file)
-        _write_tables(config, _columns(demos.episodes), lengths, pixels, partial)
+        _write_tables(config, _columns(demos.episodes, config.task), lengths, pixels, partial)
         card = dataset_card(contents, len(lengths), sum(lengths), film)
         (partial / "README.md").write_text(card)
         _write_json(partial / "meta/symsteer.json", _origin(config))
@@ -100,10 +100,12 @@ def write_dataset(
     return f"wrote {out}: {len(lengths)} episodes, {sum(lengths)} frames, {seen}{why}"
 
 
-def _columns(episodes: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> dict[str, np.ndarray]:
+def _columns(
+    episodes: Sequence[tuple[torch.Tensor, torch.Tensor]], task: str
+) -> dict[str, np.ndarray]:
     """All frames of all episodes by column; each episode ends with its only success."""
     lengths = [len(actions) for _, actions in episodes]
-    state, environment = split(np.concatenate([obs[:-1].numpy() for obs, _ in episodes]))
+    state, environment = split(np.concatenate([obs[:-1].numpy() for obs, _ in episodes]), task)
     step = np.concatenate([np.arange(length) for length in lengths])
     last = np.concatenate([np.arange(length) == length - 1 for length in lengths])
     return {
@@ -197,7 +199,7 @@ def _features(
     """Type, shape and names of every column, and of the video."""
     task = task_class(config.task)
     fields = {
-        "observation.state": GRIPPER_LAYOUT.fields,
+        "observation.state": task.gripper_fields,
         "observation.environment_state": task.task_fields,
         "action": task.action_layout.fields,
     }

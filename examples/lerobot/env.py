@@ -18,7 +18,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 import symsteer.bench.tasks as tasks
 from symsteer.bench.bundles.film import PIXELS, RENDERING
 from symsteer.bench.sim.headless import rendering_works
-from symsteer.bench.tasks.base import GRIPPER_LAYOUT
+from symsteer.policies.geometry import Layout
 
 TASK = "PickCube-v1"
 EMBODIMENT = "floating"
@@ -44,9 +44,10 @@ class LeRobotEnv(gym.Wrapper):
         self._max_episode_steps = self.env.get_wrapper_attr("spec").max_episode_steps
         self.images = images
         width = self.env.observation_space.shape[0]
+        self.gripper = Layout(tasks.task_class(task).gripper_fields).dim
         parts = {
-            "agent_pos": spaces.Box(-np.inf, np.inf, (GRIPPER_LAYOUT.dim,)),
-            "environment_state": spaces.Box(-np.inf, np.inf, (width - GRIPPER_LAYOUT.dim,)),
+            "agent_pos": spaces.Box(-np.inf, np.inf, (self.gripper,)),
+            "environment_state": spaces.Box(-np.inf, np.inf, (width - self.gripper,)),
         }
         if images:
             parts["pixels"] = spaces.Box(0, 255, (PIXELS, PIXELS, 3), np.uint8)
@@ -64,8 +65,10 @@ class LeRobotEnv(gym.Wrapper):
         return self._observed(obs), reward, terminated, truncated, info
 
     def _observed(self, obs: np.ndarray) -> dict[str, np.ndarray]:
-        dim = GRIPPER_LAYOUT.dim
-        observed = {"agent_pos": obs[:dim], "environment_state": obs[dim:]}
+        observed = {
+            "agent_pos": obs[: self.gripper],
+            "environment_state": obs[self.gripper :],
+        }
         return observed | ({"pixels": self.env.render()} if self.images else {})
 
 
