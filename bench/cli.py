@@ -117,25 +117,29 @@ def evaluate(
 
 
 def film(
-    folder: Path,
+    folders: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]")],
     /,
     variant: str | None = None,
     episodes: int = 3,
+    out: Path | None = None,
 ) -> int:
-    """Film held-out episodes with the last checkpoint of a run (mp4).
+    """Film held-out episodes with the last checkpoints of runs.
 
-    Where no Vulkan driver works, a picture of the paths seen from above is written instead.
+    Several runs play the same episodes side by side. Where no Vulkan driver works, a picture of the
+    paths seen from above is written instead.
 
     Args:
-        folder: The run's folder; the file is written there.
+        folders: The runs' folders.
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none; default: as in the run.
         episodes: Number of held-out episodes.
+        out: The film, .mp4 or .gif; default: an .mp4 in the run's folder, for several runs beside
+            the first one.
     """
     from symsteer.bench.runs.film import film
     from symsteer.bench.sim.capabilities import RENDERING_CURE
     from symsteer.bench.sim.headless import rendering_works
 
-    path = film(folder, variant, episodes)
+    path = film(folders, variant, episodes, out)
     if not rendering_works():
         print(f"no video: no Vulkan driver was found; {RENDERING_CURE}", file=sys.stderr)
     print(f"wrote {path}")

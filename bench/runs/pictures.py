@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib as mpl
@@ -170,7 +171,7 @@ def first_episode(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> list[
         UserError: if there is no Vulkan driver.
     """
     variants, seed = evaluation_variants(config.variants), held_out_seeds(1)[0]
-    return list(episode_frames(config, policy, agent, variants, seed, every_step=False))
+    return filmed(config, policy, agent, variants, seed, every_step=False).frames
 
 
 def contact_sheet(frames: Sequence[np.ndarray]) -> np.ndarray:
@@ -195,15 +196,28 @@ def to_gif(frames: Sequence[np.ndarray], rate: float) -> bytes:
     return file.getvalue()
 
 
-def episode_frames(
+@dataclass(frozen=True)
+class Filmed:
+    """An episode up to its first success or time limit.
+
+    Attributes:
+        frames: ``[height, width, 3]`` uint8, the first one before the first action.
+        solved: whether it ended with success.
+    """
+
+    frames: list[np.ndarray]
+    solved: bool
+
+
+def filmed(
     config: RunConfig,
     policy: ChunkPolicy,
     agent: Agent,
     variants: Sequence[VariantSpec],
     seed: int,
     every_step: bool = True,
-) -> Iterator[np.ndarray]:
-    """Frames ``[height, width, 3]`` uint8 of an episode up to its first success or time limit.
+) -> Filmed:
+    """Play an episode, and render it.
 
     Args:
         config: task, embodiment and simulator.
@@ -228,8 +242,8 @@ def episode_frames(
     # Not through the latent-noise environment: it starts a new episode before the last frame.
     try:
         obs, _ = env.reset(seed=[seed])
-        yield _frame(env)
-        done = False
+        frames = [_frame(env)]
+        done, info = False, {}
         while not done:
             obs = obs.to(config.device)
             actions = agent.decode(obs, agent.act(obs, deterministic=True)).to(env.device)
@@ -237,9 +251,10 @@ def episode_frames(
                 obs, _, _, truncated, info = env.step(actions[:, t])
                 done = bool(info["success"] | truncated)
                 if every_step or done or t == policy.execute - 1:
-                    yield _frame(env)
+                    frames.append(_frame(env))
                 if done:
                     break
+        return Filmed(frames, bool(info["success"]))
     finally:
         env.close()
 

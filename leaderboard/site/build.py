@@ -18,9 +18,10 @@ from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.site import markup
 from symsteer.leaderboard.site.assets import assets, needs
 from symsteer.leaderboard.site.board import DIGITS, Board, MapPicture
+from symsteer.leaderboard.site.clips import media, shared_media
 from symsteer.leaderboard.site.docs import FOLDER, Documentation, build_documentation
 from symsteer.leaderboard.site.pages import pages
-from symsteer.leaderboard.site.run_page import media, run_values
+from symsteer.leaderboard.site.run_page import run_values
 from symsteer.leaderboard.study import read_study
 from symsteer.leaderboard.summary import load_runs, summarize
 
@@ -77,9 +78,10 @@ def generate(
     found = analyse(summary, defects, read_study(study))
     board = Board(summary, found, defects, Path(study).stem, reading, tuple(_maps(audit)))
     files = {out / name: data for name, data in render(board).items()}
-    copies = {out / address: path for run in board.runs for address, _, _, path in media(run)} | {
-        out / picture.address: picture.path for picture in board.maps
-    }
+    clips = [clip for run in board.runs for clip in media(run)]
+    clips += [clip for table in summary.tables for clip in shared_media(table)]
+    copies = {out / address: path for address, _, _, path in clips}
+    copies |= {out / picture.address: picture.path for picture in board.maps}
     write_together(files, _stale(out, {*files, *copies}), durable=False)
     _copy(copies)
     if reading.built:

@@ -12,6 +12,7 @@ from symsteer.leaderboard.defects import MEASURES, defect_of
 from symsteer.leaderboard.map_page import COLOUR, map_section
 from symsteer.leaderboard.site import charts, markup
 from symsteer.leaderboard.site.board import Board, breaks, dials, strengths
+from symsteer.leaderboard.site.clips import shared_media
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import Row, Run, Table
 from symsteer.leaderboard.tables import section, status
@@ -238,6 +239,7 @@ def cell(board: Board, table: Table, before: Table | None, after: Table | None) 
         "q": charts.q_chart(table),
         "equivariance": charts.equivariance_chart(table),
         "directions": charts.direction_chart(table),
+        "media": [(f"../{address}", kind, name) for address, kind, name, _ in shared_media(table)],
         "runs": [
             (row.label, [(run, f"../{board.run(run)}") for run in row.runs])
             for row in table.rows

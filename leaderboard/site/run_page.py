@@ -2,44 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-from symsteer.leaderboard.paths import RECORD
 from symsteer.leaderboard.records import Evaluation
 from symsteer.leaderboard.site import charts
-from symsteer.leaderboard.site.board import DIGITS, Board, dials
+from symsteer.leaderboard.site.board import Board, dials
+from symsteer.leaderboard.site.clips import media
 from symsteer.leaderboard.site.pages import flat
 from symsteer.leaderboard.site.repeat import repeat_command
 from symsteer.leaderboard.summary import Run
 from symsteer.leaderboard.text import NOTHING, compact, count, number
-
-MEDIA = {"film-*.mp4": "video/mp4", "paths-*.png": "image/png"}
-"""What `symsteer film` writes into a run's folder."""
-
-BEGINNINGS = {"video/mp4": (4, b"ftyp"), "image/png": (0, b"\x89PNG\r\n\x1a\n")}
-"""Where such a file says what it is. Others are not copied into the site."""
-
-
-def media(run: Run) -> Iterator[tuple[str, str, str, Path]]:
-    """Address, type, name and path of the clips and pictures in a run's folder."""
-    if run.path.name != RECORD:
-        return
-    for pattern, kind in MEDIA.items():
-        for path in sorted(run.path.parent.glob(pattern)):
-            start, mark = BEGINNINGS[kind]
-            if path.is_symlink() or not path.is_file():
-                continue
-            with open(path, "rb") as file:
-                if file.read(32)[start : start + len(mark)] != mark:
-                    continue
-                file.seek(0)
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            stem, suffix = path.name.split("-")[0], path.suffix
-            yield f"media/{stem}-{digest[:DIGITS]}{suffix}", kind, path.stem, path
 
 
 def run_values(board: Board, run: Run) -> dict[str, Any]:

@@ -1,13 +1,9 @@
 """Using what was trained: a run as an object that acts, and its videos."""
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import symsteer
-from symsteer.bench.runs.film import film
-from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
@@ -76,18 +72,3 @@ def test_the_public_names_are_those_of_the_page():
     assert all(hasattr(symsteer, name) for name in symsteer.__all__)
     with pytest.raises(AttributeError, match="no attribute 'mkae'"):
         _ = symsteer.mkae
-
-
-def test_a_film_is_a_video_or_the_picture_of_paths(finished):
-    path = film(finished[1], "action_gain:1", episodes=2)
-    if rendering_works():
-        assert path.name == "film-action_gain=1.mp4"
-        assert path.stat().st_size > 5000
-    else:
-        assert path.name == "paths-action_gain=1.png"
-        assert np.asarray(Image.open(path)).std() > 10
-    path.unlink()
-    with pytest.raises(UserError, match="--episodes is 0"):
-        film(finished[1], episodes=0)
-    with pytest.raises(UserError, match="did you mean 'action_gain'"):
-        film(finished[1], variant="action_gian:1")

@@ -21,7 +21,7 @@ from symsteer.leaderboard.summary import load_runs, summarize
 from symsteer.leaderboard.tables import cell_name, render_csv
 from symsteer.leaderboard.text import compact, interval, number
 from tests.leaderboard.record_factory import make_evaluation, make_record
-from tests.leaderboard.site.conftest import EVIL, picture, write_all
+from tests.leaderboard.site.conftest import EVIL, VIDEO, picture, write_all
 from tests.leaderboard.site.pages import Page, dead_links, read_pages
 
 TAGS = frozenset(
@@ -208,6 +208,17 @@ def test_clips_and_paths_of_a_run_folder_are_copied(site: Path) -> None:
         if tag in ("img", "video")
     ]
     assert len(shown) == 2
+
+
+def test_films_side_by_side_are_on_the_page_of_their_cell(tmp_path: Path) -> None:
+    records = [make_record(agent=agent, variant="wind:0.5") for agent in ("base", "zero")]
+    write_all(records, tmp_path / "runs")
+    for name in ("film-PickCube-v1-floating-wind=0.5.mp4", "film-PickCube-v1-floating-wind=1.mp4"):
+        (tmp_path / "runs" / name).write_bytes(VIDEO)
+    generate([tmp_path / "runs"], tmp_path / "site", PAPER, docs=False)
+    (page,) = read_pages(tmp_path / "site" / "cells").values()
+    assert [tag for tag, _ in page.elements].count("video") == 1
+    assert "film-PickCube-v1-floating-wind=0.5" in page.text
 
 
 def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
