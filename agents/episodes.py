@@ -14,7 +14,7 @@ class Rollout:
     """Full-length episodes: N episodes of T decisions each.
 
     Attributes:
-        episodes: columns ``seed, success_once, success_at_end, return, episode_len`` of
+        episodes: columns ``seed, success_once, success_at_end, return, episode_len, direction`` of
             ManiSkill's metrics, each ``[N]``.
         obs: observation of every decision, ``[T, N, obs_dim]``.
         noise: chosen by the agent, ``[T, N, Tp, Da]``.

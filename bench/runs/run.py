@@ -274,8 +274,14 @@ def evaluate(
         run_id=folder.name,
         variant=variant_text(variants),
         evaluation=evaluation,
-        recorded=evaluation.episodes == final.episodes if final and comparable else None,
+        recorded=_alike(evaluation.episodes, final.episodes) if final and comparable else None,
     )
+
+
+def _alike(one: Episodes, other: Episodes) -> bool:
+    """Whether episodes are equal. Their directions follow from the seeds; old records lack them."""
+    parts = [episodes.model_copy(update={"direction": None}) for episodes in (one, other)]
+    return parts[0] == parts[1]
 
 
 def _check_all(config: RunConfig, workers: int) -> None:

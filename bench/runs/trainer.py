@@ -26,7 +26,6 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.evaluator import Evaluator, discount, make_env, timeouts_end
 from symsteer.bench.runs.folder import CHECKPOINT
 from symsteer.bench.runs.replays import store_replay
-from symsteer.bench.steering.directions import directions
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import task_class
 from symsteer.bench.variants import build, evaluation_variants, highest_cost
@@ -220,10 +219,7 @@ class Trainer:
         wanted = self.config.evaluation
         share = 1.0 if final else self.share
         self.evaluator.enter(evaluation_variants(self.config.variants, share))
-        rollout = self.evaluator.play(wanted.final_episodes if final else wanted.episodes)
-        columns = dict(rollout.episodes)
-        if (direction := directions(rollout.obs[0], self.base.obs_layout)) is not None:
-            columns["direction"] = direction
+        columns = self.evaluator.play(wanted.final_episodes if final else wanted.episodes).episodes
         played = time.perf_counter()
         diagnostics = dict(
             self.evaluator.diagnose(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from symsteer.agents.episodes import DECISION_FIELDS, LongEpisodes, Rollout
+from symsteer.bench.steering.directions import directions
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import steerability_seeds
 from symsteer.errors import UserError
@@ -48,6 +49,7 @@ def _rollout_batch(
     env: LatentNoiseEnv, act: Act, seeds: list[int], rows: torch.Tensor, keep: int
 ) -> Rollout:
     obs = env.reset(seeds)
+    direction = directions(obs, env.policy.obs_layout)
     decisions = math.ceil(env.max_episode_steps / env.execute)
     steps: dict[str, list[torch.Tensor]] = {name: [] for name in DECISION_FIELDS}
     running = torch.ones(env.num_envs, dtype=torch.bool, device=obs.device)
@@ -63,6 +65,8 @@ def _rollout_batch(
     # All episodes end with the last decision, so the rows are the environments in order.
     episodes = {name: value[:keep] for name, value in result.episodes.items()}
     episodes["seed"] = torch.tensor(seeds[:keep])
+    if direction is not None:
+        episodes["direction"] = direction[:keep]
     return Rollout(episodes=episodes, **{k: torch.stack(v) for k, v in steps.items()})
 
 

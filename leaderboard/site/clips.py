@@ -32,12 +32,11 @@ def shared_media(table: Table) -> Iterator[Clip]:
     """Those of a cell's runs side by side, beside the folders of the runs."""
     key = table.key
     text = file_name(f"{key.task}-{key.embodiment}-{key.variant}")
-    # Such names come from records; they must stay in the folder.
-    if "/" in text or "\0" in text:
-        return
     folders = sorted({run.path.parent.parent for run in table.runs if run.path.name == RECORD})
+    # Names in records may be anything, so they are compared and not joined to a path.
+    files = [path for folder in folders for path in sorted(folder.iterdir())]
     for name, kind in KINDS.items():
-        yield from _clips([folder / name.format(text) for folder in folders], kind)
+        yield from _clips([path for path in files if path.name == name.format(text)], kind)
 
 
 def _clips(paths: Iterable[Path], kind: str) -> Iterator[Clip]:

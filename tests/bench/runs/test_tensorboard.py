@@ -91,7 +91,7 @@ def assert_equals_record(folder):
         values = {
             f"eval/{name}": sum(column) / len(column)
             for name, column in episodes.items()
-            if name not in ("seed", "nonfinite")
+            if name not in ("seed", "direction", "nonfinite")
         }
         for name, value in evaluation.diagnostics.items():
             kind = evaluation.nonfinite.get(f"diagnostics/{name}")

@@ -130,12 +130,13 @@ def hover_text(visit: Visit, figure: Any, marker: int = 0) -> str:
 
 def test_points_tell_what_they_are(site: Path, context: Any) -> None:
     visit = Visit(context, sorted((site / "cells").glob("pickcube*wind*"))[0])
-    success, q, equivariance = visit.page.locator("figure.chart").all()
+    success, q, equivariance, directions = visit.page.locator("figure.chart").all()
     assert "steps: " in hover_text(visit, success)
     success.get_by_role("button", name="single runs").click()
     assert "[" in hover_text(visit, success, success.locator(".plot .points path").count() - 1)
     assert "steps: \u2212" in hover_text(visit, q)
     assert "0.31" in hover_text(visit, equivariance)
+    assert "\u2212180" in hover_text(visit, directions)
     assert not visit.troubles
 
 
