@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
@@ -23,6 +23,7 @@ from symsteer.leaderboard.records import (
     Role,
     RunRecord,
     config_hash,
+    flat,
     read_record,
 )
 from symsteer.leaderboard.records.curves import area_under_curve
@@ -560,20 +561,18 @@ def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     """The settings that define a row as texts; those of the agent without a prefix."""
     return {
         key.removeprefix("agent_options."): value
-        for key, value in flat(config)
+        for key, value in setting_texts(config).items()
         if not any(part in CELL or _is_seed(part) for part in key.split("."))
     }
 
 
-def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def setting_texts(config: Mapping[str, Any]) -> dict[str, str]:
     """All settings but those of the machine as texts, keys of nested tables joined by dots."""
-    for key, value in config.items():
-        if key in MACHINE:
-            continue
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value if isinstance(value, str) else json.dumps(value)
+    return {
+        key: value if isinstance(value, str) else json.dumps(value)
+        for key, value in flat(config).items()
+        if not MACHINE.intersection(key.split("."))
+    }
 
 
 def _points(run: Run) -> tuple[list[int], list[float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 BOARD = "http://localhost:6006/#custom_scalars&_smoothingWeight=0"
 """Where `tensorboard` shows the charts of runs, without smoothing."""
@@ -17,6 +18,19 @@ def printable(text: str) -> str:
     Files and arguments can bring such characters into a message.
     """
     return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
+
+
+def typed(name: str, value: Any) -> list[str]:
+    """An option as the words that one types: flags have no value, lists have several.
+
+    Args:
+        name: as in a configuration, e.g. ``policy.batch_size``.
+    """
+    *tables, last = name.replace("_", "-").split(".")
+    if isinstance(value, bool):
+        return ["--" + ".".join([*tables, last if value else f"no-{last}"])]
+    values = value if isinstance(value, list) else [value]
+    return ["--" + ".".join([*tables, last]), *map(str, values)]
 
 
 def complain(error: BaseException, text: str, code: int) -> int:

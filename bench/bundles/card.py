@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from symsteer.bench.bundles.contents import Contents
 from symsteer.bench.bundles.manifest import BundledFile, Code, next_commands
 from symsteer.bench.bundles.measure import Measured
-from symsteer.bench.runs.config import flat
 from symsteer.bench.tasks import TASKS
+from symsteer.leaderboard.records import flat
+from symsteer.terminal import typed
 
 LICENCE = "Apache-2.0"
 """Of SymSteer, and so of the demonstrations and policies that it makes."""
@@ -100,7 +100,7 @@ def how_made(contents: Contents) -> str:
         return f"The run that it was taken from began with files of its user: {files}."
     defaults = flat(type(config.policy)().to_json())
     options = [
-        f" {_typed(key.replace('_', '-'), value)}"
+        f" {shlex.join(typed(f'policy.{key}', value))}"
         for key, value in flat(config.policy.to_json()).items()
         if value != defaults[key]
     ]
@@ -111,14 +111,6 @@ def how_made(contents: Contents) -> str:
         f"{''.join(options)}"
     )
     return f"`symsteer run` trains this policy before it steers it:\n\n```sh\n{command}\n```"
-
-
-def _typed(name: str, value: Any) -> str:
-    """An option of a policy as it is typed: flags have no value, lists have several."""
-    if isinstance(value, bool):
-        return f"--policy.{'' if value else 'no-'}{name}"
-    values = value if isinstance(value, list) else [value]
-    return f"--policy.{name} {' '.join(shlex.quote(str(v)) for v in values)}"
 
 
 def _measured_table(measured: Measured) -> str:

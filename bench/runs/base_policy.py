@@ -14,12 +14,12 @@ from tqdm import tqdm
 from symsteer.agents.replay import Transition
 from symsteer.bench.demos import FORMAT, MODES, Demonstrations, collect, load
 from symsteer.bench.demos.decisions import decisions
-from symsteer.bench.runs.config import RunConfig, build_config, content_key, flat
+from symsteer.bench.runs.config import RunConfig, build_config, content_key
 from symsteer.bench.steering.evaluation import DRAWS, Steerability, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import BasePolicy
+from symsteer.leaderboard.records import BasePolicy, flat
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path, save_policy

@@ -214,17 +214,6 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
         raise UserError(f"{where}{error}") from error
 
 
-def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one table, keys joined by dots, e.g. ``policy.width``."""
-    found: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            found |= flat(value, f"{prefix}{key}.")
-        else:
-            found[prefix + key] = value
-    return found
-
-
 def check_keys(data: Iterable[str], valid: Iterable[str], source: str, prefix: str = "") -> None:
     """Check that all keys are valid.
 

@@ -21,10 +21,10 @@ from torch.utils.tensorboard import SummaryWriter
 
 from symsteer.agents import AGENTS
 from symsteer.bench.runs.charts import DESCRIPTIONS, LAYOUT
-from symsteer.bench.runs.config import RunConfig, flat
+from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.pictures import to_gif
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import Provenance, RunRecord
+from symsteer.leaderboard.records import Provenance, RunRecord, flat
 from symsteer.policies import POLICIES
 
 IDENTITY = frozenset({"task", "embodiment", "variant", "agent", "seed"})

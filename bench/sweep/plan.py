@@ -11,12 +11,13 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from symsteer.bench.runs.config import RunConfig, flat
+from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import run_id, write_json
 from symsteer.bench.runs.run import check
 from symsteer.bench.runs.tracking import Tracking
 from symsteer.bench.sweep.suite import Suite
 from symsteer.errors import UserError
+from symsteer.leaderboard.records import flat
 
 BASIC = ("task", "embodiment", "variant", "agent", "seed")
 """Keys of a configuration that all tables and lines show."""

@@ -16,7 +16,7 @@ from typing import TypeAlias
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.compare.sides import Leftover, Side
-from symsteer.leaderboard.summary import Key, Run, flat
+from symsteer.leaderboard.summary import Key, Run, setting_texts
 
 OPTIONS = "agent_options."
 BASE_POLICY = "base policy"
@@ -146,7 +146,7 @@ def facts_of(run: Run, with_agent: bool = True) -> dict[str, str]:
     """What tells a run from others: settings, base policy, held-out episodes."""
     settings = {
         key: value
-        for key, value in flat(run.record.config)
+        for key, value in setting_texts(run.record.config).items()
         if with_agent or not (key == "agent" or key.startswith(OPTIONS))
     }
     return settings | {BASE_POLICY: run.policy, "held-out episodes": str(list(run.final_success))}

@@ -28,7 +28,7 @@ from symsteer.leaderboard.records.schema import (
     RunSettings,
     WallClock,
 )
-from symsteer.leaderboard.records.values import canonical_json, config_hash, portable
+from symsteer.leaderboard.records.values import canonical_json, config_hash, flat, portable
 
 __all__ = [
     "HELD_OUT_SEED",
@@ -52,6 +52,7 @@ __all__ = [
     "canonical_json",
     "config_hash",
     "dump_record",
+    "flat",
     "portable",
     "read_record",
     "write_record",

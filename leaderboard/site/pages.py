@@ -10,6 +10,7 @@ from typing import Any
 from symsteer.leaderboard import page
 from symsteer.leaderboard.defects import MEASURES, defect_of
 from symsteer.leaderboard.map_page import COLOUR, map_section
+from symsteer.leaderboard.records import flat
 from symsteer.leaderboard.site import charts, markup
 from symsteer.leaderboard.site.board import Board, breaks, dials, strengths
 from symsteer.leaderboard.site.clips import shared_media
@@ -285,7 +286,7 @@ def agent(board: Board, name: str) -> Values:
         "facts": board.docs.agent(name, "../"),
         "text": board.docs.agent_page(name, "../"),
         "page": board.docs.page("agents.md", "../"),
-        "options": flat(options if isinstance(options, Mapping) else {}),
+        "options": options_of(options if isinstance(options, Mapping) else {}),
         "chart": charts.standing_chart(
             [(board.names[table.key], row, table.best_reference) for table, row in shown]
         )
@@ -315,16 +316,12 @@ def _standing(table: Table, name: str) -> list[Row]:
     return page.at_a_glance(table, name)
 
 
-def flat(table: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+def options_of(table: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Nested settings as names with dots and texts."""
-    found = []
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            found += flat(value, f"{prefix}{key}.")
-        else:
-            text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-            found.append((prefix + key, text))
-    return found
+    return [
+        (key, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
+        for key, value in flat(table).items()
+    ]
 
 
 def variants(board: Board) -> Values:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
+
+from symsteer.leaderboard.records import flat
+from symsteer.terminal import typed
 
 DERIVED = ("evaluation_variant", "files")
 """Keys that the run adds to its configuration."""
@@ -19,9 +22,6 @@ KEYS = frozenset(
 )
 """The keys of a run's configuration that are options of `symsteer run`. Others that this verb has,
 such as `--out`, are no part of a configuration, and a record must not bring them in."""
-
-PREFIXES = {"agent_options": "agent"}
-"""Tables whose options have another name on the command line."""
 
 FILES = {"demonstrations": ("--demos", "FILE.h5"), "policy": ("--base-policy", "FILE.safetensors")}
 """Options and placeholders of the files from which a run may have started."""
@@ -47,10 +47,11 @@ def repeat_command(config: Mapping[str, Any]) -> str | None:
     own = {key: value for key, value in config.items() if key not in DERIVED}
     if not own.keys() <= KEYS:
         return None
-    for key, value in _flat(own):
-        if not OPTION.fullmatch(key):
+    for key, value in flat(own).items():
+        name = key.replace("agent_options.", "agent.", 1)
+        if not OPTION.fullmatch(name):
             return None
-        option = _option(key, value)
+        option = typed(name, value)
         if not all(VALUE.fullmatch(word) for word in option[1:]):
             return None
         words += option
@@ -60,26 +61,3 @@ def repeat_command(config: Mapping[str, Any]) -> str | None:
             return None
         words += FILES[key]
     return shlex.join(words)
-
-
-def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys joined by dots, with the names that they have on the command line."""
-    for key, value in table.items():
-        name = prefix + PREFIXES.get(key, key)
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{name}.")
-        else:
-            yield name, value
-
-
-def _option(key: str, value: Any) -> list[str]:
-    """An option as words: flags say themselves which value they have, lists have several."""
-    *tables, name = key.replace("_", "-").split(".")
-    if isinstance(value, bool):
-        return ["--" + ".".join([*tables, name if value else f"no-{name}"])]
-    values = value if isinstance(value, list) else [value]
-    return ["--" + ".".join([*tables, name]), *map(_text, values)]
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else repr(value)

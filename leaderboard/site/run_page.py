@@ -9,7 +9,7 @@ from symsteer.leaderboard.records import Evaluation
 from symsteer.leaderboard.site import charts
 from symsteer.leaderboard.site.board import Board, dials
 from symsteer.leaderboard.site.clips import media
-from symsteer.leaderboard.site.pages import flat
+from symsteer.leaderboard.site.pages import options_of
 from symsteer.leaderboard.site.repeat import repeat_command
 from symsteer.leaderboard.summary import Run
 from symsteer.leaderboard.text import NOTHING, compact, count, number
@@ -69,7 +69,7 @@ def run_values(board: Board, run: Run) -> dict[str, Any]:
         "facts": {key: text for key, text in facts.items() if text},
         "made": {key: text for key, text in made.items() if text},
         "command": command and re.split(" (?=--)", command),
-        "config": flat(record.config),
+        "config": options_of(record.config),
         "charts": charts.run_charts(record, run, run.feasible) if run.curve else [],
         "episodes": charts.episodes_chart(run) if run.curve else None,
         "evaluations": [_evaluation(evaluation) for evaluation in run.curve.values()],

@@ -11,12 +11,12 @@ import pytest
 from symsteer.bench.bundles.bundle import write_bundle
 from symsteer.bench.bundles.contents import contents_of_run
 from symsteer.bench.runs.checkpoint import load_checkpoint
-from symsteer.bench.runs.config import RunConfig, flat
+from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep.plan import make_plan, write_manifest
 from symsteer.bench.sweep.suite import Suite
-from symsteer.leaderboard.records import dump_record
+from symsteer.leaderboard.records import dump_record, flat
 from tests.bench.tiny_run import tiny_config
 from tests.fuzz.kinds import Workshop
 from tests.leaderboard.record_factory import make_record

@@ -38,11 +38,11 @@ from symsteer import cli
 from symsteer.bench.runs import base_policy
 from symsteer.bench.runs import run as run_module
 from symsteer.bench.runs.checkpoint import CHECKSUM_BYTES, FORMAT, load_checkpoint
-from symsteer.bench.runs.config import RunConfig, flat
+from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.bench.tasks import task_class
-from symsteer.leaderboard.records import config_hash, read_record
+from symsteer.leaderboard.records import config_hash, flat, read_record
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 from symsteer.variant import parse_variant, variant_text
