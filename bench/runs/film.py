@@ -8,7 +8,6 @@ from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from symsteer.bench.runs.evaluator import Evaluator
 from symsteer.bench.runs.pictures import (
@@ -22,15 +21,13 @@ from symsteer.bench.runs.pictures import (
 )
 from symsteer.bench.runs.stored import Restored, restored
 from symsteer.bench.runs.trainer import feasible_return
+from symsteer.bench.sim.caption import captioned
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.variants import evaluation_variants, read
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
 from symsteer.variant import VariantSpec, file_name, variant_text
-
-CAPTION = 26
-"""Height of the captions of films side by side, in pixels."""
 
 COLUMNS = 4
 """Films side by side, at most; more of them begin another row."""
@@ -139,18 +136,14 @@ def _episode(
 
 
 def _panel(played: Filmed, caption: str, step: int) -> np.ndarray:
-    """A frame below its caption, ``[CAPTION + height, width, 3]``; the last frame stays."""
+    """A frame below its caption; the last frame stays."""
     last = len(played.frames) - 1
     text, color, ground = caption, "black", "white"
     if step >= last:
         seconds = last / FRAMES_PER_SECOND
         text += f": solved in {seconds:.1f} s" if played.solved else ": not solved"
         color, ground = "white", SUCCESS if played.solved else FAILURE
-    frame = played.frames[min(step, last)]
-    bar = Image.new("RGB", (frame.shape[1], CAPTION), ground)
-    font = ImageFont.load_default(15)
-    ImageDraw.Draw(bar).text((8, CAPTION / 2), text, fill=color, font=font, anchor="lm")
-    return np.concatenate([np.asarray(bar), frame])
+    return captioned(played.frames[min(step, last)], text, color, ground)
 
 
 def _in_rows(pictures: Sequence[np.ndarray]) -> np.ndarray:

@@ -17,6 +17,7 @@ import sapien
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image
 
+from symsteer.bench.sim.caption import captioned
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.tasks.tilted import Tilted
@@ -25,7 +26,7 @@ from symsteer.errors import UserError
 SIZE = 320
 CAMERA = {
     "pose": look_at([0.5, 0.65, 0.55], [0.0, 0.0, 0.08]),
-    "fov": 1.0,
+    "fov": 0.8,
     "width": SIZE,
     "height": SIZE,
 }
@@ -66,7 +67,10 @@ def _camera_pose(task: str, seed: int) -> sapien.Pose:
 
 def task_picture(task: str, axis: int = 1, seed: int = 1, steps: int = 8) -> np.ndarray:
     """One task with all embodiments, along ``axis`` (0: in a column, 1: side by side), uint8."""
-    frames = [snapshot(task, e, seed, steps)[SIZE // 5 :] for e in EMBODIMENTS]
+    frames = [
+        captioned(snapshot(task, e, seed, steps)[SIZE // 5 :], f"{task.removesuffix('-v1')}, {e}")
+        for e in EMBODIMENTS
+    ]
     return np.concatenate(frames, axis=axis)
 
 

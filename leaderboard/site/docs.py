@@ -81,6 +81,13 @@ class Documentation:
         picture = f"tasks/{stem}.png"
         return (picture, f"tasks/{stem}.md") if (self.folder / picture).is_file() else None
 
+    def variant_picture(self, name: str) -> str | None:
+        """Name of a variant's picture, below the documentation's folder."""
+        if self.folder is None or not re.fullmatch(r"[a-z0-9_]+", name):
+            return None
+        picture = f"variants/{name}.png"
+        return picture if (self.folder / picture).is_file() else None
+
     def page(self, name: str, root: str) -> str | None:
         """Address of a page of the documentation, given as `agents.md`; None if it is not built."""
         path, hash_sign, anchor = name.partition("#")

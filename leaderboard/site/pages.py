@@ -349,6 +349,7 @@ def variant(board: Board, name: str) -> Values:
     """One way to break the symmetry: what it does, how much, and the cells that have it."""
     audited = board.audited(name)
     maps = [found for found in board.maps if name in dials(found.variant)]
+    picture = board.docs.variant_picture(name) if board.docs.built else None
     rising = sorted(maps, key=lambda found: strengths(found.variant))
     strongest = list({(found.task, found.embodiment): found for found in rising}.values())
     return {
@@ -356,6 +357,7 @@ def variant(board: Board, name: str) -> Values:
         "facts": board.docs.variant(name, "../"),
         "notes": board.docs.notes(name, "../"),
         "page": board.docs.page("variants.md", "../"),
+        "picture": picture and f"../docs/{picture}",
         "audit_page": board.docs.page("audit.md", "../"),
         "chart": charts.audit_chart([cell[:5] for cell in audited]) if audited else None,
         "audited": [
