@@ -654,6 +654,7 @@ def throughput(
     cores: int = 0,
     memory: bool = False,
     learner: bool = False,
+    decode: bool = False,
     run: bool = False,
     runs: Path = Path("runs"),
     json: bool = False,
@@ -668,6 +669,7 @@ def throughput(
         cores: Processes in the measurement on all cores; 0: one per core.
         memory: Only measure how memory grows over 10,000 steps with resets.
         learner: Only measure the CPU time of an update of each learner.
+        decode: Only measure the CPU time in which each base policy decodes.
         run: Only measure the CPU time of whole runs with the default settings, alone and in teams
             of five, two agents; about an hour for each repeat.
         runs: Folder that keeps the base policy of these runs.
@@ -683,6 +685,12 @@ def throughput(
 
         rows = learner_throughput.measure(task, updates=20, repeats=repeats, report=report)
         print(speed.dump({"rows": rows}) if json else learner_throughput.table(rows))
+        return 0
+    if decode:
+        from symsteer.bench import decode_throughput
+
+        rows = decode_throughput.measure(task, calls=10, repeats=repeats, report=report)
+        print(speed.dump({"rows": rows}) if json else decode_throughput.table(rows))
         return 0
     if run:
         from symsteer.bench import run_throughput

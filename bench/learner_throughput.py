@@ -1,7 +1,7 @@
 """CPU time of an update of each learner, side by side with what bounds it.
 
 The base policy has the default size and is untrained, transitions are random: neither changes the
-cost. All contenders run in turns, so that a change in the machine's speed reaches all of them.
+cost.
 """
 
 from __future__ import annotations
@@ -9,13 +9,11 @@ from __future__ import annotations
 import functools
 import importlib.util
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext
@@ -24,19 +22,14 @@ from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
 from symsteer.bench.tasks import task_class
+from symsteer.bench.timing import in_turns, products_of
 from symsteer.policies import POLICIES
 
 DECISIONS = 512
 """Random decisions in the replay."""
 
-WARM_UP = 5
-"""Updates before the first measurement."""
-
 TEAM = 5
 """Members of a team."""
-
-PRODUCTS = ("mm", "addmm", "bmm", "baddbmm")
-"""Operations that multiply matrices."""
 
 
 @dataclass
@@ -79,18 +72,14 @@ def measure(
         update of one member: ``median``, ``min``, ``max``.
     """
     contenders = _contenders(task, agents)
-    for contender in contenders:
-        for _ in range(WARM_UP):
-            contender.run()
-    times: list[list[float]] = [[] for _ in contenders]
-    for turn in range(repeats):
-        for found, contender in zip(times, contenders, strict=True):
-            begin = time.process_time()
-            for _ in range(updates):
-                contender.run()
-            seconds = time.process_time() - begin
-            found.append(1e3 * seconds / updates / contender.members)
-        report(f"round {turn + 1} of {repeats}")
+    times = [
+        [spent / contender.members for spent in found]
+        for contender, found in zip(
+            contenders,
+            in_turns([contender.run for contender in contenders], updates, repeats, report),
+            strict=True,
+        )
+    ]
     return [
         {
             **{key: value for key, value in vars(contender).items() if key != "run"},
@@ -143,36 +132,9 @@ def _contenders(task: str, agents: Sequence[str]) -> list[Contender]:
                 run = functools.partial(_update_team, Team(team))
                 found.append(Contender(name, "update", critic, TEAM, size, run))
     context = _context(task, 0)
-    some, size = _decisions(context, context.horizon), _batch_size()
-    decode = functools.partial(context.decode, some.obs[:size], some.noise[:size])
-    found.append(Contender("decoder", "decode", "", 1, 0, decode))
-    found.append(Contender("decoder", "products alone", "", 1, 0, products_of(decode)))
     if importlib.util.find_spec("stable_baselines3"):
         found.append(Contender("stable-baselines3", "update", "noise", 1, 0, _sb3(context)))
     return found
-
-
-def products_of(run: Callable[[], Any]) -> Callable[[], None]:
-    """The matrix products of a computation alone, on the same matrices."""
-    seen: list[tuple[Any, list[torch.Tensor]]] = []
-
-    class Products(TorchDispatchMode):
-        def __torch_dispatch__(
-            self, function: Any, types: Any, args: Any = (), kwargs: Any = None
-        ) -> Any:
-            if function._schema.name.removeprefix("aten::") in PRODUCTS:
-                seen.append((function, [matrix.detach() for matrix in args]))
-            return function(*args, **(kwargs or {}))
-
-    with Products():
-        run()
-
-    def products() -> None:
-        with torch.no_grad():
-            for function, matrices in seen:
-                function(*matrices)
-
-    return products
 
 
 def _context(task: str, seed: int) -> AgentContext:

@@ -12,8 +12,14 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from symsteer.agents import AGENTS
 from symsteer.agents.options import critics_of
-from symsteer.bench import learner_throughput, run_throughput, throughput
+from symsteer.bench import (
+    decode_throughput,
+    learner_throughput,
+    run_throughput,
+    throughput,
+)
 from symsteer.bench.throughput import Replay, Row, Turn, _Stopwatch
+from symsteer.bench.timing import products_of
 from symsteer.errors import UserError
 from tests.bench.tiny_run import tiny_config
 
@@ -170,8 +176,6 @@ def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
             assert ((name, "update", 5, critic) in kinds) == (name != "partial")
     others = {kind for kind in kinds if kind[0] not in learners}
     assert others == {
-        ("decoder", "decode", 1, ""),
-        ("decoder", "products alone", 1, ""),
         ("stable-baselines3", "update", 1, "noise"),
     }
     text = learner_throughput.table(rows)
@@ -179,6 +183,23 @@ def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
         row for row in text.splitlines() if row.split()[:3] == ["standard", "update", "noise"]
     )
     assert line.endswith("1.00")
+
+
+def test_decoders_are_timed_beside_their_products():
+    names = ("edp", "plain", "so2")
+    rows = decode_throughput.measure(TASK, 1, 2, lambda text: None, names)
+    assert [(row["policy"], row["chunks"]) for row in rows] == [
+        (name, chunks) for name in names for chunks in (64, 192)
+    ]
+    for row in rows:
+        assert 0 < row["products"] < row["median"]
+        assert 0 < row["min"] <= row["median"] <= row["max"]
+        assert row["sampling_steps"] == 2
+    *_, first, second = decode_throughput.table(rows[:2]).splitlines()
+    assert first.split()[:4] == ["edp", f"{rows[0]['parameters']:,}", "2", "64"]
+    assert second.split()[0] == "edp"
+    assert " 1.00 " in first
+    assert " 1.00 " in second
 
 
 def test_whole_runs_are_timed_alone_and_in_teams(tmp_path):
@@ -205,7 +226,7 @@ def test_the_products_of_an_update_are_the_same_products():
     def compute():
         done.append((a @ b).relu().sum())
 
-    products = learner_throughput.products_of(compute)
+    products = products_of(compute)
     assert len(done) == 1
     with FlopCounterMode(display=False) as counter:
         products()

@@ -1,0 +1,108 @@
+"""CPU time in which base policies decode noise, beside that of their matrix products alone.
+
+The policies have their default sizes and are untrained, which does not change the cost. All take
+turns. Action critics decode in every update, so this is a large part of a run's time.
+"""
+
+from __future__ import annotations
+
+import functools
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+from symsteer.bench.tasks import task_class
+from symsteer.bench.timing import in_turns, products_of
+from symsteer.errors import UserError
+from symsteer.policies import POLICIES
+from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.networks.denoiser import parameter_count
+
+CHUNKS = (64, 192)
+"""Chunks that are decoded at once: those of 64 environments, those of a batch of an update."""
+
+
+def measure(
+    task: str,
+    calls: int,
+    repeats: int,
+    report: Callable[[str], None],
+    policies: Sequence[str] = tuple(POLICIES.builtin),
+) -> list[dict[str, Any]]:
+    """Time the decoders of policies.
+
+    Args:
+        task: gives the layouts.
+        calls: in one measurement.
+        repeats: measurements of each contender.
+        report: receives a line for each round, and for each policy that cannot be built here.
+        policies: names.
+
+    Returns:
+        A row for each policy and number of ``chunks``: ``policy``, ``parameters``,
+        ``sampling_steps`` (None for policies without them), milliseconds of one call ``median``,
+        ``min``, ``max``, and ``products``, the median of the matrix products alone.
+    """
+    rows: list[dict[str, Any]] = []
+    contenders: list[Callable[[], Any]] = []
+    for name in policies:
+        try:
+            policy = _policy(task, name)
+        except UserError as error:
+            report(f"without {name}: {error}")
+            continue
+        for chunks in CHUNKS:
+            decode = functools.partial(policy.decode, *_inputs(policy, chunks))
+            rows.append(
+                {
+                    "policy": name,
+                    "parameters": parameter_count(policy),
+                    "sampling_steps": getattr(policy.options, "sampling_steps", None),
+                    "chunks": chunks,
+                }
+            )
+            contenders += [decode, products_of(decode)]
+    times = in_turns(contenders, calls, repeats, report)
+    for row, found, products in zip(rows, times[::2], times[1::2], strict=True):
+        row |= {"median": statistics.median(found), "min": min(found), "max": max(found)}
+        row |= {"products": statistics.median(products)}
+    return rows
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Text table of :func:`measure`; ratios to the first policy with as many chunks."""
+    units = {row["chunks"]: row["median"] for row in reversed(rows)}
+    lines = [
+        "CPU time of one call of decode, one thread; median of the measurements (smallest to "
+        "largest), and of its matrix products alone",
+        "",
+        f"{'policy':16s} {'parameters':>10s} {'steps':>5s} {'chunks':>6s} {'ms':>7s} {'':18s} "
+        f"{'ratio':>5s} {'products':>8s} {'share':>5s}",
+    ]
+    for row in rows:
+        spread = f"({row['min']:.1f} to {row['max']:.1f})"
+        lines.append(
+            f"{row['policy']:16s} {row['parameters']:10,d} {row['sampling_steps'] or '':>5} "
+            f"{row['chunks']:6d} {row['median']:7.2f} {spread:18s} "
+            f"{row['median'] / units[row['chunks']]:5.2f} {row['products']:8.2f} "
+            f"{row['products'] / row['median']:5.0%}"
+        )
+    return "\n".join(lines)
+
+
+def _policy(task: str, name: str) -> ChunkPolicy:
+    kind, policy = task_class(task), POLICIES.get(name)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        found = policy(policy.Options(), kind.observation_layout, kind.action_layout)
+    found.freeze()
+    return found
+
+
+def _inputs(policy: ChunkPolicy, chunks: int) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    obs = 0.1 * torch.randn(chunks, policy.obs_layout.dim, generator=generator)
+    noise = torch.randn(chunks, policy.horizon, policy.act_layout.dim, generator=generator)
+    return obs, noise

@@ -1,0 +1,71 @@
+"""CPU time of computations that take turns, and of their matrix products alone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+WARM_UP = 5
+"""Calls before the first measurement."""
+
+PRODUCTS = ("mm", "addmm", "bmm", "baddbmm", "convolution")
+"""Operations that multiply matrices."""
+
+
+def in_turns(
+    contenders: Sequence[Callable[[], Any]],
+    calls: int,
+    repeats: int,
+    report: Callable[[str], None],
+) -> list[list[float]]:
+    """CPU milliseconds of one call, ``repeats`` measurements of each contender.
+
+    They take turns, so that a change in the machine's speed reaches all of them.
+
+    Args:
+        contenders: what is timed.
+        calls: in one measurement.
+        repeats: measurements of each contender.
+        report: receives a line for each round.
+    """
+    for run in contenders:
+        for _ in range(WARM_UP):
+            run()
+    times: list[list[float]] = [[] for _ in contenders]
+    for turn in range(repeats):
+        for found, run in zip(times, contenders, strict=True):
+            begin = time.process_time()
+            for _ in range(calls):
+                run()
+            found.append(1e3 * (time.process_time() - begin) / calls)
+        report(f"round {turn + 1} of {repeats}")
+    return times
+
+
+def products_of(run: Callable[[], Any]) -> Callable[[], None]:
+    """The matrix products of a computation alone, on the same matrices."""
+    seen: list[tuple[Any, list[Any]]] = []
+
+    class Products(TorchDispatchMode):
+        def __torch_dispatch__(
+            self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+        ) -> Any:
+            if function._schema.name.removeprefix("aten::") in PRODUCTS:
+                seen.append(
+                    (function, [a.detach() if isinstance(a, torch.Tensor) else a for a in args])
+                )
+            return function(*args, **(kwargs or {}))
+
+    with Products():
+        run()
+
+    def products() -> None:
+        with torch.no_grad():
+            for function, args in seen:
+                function(*args)
+
+    return products
