@@ -187,10 +187,10 @@ def test_presets_load_for_every_agent(problem, name, preset):
         return
     options = kind.Options(**wanted)
     if name in TRAINED:
-        assert options != kind.Options()
+        assert wanted == {key: getattr(options, key) for key in wanted}
         small = {"width": 16, "batch_size": 8, "warmup": 0, "utd": 1.0}
         agent = problem.agent(name, **{**vars(options), **small})
-        agent.observe(problem.transition(8))
+        agent.observe(problem.transition(8, rows=agent.rows))
         for batch in agent.batches():
             scalars = agent.update(batch)
         assert agent.updates == 8
