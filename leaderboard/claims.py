@@ -173,7 +173,7 @@ def selected(cells: Cells, tables: Sequence[Table], audit: Audit) -> tuple[list[
     tables = [table for table in tables if _selects(cells, table.key, audit)]
     if not tables:
         return [], f"there are no {where(cells)}"
-    if cells.demonstrations is None:
+    if cells.demonstrations not in ("fewest", "most"):
         return tables, ""
     families: dict[Key, list[Table]] = defaultdict(list)
     for table in sorted(tables, key=lambda table: table.key.demonstrations):
@@ -193,6 +193,10 @@ def _selects(cells: Cells, key: Key, audit: Audit) -> bool:
         (cells.broken is None or cells.broken == bool(key.broken_by))
         and (cells.task is None or key.task in cells.task)
         and (cells.embodiment is None or key.embodiment in cells.embodiment)
+        and (cells.env_steps is None or key.env_steps in cells.env_steps)
+        and (
+            not isinstance(cells.demonstrations, tuple) or key.demonstrations in cells.demonstrations
+        )
         and (
             cells.variant is None
             or not {key.variant, *_parts(key.variant)}.isdisjoint(cells.variant)
@@ -210,9 +214,17 @@ def where(cells: Cells) -> str:
     for names in (cells.task, cells.embodiment, cells.variant):
         if names is not None:
             words += f" of {' or '.join(map(code, names))}"
-    if cells.demonstrations is not None:
+    if isinstance(cells.demonstrations, tuple):
+        words += f" with {_listed(cells.demonstrations)} demonstrations"
+    elif cells.demonstrations is not None:
         words += f" with the {cells.demonstrations} demonstrations"
+    if cells.env_steps is not None:
+        words += f" of {_listed(cells.env_steps)} steps"
     return words
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return " or ".join(f"{number:,}" for number in numbers)
 
 
 def _without_pairs(tables: Sequence[Table], claim: Claim, cells: Cells) -> str:

@@ -31,6 +31,8 @@ Words = Annotated[str, Field(pattern=r"^[\w ,;:.()'=%-]{1,120}$")]
 
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
 
+Numbers = Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)]
+
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -47,8 +49,10 @@ class Cells(_Table):
     embodiment: Names | None = None
     variant: Names | None = None
     """Variants with or without strength; a cell is selected if it has one of them."""
-    demonstrations: Literal["fewest", "most"] | None = None
-    """Of cells that differ in the number of demonstrations alone, those at this end."""
+    demonstrations: Literal["fewest", "most"] | Numbers | None = None
+    """Numbers of them, or: of cells that differ in this number alone, those at one end."""
+    env_steps: Numbers | None = None
+    """Budgets."""
 
 
 class Claim(_Table):

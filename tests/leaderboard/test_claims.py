@@ -336,6 +336,31 @@ def test_few_demonstrations_compare_the_ends() -> None:
     assert (fewest.cells, fewest.pairs, fewer.cells, fewer.pairs) == (1, 5, 2, 10)
     fewest, fewer = outcomes(demonstrations({10: 0.2, 50: 0.5}), *claimed)
     assert (fewest.verdict, fewer.verdict) == ("supported", "contradicted")
+    some, none = outcomes(
+        demonstrations({10: 0.4, 50: 0.2, 100: 0.3}),
+        claim_of(cells={"demonstrations": [50, 100]}),
+        claim_of(cells={"demonstrations": [5]}),
+    )
+    assert value(some) == pytest.approx(0.25)
+    assert none.reason == "there are no cells with 5 demonstrations"
+
+
+def test_budgets_are_told_apart() -> None:
+    records = [
+        record
+        for steps, advantage in ((12_000, 0.2), (60_000, -0.3))
+        for record in make_cell({"standard": 0.5, "equivariant": 0.5 + advantage}, env_steps=steps)
+    ]
+    short, gained, none = outcomes(
+        records,
+        claim_of(cells={"env_steps": [12_000]}),
+        claim_of(cells={"env_steps": [60_000]}, minus={"env_steps": [12_000]}, predicted=-1),
+        claim_of(cells={"env_steps": [1_000, 2_000]}),
+    )
+    assert value(short) == pytest.approx(0.2)
+    assert value(gained) == pytest.approx(-0.5)
+    assert gained.verdict == "supported"
+    assert none.reason == "there are no cells of 1,000 or 2,000 steps"
 
 
 def test_the_slope_is_that_within_base_policies() -> None:
