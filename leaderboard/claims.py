@@ -194,9 +194,7 @@ def _selects(cells: Cells, key: Key, audit: Audit) -> bool:
         and (cells.task is None or key.task in cells.task)
         and (cells.embodiment is None or key.embodiment in cells.embodiment)
         and (cells.env_steps is None or key.env_steps in cells.env_steps)
-        and (
-            not isinstance(cells.demonstrations, tuple) or key.demonstrations in cells.demonstrations
-        )
+        and (not isinstance(few := cells.demonstrations, tuple) or key.demonstrations in few)
         and (
             cells.variant is None
             or not {key.variant, *_parts(key.variant)}.isdisjoint(cells.variant)

@@ -14,6 +14,7 @@ from symsteer.bench.sweep.schedule import tasks_of
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.errors import UserError
 from symsteer.leaderboard.paths import RECORDS
+from symsteer.leaderboard.study import read_study
 
 
 def write(tmp_path, text: str) -> str:
@@ -88,6 +89,28 @@ def test_the_suite_first_describes_the_committed_records():
         assert config["policy_seed"] == config["demonstrations"]["seed"] == 0
     # This agent was replaced.
     assert {key[BASIC.index("agent")] for key in recorded} == {"approximate"}
+
+
+def test_the_suite_second_runs_what_its_study_claims():
+    runs = load_suite("second").runs
+    claims = read_study("second").claims
+    for claim in claims:
+        for cells in filter(None, (claim.cells, claim.minus)):
+            of = [
+                run
+                for run in runs
+                if (cells.variant is None or {run.variant, "none"} & set(cells.variant))
+                and run.env_steps in (cells.env_steps or [run.env_steps])
+                and run.embodiment in (cells.embodiment or [run.embodiment])
+                and run.task in (cells.task or [run.task])
+            ]
+            assert set(cells.variant or ()) <= {run.variant for run in of}, claim.name
+            for agent in claim.agents:
+                policies = {(r.task, r.seed) for r in of if r.agent == agent}
+                assert len(policies) >= 5, (claim.name, agent)
+    # No policy and no seed on which settings were chosen, and every policy for all agents.
+    assert {run.seed for run in runs} == set(range(20, 30))
+    assert not {"StackCube-v1", "PokeCube-v1"} & {run.task for run in runs}
 
 
 def test_agents_and_variants_of_a_seed_share_its_base_policy(tmp_path):
