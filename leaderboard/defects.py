@@ -51,6 +51,9 @@ SIGNIFICANT = 0.01
 MEASURES = ("auc", "success")
 """What the advantage is measured in: area under the curve, final-window success."""
 
+CROSSING_GRID = 101
+"""Defects at which the sign of a fitted advantage is asked for."""
+
 NORMAL = 1.96
 """Half the width of a 95 % interval in standard deviations."""
 
@@ -245,6 +248,23 @@ class Line:
 
 
 @dataclass(frozen=True)
+class Crossing:
+    """The defect at which a fitted advantage is 0, in the range of the fit.
+
+    Attributes:
+        value: None if the line does not cross 0 in the range.
+        low, high: the advantage may be 0 between them (95 %); None at an end of the range.
+        before, after: sign of the advantage at the ends of the range, 0 if undecided.
+    """
+
+    value: float | None
+    low: float | None
+    high: float | None
+    before: int
+    after: int
+
+
+@dataclass(frozen=True)
 class Fit:
     """Least squares with an intercept for each base policy, so that only the dials move it.
 
@@ -252,16 +272,38 @@ class Fit:
         slope: change of the advantage per 1 of defect.
         policies: base policies that were steered at two defects or more.
         lines: the mean over the policies of each setting.
+        level: advantage at the mean defect `centre`.
     """
 
     slope: Estimate
     policies: int
     lines: tuple[Line, ...]
+    level: Estimate
+    centre: float
 
     @property
     def settings(self) -> set[Key]:
         """The settings whose points it is about."""
         return {line.setting for line in self.lines}
+
+    def at(self, defect: float) -> Interval:
+        """The advantage on the fitted line."""
+        return combined([self.level, self.slope], [1, defect - self.centre]).interval()
+
+    def crossing(self) -> Crossing:
+        """Where the line crosses 0: by Fieller's method, the defects at which 0 is not excluded."""
+        ends = [end for line in self.lines for end in line.span]
+        grid = np.linspace(min(ends), max(ends), CROSSING_GRID)
+        signs = np.array([self.at(float(x)).sign for x in grid])
+        zero = self.centre - self.level.value / self.slope.value if self.slope.value else np.inf
+        undecided = grid[signs == 0]
+        return Crossing(
+            float(zero) if grid[0] <= zero <= grid[-1] else None,
+            float(undecided[0]) if len(undecided) and signs[0] else None,
+            float(undecided[-1]) if len(undecided) and signs[-1] else None,
+            int(signs[0]),
+            int(signs[-1]),
+        )
 
     @property
     def reason(self) -> str:
@@ -399,7 +441,14 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> F
         y = [sample.value for unit in units for sample in unit.values()]
         centre = float(x.mean()), float(np.mean(y))
         lines.append(Line(setting, centre, (float(x.min()), float(x.max()))))
+    means = [
+        [_sum(unit, np.full(len(unit), 1 / len(unit))) for unit in units]
+        for units in settings.values()
+    ]
+    shares = [len(units) / len(every) for units in settings.values()]
     return Fit(
+        level=combined(cell_estimates(means, resamples=resamples), shares),
+        centre=float(np.mean([defects[list(unit)].mean() for unit in every])),
         slope=replace(slope, episodes=slope.episodes + moved - slope.value),
         policies=len({sample.policy for unit in every for sample in unit.values()}),
         lines=tuple(lines),

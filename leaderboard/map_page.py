@@ -8,7 +8,16 @@ from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel, audit_
 from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.summary import MIN_SEEDS, Summary
 from symsteer.leaderboard.tables import cell_name
-from symsteer.leaderboard.text import NOTHING, code, difference, grid, image, interval
+from symsteer.leaderboard.text import (
+    NOTHING,
+    SPACE,
+    code,
+    difference,
+    grid,
+    image,
+    interval,
+    number,
+)
 
 Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
 """By place, (task, embodiment), (embodiment,) or (), then by kind: description and address."""
@@ -30,7 +39,9 @@ The *slope* is that of least squares with an intercept for each base policy: it 
 alone, never from a comparison of policies, tasks or embodiments. Its interval draws base policies
 (runs, where a task has one policy) and episodes, and the defects within their intervals; it is
 about these cells. With fewer than {MIN_SEEDS} base policies it decides nothing. Lines in the figure
-have this slope and go through the mean of their task; the fan has the slopes of the interval.
+have this slope and go through the mean of their task; the fan has the slopes of the interval. An
+advantage *ends* where the line crosses 0; between the numbers in brackets 0 is not excluded (95 %,
+Fieller's method), and a dash there means: up to the end of the measured range.
 """
 
 
@@ -73,13 +84,14 @@ def _slopes(panels: Sequence[Panel]) -> str:
             fits = {"all": panel.fit} | fits
         rows += [[*_name(panel), dial, *_fit(fit)] for dial, fit in fits.items()]
         if not fits:
-            rows.append([*_name(panel), NOTHING, NOTHING, NOTHING, panel.reason])
+            rows.append([*_name(panel), *[NOTHING] * 4, panel.reason])
     header = [
         "Agent",
         "Advantage in",
         "Dial",
         "Base policies",
         "Slope per 1 of defect",
+        "Advantage ends at a defect of",
         "Undecided because",
     ]
     return grid(header, rows, left=3)
@@ -90,7 +102,17 @@ def _fit(fit: Fit) -> list[str]:
     # A mark would be read as a decision.
     text = interval(slope, sign=True) if fit.reason else difference(slope)
     reason = fit.reason or ("" if slope.sign else "the interval contains 0")
-    return [str(fit.policies), text, reason]
+    return [str(fit.policies), text, NOTHING if fit.reason else _crossing(fit), reason]
+
+
+def _crossing(fit: Fit) -> str:
+    """Where the fitted advantage is 0, in words."""
+    found = fit.crossing()
+    if found.value is None:
+        signs = {(1, 1): "none: above 0 everywhere", (-1, -1): "none: below 0 everywhere"}
+        return signs.get((found.before, found.after), "undecided")
+    low, high = number(found.low), number(found.high)
+    return f"{number(found.value)} [{low}, {high}]".replace(" ", SPACE)
 
 
 def _numbers(summary: Summary, panels: Sequence[Panel]) -> str:

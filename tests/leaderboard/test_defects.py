@@ -224,9 +224,16 @@ def test_a_slope_is_recovered() -> None:
         (line,) = panel.fit.lines
         assert line.centre == pytest.approx((0.24, 0.06))
         assert line.span == (0.0, 0.5)
+        ends = panel.fit.crossing()
+        assert ends.value == pytest.approx(0.3, abs=0.01)
+        assert 0.1 < ends.low < 0.3 < ends.high < 0.5
+        assert (ends.before, ends.after) == (1, -1)
         flat = found.panel("floating", "approximate", measure).slope
         assert flat is not None
         assert flat.interval().sign == 0
+        never = found.panel("floating", "approximate", measure).fit.crossing()
+        assert (never.value, never.low, never.high) == (None, None, None)
+        assert (never.before, never.after) == (1, 1)
 
 
 def test_policies_and_tasks_have_levels_of_their_own() -> None:
@@ -357,6 +364,23 @@ def test_the_interval_covers_the_slope() -> None:
     assert near is not None
     assert far is not None
     assert near.slope.value == pytest.approx(far.slope.value, abs=1e-6)
+
+
+def test_the_interval_covers_the_crossing() -> None:
+    """The mean policy's advantage is 0.2 - 0.8 x defect: it ends at 0.25."""
+    table = summary_of(cells({"none": (0.5, 0.6, 0.5)})).tables[0]
+    generator = np.random.default_rng(6)
+    covered, widths = 0, []
+    for trial in range(60):
+        found = fit(synthetic(generator, table, spread=0.1), resamples=400, seed=trial)
+        assert found is not None
+        ends = found.crossing()
+        low = 0.0 if ends.low is None else ends.low
+        high = 0.5 if ends.high is None else ends.high
+        covered += low - 0.005 <= 0.25 <= high + 0.005
+        widths.append(high - low)
+    assert covered >= 53
+    assert np.median(widths) < 0.4
 
 
 def test_the_audits_uncertainty_widens_the_slope() -> None:

@@ -1,0 +1,106 @@
+"""What symmetry gains over the standard agent, by kind of break: the page's first screen."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+
+from symsteer.errors import UserError
+from symsteer.leaderboard.defects import MEASURES, advantage
+from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.statistics import Interval, cell_estimates, combined
+from symsteer.leaderboard.summary import MIN_SEEDS, SYMMETRIC_EMBODIMENT, Key, Summary, Table
+from symsteer.leaderboard.text import code, count
+from symsteer.variant import parse_variant
+
+AGENTS = ("augmented", *WITH_SYMMETRY)
+"""Those that use the symmetry: the fair rival, which has it from data, and those of the map."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Advantage of an agent over `STANDARD`, mean over the cells of one kind.
+
+    Attributes:
+        kind: what these cells have in common, as markdown.
+        measure: one of `MEASURES`.
+        cells: their number; those with fewer pairs than a verdict needs are left out, unless
+            all have fewer.
+        pairs: paired runs in all of them.
+        enough: whether the cells have the pairs that a verdict needs.
+    """
+
+    kind: str
+    agent: str
+    measure: str
+    effect: Interval
+    cells: int
+    pairs: int
+    enough: bool
+
+
+def gains(summary: Summary) -> list[Gain]:
+    """By kind (unbroken worlds first), agent and measure; what has no paired runs is left out."""
+    found = []
+    for kind, tables in kinds(summary).items():
+        for agent in AGENTS:
+            for measure in MEASURES:
+                cells = [pairs for t in tables if (pairs := advantage(t, agent, STANDARD, measure))]
+                enough = [pairs for pairs in cells if len(pairs) >= MIN_SEEDS]
+                if used := enough or cells:
+                    drawn = combined(cell_estimates([list(pairs.values()) for pairs in used]))
+                    sizes = len(used), sum(map(len, used)), bool(enough)
+                    found.append(Gain(kind, agent, measure, drawn.interval(), *sizes))
+    return found
+
+
+def kinds(summary: Summary) -> dict[str, list[Table]]:
+    """Tables by the kind of break: unbroken, each dial, each dial with an arm.
+
+    Cells with another budget than most, with fewer demonstrations than the most of their place, or
+    whose break begins in mid-run are kinds of their own.
+    """
+    keys = [table.key for table in summary.tables]
+    budgets = Counter(key.env_steps for key in keys)
+    usual = max(budgets, key=lambda steps: (budgets[steps], steps), default=0)
+    most: dict[tuple[str, ...], int] = {}
+    for key in keys:
+        most[_place(key)] = max(key.demonstrations, most.get(_place(key), 0))
+    found: dict[str, list[Table]] = defaultdict(list)
+    for table in sorted(summary.tables, key=lambda table: _order(table.key, usual)):
+        key = table.key
+        words = [_break(key)]
+        if key.env_steps != usual:
+            words.append(f"{count(key.env_steps)} steps")
+        if key.demonstrations < most[_place(key)]:
+            words.append("few demonstrations")
+        found[", ".join(words)].append(table)
+    return dict(found)
+
+
+def _place(key: Key) -> tuple[str, ...]:
+    return key.task, key.embodiment, key.base, key.group, key.mode
+
+
+def _order(key: Key, usual: int) -> tuple[bool, bool, bool, str]:
+    """Unbroken and short first, then with an arm, then other budgets."""
+    return (
+        key.env_steps != usual,
+        key.embodiment != SYMMETRIC_EMBODIMENT,
+        key.variant != "none",
+        key.variant,
+    )
+
+
+def _break(key: Key) -> str:
+    """What breaks the symmetry, without strengths."""
+    arm = "" if key.embodiment == SYMMETRIC_EMBODIMENT else "arm"
+    if key.variant == "none":
+        return arm or "unbroken"
+    try:
+        specs = parse_variant(key.variant)
+    except UserError:
+        return f"{arm}, {code(key.variant)}" if arm else code(key.variant)
+    dials = " and ".join(code(spec.name) for spec in specs)
+    late = "" if all(spec.is_constant for spec in specs) else ", changing"
+    return (f"{arm}, {dials}" if arm else dials) + late
