@@ -67,13 +67,16 @@ def kinds(summary: Summary) -> dict[str, list[Table]]:
     for key in keys:
         most[_place(key)] = max(key.demonstrations, most.get(_place(key), 0))
     found: dict[str, list[Table]] = defaultdict(list)
-    for table in sorted(summary.tables, key=lambda table: _order(table.key, usual)):
+
+    def others(key: Key) -> tuple[bool, bool]:
+        return key.env_steps != usual, key.demonstrations < most[_place(key)]
+
+    for table in sorted(summary.tables, key=lambda table: (others(table.key), _order(table.key))):
         key = table.key
+        longer, fewer = others(key)
         words = [_break(key)]
-        if key.env_steps != usual:
-            words.append(f"{count(key.env_steps)} steps")
-        if key.demonstrations < most[_place(key)]:
-            words.append("few demonstrations")
+        words += [f"{count(key.env_steps)} steps"] if longer else []
+        words += ["few demonstrations"] if fewer else []
         found[", ".join(words)].append(table)
     return dict(found)
 
@@ -82,14 +85,9 @@ def _place(key: Key) -> tuple[str, ...]:
     return key.task, key.embodiment, key.base, key.group, key.mode
 
 
-def _order(key: Key, usual: int) -> tuple[bool, bool, bool, str]:
-    """Unbroken and short first, then with an arm, then other budgets."""
-    return (
-        key.env_steps != usual,
-        key.embodiment != SYMMETRIC_EMBODIMENT,
-        key.variant != "none",
-        key.variant,
-    )
+def _order(key: Key) -> tuple[bool, bool, str]:
+    """Without an arm first, unbroken first."""
+    return key.embodiment != SYMMETRIC_EMBODIMENT, key.variant != "none", key.variant
 
 
 def _break(key: Key) -> str:

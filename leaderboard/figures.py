@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+from symsteer.leaderboard.answer import Gain, gains
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
 from symsteer.leaderboard.curves import mean_series, series, success_curve
 from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel
@@ -101,6 +102,9 @@ def render_figures(summary: Summary, findings: Findings) -> list[Drawing]:
         if table.runs:
             places.setdefault((table.key.task, table.key.embodiment), []).append(table)
     with mpl_style.context(SHEETS):
+        if found := gains(summary):
+            text = "Advantage of symmetry over the standard agent, by kind of break"
+            drawings.append(Drawing("answer", (), text, answer_chart(found)))
         for embodiment in findings.map.embodiments:
             text = "Advantage of symmetry against the audited defect"
             figure = advantage_map(findings.map, embodiment)
@@ -345,6 +349,42 @@ def _draw_fit(ax: Axes, fit: Fit) -> None:
         ax.plot(grid, heights[0], color=FIT, linewidth=1.4)
         low, high = np.minimum(*heights[1:]), np.maximum(*heights[1:])
         ax.fill_between(grid, low, high, color=FIT, alpha=0.1, linewidth=0)
+
+
+def answer_chart(found: Sequence[Gain]) -> Figure:
+    """Advantage over the standard agent by kind of break, with 95 % intervals; hollow: few runs."""
+    kinds = list(dict.fromkeys(gain.kind for gain in found))
+    agents = list(dict.fromkeys(gain.agent for gain in found))
+    figure = Figure(figsize=(9.0, 1.2 + 0.36 * len(kinds)), layout="constrained")
+    names = {"auc": "area under the curve", "success": "final success"}
+    axes = figure.subplots(1, len(MEASURES), sharey=True)
+    for ax, measure in zip(axes, MEASURES, strict=True):
+        ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
+        for gain in found:
+            if gain.measure != measure:
+                continue
+            color, marker, _ = style_of(gain.agent)
+            shift = agents.index(gain.agent) - (len(agents) - 1) / 2
+            ax.errorbar(
+                gain.effect.value,
+                kinds.index(gain.kind) + 0.2 * shift,
+                xerr=_arms(gain.effect),
+                color=color,
+                marker=marker,
+                markersize=5,
+                markerfacecolor=color if gain.enough else "white",
+                elinewidth=1.2,
+            )
+        ax.set_title(f"advantage over {STANDARD}: {names[measure]}")
+        ax.grid(axis="y", visible=False)
+    axes[0].set_yticks(range(len(kinds)), [plain(kind.replace("`", ""), 44) for kind in kinds])
+    axes[0].set_ylim(len(kinds) - 0.5, -0.5)
+    handles: dict[str, Line2D | Patch] = {}
+    for agent in agents:
+        color, marker, line = style_of(agent)
+        handles[plain(agent, 26)] = Line2D([], [], color=color, marker=marker, linestyle=line)
+    _legend(figure, handles)
+    return figure
 
 
 def performance_profiles(found: Comparisons) -> Figure:

@@ -9,14 +9,15 @@ from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.summary import MIN_SEEDS, Summary
 from symsteer.leaderboard.tables import cell_name
 from symsteer.leaderboard.text import (
+    MARKS,
     NOTHING,
     SPACE,
     code,
     difference,
     grid,
     image,
-    interval,
     number,
+    stacked,
 )
 
 Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
@@ -100,7 +101,7 @@ def _slopes(panels: Sequence[Panel]) -> str:
 def _fit(fit: Fit) -> list[str]:
     slope = fit.slope.interval()
     # A mark would be read as a decision.
-    text = interval(slope, sign=True) if fit.reason else difference(slope)
+    text = stacked(slope, sign=True, marks="" if fit.reason else MARKS[slope.sign])
     reason = fit.reason or ("" if slope.sign else "the interval contains 0")
     return [str(fit.policies), text, NOTHING if fit.reason else _crossing(fit), reason]
 
@@ -118,16 +119,23 @@ def _crossing(fit: Fit) -> str:
 def _numbers(summary: Summary, panels: Sequence[Panel]) -> str:
     points = {(p.table.key, index): p for index, panel in enumerate(panels) for p in panel.points}
     cells = {key: point for (key, _), point in points.items()}
+    indices = range(len(panels))
+    by_agent = {
+        panel.agent: [i for i in indices if panels[i].agent == panel.agent] for panel in panels
+    }
     rows = []
     for key, cell in sorted(cells.items(), key=lambda item: (item[1].defect.value, item[0])):
         defect, row = cell.defect, []
-        for index in range(len(panels)):
-            point = points.get((key, index))
-            row.append(f"{difference(point.advantage)} ({len(point.pairs)})" if point else NOTHING)
-        resets = interval(defect.resets, digits=3) if defect.resets_differ else "alike"
-        size = interval(defect.interval, digits=3)
-        rows.append([cell_name(cell.table, summary), size, defect.part, resets, *row])
-    header = ["Cell", "Audited defect", "Of", "Resets"]
-    header += [f"{agent}, {measure} (runs)" for agent, measure in map(_name, panels)]
-    table = grid(header, rows, left=1)
+        for own in by_agent.values():
+            found = [point for index in own if (point := points.get((key, index)))]
+            texts = [difference(point.advantage) for point in found] or [NOTHING]
+            row.append("<br>".join(texts))
+        row.append(str(max(len(points[key, i].pairs) for i in indices if (key, i) in points)))
+        resets = stacked(defect.resets, digits=3) if defect.resets_differ else "alike"
+        size = stacked(defect.interval, digits=3)
+        size += f"<br>{defect.part}"
+        rows.append([cell_name(cell.table, summary), size, resets, *row])
+    header = ["Cell", "Audited defect, of", "Resets"]
+    header += [f"{code(agent)}: AUC,<br>success" for agent in by_agent]
+    table = grid([*header, "Runs"], rows, left=1)
     return f"<details>\n<summary>The map's numbers</summary>\n\n{table}\n\n</details>"

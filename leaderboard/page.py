@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 
+from symsteer.leaderboard.answer import Gain, gains
 from symsteer.leaderboard.claims import SLOPE_UNIT, Outcome, where
 from symsteer.leaderboard.comparisons import Comparisons
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.map_page import Figures, map_section
+from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
 from symsteer.leaderboard.soundness import MAX_BIAS, MAX_FALL, MIN_CORRELATION, soundness
 from symsteer.leaderboard.statistics import Spread
@@ -20,6 +23,7 @@ from symsteer.leaderboard.text import (
     SPACE,
     code,
     compact,
+    difference,
     grid,
     image,
     interval,
@@ -40,7 +44,7 @@ demonstrations, the budget and the held-out episodes.
   mean (IQM) over base policies and its 95 % interval. The interval draws base policies, each with
   all its runs, or the runs of a cell with one base policy; and it draws episodes, each for all runs
   at once, because all are scored on the same initial states. Of fewer than 4 the IQM is the plain
-  mean. **Last checkpoint** is the same for the final evaluation alone. No number is the best of
+  mean. **Last** is the same for the final evaluation alone. No number is the best of
   several evaluations. Below each table is the change of success *from the fourth to the last fifth
   of the budget*: an agent with ▲ there was still improving, and more steps may change its place.
 - **Against base** is the mean difference (not the IQM's) to the base policy on the same episodes
@@ -54,7 +58,7 @@ demonstrations, the budget and the held-out episodes.
   which success stays at or above {100 * THRESHOLD:.0f} % of the best learner's, and how many seeds
   reached that; `>` means that the median seed did not reach it within the budget. **Dip** is the
   lowest value below the base policy at any evaluation of any seed.
-- **Q diverged** († at a glance) counts the seeds whose largest |Q| exceeded the largest feasible
+- **Q diverged** (†) counts the seeds whose largest |Q| exceeded the largest feasible
   one after learning had begun, whose Q-values grew out of the feasible interval (|Q| {MAX_GROWTH:g}
   times as large at the end as in the middle, and {MAX_OVERSHOOT:g} of the interval outside), or
   were not finite.
@@ -64,6 +68,12 @@ demonstrations, the budget and the held-out episodes.
   reward allows; a cross there ends a run whose Q was not finite.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
   **Status**. The seeds below the number of seeds and episodes are links to the records.
+"""
+
+ANSWER = f"""\
+Advantage over `{STANDARD}` by what breaks the symmetry: mean over cells of the difference in
+success (final window) and in the area under its curve, paired by base policy and episode, with 95 %
+intervals. \u25b2 and \u25bc: the interval excludes 0, in cells with {MIN_SEEDS} pairs of runs.
 """
 
 CLAIMS = f"""\
@@ -102,32 +112,83 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
         "This page is generated from run records by `symsteer report`; do not edit it.",
     ]
     parts += [findings.study.notice] if findings.study.notice else []
-    parts += ["## How to read it", READING.strip()]
     if notice := seed_notice(summary):
         parts.append(notice)
-    parts += ["## At a glance", _overview(summary)]
-    if beaten := _beaten(summary):
-        parts.append(beaten)
-    if findings.spreads:
-        parts += ["## How much is the base policy's", *spreads_section(summary, findings.spreads)]
-    if sound := soundness_table(summary):
-        parts += ["## Are the learners sound", SOUND.strip(), sound]
-    parts += ["## Claims", CLAIMS.strip(), *claims_section(findings)]
-    heading = "## The advantage of symmetry against the defect"
-    parts += [heading, *map_section(summary, findings.map, figures)]
+    parts += answer_section(summary, findings, overall)
+    parts += ["## Details", *folded("How to read it", [READING.strip()])]
+    parts += folded("Claims, effects and p-values", [CLAIMS.strip(), *claims_section(findings)])
+    beaten = _beaten(summary)
+    parts += folded("Success in every cell", [_overview(summary), *([beaten] if beaten else [])])
+    against = map_section(summary, findings.map, figures)
+    parts += folded("The advantage of symmetry against the defect", against)
     if findings.comparisons.cells:
-        parts += ["## All cells together", *comparisons_section(findings.comparisons, overall)]
-    place = None
+        parts += folded("All cells together", comparisons_section(findings.comparisons, overall))
+    if sound := soundness_table(summary):
+        parts += folded("Are the learners sound", [SOUND.strip(), sound])
+    if findings.spreads:
+        parts += folded("How much is the base policy's", spreads_section(summary, findings.spreads))
+    places: dict[tuple[str, str], list[Table]] = {}
     for table in summary.tables:
-        key = table.key
-        if (key.task, key.embodiment) != place:
-            place = key.task, key.embodiment
-            parts.append(f"## {code(key.task)}, {code(key.embodiment)}")
-            if drawn := figures.get(place):
-                parts += [image(*figure) for figure in drawn.values()]
-        parts += section(table, links)
-    parts += ["## Provenance", *_provenance(summary, findings.audit, links)]
+        places.setdefault((table.key.task, table.key.embodiment), []).append(table)
+    for place, tables in places.items():
+        drawn = [image(*figure) for figure in figures.get(place, {}).values()]
+        blocks = [block for table in tables for block in section(table, links)]
+        simple = all(re.fullmatch(r"[A-Za-z0-9][\w.-]{,60}", word, re.ASCII) for word in place)
+        # A name that a record may have, and no task, is shown as code below the title.
+        title = ", ".join(place) if simple else "Other cells"
+        names = [] if simple else [f"### {', '.join(map(code, place))}"]
+        parts += folded(title, [*names, *drawn, *blocks])
+    parts += folded("Provenance", _provenance(summary, findings.audit, links))
     return "\n\n".join(parts) + "\n"
+
+
+def folded(title: str, blocks: Sequence[str]) -> list[str]:
+    """Blocks of markdown that a reader opens; the title is our own."""
+    return [f"<details>\n<summary>{title}</summary>", *blocks, "</details>"]
+
+
+def answer_section(
+    summary: Summary, findings: Findings, figures: Mapping[str, tuple[str, str]]
+) -> list[str]:
+    """The picture, the gains by kind of break, and what became of the claims."""
+    found = gains(summary)
+    parts = []
+    if found:
+        parts += ["## What symmetry gains", ANSWER.strip()]
+        if "answer" in figures:
+            parts.append(image(*figures["answer"]))
+        parts.append(_gains_table(found))
+    verdicts = _verdicts(findings)
+    return [*parts, *(["## Verdicts", verdicts] if verdicts else [])]
+
+
+def _gains_table(found: Sequence[Gain]) -> str:
+    agents = list(dict.fromkeys(gain.agent for gain in found))
+    texts: dict[str, dict[str, list[str]]] = {}
+    cells: dict[str, int] = {}
+    for gain in found:
+        text = difference(gain.effect) if gain.enough else interval(gain.effect, sign=True)
+        texts.setdefault(gain.kind, {}).setdefault(gain.agent, []).append(text)
+        cells[gain.kind] = max(gain.cells, cells.get(gain.kind, 0))
+    rows = [
+        [kind, str(cells[kind]), *("<br>".join(own.get(agent, [NOTHING])) for agent in agents)]
+        for kind, own in texts.items()
+    ]
+    header = [f"{code(agent)}: AUC,<br>success" for agent in agents]
+    return grid(["World", "Cells", *header], rows, left=1)
+
+
+def _verdicts(findings: Findings) -> str:
+    """Names of the claims by their verdicts, as a list."""
+    named: dict[str, list[str]] = {}
+    for outcome in findings.claims:
+        named.setdefault(outcome.verdict, []).append(outcome.claim.name)
+    order = ("supported", "contradicted", "equivalent", "undecided", "not tested")
+    return "\n".join(
+        f"- **{verdict.capitalize()}** ({len(named[verdict])}): {'; '.join(named[verdict])}."
+        for verdict in order
+        if verdict in named
+    )
 
 
 def seed_notice(summary: Summary) -> str:
@@ -167,7 +228,7 @@ def _glance(row: Row) -> str:
         return status(row)
     mark = MARKS[row.difference.sign] if row.difference else ""
     dagger = " \u2020" if any(row.diverged) else ""
-    return stacked(row.success, marks=f"{mark}{dagger}")
+    return f"{number(row.success.value)}{mark}{dagger}".replace(" ", SPACE)
 
 
 def against_references(summary: Summary) -> dict[str, tuple[int, int, int]]:
@@ -281,13 +342,12 @@ def claims_section(findings: Findings) -> list[str]:
             continue
         rows.append(
             [
-                claim.family,
-                claim.name,
+                f"{claim.name} ({claim.family})",
                 _test(claim),
-                interval(effect.interval(), sign=True, digits=3)
+                stacked(effect.interval(), sign=True, digits=3)
                 + (f"<br>{outcome.counts}" if outcome.counts else ""),
                 f"{claim.smallest:g}",
-                *([NOTHING] * 2 if outcome.reason else map(_p, (outcome.p, outcome.p_equal))),
+                NOTHING if outcome.reason else f"{_p(outcome.p)}<br>{_p(outcome.p_equal)}",
                 f"{outcome.cells}, {outcome.pairs}, {outcome.policies}",
                 _verdict(outcome),
             ]
@@ -295,17 +355,15 @@ def claims_section(findings: Findings) -> list[str]:
     parts = [origin]
     if rows:
         header = [
-            "Family",
-            "Claim",
+            "Claim (family)",
             "Effect",
             "Size, 95 % interval",
             "Smallest of interest",
-            "p (none)",
-            "p (at least the smallest)",
+            "p: none; at least that",
             "Cells, pairs, policies",
             "Verdict",
         ]
-        parts.append(grid(header, rows, left=3))
+        parts.append(grid(header, rows, left=2))
     if untested:
         lines = [f"- {reason}: {'; '.join(names)}" for reason, names in untested.items()]
         parts.append("Not tested:\n\n" + "\n".join(lines))
@@ -387,24 +445,8 @@ def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
         "records and audit give the same bytes. Each record holds the whole configuration and "
         "every evaluation episode with its seed.",
         provenance_facts(summary, audit),
+        "[records.csv](records.csv) names all records, with seed, status, commit and hash.",
     ]
-    rows = [
-        [
-            cell_name(table, summary),
-            code(row.label),
-            str(run.seed),
-            run.record.status,
-            _values(_commit(place, short=True) for place in run.provenances),
-            code(run.record.config_hash[:12]),
-            _link(run, links),
-        ]
-        for table in summary.tables
-        for row in table.rows
-        for run in row.runs
-    ]
-    header = ["Task", "Agent", "Seed", "Status", "Commit", "Config", "Record"]
-    every = grid(header, rows, left=2)
-    parts.append(f"<details>\n<summary>All records</summary>\n\n{every}\n\n</details>")
     if summary.set_aside:
         aside = ", ".join(_link(run, links) for run in summary.set_aside)
         parts.append(
@@ -414,11 +456,10 @@ def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
     return parts
 
 
-def _commit(place: Provenance, short: bool = False) -> str:
+def _commit(place: Provenance) -> str:
     if place.commit is None:
         return f"version {place.version}" if place.version else "outside git"
-    dirty = "+" if short else " with local changes"
-    return place.commit[:12] + (dirty if place.dirty else "")
+    return place.commit[:12] + (" with local changes" if place.dirty else "")
 
 
 def _values(texts: Iterable[str]) -> str:

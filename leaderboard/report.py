@@ -14,6 +14,7 @@ from symsteer.files import write_together
 from symsteer.leaderboard.defects import Audit, read_audit
 from symsteer.leaderboard.figures import render_figures, to_svg
 from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.listing import render_records
 from symsteer.leaderboard.page import render_page
 from symsteer.leaderboard.study import PAPER, Study, read_study
 from symsteer.leaderboard.summary import Run, load_runs, summarize
@@ -21,13 +22,15 @@ from symsteer.leaderboard.tables import render_csv
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
 
-FIGURE_NAME = re.compile(r"(map|profiles|improvement|(map|success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg")
+FIGURE_NAME = re.compile(
+    r"(map|answer|profiles|improvement|(map|success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg"
+)
 
 
 def generate(
     records: Sequence[Path], out: Path, audit: Path | None = None, study: str = PAPER
 ) -> list[Path]:
-    """Write LEADERBOARD.md, leaderboard.csv and figures/ into `out`.
+    """Write LEADERBOARD.md, leaderboard.csv, records.csv and figures/ into `out`.
 
     Figures of an earlier call that no longer belong to a table are removed.
 
@@ -82,6 +85,7 @@ def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[s
         files[name] = to_svg(drawing.figure)
         shown.setdefault(drawing.place, {})[drawing.kind] = (drawing.text, name)
     links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
+    files["records.csv"] = render_records(summary, links).encode()
     files["leaderboard.csv"] = render_csv(summary).encode()
     files["LEADERBOARD.md"] = render_page(summary, findings, shown, links).encode()
     return files

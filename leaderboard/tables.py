@@ -55,14 +55,16 @@ def section(table: Table, links: Links) -> list[str]:
     header = [
         "Agent",
         "Success (final window)",
-        "Last checkpoint",
+        "Last",
         "Against base",
-        "AUC",
+        "AUC,<br>dip",
         f"Steps to {100 * THRESHOLD:.0f}\u00a0%",
-        "Dip",
         "Seeds \u00d7 episodes",
-        "Status",
     ]
+    # Where all runs have ended as they should, their status is no news.
+    shows_status = any(status(row) != f"{len(row.runs)}{SPACE}finished" for row in table.rows)
+    if shows_status:
+        header.append("Status")
     if table.is_ranked:
         header.insert(0, "Rank")
     rows = []
@@ -72,11 +74,10 @@ def section(table: Table, links: Links) -> list[str]:
             stacked(row.success),
             number(row.last.value if row.last else None),
             stacked(row.difference, True, MARKS[row.difference.sign] if row.difference else ""),
-            number(row.area),
+            f"{number(row.area)}<br>{number(row.dip)}",
             _steps(row, key.env_steps),
-            number(row.dip),
             _episodes(row, links),
-            status(row),
+            *([status(row)] if shows_status else []),
         ]
         rows.append([_rank(row, table), *cells] if table.is_ranked else cells)
     parts.append(grid(header, rows, left=2 if table.is_ranked else 1))
@@ -200,8 +201,9 @@ def _diagnostics(table: Table) -> list[str]:
         "Q bias, rank correlation": [
             _pair(row.over_runs("q_bias"), row.over_runs("q_rank_correlation")) for row in rows
         ],
-        "TD error": [compact(row.over_runs("td_error")) for row in rows],
-        "Orbit variance": [compact(row.over_runs("orbit_variance")) for row in rows],
+        "TD error, orbit variance": [
+            _pair(row.over_runs("td_error"), row.over_runs("orbit_variance")) for row in rows
+        ],
         "Equivariance error: actor, critic": [
             _pair(row.over_runs("equivariance_actor"), row.over_runs("equivariance_critic"))
             for row in rows
@@ -219,7 +221,9 @@ def _share(flags: Sequence[bool]) -> str:
 
 
 def _pair(first: float | None, second: float | None) -> str:
-    return NOTHING if first is None and second is None else f"{compact(first)}, {compact(second)}"
+    if first is None and second is None:
+        return NOTHING
+    return f"{compact(first)}<br>{compact(second)}"
 
 
 def _magnitude_header(table: Table) -> str:
@@ -243,7 +247,7 @@ def _parameters(row: Row) -> str:
         return NOTHING
     texts = []
     for actor, critic, width in sorted(sizes, key=str):
-        text = f"{count(actor)}, {count(critic)}" + (f" ({width})" if width else "")
+        text = f"{count(actor)}, {count(critic)}" + (f"<br>({width})" if width else "")
         texts.append(text.replace(" ", SPACE))
     return "; ".join(texts)
 
@@ -296,7 +300,7 @@ def render_csv(summary: Summary) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(rows[0])
-    writer.writerows([_csv_cell(value) for value in row.values()] for row in rows)
+    writer.writerows([csv_cell(value) for value in row.values()] for row in rows)
     return out.getvalue()
 
 
@@ -355,7 +359,8 @@ def _ends(name: str, found: Interval | None) -> dict[str, object]:
     return dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
 
 
-def _csv_cell(value: object) -> str:
+def csv_cell(value: object) -> str:
+    """A value of a CSV file: six significant digits, no formulas."""
     if value is None:
         return ""
     if isinstance(value, float):

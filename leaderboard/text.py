@@ -80,11 +80,11 @@ def difference(value: Interval | None) -> str:
     return interval(value, sign=True) + (MARKS[value.sign].replace(" ", SPACE) if value else "")
 
 
-def stacked(value: Interval | None, sign: bool = False, marks: str = "") -> str:
+def stacked(value: Interval | None, sign: bool = False, marks: str = "", digits: int = 2) -> str:
     """An interval on two lines, for tables with many columns: value and marks above its ends."""
     if value is None:
         return NOTHING
-    middle, ends = interval(value, sign).split(SPACE, 1)
+    middle, ends = interval(value, sign, digits).split(SPACE, 1)
     return f"{middle}{marks}".replace(" ", SPACE) + f"<br>{ends}"
 
 

@@ -111,7 +111,7 @@ def page(records: list[RunRecord]) -> str:
 
 def test_the_page_has_a_row_for_each_learner():
     text = page([record([0.3], "base"), record([0.5, 0.1, 0.9], **GOOD)])
-    section = text.split("## Are the learners sound")[1].split("\n## ")[0]
+    section = text.split("Are the learners sound")[1].split("</details>")[0]
     assert "| `standard` | 1 | 0.40 (worst 0.40) | 0.90 | 1.5 | success falls |" in section
     assert "`base` |" not in section
 

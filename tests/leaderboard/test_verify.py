@@ -78,7 +78,7 @@ def test_each_file_that_differs_has_its_line(
     board: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page, table = board / "LEADERBOARD.md", board / "leaderboard.csv"
-    page.write_text(page.read_text().replace("At a glance", "At a glimpse", 1))
+    page.write_text(page.read_text().replace("## Details", "## Detail", 1))
     # The line ends that a careless checkout makes.
     table.write_bytes(table.read_bytes().replace(b"\n", b"\r\n"))
     first, second, *_ = sorted((board / "figures").iterdir())
@@ -92,9 +92,9 @@ def test_each_file_that_differs_has_its_line(
     assert error.count("\n") == 1
     assert len(lines) == 5
     shown = dict(line.split(": ", 1) for line in lines)
-    number = page.read_text().splitlines().index("## At a glimpse") + 1
+    number = page.read_text().splitlines().index("## Detail") + 1
     assert re.fullmatch(
-        rf"differs from line {number}, column \d+ on: 'impse', but the records give 'ance'",
+        rf"differs from line {number}, column 10 on: '\\n', but the records give 's'",
         shown[str(page)],
     )
     assert "'\\r'" in shown[str(table)]

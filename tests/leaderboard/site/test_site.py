@@ -19,7 +19,7 @@ from symsteer.leaderboard.site.command import site as verb
 from symsteer.leaderboard.study import PAPER
 from symsteer.leaderboard.summary import load_runs, summarize
 from symsteer.leaderboard.tables import cell_name, render_csv
-from symsteer.leaderboard.text import compact, interval, number
+from symsteer.leaderboard.text import SPACE, compact, interval, number
 from tests.leaderboard.record_factory import make_evaluation, make_record
 from tests.leaderboard.site.conftest import EVIL, VIDEO, picture, write_all
 from tests.leaderboard.site.pages import Page, dead_links, read_pages
@@ -157,7 +157,9 @@ def test_the_findings_are_those_of_the_page(site: Path) -> None:
     for outcome in found.claims:
         assert outcome.claim.name in text
         if outcome.effect:
-            assert interval(outcome.effect.interval(), sign=True, digits=3) in text
+            middle, ends = interval(outcome.effect.interval(), sign=True, digits=3).split(SPACE, 1)
+            assert middle in text
+            assert ends in text
     for cell in re.findall(r"\d\.\d\d \(worst \d\.\d\d\)", markdown):
         assert cell in text
     assert "verdict" not in text
