@@ -22,6 +22,49 @@ STILL = 1e-2
 """Action blocks that vary less in the demonstrations are left out of the mean."""
 
 
+NUDGE = 1e-3
+"""Length of the change of an observation in :func:`jumps`: a millimetre, if it moves a position."""
+
+NUDGES = 16
+
+
+@torch.no_grad()
+def jumps(policy: ChunkPolicy, observations: torch.Tensor, seed: int = 0) -> dict[str, float]:
+    """How much the executed actions change when the observation hardly does, at fixed noise.
+
+    Each observation is changed ``NUDGES`` times by a random vector of length ``NUDGE``. The change
+    of the executed actions is the largest over steps of its norm, in units of the bound of an
+    action's block. A policy that is continuous changes a little everywhere; one whose frame jumps
+    changes a lot in few places.
+
+    Args:
+        policy: the base policy.
+        observations: ``[N, obs_dim]``, environment units.
+        seed: of noise and changes.
+
+    Returns:
+        ``median`` and ``high`` (the 99.9 % quantile) of the changes, and ``share`` of those larger
+        than ten medians.
+    """
+    count, layout = len(observations), policy.act_layout
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(count, policy.horizon, layout.dim, generator=generator).to(observations)
+    own = policy.decode(observations, noise)[:, : policy.execute]
+    found = []
+    for _ in range(NUDGES):
+        change = torch.randn(observations.shape, generator=generator).to(observations)
+        change *= NUDGE / change.norm(dim=1, keepdim=True)
+        moved = policy.decode(observations + change, noise)[:, : policy.execute]
+        found.append((moved - own).norm(dim=-1).amax(dim=1))
+    changes = torch.cat(found).double()
+    median = changes.median()
+    return {
+        "median": median.item(),
+        "high": changes.quantile(0.999).item(),
+        "share": (changes > 10 * median).double().mean().item(),
+    }
+
+
 @torch.no_grad()
 def action_spread(
     policy: ChunkPolicy, observations: torch.Tensor, draws: int = 16, seed: int = 0

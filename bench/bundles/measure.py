@@ -8,13 +8,15 @@ from typing import Any
 import torch
 from scipy.stats import binomtest
 
-from symsteer.bench.runs.base_study import held_out_episodes
+from symsteer.bench.runs.base_study import (
+    decode_error,
+    held_out_episodes,
+    unbroken,
+    visited_states,
+)
 from symsteer.bench.runs.config import RunConfig
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.geometry import Group, equivariance_error
-
-STATES = 256
-"""Visited states on which decoding is compared with its turned copies, at most."""
+from symsteer.policies.geometry import Group
 
 
 @dataclass(frozen=True)
@@ -55,23 +57,17 @@ def measure(config: RunConfig, policy: ChunkPolicy) -> Measured:
         policy: the base policy, on the CPU.
     """
     seed, episodes = config.policy_seed, config.evaluation.final_episodes
-    played = held_out_episodes(config, policy, seed, episodes)
+    with unbroken(config, policy, episodes) as env:
+        played = held_out_episodes(env, policy, seed, episodes)
     successes = int(played.episodes["success_once"].sum())
     sure = binomtest(successes, episodes).proportion_ci(method="wilson")
-    visited = played.obs[played.running]
-    states = visited[torch.linspace(0, len(visited) - 1, min(STATES, len(visited))).long()]
-    shape = (len(states), policy.horizon, policy.act_layout.dim)
-    noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
     group = policy.group if policy.group.order > 1 else Group.parse("C8")
-    layouts = (policy.obs_layout, policy.act_layout)
     return Measured(
         success=successes / episodes,
         interval=(round(float(sure.low), 4), round(float(sure.high), 4)),
         successes=successes,
         episodes=episodes,
         group=str(group),
-        equivariance_error=equivariance_error(
-            policy.decode, (states, noise), layouts, policy.act_layout, group
-        ),
+        equivariance_error=decode_error(policy, visited_states(played), group, seed),
         steerability=policy.report["steerability"],
     )

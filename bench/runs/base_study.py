@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,21 @@ from symsteer.bench.demos import load
 from symsteer.bench.runs.base_policy import demonstration_file
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
 from symsteer.bench.runs.folder import write_json
-from symsteer.bench.steering.evaluation import rollout
+from symsteer.bench.steering.evaluation import rollout, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.geometry import Group, equivariance_error
+from symsteer.policies.steerability import jumps
 
 EVALUATION_ENVS = 100
+STATES = 32
+"""Initial states that are tried with 16 draws of the noise each."""
+VISITED = 256
+"""Visited states at which symmetry and jumps are measured."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,9 @@ def study(
 
     Returns:
         A plain dictionary for each policy and task: its cell, ``task``, ``success``, ``successes``,
-        ``episodes``, ``parameters``, ``training_seconds``.
+        ``episodes``, ``zero`` (success with zero noise), ``parameters``, ``training_seconds``; of
+        its visited states ``equivariance_error`` (under C8), ``action_std`` and ``jumps``; and
+        ``solvable``, the share of ``STATES`` initial states that 16 draws of the noise solve.
 
     Raises:
         UserError: if a number is not positive or there is no such policy.
@@ -122,26 +131,52 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def held_out_episodes(config: RunConfig, policy: ChunkPolicy, seed: int, episodes: int) -> Rollout:
-    """Held-out episodes of a base policy with noise from N(0, I), in the unbroken task.
+@contextmanager
+def unbroken(
+    config: RunConfig, policy: ChunkPolicy, episodes: int
+) -> Generator[LatentNoiseEnv, None, None]:
+    """The unbroken task of a run, for at most ``episodes`` held-out episodes at a time."""
+    env = make(config.task, num_envs=min(EVALUATION_ENVS, episodes), embodiment=config.embodiment)
+    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
+    try:
+        yield latent
+    finally:
+        latent.close()
+
+
+def visited_states(played: Rollout) -> torch.Tensor:
+    """At most ``VISITED`` observations before success, evenly over episodes and their steps."""
+    visited = played.obs[played.running]
+    return visited[torch.linspace(0, len(visited) - 1, min(VISITED, len(visited))).long()]
+
+
+def decode_error(policy: ChunkPolicy, states: torch.Tensor, group: Group, seed: int) -> float:
+    """Equivariance error of decoding N(0, I) noise at observations ``[N, obs_dim]``."""
+    shape = (len(states), policy.horizon, policy.act_layout.dim)
+    noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+    layouts = (policy.obs_layout, policy.act_layout)
+    return equivariance_error(policy.decode, (states, noise), layouts, policy.act_layout, group)
+
+
+def held_out_episodes(
+    env: LatentNoiseEnv, policy: ChunkPolicy, seed: int, episodes: int, scale: float = 1.0
+) -> Rollout:
+    """Held-out episodes of a base policy with noise from N(0, scale^2 I).
 
     Args:
-        config: task and embodiment.
+        env: the policy's task.
         policy: the base policy, on the CPU.
         seed: of the noise.
         episodes: how many.
+        scale: of the noise.
     """
-    env = make(config.task, num_envs=min(EVALUATION_ENVS, episodes), embodiment=config.embodiment)
     generator = torch.Generator().manual_seed(seed)
 
     def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-        return torch.randn(len(obs), policy.horizon, policy.act_layout.dim, generator=generator)
+        shape = (len(obs), policy.horizon, policy.act_layout.dim)
+        return scale * torch.randn(shape, generator=generator)
 
-    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
-    try:
-        return rollout(latent, act, held_out_seeds(episodes))
-    finally:
-        latent.close()
+    return rollout(env, act, held_out_seeds(episodes))
 
 
 def _play(
@@ -172,15 +207,23 @@ def _play(
 def _row(
     config: RunConfig, cell: BaseCell, task: str, policy: ChunkPolicy, episodes: int
 ) -> dict[str, Any]:
-    mine = dataclasses.replace(config, task=task)
-    result = held_out_episodes(mine, policy, cell.seed, episodes)
+    with unbroken(dataclasses.replace(config, task=task), policy, episodes) as env:
+        result = held_out_episodes(env, policy, cell.seed, episodes)
+        zero = held_out_episodes(env, policy, cell.seed, episodes, scale=0.0)
+        report = steerability(env, policy, cell.seed, STATES)
     successes = int(result.episodes["success_once"].sum())
+    visited = visited_states(result)
     return {
         **dataclasses.asdict(cell),
         "task": task,
         "success": successes / episodes,
         "successes": successes,
         "episodes": episodes,
+        "zero": float(zero.episodes["success_once"].float().mean()),
+        "solvable": report.solvable,
+        "action_std": report.action_std,
+        "equivariance_error": decode_error(policy, visited, Group.parse("C8"), cell.seed),
+        "jumps": jumps(policy, visited, cell.seed),
         "parameters": policy.parameter_count(),
         "training_seconds": round(policy.training_record["seconds"], 1),
     }

@@ -7,7 +7,7 @@ import torch
 
 from symsteer.errors import UserError
 from symsteer.policies.normalizer import clip_blocks
-from symsteer.policies.steerability import action_spread
+from symsteer.policies.steerability import action_spread, jumps
 from symsteer.policies.training.demonstrations import make_chunks
 
 
@@ -69,3 +69,16 @@ def test_a_spread_needs_observations_and_draws(trained, world):
         action_spread(trained(group="C8"), world.observations(4), draws=1)
     with pytest.raises(UserError):
         action_spread(trained(group="C8"), torch.zeros(0, world.obs_layout.dim))
+
+
+def test_jumps_are_where_the_frame_of_a_canonical_policy_jumps(trained, world):
+    obs = world.observations(64)
+    near = obs.clone()
+    near[:, world.obs_layout.slice("goal")] *= 1e-3
+    for name, options in (("canonical", {"anchor": "goal"}), ("edp", {"group": "C8"})):
+        policy = trained(name, **options)
+        far_away, at_the_jump = jumps(policy, obs), jumps(policy, near)
+        assert 0 < far_away["median"] < 0.05
+        assert 0 <= far_away["share"] < 0.1
+        assert (at_the_jump["high"] > 0.1) == (name == "canonical")
+    assert jumps(policy, obs, seed=1) != far_away == jumps(policy, obs)

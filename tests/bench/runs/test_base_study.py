@@ -15,6 +15,13 @@ def test_a_small_study(tmp_path):
         (name, count, 0) for count in counts for name in names
     ]
     assert all(r["success"] == r["successes"] / 4 for r in rows)
+    symmetric, plain = rows
+    assert symmetric["equivariance_error"] < 1e-4 < 0.01 < plain["equivariance_error"]
+    for row in rows:
+        assert 0 <= row["zero"] <= 1
+        assert 0 <= row["solvable"] <= 1
+        assert row["action_std"] > 0
+        assert 0 < row["jumps"]["median"] < row["jumps"]["high"] < 1
     assert len(list((tmp_path / "base").glob("*.h5"))) == 1
     write_study(tmp_path / "study.json", tiny_config(), rows)
     assert (tmp_path / "study.json").stat().st_size > 500
