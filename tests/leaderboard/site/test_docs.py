@@ -120,6 +120,8 @@ def test_results_show_what_the_documentation_says() -> None:
     for name in ("../../etc/passwd", "no-such-agent"):
         assert not reading.agent(name, "../")
         assert reading.task_picture(name) is None
+        assert reading.variant_picture(name) is None
+    assert reading.variant_picture("wind") == "variants/wind.png"
 
 
 def test_without_the_documentation_nothing_is_linked() -> None:
