@@ -8,7 +8,7 @@ from symsteer.leaderboard.claims import SLOPE_UNIT, Outcome, where
 from symsteer.leaderboard.comparisons import Comparisons
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.map_page import Figures, map_section
-from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
+from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, REPRODUCED, Provenance
 from symsteer.leaderboard.soundness import MAX_BIAS, MAX_FALL, MIN_CORRELATION, soundness
 from symsteer.leaderboard.statistics import Spread
 from symsteer.leaderboard.study import Claim
@@ -66,6 +66,13 @@ demonstrations, the budget and the held-out episodes.
   **Status**. The seeds below the number of seeds and episodes are links to the records.
 """
 
+MADE_AGAIN = """\
+Some runs were made again from their records (`symsteer reproduce`); **Status** counts them.
+*Reproduced exactly*: every episode and every measured number agrees. *Reproduced within its
+interval*: the final success lies within Wilson's 95 % interval of the record's.
+"""
+"""Shown only where it is so."""
+
 CLAIMS = f"""\
 Effects are differences of two agents, paired by base policy and seed (success and its area by
 episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNIT:g} of defect,
@@ -103,6 +110,8 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     ]
     parts += [findings.study.notice] if findings.study.notice else []
     parts += ["## How to read it", READING.strip()]
+    if summary.has_reproductions:
+        parts.append(MADE_AGAIN.strip())
     if notice := seed_notice(summary):
         parts.append(notice)
     parts += ["## At a glance", _overview(summary)]
@@ -393,7 +402,7 @@ def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
             cell_name(table, summary),
             code(row.label),
             str(run.seed),
-            run.record.status,
+            _state(run),
             _values(_commit(place, short=True) for place in run.provenances),
             code(run.record.config_hash[:12]),
             _link(run, links),
@@ -412,6 +421,11 @@ def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
             f"exists: {aside}."
         )
     return parts
+
+
+def _state(run: Run) -> str:
+    again = run.reproduction
+    return f"{run.record.status}, {REPRODUCED[again.verdict]}" if again else run.record.status
 
 
 def _commit(place: Provenance, short: bool = False) -> str:

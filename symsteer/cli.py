@@ -54,6 +54,7 @@ VERBS = {
     "run": Verb(f"{BENCH}:run", "Steer a base policy with one agent on one task.", parses=True),
     "resume": Verb(f"{BENCH}:resume", "Continue a run that was stopped."),
     "evaluate": Verb(f"{BENCH}:evaluate", "Play held-out episodes with the checkpoint of a run."),
+    "reproduce": Verb(f"{BENCH}:reproduce", "Make a run again from its record, and compare."),
     "film": Verb(f"{BENCH}:film", "Film episodes with the checkpoint of a run."),
     "sweep": Verb(f"{BENCH}:sweep", "Run all runs of a suite that are not finished."),
     "tune": Verb(f"{BENCH}:tune", "Search for settings, with equal trials for every agent."),

@@ -62,6 +62,12 @@ compare standard equivariant
 compare standard equivariant --runs folder
 compare folder folder --margin much
 compare folder folder --picture file
+reproduce
+reproduce nowhere
+reproduce folder
+reproduce file
+reproduce x.json
+reproduce x.json --workers many
 audit --task Nothing
 audit --count -3
 audit --group E8
