@@ -44,6 +44,16 @@ def chosen_records(records: Sequence[Path], verb: str) -> Sequence[Path]:
     return records or (RECORDS,)
 
 
+def committed_records() -> list[Path]:
+    """The folders of `RESULTS` that hold records."""
+    folders = sorted(path for path in RESULTS.glob("*") if path.is_dir())
+    return [
+        folder
+        for folder in folders
+        if (first := min(folder.rglob("*.json"), default=None)) and _begins_like_a_record(first)
+    ]
+
+
 def reproductions_for(records: Iterable[Path], folder: Path | None) -> Path | None:
     """The folder with the reproductions of records; None for none.
 

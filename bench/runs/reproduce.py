@@ -92,6 +92,8 @@ def reproduce(
             repeat it, or the files are not those that the run began from.
     """
     path = path / RECORD if path.is_dir() else path
+    if not path.is_file():
+        raise UserError(f"there is no record {path}; name a record.json, or the folder of a run")
     record = read_record(path)
     if record.status != "finished":
         raise UserError(
