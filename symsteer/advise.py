@@ -187,7 +187,7 @@ def _text(advice: Advice, source: str) -> str:
         lines.append("its initial states are broken, too, which is no part of a decision")
     if advice.expected:
         lines += ["", "Expected advantage over standard, 95 % interval; ? decides nothing:"]
-        head = ("agent", "measure", "advantage", "from", "cells through")
+        head = ("agent", "measure", "advantage", "from", "line of")
         lines.append(_row(*head, "cells", "policies", "tasks"))
         lines += [_expected(one) for one in advice.expected]
     lines += ["", *(_choice(choice) for choice in advice.choices)]
@@ -204,7 +204,7 @@ def _expected(one: Expected) -> str:
 
 
 def _row(*cells: str) -> str:
-    return "{:18s} {:8s} {:>27s}  {:12s} {:18s} {:>5s} {:>8s} {:>5s}".format(*cells)
+    return "{:18s} {:8s} {:>27s}  {:11s} {:16s} {:>5s} {:>8s} {:>5s}".format(*cells)
 
 
 def _interval(found: Any, digits: str) -> str:
