@@ -140,6 +140,29 @@ def test_an_unbroken_world_has_the_level_of_unbroken_cells(
     assert one.value == pytest.approx(0.3, abs=0.02)
 
 
+def test_an_uncertain_audit_widens_the_interval(map_of_five: tuple[Summary, Audit]) -> None:
+    where = world("wind:0.3", 0.2)
+    vague = replace(where, defect=Defect(Interval(0.2, 0.0, 0.4), "tool"))
+    sure, unsure = (
+        of(advise([map_of_five[0]], map_of_five[1], w), "equivariant").interval
+        for w in (where, vague)
+    )
+    assert sure is not None
+    assert unsure is not None
+    assert unsure.value == sure.value
+    assert unsure.high - unsure.low > 1.2 * (sure.high - sure.low)
+
+
+def test_few_cells_do_not_say_how_far_they_lie_from_a_line() -> None:
+    """Two tasks with two cells each: one degree of freedom is left."""
+    summary, audit = crossing({"A-v1": 0.0, "B-v1": 0.0})
+    few = {place: d for place, d in audit.items() if place[2] in ("none", "wind:1")}
+    one = of(advise([summary], few, world("wind:0.3", 0.1, "A-v1")), "equivariant")
+    assert (one.source, one.cells) == ("this task", 4)
+    assert one.reason == "too few cells to say how far they lie from their line"
+    assert one.sign == 0
+
+
 def test_studies_are_paired_apart_and_few_policies_do_not_count(
     map_of_five: tuple[Summary, Audit],
 ) -> None:

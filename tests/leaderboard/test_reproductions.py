@@ -72,6 +72,11 @@ def diverge(record: RunRecord) -> None:
     evaluation.nonfinite["diagnostics/td_error"] = "nan"
 
 
+def measure(record: RunRecord) -> None:
+    """What the record has as not measured."""
+    record.evaluations[2].diagnostics["q_correlation"] = 0.5
+
+
 def shorten(record: RunRecord) -> None:
     del record.evaluations[1]
 
@@ -103,6 +108,7 @@ def update_less(record: RunRecord) -> None:
         (shift, "diagnostics", 50_000, 1),
         (unmeasure, "diagnostics", 0, 1),
         (diverge, "diagnostics", 25_000, 1),
+        (measure, "diagnostics", 50_000, 1),
         (lengthen, "episodes", 60_000, 1),
         (play_more, "episodes", 25_000, None),
         (shorten, "episodes", 25_000, None),
@@ -114,7 +120,7 @@ def update_less(record: RunRecord) -> None:
 def test_every_difference_is_found(
     change: Callable[[RunRecord], None], part: str, first: int | None, differ: int | None
 ) -> None:
-    record = record_of(q_mean=-3.0)
+    record = record_of(q_mean=-3.0, q_correlation=None)
     change(again := copy_of(record))
     parts = {one.part: one for one in compare_records(record, again)[0]}
     assert parts[part].first == first
