@@ -120,6 +120,8 @@ class Reproduction(Block):
     def _consistent(self) -> Self:
         if self.verdict != _verdict(self.differences, self.success):
             raise ValueError("the verdict does not follow from the differences")
+        if self.record.sha256 == self.repeated.sha256:
+            raise ValueError("the record was compared with itself")
         return self
 
 

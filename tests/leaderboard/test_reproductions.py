@@ -11,6 +11,7 @@ import pytest
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import (
+    Reproduction,
     RunRecord,
     compare_records,
     dump_reproduction,
@@ -152,6 +153,7 @@ def results(tmp_path: Path) -> Path:
     for seed, record in enumerate(r for r in records if r.settings.agent == "equivariant"):
         if seed < 2:
             again = copy_of(record)
+            again.wall_clock.total += 1
             if seed == 1:
                 again.evaluations[1].diagnostics["q_mean"] = -1.0
             write_record(again, tmp_path / "again" / f"{seed}.json")
@@ -239,6 +241,8 @@ def test_a_bad_reproduction_is_one_sentence(results: Path) -> None:
             '"verdict": "within the interval",\n "record"', '"verdict": "different",\n "record"', 1
         ),
         text.replace('"schema_version": 1', '"schema_version": 2'),
+        # A copy of the record is no second run.
+        text.replace(Reproduction.model_validate_json(text).repeated.sha256, good.stem),
     ):
         good.write_text(damaged)
         with pytest.raises(UserError, match=r"is no valid reproduction") as error:
