@@ -70,6 +70,41 @@ def resume(
     return 0
 
 
+def reproduce(
+    record: Annotated[Path, tyro.conf.arg(metavar="RECORD")],
+    /,
+    out: Path | None = None,
+    demos: Path | None = None,
+    base_policy: Path | None = None,
+    into: Path | None = None,
+    workers: int = 1,
+    quiet: bool = False,
+) -> int:
+    """Make a run again from its record, and say what agrees (docs/runner.md).
+
+    Demonstrations and base policy are made anew, too. Exit code 0 if every episode and number
+    agrees exactly, 1 if not.
+
+    Args:
+        record: A record.json, or the folder of a run.
+        out: Folder for the new run and reproduction.json; default: a temporary folder, which is
+            kept. The same command continues a reproduction that was stopped there.
+        demos: The trajectory file that the run began from, if it did.
+        base_policy: The saved base policy that the run began from, if it did.
+        into: Folder that gets a copy of reproduction.json, named after the record's hash.
+        workers: Processes that share the simulation.
+        quiet: No progress bars.
+    """
+    from symsteer.bench.runs.reproduce import reproduce, text
+
+    def report(line: str) -> None:
+        print(printable(line), file=sys.stderr, flush=True)
+
+    done = reproduce(record, out, demos, base_policy, into, not quiet, workers, report)
+    print(printable(text(done)))
+    return 0 if done.reproduction.verdict == "exact" else 1
+
+
 def evaluate(
     folder: Path,
     /,

@@ -25,6 +25,7 @@ def report(
     out: Path | None = None,
     audit: Path | None = None,
     study: str | None = None,
+    reproductions: Path | None = None,
     verify: bool = False,
     check: bool = False,
 ) -> int:
@@ -37,6 +38,8 @@ def report(
         audit: The summary.json of an audit, for the map; default: the committed one.
         study: The claims to test: name of a study in leaderboard/studies or path of a .toml file;
             default: those of the paper, for the committed records those of their study.
+        reproductions: The folder that `symsteer reproduce --into` wrote to: its runs are marked;
+            default: for committed records the committed one.
         verify: Write nothing; fail if OUT is not, byte for byte, what the records give.
         check: Write nothing; say of each record whether the leaderboard admits it, and why not.
 
@@ -60,8 +63,8 @@ def report(
     out = out or _folder_for(records)
     study = study or (PAPER if records else STUDY)
     if verify:
-        return _show_differences(report.verify(paths, out, audit, study))
-    files = report.generate(paths, out, audit, study)
+        return _show_differences(report.verify(paths, out, audit, study, reproductions))
+    files = report.generate(paths, out, audit, study, reproductions)
     page = next(file for file in files if file.name == "LEADERBOARD.md")
     _say(f"wrote {page} and {len(files) - 1} files beside it")
     return 0

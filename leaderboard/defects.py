@@ -127,9 +127,15 @@ def read_audit(path: Path | None = None) -> Audit:
     """
     path = path or AUDIT
     try:
-        cells = _CELLS.validate_json(path.read_bytes())
+        return parse_audit(path.read_bytes(), path)
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def parse_audit(data: bytes, path: Path) -> dict[Place, Defect]:
+    """`read_audit` of a file's content; `path` is for messages."""
+    try:
+        cells = _CELLS.validate_json(data)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         if first["loc"][1:] == ("version",):
@@ -144,7 +150,7 @@ def read_audit(path: Path | None = None) -> Audit:
         ) from error
     audit: dict[Place, Defect] = {}
     for cell in cells:
-        place = cell.task, cell.embodiment, _in_order(cell.variant), cell.group
+        place = cell.task, cell.embodiment, in_order(cell.variant), cell.group
         if place in audit:
             raise UserError(
                 f"{path} holds {' '.join(place)} twice: remove the older of the two cells."
@@ -161,7 +167,7 @@ def fingerprint(audit: Audit) -> str:
     return f"{len(audit)} cells, {digest[:12]}"
 
 
-def _in_order(variant: str) -> str:
+def in_order(variant: str) -> str:
     """One spelling for one variant, its parts in alphabetical order; other texts as they are."""
     specs = sorted(_parsed(variant), key=lambda spec: spec.text)
     return variant_text(specs) if specs else variant
@@ -175,9 +181,15 @@ def _parsed(variant: str) -> tuple[VariantSpec, ...]:
         return ()
 
 
+def dial_of(variant: str) -> str:
+    """A variant without strengths, its parts in alphabetical order; other texts as they are."""
+    names = sorted(spec.name for spec in _parsed(variant))
+    return "+".join(names) or variant
+
+
 def defect_of(key: Key, audit: Audit) -> Defect | None:
     """The audited defect of a table's task, embodiment, variant and group; None if not audited."""
-    return audit.get((key.task, key.embodiment, _in_order(key.variant), key.group))
+    return audit.get((key.task, key.embodiment, in_order(key.variant), key.group))
 
 
 def audit_commands(keys: Sequence[Key]) -> list[str]:
@@ -224,13 +236,14 @@ class Point:
         return len(self.pairs) >= MIN_SEEDS
 
     @property
+    def policies(self) -> int:
+        """How many base policies it has pairs on."""
+        return len({policy for policy, _ in self.pairs})
+
+    @property
     def dial(self) -> str:
         """The variant without its strength; `none` for the unbroken control."""
-        try:
-            names = sorted(spec.name for spec in parse_variant(self.table.key.variant))
-            return "+".join(names) or UNBROKEN
-        except UserError:
-            return self.table.key.variant
+        return dial_of(self.table.key.variant)
 
     @property
     def setting(self) -> Key:
@@ -375,13 +388,7 @@ def defect_map(summary: Summary, audit: Audit) -> DefectMap:
     for embodiment in sorted({table.key.embodiment for table in summary.tables}):
         for agent in WITH_SYMMETRY:
             for measure in MEASURES:
-                points = []
-                for table in summary.tables:
-                    defect = defect_of(table.key, audit)
-                    if defect is None or table.key.embodiment != embodiment:
-                        continue
-                    if pairs := advantage(table, agent, STANDARD, measure):
-                        points.append(Point(table, defect, pairs))
+                points = points_of(summary, audit, embodiment, agent, measure)
                 fits = {
                     dial: found
                     for dial in sorted({point.dial for point in points} - {UNBROKEN})
@@ -392,6 +399,20 @@ def defect_map(summary: Summary, audit: Audit) -> DefectMap:
                 )
     unaudited = [table.key for table in summary.tables if not defect_of(table.key, audit)]
     return DefectMap(panels, tuple(unaudited))
+
+
+def points_of(
+    summary: Summary, audit: Audit, embodiment: str, agent: str, measure: str
+) -> list[Point]:
+    """The audited tables of an embodiment with paired runs of an agent and of `STANDARD`."""
+    points = []
+    for table in summary.tables:
+        defect = defect_of(table.key, audit)
+        if defect is None or table.key.embodiment != embodiment:
+            continue
+        if pairs := advantage(table, agent, STANDARD, measure):
+            points.append(Point(table, defect, pairs))
+    return points
 
 
 def advantage(table: Table, first: str, second: str, measure: str) -> dict[Pair, Sample]:
@@ -412,23 +433,18 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> F
     (`cell_estimates`), and each defect within its interval. The points themselves are not drawn.
     """
     defects = np.array([point.defect.value for point in points])
-    settings: dict[Key, list[dict[int, Sample]]] = {}
-    for setting in sorted({point.setting for point in points}):
-        here = {i: point for i, point in enumerate(points) if point.setting == setting}
-        units = [unit for unit in _units(here) if len({defects[i] for i in unit}) > 1]
-        if units:
-            settings[setting] = units
+    settings = steered(points, defects=2)
     every = [unit for units in settings.values() for unit in units]
     if not every:
         return None
     total = sum(float((_centred(defects[list(unit)]) ** 2).sum()) for unit in every)
     cells = [
-        [_sum(unit, _centred(defects[list(unit)])) for unit in units] for units in settings.values()
+        [weighted(unit, _centred(defects[list(unit)])) for unit in units]
+        for units in settings.values()
     ]
     estimates = cell_estimates(cells, resamples=resamples)
     slope = combined(estimates, [len(units) / total for units in settings.values()])
-    generator = np.random.default_rng(seed)
-    drawn = np.stack([point.defect.draw(resamples, generator) for point in points])
+    drawn = drawn_defects(points, resamples, seed)
     rise, run = np.zeros(resamples), np.zeros(resamples)
     for unit in every:
         x = _centred(drawn[list(unit)])
@@ -442,7 +458,7 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> F
         centre = float(x.mean()), float(np.mean(y))
         lines.append(Line(setting, centre, (float(x.min()), float(x.max()))))
     means = [
-        [_sum(unit, np.full(len(unit), 1 / len(unit))) for unit in units]
+        [weighted(unit, np.full(len(unit), 1 / len(unit))) for unit in units]
         for units in settings.values()
     ]
     shares = [len(units) / len(every) for units in settings.values()]
@@ -455,7 +471,30 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> F
     )
 
 
-def _units(points: Mapping[int, Point]) -> list[dict[int, Sample]]:
+Unit = dict[int, Sample]
+"""What a base policy has at each point, by the point's index."""
+
+
+def steered(points: Sequence[Point], defects: int = 1) -> dict[Key, list[Unit]]:
+    """The base policies of each setting that were steered at so many different defects."""
+    found: dict[Key, list[Unit]] = {}
+    for setting in sorted({point.setting for point in points}):
+        here = {i: point for i, point in enumerate(points) if point.setting == setting}
+        units = [
+            unit for unit in _units(here) if len({here[i].defect.value for i in unit}) >= defects
+        ]
+        if units:
+            found[setting] = units
+    return found
+
+
+def drawn_defects(points: Sequence[Point], resamples: int, seed: int = 0) -> Array:
+    """Each point's defect within its interval: [points, resamples]."""
+    generator = np.random.default_rng(seed)
+    return np.stack([point.defect.draw(resamples, generator) for point in points])
+
+
+def _units(points: Mapping[int, Point]) -> list[Unit]:
     """What each base policy has at each point of a setting; each run if there is one policy."""
     alone = len({policy for point in points.values() for policy, _ in point.pairs}) == 1
     found: dict[Pair, dict[int, list[Sample]]] = defaultdict(lambda: defaultdict(list))
@@ -473,7 +512,7 @@ def _centred(values: Array) -> Array:
     return values - values.mean(axis=0)
 
 
-def _sum(unit: Mapping[int, Sample], factors: Array) -> Sample:
+def weighted(unit: Unit, factors: Array) -> Sample:
     """The sum of samples of one base policy, each times its factor."""
     samples = list(unit.values())
     blocks = tuple(block for sample in samples for block in sample.blocks)

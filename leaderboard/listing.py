@@ -10,7 +10,8 @@ from symsteer.leaderboard.tables import Links, csv_cell
 
 HEADER = (
     *("task", "embodiment", "variant", "demonstrations", "env_steps", "agent", "row", "seed"),
-    *("status", "success", "commit", "local_changes", "config_sha256", "run", "record"),
+    *("status", "reproduced", "success", "commit", "local_changes", "config_sha256"),
+    *("run", "record"),
 )
 
 
@@ -28,6 +29,7 @@ def render_records(summary: Summary, links: Links) -> str:
                 values = [
                     *place,
                     *(run.agent, row.label, run.seed, run.record.status),
+                    run.reproduction and run.reproduction.verdict,
                     run.success if run.finished else None,
                     " ".join(dict.fromkeys(p.commit or p.version or "" for p in made)),
                     int(any(p.dirty for p in made)),

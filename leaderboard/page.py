@@ -76,6 +76,13 @@ success (final window) and in the area under its curve, paired by base policy an
 intervals. \u25b2 and \u25bc: the interval excludes 0, in cells with {MIN_SEEDS} pairs of runs.
 """
 
+MADE_AGAIN = """\
+Some runs were made again from their records (`symsteer reproduce`); **Status** counts them.
+*Reproduced exactly*: every episode and every measured number agrees. *Reproduced within its
+interval*: the final success lies within Wilson's 95 % interval of the record's.
+"""
+"""Shown only where it is so."""
+
 CLAIMS = f"""\
 Effects are differences of two agents, paired by base policy and seed (success and its area by
 episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNIT:g} of defect,
@@ -115,7 +122,10 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     if notice := seed_notice(summary):
         parts.append(notice)
     parts += answer_section(summary, findings, overall)
-    parts += ["## Details", *folded("How to read it", [READING.strip()])]
+    reading = [READING.strip()]
+    if summary.has_reproductions:
+        reading.append(MADE_AGAIN.strip())
+    parts += ["## Details", *folded("How to read it", reading)]
     parts += folded("Claims, effects and p-values", [CLAIMS.strip(), *claims_section(findings)])
     beaten = _beaten(summary)
     parts += folded("Success in every cell", [_overview(summary), *([beaten] if beaten else [])])

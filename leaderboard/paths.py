@@ -13,8 +13,13 @@ from symsteer.errors import UserError
 PAGE_FOLDER = Path(__file__).resolve().parent
 """The folder of the committed leaderboard, in a checkout of the repository."""
 
-RECORDS = PAGE_FOLDER / "results" / "records"
+RESULTS = PAGE_FOLDER / "results"
+
+RECORDS = RESULTS / "records"
 """The committed records; an installed package has none."""
+
+REPRODUCTIONS = RESULTS / "reproductions"
+"""What `symsteer reproduce --into` wrote about committed records."""
 
 STUDY = "first"
 """The study that the committed records belong to."""
@@ -37,6 +42,36 @@ def chosen_records(records: Sequence[Path], verb: str) -> Sequence[Path]:
             f"symsteer {verb} RUNS"
         )
     return records or (RECORDS,)
+
+
+def committed_records() -> list[Path]:
+    """The folders of `RESULTS` that hold records."""
+    folders = sorted(path for path in RESULTS.glob("*") if path.is_dir())
+    return [
+        folder
+        for folder in folders
+        if (first := min(folder.rglob("*.json"), default=None)) and _begins_like_a_record(first)
+    ]
+
+
+def reproductions_for(records: Iterable[Path], folder: Path | None) -> Path | None:
+    """The folder with the reproductions of records; None for none.
+
+    Args:
+        records: paths of the records.
+        folder: the one that was named; else the committed one counts, for committed records.
+
+    Raises:
+        UserError: if the folder that was named is none.
+    """
+    if folder is None:
+        committed = all(Path(os.path.realpath(p)).is_relative_to(RESULTS) for p in records)
+        return REPRODUCTIONS if committed else None
+    if not folder.is_dir():
+        raise UserError(
+            f"{folder} is no folder: name the one that `symsteer reproduce --into` wrote to"
+        )
+    return folder
 
 
 def record_files(paths: Iterable[Path]) -> list[Path]:

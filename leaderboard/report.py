@@ -16,6 +16,7 @@ from symsteer.leaderboard.figures import render_figures, to_svg
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.listing import render_records
 from symsteer.leaderboard.page import render_page
+from symsteer.leaderboard.paths import reproductions_for
 from symsteer.leaderboard.study import PAPER, Study, read_study
 from symsteer.leaderboard.summary import Run, load_runs, summarize
 from symsteer.leaderboard.tables import render_csv
@@ -28,7 +29,11 @@ FIGURE_NAME = re.compile(
 
 
 def generate(
-    records: Sequence[Path], out: Path, audit: Path | None = None, study: str = PAPER
+    records: Sequence[Path],
+    out: Path,
+    audit: Path | None = None,
+    study: str = PAPER,
+    reproductions: Path | None = None,
 ) -> list[Path]:
     """Write LEADERBOARD.md, leaderboard.csv, records.csv and figures/ into `out`.
 
@@ -39,6 +44,7 @@ def generate(
         out: the folder to write into.
         audit: summary of an audit, the committed one by default (`read_audit`).
         study: name or file of the study that declares the claims (`read_study`).
+        reproductions: folder of the reproductions (`reproductions_for`).
 
     Returns:
         The files written.
@@ -47,7 +53,8 @@ def generate(
         UserError: for bad records, a full disk or a folder that cannot be written; `out` is then
             as it was (`write_together`).
     """
-    runs, out = load_runs(records), _folder(out)
+    runs = load_runs(records, reproductions_for(records, reproductions))
+    out = _folder(out)
     files = render(runs, out, read_audit(audit), read_study(study))
     if (out / "figures").is_symlink():
         raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it")
@@ -57,13 +64,18 @@ def generate(
 
 
 def verify(
-    records: Sequence[Path], out: Path, audit: Path | None = None, study: str = PAPER
+    records: Sequence[Path],
+    out: Path,
+    audit: Path | None = None,
+    study: str = PAPER,
+    reproductions: Path | None = None,
 ) -> Verification:
     """Compare the files in `out` with what `generate` would write; changes nothing.
 
     Arguments and errors are those of `generate`.
     """
-    runs, out = load_runs(records), _folder(out)
+    runs = load_runs(records, reproductions_for(records, reproductions))
+    out = _folder(out)
     files = render(runs, out, read_audit(audit), read_study(study))
     found = differences(files, _stale(out, files), out)
     return Verification(len(runs), len(files), found)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from symsteer.errors import UserError
 from symsteer.leaderboard.paper import BASE, ROW_ORDER
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import (
@@ -20,13 +21,17 @@ from symsteer.leaderboard.records import (
     Divergence,
     Evaluation,
     Provenance,
+    Reproduction,
     Role,
     RunRecord,
     config_hash,
+    file_hash,
     flat,
     read_record,
+    read_reproductions,
 )
 from symsteer.leaderboard.records.curves import area_under_curve
+from symsteer.leaderboard.records.reproductions import Verdict
 from symsteer.leaderboard.statistics import (
     Block,
     Interval,
@@ -84,6 +89,8 @@ class Run:
 
     path: Path
     record: RunRecord
+    reproduction: Reproduction | None = None
+    """What the same run said when it was made again."""
 
     @property
     def seed(self) -> int:
@@ -318,6 +325,11 @@ class Row:
         """Whether Q diverged, for the same runs."""
         return [found.diverged for found in self.divergences]
 
+    @property
+    def reproductions(self) -> Counter[Verdict]:
+        """Of its runs that were made again: how many for each verdict."""
+        return Counter(run.reproduction.verdict for run in self.runs if run.reproduction)
+
     def over_runs(self, *names: str) -> float | None:
         """Mean over finished runs of a diagnostic's final value."""
         values = [value for run in self.finished if (value := run.last(*names)) is not None]
@@ -381,6 +393,11 @@ class Summary:
         return [run for table in self.tables for run in table.runs]
 
     @property
+    def has_reproductions(self) -> bool:
+        """Whether any of the runs was made again."""
+        return any(run.reproduction for run in self.runs)
+
+    @property
     def roles(self) -> dict[str, Role]:
         """Role by agent, in the order of the rows."""
         roles = {row.agent: row.role for table in self.tables for row in table.rows}
@@ -391,13 +408,30 @@ class Summary:
         return list(self.roles)
 
 
-def load_runs(paths: Iterable[Path]) -> list[Run]:
+def load_runs(paths: Iterable[Path], reproductions: Path | None = None) -> list[Run]:
     """Read the records that `paths` name: files, run folders, folders of either.
 
-    `record_files` says which files those are. Raises UserError for a path that names none and
-    for a file that is not a valid record.
+    `record_files` says which files those are. Raises UserError for a path that names none, for a
+    file that is not a valid record, and for a reproduction of another version of a record.
+
+    Args:
+        paths: of the records.
+        reproductions: folder of their reproductions (`read_reproductions`).
     """
-    return [Run(file, read_record(file)) for file in record_files(paths)]
+    known = read_reproductions(reproductions) if reproductions else {}
+    runs = [
+        Run(file, read_record(file), known.get(file_hash(file)) if known else None)
+        for file in record_files(paths)
+    ]
+    used = {run.reproduction.record.sha256 for run in runs if run.reproduction}
+    present = {run.record.run_id for run in runs}
+    for digest in sorted(known.keys() - used):
+        if (name := known[digest].record.run_id) in present:
+            raise UserError(
+                f"{reproductions}/{digest}.json is about a record of {name} that has changed since "
+                "then: make it again with `symsteer reproduce`, or remove the file"
+            )
+    return runs
 
 
 def recipe_of(config: Mapping[str, Any]) -> str:

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from symsteer.leaderboard.paper import BASE
+from symsteer.leaderboard.records import REPRODUCED, VERDICTS
+from symsteer.leaderboard.records.reproductions import Verdict
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import ARM, THRESHOLD, Key, Row, Summary, Table
 from symsteer.leaderboard.text import (
@@ -161,6 +163,8 @@ def status(row: Row) -> str:
             parts.append(f"{number_of} {status}")
     if row.missing:
         parts.append(f"{row.missing} missing")
+    made_again = row.reproductions
+    parts += [f"{made_again[v]} {REPRODUCED[v]}" for v in VERDICTS if made_again[v]]
     return ", ".join(parts).replace(" ", SPACE).replace(f",{SPACE}", ", ")
 
 
@@ -294,9 +298,19 @@ CSV_DIAGNOSTICS = (
 )
 
 
+REPRODUCTION_COLUMNS: dict[str, Verdict] = {
+    "reproduced_exactly": "exact",
+    "reproduced_within_interval": "within the interval",
+    "not_reproduced": "different",
+}
+"""Columns of leaderboards in which a run was made again: the number of such runs."""
+
+
 def render_csv(summary: Summary) -> str:
     """One line a row of the tables, full precision (6 significant digits), empty where unknown."""
     rows = [_csv_row(table, row) for table in summary.tables for row in table.rows]
+    if not summary.has_reproductions:
+        rows = [{k: v for k, v in row.items() if k not in REPRODUCTION_COLUMNS} for row in rows]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(rows[0])
@@ -324,6 +338,7 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
         "runs": len(row.runs),
         **{s: statuses.count(s) for s in ("finished", "failed", "interrupted", "running")},
         "missing": row.missing,
+        **{column: row.reproductions[v] for column, v in REPRODUCTION_COLUMNS.items()},
         "episodes": sum(row.episodes),
         "success_iqm": success and success.value,
         "success_low": success and success.low,

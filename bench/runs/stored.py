@@ -22,6 +22,7 @@ from symsteer.bench.runs.trainer import new_agent
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
+from symsteer.leaderboard.records import DERIVED
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path
 
@@ -80,22 +81,34 @@ def stored_config(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
     Raises:
         UserError: if the folder is not a run's, or its configuration is damaged or edited.
     """
-    data = read_config(folder)
-    files = data.pop("files", {})
-    data.pop("evaluation_variant", None)
-    if "sac" in data:
-        raise UserError(
-            f"{folder / CONFIG} is of a run of SymSteer 0.1, which this version reports but cannot "
-            "load or continue; use SymSteer 0.1 for that"
-        )
-    require_extensions(folder / RECORD)
-    config = build_config(data, str(folder / CONFIG))
+    config, files = read_back(read_config(folder), folder / CONFIG, folder / RECORD)
     if not isinstance(files, dict) or run_id(config, files) != folder.name:
         raise UserError(
             f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or the "
             "folder renamed; undo that"
         )
     return config, files
+
+
+def read_back(data: Mapping[str, Any], path: Path, record: Path) -> tuple[RunConfig, Any]:
+    """A run's configuration, and the content hashes of its files, from its resolved configuration.
+
+    Args:
+        data: as `config.json` and records have it.
+        path: the file that it is from, for messages.
+        record: of the run; all code that it names must be installed.
+
+    Raises:
+        UserError: if this version has no such configuration, or code is not installed.
+    """
+    if "sac" in data:
+        raise UserError(
+            f"{path} is of a run of SymSteer 0.1, which this version reports but cannot load, "
+            "continue or repeat; use SymSteer 0.1 for that"
+        )
+    require_extensions(record)
+    own = {key: value for key, value in data.items() if key not in DERIVED}
+    return build_config(own, str(path)), data.get("files", {})
 
 
 def stored_policy(folder: Path, config: RunConfig) -> ChunkPolicy | None:

@@ -5,11 +5,24 @@ A record says what was run (`config`, `role`, `provenance`, `seeds`), how it wen
 seed, and the diagnostics measured at that evaluation. docs/metrics.md defines every number.
 
 `schema` defines the blocks, `migrations` reads older versions, `provenance` finds commit and
-packages, `files` reads and writes. This package imports nothing of the leaderboard above it.
+packages, `files` reads and writes, `repeat` has the command that repeats a run, `reproductions`
+compares a run with its repetition. This package imports nothing of the leaderboard above it.
 """
 
 from symsteer.leaderboard.records.files import dump_record, read_record, write_record
 from symsteer.leaderboard.records.provenance import Provenance, RecordedExtension
+from symsteer.leaderboard.records.repeat import DERIVED, FILES, repeat_command
+from symsteer.leaderboard.records.reproductions import (
+    PARTS,
+    REPRODUCED,
+    VERDICTS,
+    Reproduction,
+    compare_records,
+    dump_reproduction,
+    file_hash,
+    read_reproductions,
+    reproduction_of,
+)
 from symsteer.leaderboard.records.schema import (
     HELD_OUT_SEED,
     MAX_GROWTH,
@@ -31,11 +44,16 @@ from symsteer.leaderboard.records.schema import (
 from symsteer.leaderboard.records.values import canonical_json, config_hash, flat, portable
 
 __all__ = [
+    "DERIVED",
+    "FILES",
     "HELD_OUT_SEED",
     "MAX_GROWTH",
     "MAX_OVERSHOOT",
+    "PARTS",
+    "REPRODUCED",
     "ROLES",
     "SCHEMA_VERSION",
+    "VERDICTS",
     "BasePolicy",
     "Budget",
     "Divergence",
@@ -45,15 +63,22 @@ __all__ = [
     "Parameters",
     "Provenance",
     "RecordedExtension",
+    "Reproduction",
     "Role",
     "RunRecord",
     "RunSettings",
     "WallClock",
     "canonical_json",
+    "compare_records",
     "config_hash",
     "dump_record",
+    "dump_reproduction",
+    "file_hash",
     "flat",
     "portable",
     "read_record",
+    "read_reproductions",
+    "repeat_command",
+    "reproduction_of",
     "write_record",
 ]

@@ -27,6 +27,7 @@ from symsteer.leaderboard.records.values import (
     MetricName,
     Moment,
     Name,
+    RunId,
     Seconds,
     Sha256,
     Share,
@@ -241,7 +242,7 @@ class RunRecord(Block):
     """Everything the leaderboard may know about one run."""
 
     schema_version: Literal[5] = SCHEMA_VERSION
-    run_id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+=:,@-]{0,199}$")]
+    run_id: RunId
     config: dict[str, JsonValue]
     config_hash: str = ""
     role: Role

@@ -15,6 +15,7 @@ from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.defects import read_audit
 from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.paths import reproductions_for
 from symsteer.leaderboard.site import markup
 from symsteer.leaderboard.site.assets import assets, needs
 from symsteer.leaderboard.site.board import DIGITS, Board, MapPicture
@@ -54,7 +55,12 @@ class Written:
 
 
 def generate(
-    records: Sequence[Path], out: Path, study: str, audit: Path | None = None, docs: bool = True
+    records: Sequence[Path],
+    out: Path,
+    study: str,
+    audit: Path | None = None,
+    docs: bool = True,
+    reproductions: Path | None = None,
 ) -> Written:
     """Write the site; files of an earlier one that no longer belong to it are removed.
 
@@ -64,6 +70,7 @@ def generate(
         study: name or file of the study that declares the claims (`read_study`).
         audit: summary or folder of an audit; the committed one by default.
         docs: whether to build the documentation, if there is one.
+        reproductions: folder of the reproductions (`reproductions_for`).
 
     Raises:
         UserError: for bad records, a missing package, a folder that holds something else or
@@ -73,7 +80,7 @@ def generate(
     reading = Documentation.of_checkout(docs)
     needs("jinja2", "markdown_it", *(["mkdocs", "material"] if reading.built else []))
     _check_folder(out)
-    summary = summarize(load_runs(records))
+    summary = summarize(load_runs(records, reproductions_for(records, reproductions)))
     defects = read_audit(_summary_of(audit))
     found = analyse(summary, defects, read_study(study))
     board = Board(summary, found, defects, Path(study).stem, reading, tuple(_maps(audit)))

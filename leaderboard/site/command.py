@@ -15,6 +15,7 @@ def site(
     out: Path = Path("site"),
     study: str | None = None,
     audit: Path | None = None,
+    reproductions: Path | None = None,
     docs: bool = True,
 ) -> int:
     """Write results and documentation as a folder of static pages (docs/site.md).
@@ -26,6 +27,8 @@ def site(
             default: those of the paper, for the committed records those of their study.
         audit: The folder that `symsteer audit --out` wrote, for its numbers and maps, or its
             summary.json; default: the committed numbers.
+        reproductions: The folder that `symsteer reproduce --into` wrote to: its runs are marked;
+            default: for committed records the committed one.
         docs: Build the documentation, too, in a checkout of the repository.
 
     Returns:
@@ -40,7 +43,8 @@ def site(
     from symsteer.leaderboard.site.build import generate
     from symsteer.leaderboard.study import PAPER
 
-    written = generate(paths, out, study or (PAPER if records else STUDY), audit, docs)
+    study = study or (PAPER if records else STUDY)
+    written = generate(paths, out, study, audit, docs, reproductions)
     print(printable(f"wrote {written.index}: {written.pages} pages of {written.records} records"))
     if docs and not written.docs:
         print("without the documentation, which only a checkout of the repository has")

@@ -203,7 +203,7 @@ def findings(board: Board) -> Values:
     spreads = page.spreads_section(summary, found.spreads) if found.spreads else []
     return {
         "notice": _notice(board),
-        "reading": markup.html(page.READING),
+        "reading": markup.html([page.READING, page.MADE_AGAIN][: 1 + summary.has_reproductions]),
         "claims": markup.html([page.CLAIMS, *page.claims_section(found)]),
         "sound": markup.html([page.SOUND, sound])
         if (sound := page.soundness_table(summary))

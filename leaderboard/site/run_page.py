@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from symsteer.leaderboard.records import Evaluation
+from symsteer.leaderboard.records import REPRODUCED, Evaluation, repeat_command
 from symsteer.leaderboard.site import charts
 from symsteer.leaderboard.site.board import Board, dials
 from symsteer.leaderboard.site.clips import media
 from symsteer.leaderboard.site.pages import options_of
-from symsteer.leaderboard.site.repeat import repeat_command
 from symsteer.leaderboard.summary import Run
 from symsteer.leaderboard.text import NOTHING, compact, count, number
 
@@ -20,7 +19,7 @@ def run_values(board: Board, run: Run) -> dict[str, Any]:
     record, where = run.record, board.row_of.get(run.path)
     settings, policy = record.settings, record.base_policy
     table, row = where or (None, None)
-    provenance = record.provenance
+    provenance, again = record.provenance, run.reproduction
     commit = provenance.commit and provenance.commit + (" with changes" * bool(provenance.dirty))
     facts = {
         "status": record.status,
@@ -37,6 +36,7 @@ def run_values(board: Board, run: Run) -> dict[str, Any]:
         else None,
         "started": f"{record.started:%Y-%m-%d %H:%M} UTC",
         "minutes": number(record.wall_clock.total / 60, 1),
+        "made again": again and f"{REPRODUCED[again.verdict]} on {again.repeated.ended:%Y-%m-%d}",
         "continued": f"{record.wall_clock.resumed} times" if record.wall_clock.resumed else None,
         "base policy": f"{policy.name} {policy.group or ''}, {policy.content_hash[:12]}",
         "base policy's success": number(policy.base_success),

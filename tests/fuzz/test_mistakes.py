@@ -62,6 +62,25 @@ compare standard equivariant
 compare standard equivariant --runs folder
 compare folder folder --margin much
 compare folder folder --picture file
+reproduce
+reproduce nowhere
+reproduce folder
+reproduce file
+reproduce x.json
+reproduce x.json --workers many
+advise
+advise --task Nothing
+advise --task PickCube-v1 --variant wnid:1
+advise --task PickCube-v1 --audit x.json
+advise --task PickCube-v1 --states few
+advise --audit nowhere
+advise --audit folder
+advise --audit file
+advise --audit x.json
+advise --detection folder
+advise --detection x.json
+advise --task PickCube-v1 --records nowhere
+advise --task PickCube-v1 --records folder
 audit --task Nothing
 audit --count -3
 audit --group E8

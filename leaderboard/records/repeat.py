@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
-from symsteer.leaderboard.records import flat
+from symsteer.leaderboard.records.values import flat
 from symsteer.terminal import typed
 
 DERIVED = ("evaluation_variant", "files")

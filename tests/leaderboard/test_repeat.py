@@ -12,7 +12,7 @@ from symsteer.bench.runs.arguments import parse_run
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.leaderboard.paths import PAGE_FOLDER
 from symsteer.leaderboard.records import config_hash, read_record
-from symsteer.leaderboard.site.repeat import DERIVED, FILES, KEYS, repeat_command
+from symsteer.leaderboard.records.repeat import DERIVED, FILES, KEYS, repeat_command
 from tests.bench.tiny_run import tiny_config
 
 LEARNERS = PAGE_FOLDER / "results" / "learners"

@@ -1,0 +1,323 @@
+"""Runs that were made again from their records: what agrees, and the files that say so.
+
+A reproduction belongs to the bytes of one record file. On one kind of machine, with the same code
+and packages, a run on the CPU repeats to the last digit; elsewhere it may agree within the interval
+of its final success.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Self, get_args
+
+from pydantic import ValidationError, model_validator
+from scipy.stats import binomtest
+
+from symsteer.errors import UserError
+from symsteer.leaderboard.records.curves import area_under_curve
+from symsteer.leaderboard.records.files import read_record
+from symsteer.leaderboard.records.provenance import Provenance
+from symsteer.leaderboard.records.schema import Evaluation, RunRecord
+from symsteer.leaderboard.records.values import (
+    Block,
+    Count,
+    Finite,
+    Moment,
+    Name,
+    RunId,
+    Sha256,
+    Share,
+    Text,
+    canonical_json,
+    first_problem,
+)
+
+Verdict = Literal["exact", "within the interval", "different"]
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
+
+REPRODUCED: dict[Verdict, str] = {
+    "exact": "reproduced exactly",
+    "within the interval": "reproduced within its interval",
+    "different": "NOT reproduced",
+}
+"""How pages say it of a run."""
+
+Part = Literal[
+    "seeds", "parameters", "base policy", "feasible Q", "budget", "episodes", "diagnostics"
+]
+PARTS: tuple[Part, ...] = get_args(Part)
+"""What is compared. Times, provenance and the name of the machine are not."""
+
+IGNORED = {"base_policy": {"training_seconds"}}
+
+
+class Original(Block):
+    """The record that was repeated: `sha256` is that of its file."""
+
+    run_id: RunId
+    sha256: Sha256
+    config_hash: Sha256
+    commit: Name | None
+
+
+class Repeated(Block):
+    """The run that repeated it: when, with which code, on what machine."""
+
+    sha256: Sha256
+    started: Moment
+    ended: Moment
+    provenance: Provenance
+
+
+class Difference(Block):
+    """Values of one part that differ.
+
+    `first` is the step of the first evaluation with one (null outside of evaluations), `largest`
+    the largest absolute difference of two numbers (null where none are comparable), `example` the
+    first value that differs.
+    """
+
+    part: Part
+    differ: Count
+    of: Count
+    first: Count | None
+    largest: Finite | None
+    example: Text
+
+
+class Success(Block):
+    """Share of the final episodes with success, and Wilson's 95 % interval of the record's."""
+
+    recorded: Share
+    low: Share
+    high: Share
+    repeated: Share
+
+
+class Area(Block):
+    """Area under the success curve as a share of the budget's maximum."""
+
+    recorded: Finite
+    repeated: Finite
+
+
+class Reproduction(Block):
+    """What a repeated run says about a record. `conditions` are what differed beforehand."""
+
+    schema_version: Literal[1] = 1
+    verdict: Verdict
+    record: Original
+    repeated: Repeated
+    conditions: list[Text]
+    success: Success
+    area: Area
+    differences: list[Difference]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.verdict != _verdict(self.differences, self.success):
+            raise ValueError("the verdict does not follow from the differences")
+        if self.record.sha256 == self.repeated.sha256:
+            raise ValueError("the record was compared with itself")
+        return self
+
+
+def file_hash(path: Path) -> str:
+    """sha256 of a record's file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def compare_records(record: RunRecord, again: RunRecord) -> tuple[list[Difference], Success, Area]:
+    """What differs between a finished record and that of the same run made again.
+
+    What the record does not have, such as a diagnostic that is newer, is not compared.
+    """
+    differences = [
+        _difference(part, [(None, leaf) for leaf in _leaves(*blocks)])
+        for part, blocks in _blocks(record, again).items()
+    ]
+    differences += [
+        _difference(part, list(_over_evaluations(part, record, again)))
+        for part in ("episodes", "diagnostics")
+    ]
+    mine, theirs = (_final(one).success_once for one in (record, again))
+    trials = len(_final(record).episodes.seed)
+    sure = binomtest(round(mine * trials), trials).proportion_ci(method="wilson")
+    areas = [
+        area_under_curve(
+            [e.env_steps for e in one.evaluations],
+            [e.success_once for e in one.evaluations],
+            record.settings.env_steps,
+        )
+        for one in (record, again)
+    ]
+    success = Success(recorded=mine, low=sure.low, high=sure.high, repeated=theirs)
+    found = [difference for difference in differences if difference.differ]
+    return found, success, Area(recorded=areas[0], repeated=areas[1])
+
+
+def reproduction_of(path: Path, again: Path, conditions: Sequence[str]) -> Reproduction:
+    """Compare the record at `path` with that of the repeated run at `again`."""
+    record, repeated = read_record(path), read_record(again)
+    differences, success, area = compare_records(record, repeated)
+    return Reproduction(
+        verdict=_verdict(differences, success),
+        record=Original(
+            run_id=record.run_id,
+            sha256=file_hash(path),
+            config_hash=record.config_hash,
+            commit=record.provenance.commit,
+        ),
+        repeated=Repeated(
+            sha256=file_hash(again),
+            started=repeated.started,
+            ended=repeated.ended or repeated.started,
+            provenance=repeated.provenance,
+        ),
+        conditions=list(conditions),
+        success=success,
+        area=area,
+        differences=differences,
+    )
+
+
+def dump_reproduction(reproduction: Reproduction) -> bytes:
+    """The file of a reproduction: strict JSON, a line for each key."""
+    data = reproduction.model_dump(mode="json")
+    lines = [f'"{key}": {canonical_json(value)}' for key, value in data.items()]
+    return ("{\n " + ",\n ".join(lines) + "\n}\n").encode()
+
+
+def read_reproductions(folder: Path) -> dict[str, Reproduction]:
+    """The reproductions in a folder by the hash of their record's file; none without the folder.
+
+    Raises:
+        UserError: for a file that is damaged, or is not named after the hash of its record.
+    """
+    found = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            reproduction = Reproduction.model_validate_json(path.read_bytes())
+        except OSError as error:
+            raise UserError(f"{path} cannot be read: {error.strerror}") from error
+        except ValidationError as error:
+            raise UserError(
+                f"{path} is no valid reproduction: {first_problem(error)}; write it again with "
+                "`symsteer reproduce`, or remove it"
+            ) from error
+        if path.stem != reproduction.record.sha256:
+            raise UserError(
+                f"{path} is about a record with another hash; name it "
+                f"{reproduction.record.sha256}.json, or remove it"
+            )
+        found[path.stem] = reproduction
+    return found
+
+
+def _verdict(differences: Sequence[Difference], success: Success) -> Verdict:
+    if not differences:
+        return "exact"
+    inside = success.low <= success.repeated <= success.high
+    return "within the interval" if inside else "different"
+
+
+def _final(record: RunRecord) -> Evaluation:
+    if record.final is None:
+        raise ValueError("only finished runs are compared")
+    return record.final
+
+
+def _blocks(record: RunRecord, again: RunRecord) -> dict[Part, tuple[Any, Any]]:
+    """The blocks outside of evaluations, of both records."""
+    keys: dict[Part, str] = {
+        "seeds": "seeds",
+        "parameters": "parameters",
+        "base policy": "base_policy",
+        "feasible Q": "feasible_q",
+        "budget": "budget",
+    }
+    wanted = set(keys.values())
+    mine = record.model_dump(include=wanted, exclude=IGNORED, exclude_none=True)
+    theirs = again.model_dump(include=wanted, exclude=IGNORED)
+    return {part: (mine.get(key), theirs.get(key)) for part, key in keys.items()}
+
+
+Leaf = tuple[str, Any, Any]
+"""Name of a value, the recorded one and the repeated one."""
+
+_MISSING = object()
+
+
+def _over_evaluations(
+    part: Part, record: RunRecord, again: RunRecord
+) -> Iterator[tuple[int | None, Leaf]]:
+    """Every value of the evaluations, with the step of its evaluation."""
+    repeated = [_measured(evaluation, part) for evaluation in again.evaluations]
+    for index, evaluation in enumerate(record.evaluations):
+        mine = _measured(evaluation, part)
+        mine = {key: value for key, value in mine.items() if value is not None}
+        theirs = repeated[index] if index < len(repeated) else {}
+        for leaf in _leaves(mine, theirs):
+            yield evaluation.env_steps, leaf
+    for evaluation in again.evaluations[len(record.evaluations) :]:
+        yield evaluation.env_steps, ("evaluation", _MISSING, evaluation.env_steps)
+
+
+def _measured(evaluation: Evaluation, part: Part) -> dict[str, Any]:
+    """What is compared of an evaluation."""
+    if part == "diagnostics":
+        return {"diagnostics": evaluation.diagnostics, "nonfinite": evaluation.nonfinite}
+    place = {name: getattr(evaluation, name) for name in ("env_steps", "decisions", "updates")}
+    return place | evaluation.episodes.model_dump(by_alias=True)
+
+
+def _leaves(recorded: Any, repeated: Any, name: str = "") -> Iterator[Leaf]:
+    """Every value of nested data that the record has, and items of its lists that it lacks."""
+    if isinstance(recorded, Mapping):
+        theirs = repeated if isinstance(repeated, Mapping) else {}
+        for key, value in recorded.items():
+            yield from _leaves(value, theirs.get(key, _MISSING), f"{name}.{key}" if name else key)
+        if name == "nonfinite":
+            for key in theirs.keys() - recorded.keys():
+                yield f"{name}.{key}", _MISSING, theirs[key]
+    elif isinstance(recorded, list):
+        others = repeated if isinstance(repeated, list) else []
+        for index in range(max(len(recorded), len(others))):
+            pair = [x[index] if index < len(x) else _MISSING for x in (recorded, others)]
+            yield f"{name}.{index}", pair[0], pair[1]
+    elif recorded is not None or repeated not in (None, _MISSING):
+        yield name, recorded, repeated
+
+
+def _difference(part: Part, leaves: Sequence[tuple[int | None, Leaf]]) -> Difference:
+    differing = [(step, leaf) for step, leaf in leaves if leaf[1] != leaf[2]]
+    sizes = [
+        abs(one - other)
+        for _, (_, one, other) in differing
+        if isinstance(one, int | float) and isinstance(other, int | float)
+    ]
+    example = ""
+    if differing:
+        name, one, other = differing[0][1]
+        example = f"{name.removeprefix('diagnostics.')}: {_shown(one)} -> {_shown(other)}"
+    return Difference(
+        part=part,
+        differ=len(differing),
+        of=len(leaves),
+        first=differing[0][0] if differing else None,
+        largest=max((size for size in map(float, sizes) if math.isfinite(size)), default=None),
+        example=example[:300],
+    )
+
+
+def _shown(value: Any) -> str:
+    if value is _MISSING:
+        return "missing"
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, str):
+        return " ".join(value.split())[:12]
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,212 @@
+"""`symsteer reproduce`: a tiny run is really repeated; a record that was changed does not agree."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from symsteer.bench.runs.reproduce import conditions, reproduce
+from symsteer.bench.runs.run import execute
+from symsteer.cli import main
+from symsteer.leaderboard.records import (
+    config_hash,
+    dump_record,
+    file_hash,
+    read_record,
+    read_reproductions,
+)
+from tests.bench.tiny_run import tiny_config, without_clock
+
+
+def call(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr("sys.argv", ["symsteer", "reproduce", *map(str, arguments), "--quiet"])
+    code = main()
+    return code, capsys.readouterr()
+
+
+@pytest.fixture(scope="module")
+def repeated(finished, tmp_path_factory) -> tuple[Path, Path]:
+    """The folder of a finished run, and that in which it was made again."""
+    out = tmp_path_factory.mktemp("again")
+    done = reproduce(finished[1], out, progress=False)
+    assert done.run.parent.parent == out
+    return finished[1], done.run
+
+
+@pytest.fixture
+def changed(repeated, tmp_path):
+    """Changes a copy of the record; its reproduction is the run that was made already."""
+    folder, again = repeated
+
+    def change(edit) -> Path:
+        data = json.loads((folder / "record.json").read_text())
+        edit(data)
+        path = tmp_path / "record.json"
+        path.write_text(json.dumps(data))
+        place = tmp_path / "out" / f"reproduction-{file_hash(path)[:12]}"
+        shutil.copytree(again, place / again.name)
+        return path
+
+    return change
+
+
+def test_a_run_is_made_again_and_agrees_exactly(repeated, tmp_path, monkeypatch, capsys):
+    folder, again = repeated
+    assert without_clock(folder) == without_clock(again)
+    record = folder / "record.json"
+    assert record.read_bytes() != (again / "record.json").read_bytes()
+    assert any((again.parent / "base").iterdir()), "the base policy was not made anew"
+    marks = tmp_path / "marks"
+    # The same command finds the finished run in its place.
+    code, shown = call(monkeypatch, capsys, folder, "--out", again.parent.parent, "--into", marks)
+    assert code == 0
+    assert "compared without making it again" in shown.err
+    assert "Everything agrees exactly." in shown.out
+    digest = hashlib.sha256(record.read_bytes()).hexdigest()
+    assert [path.name for path in marks.iterdir()] == [f"{digest}.json"]
+    assert (marks / f"{digest}.json").read_bytes() == (
+        again.parent / "reproduction.json"
+    ).read_bytes()
+    found = read_reproductions(marks)[digest]
+    assert (found.verdict, found.differences) == ("exact", [])
+    assert found.record.run_id == folder.name
+    assert found.repeated.sha256 == file_hash(again / "record.json")
+    assert str(tmp_path.parent) not in (marks / f"{digest}.json").read_text()
+
+
+def test_a_flipped_episode_is_found(changed, tmp_path, monkeypatch, capsys):
+    def flip(data):
+        episodes = data["evaluations"][1]["episodes"]
+        episodes["success_once"][2] ^= 1
+        episodes["success_at_end"][2] = 0
+
+    path = changed(flip)
+    code, shown = call(monkeypatch, capsys, path, "--out", tmp_path / "out")
+    assert code == 1
+    (line,) = [line for line in shown.out.splitlines() if line.startswith("episodes")]
+    assert "1 of " in line
+    assert "160 steps" in line
+    assert "success_once.2" in line
+    assert "agree exactly  seeds, parameters, base policy, feasible Q, budget, diagnostics" in (
+        shown.out
+    )
+    assert "within the 95 % interval" in shown.out
+
+
+def test_final_success_outside_of_the_interval_is_different(changed, tmp_path, monkeypatch, capsys):
+    def succeed(data):
+        episodes = data["evaluations"][-1]["episodes"]
+        before = sum(episodes["success_once"])
+        episodes["success_once"] = [int(before < 3)] * len(episodes["success_once"])
+        episodes["success_at_end"] = [0] * len(episodes["success_once"])
+
+    path = changed(succeed)
+    code, shown = call(monkeypatch, capsys, path, "--out", tmp_path / "out")
+    assert code == 1
+    assert "outside of the 95 % interval" in shown.out
+    assert ", 0.000 here (-1.000)" in shown.out
+
+
+def test_a_changed_hyperparameter_gives_another_run(repeated, tmp_path):
+    folder, _ = repeated
+    data = json.loads((folder / "record.json").read_text())
+    data["config"]["agent_options"]["lr"] *= 10
+    data["config_hash"] = config_hash(data["config"])
+    path = tmp_path / "record.json"
+    path.write_text(json.dumps(data))
+    done = reproduce(path, tmp_path / "out", progress=False)
+    parts = {one.part: one for one in done.reproduction.differences}
+    assert done.reproduction.verdict != "exact"
+    # The critics differ as soon as they have learned; the base policy and the sizes do not.
+    assert parts["diagnostics"].first == 160
+    assert parts["diagnostics"].largest > 0
+    assert not {"parameters", "base policy", "seeds", "feasible Q"} & parts.keys()
+
+
+def test_files_that_the_run_began_from_are_checked(finished, tmp_path, monkeypatch, capsys):
+    config, folder = finished
+    policy = folder / "policy.safetensors"
+    evaluation = dataclasses.replace(config.evaluation, every=240)
+    own = tiny_config(agent="zero", env_steps=240, evaluation=evaluation)
+    run = execute(own, tmp_path / "runs", policy=policy, progress=False)
+    code, shown = call(monkeypatch, capsys, run)
+    assert code == 2
+    assert "began from a policy file" in shown.err
+    assert "--base-policy FILE.safetensors" in shown.err
+    other = tmp_path / "other.safetensors"
+    other.write_bytes(policy.read_bytes() + b"\0")
+    code, shown = call(monkeypatch, capsys, run, "--base-policy", other)
+    assert code == 2
+    assert "has the hash" in shown.err
+    code, shown = call(monkeypatch, capsys, folder, "--demos", policy)
+    assert code == 2
+    assert "began from no demonstrations file; leave --demos out" in shown.err
+    out = tmp_path / "out"
+    code, shown = call(monkeypatch, capsys, run, "--base-policy", policy, "--out", out)
+    assert code == 0
+
+
+def test_what_cannot_be_repeated_is_one_sentence(repeated, tmp_path, monkeypatch, capsys):
+    folder, _ = repeated
+    record = read_record(folder / "record.json")
+
+    def refused(**changes) -> str:
+        copy = record.model_copy(update=changes)
+        copy.__dict__["config_hash"] = config_hash(copy.config)
+        path = tmp_path / "record.json"
+        path.write_text(dump_record(copy))
+        code, shown = call(monkeypatch, capsys, path, "--out", tmp_path / "out")
+        assert (code, shown.out) == (2, "")
+        assert shown.err.startswith("error: ")
+        assert shown.err.count("\n") == 1
+        return shown.err
+
+    assert "running, not finished" in refused(status="running", ended=None)
+    gone = refused(config=record.config | {"agent": "approximate", "agent_options": {}})
+    assert "cannot repeat" in gone
+    assert "there is no agent 'approximate'" in gone
+    assert f"commit {record.provenance.commit[:12]}: use that" in gone
+    assert "SymSteer 0.1" in refused(config=record.config | {"sac": {"width": 3}})
+    strange = {**record.config, "files": {"weights": "0" * 64}}
+    assert "files of a kind" in refused(config=strange)
+    for path in (tmp_path / "nowhere", tmp_path.parent):
+        code, shown = call(monkeypatch, capsys, path)
+        assert code == 2
+        assert "record.json" in shown.err or "nowhere" in shown.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_circumstances_are_named(repeated):
+    folder, again = repeated
+    record, config = read_record(folder / "record.json"), tiny_config()
+    here = read_record(again / "record.json").provenance
+    clean = record.provenance.model_copy(update={"dirty": False})
+    record.provenance = clean
+    here = clean.model_copy()
+    assert conditions(record, config, here) == []
+    packages = clean.packages | {"numpy": "1.0"}
+    elsewhere = clean.model_copy(
+        update={
+            "commit": "f" * 40,
+            "packages": packages,
+            "platform": "Linux riscv64",
+            "torch_threads": 7,
+            "dirty": True,
+        }
+    )
+    text = "\n".join(conditions(record, config, elsewhere))
+    for words in ("commit ffffffffffff", "numpy was", "Linux riscv64", "OMP_NUM_THREADS", "local"):
+        assert words in text
+    team = record.model_copy(update={"provenance": clean.model_copy(update={"together": 5})})
+    assert "together with 4 others" in "\n".join(conditions(team, config, here))
+    older = dict(record.config)
+    del older["keep_replay"]
+    record.__dict__["config"] = older
+    assert conditions(record, config, here) == [
+        "options that are newer than the record have defaults: keep_replay"
+    ]

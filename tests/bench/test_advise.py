@@ -1,0 +1,133 @@
+"""`symsteer advise`: worlds by name, from an audit and from a detection; mistakes."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from symsteer.cli import main
+from symsteer.leaderboard.records import write_record
+from tests.leaderboard.test_defects import CELL, cells
+
+VARIANTS = {"none": 0.9, "action_gain:0.5": 0.7, "action_gain:1": 0.2}
+TASKS = ("PickCube-v1", "PushCube-v1", "StackCube-v1", "PullCube-v1")
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory):
+    """Runs of four audited tasks, in which symmetry helps only while the world is symmetric."""
+    folder = tmp_path_factory.mktemp("records")
+    for task in TASKS:
+        rates = {variant: (0.5, rate, 0.5) for variant, rate in VARIANTS.items()}
+        for record in cells(rates, task=task):
+            write_record(record, folder / task / f"{record.run_id}.json")
+    return folder
+
+
+@pytest.fixture
+def advise(records, monkeypatch, capsys):
+    def call(*arguments):
+        words = ["symsteer", "advise", *map(str, arguments), "--records", str(records)]
+        monkeypatch.setattr("sys.argv", words)
+        code = main()
+        return code, capsys.readouterr()
+
+    return call
+
+
+def test_a_world_by_name(advise, tmp_path):
+    path = tmp_path / "advice.json"
+    variant = ("--variant", "action_gain:0.25")
+    code, shown = advise("--task", "PushT-v1", *variant, "--json", path)
+    assert code == 0
+    assert "PushT-v1, floating, action_gain:0.25, C8" in shown.out
+    assert "committed audit" in shown.out
+    (data,) = json.loads(path.read_text())["advice"]
+    (one,) = [
+        e for e in data["expected"] if (e["agent"], e["measure"]) == ("equivariant", "success")
+    ]
+    assert (one["source"], one["kind"], one["tasks"]) == ("other tasks", "action_gain", 4)
+    assert 0.1 < one["value"] < 0.5
+    assert f"{one['value']:+.3f} [" in shown.out
+    assert "success: take equivariant" in shown.out
+    (test,) = json.loads(path.read_text())["left_out"]
+    assert len(test["tasks"]) == 4
+    assert "best agent by success: right in 12/12 (100%) cells" in shown.out
+
+
+def test_worlds_of_an_audit(advise, tmp_path):
+    worlds = [
+        CELL | {"task": "Mine-v1", "variant": variant, "decision": [x, x, x], "part": "tool"}
+        for variant, x in (("action_gain:0.1", 0.1), ("shelf:0.5", 0.2))
+    ]
+    (tmp_path / "summary.json").write_text(json.dumps(worlds))
+    for path in (tmp_path, tmp_path / "summary.json"):
+        code, shown = advise("--audit", path)
+        assert code == 0
+        assert "Mine-v1, floating, action_gain:0.1, C8" in shown.out
+        # The task and its dial are unknown here, and one dial is not enough for a part.
+        assert "kind of break         shelf or else part tool" in shown.out
+        assert "success: undecided, because" in shown.out
+        assert shown.out.count("Tested by leaving out") == 1
+
+
+def test_the_file_of_one_audit(advise, tmp_path, monkeypatch, capsys):
+    small = ("--states", "expert", "--count", "8", "--resets", "16", "--out", str(tmp_path))
+    words = ["symsteer", "audit", "--task", "PushCube-v1", "--variant", "wind:0.3", *small]
+    monkeypatch.setattr("sys.argv", words)
+    assert main() == 0
+    for path in (tmp_path, tmp_path / "audit.json"):
+        code, shown = advise("--audit", path)
+        assert code == 0
+        assert "PushCube-v1, floating, wind:0.3, C8" in shown.out
+
+
+def test_a_detection_names_its_world_alone(advise, tmp_path):
+    settings = {
+        "task": "PushT-v1",
+        "embodiment": "floating",
+        "variant": "action_gain:0.25",
+        "group": "C8",
+    }
+    (tmp_path / "detect.json").write_text(json.dumps({"settings": settings, "broken": 3}))
+    code, shown = advise("--detection", tmp_path)
+    assert code == 0
+    assert "PushT-v1, floating, action_gain:0.25, C8" in shown.out
+    assert "A detection has no defect" in shown.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "name one world"),
+        (("--task", "PushT-v1", "--audit", "x"), "name one world"),
+        (("--task", "PushTea-v1"), "did you mean 'PushT-v1'"),
+        (("--task", "PushT-v1", "--variant", "wnid:1"), "did you mean 'wind'"),
+        (("--task", "PushT-v1", "--variant", "wind"), "wind"),
+        (("--task", "all"), "not all"),
+        (("--task", "PushT-v1", "--embodiment", "hand"), "hand"),
+        (("--task", "PushT-v1", "--variant", "wind:0.33", "--states", "1"), "at least 8"),
+        (("--audit", "nowhere"), "cannot read nowhere"),
+        (("--audit", "."), "holds no audit"),
+        (("--detection", "."), "cannot read detect.json"),
+        (("--detection", "detect-me.json"), "no detection of one run"),
+    ],
+)
+def test_mistakes(advise, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "detect-me.json").write_text("[1]")
+    code, shown = advise(*arguments)
+    assert (code, shown.out) == (2, "")
+    assert words in shown.err
+    assert shown.err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_a_world_without_an_audit_is_measured(advise, tmp_path):
+    """With a base policy of its own, in minutes."""
+    options = ("--states", 8, "--runs", tmp_path)
+    code, shown = advise("--task", "PushCube-v1", "--variant", "action_gain:0.3", *options)
+    assert code == 0
+    assert "measured now, 8 states" in shown.out
+    assert "this task" in shown.out
