@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from symsteer.leaderboard.answer import Gain, gains
 from symsteer.leaderboard.claims import SLOPE_UNIT, Outcome, where
 from symsteer.leaderboard.comparisons import Comparisons
+from symsteer.leaderboard.factors import MEASURES as EFFECT_MEASURES
+from symsteer.leaderboard.factors import MainEffect, main_effects
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.map_page import Figures, map_section
 from symsteer.leaderboard.paper import STANDARD
@@ -83,6 +85,13 @@ interval*: the final success lies within Wilson's 95 % interval of the record's.
 """
 """Shown only where it is so."""
 
+EFFECTS = f"""\
+Some agents were run in a balanced grid of options. The main effect of an option is the mean of its
+second value minus that of its first, over all settings of the others, on the same base policies:
+final success, largest |Q| as a multiple of the largest feasible one, share of diverged runs. Marks
+need {MIN_SEEDS} base policies.
+"""
+
 CLAIMS = f"""\
 Effects are differences of two agents, paired by base policy and seed (success and its area by
 episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNIT:g} of defect,
@@ -133,6 +142,8 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     parts += folded("The advantage of symmetry against the defect", against)
     if findings.comparisons.cells:
         parts += folded("All cells together", comparisons_section(findings.comparisons, overall))
+    if effects := main_effects(summary):
+        parts += folded("Effects of options", [EFFECTS.strip(), _effects_table(effects)])
     if sound := soundness_table(summary):
         parts += folded("Are the learners sound", [SOUND.strip(), sound])
     if findings.spreads:
@@ -186,6 +197,21 @@ def _gains_table(found: Sequence[Gain]) -> str:
     ]
     header = [f"{code(agent)}: AUC,<br>success" for agent in agents]
     return grid(["World", "Cells", *header], rows, left=1)
+
+
+def _effects_table(found: Sequence[MainEffect]) -> str:
+    rows: dict[tuple[str, ...], dict[str, str]] = {}
+    for one in found:
+        change = f"{code(one.option)} {code(one.levels[0])} to {code(one.levels[1])}"
+        counts = f"{one.runs}, {one.policies}"
+        own = rows.setdefault((code(one.agent), change), {})
+        mark = MARKS[one.effect.sign] if one.policies >= MIN_SEEDS else ""
+        own[one.measure] = stacked(one.effect, sign=True, marks=mark)
+        own["counts"] = counts
+    names = [*EFFECT_MEASURES, "counts"]
+    header = ["Agent", "Change", "Success", "Largest \\|Q\\|", "Diverged", "Runs, policies"]
+    body = [[*place, *(own.get(name, NOTHING) for name in names)] for place, own in rows.items()]
+    return grid(header, body, left=2)
 
 
 def _verdicts(findings: Findings) -> str:

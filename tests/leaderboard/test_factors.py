@@ -1,0 +1,58 @@
+"""Main effects of options: a fractional design, what is unbalanced, what does not vary."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from symsteer.leaderboard.factors import MainEffect, main_effects
+from symsteer.leaderboard.records import RunRecord
+from symsteer.leaderboard.summary import Run, summarize
+from tests.leaderboard.record_factory import make_cell
+
+
+def effects(records: list[RunRecord]) -> dict[tuple[str, str], MainEffect]:
+    summary = summarize([Run(Path(f"{i}.json"), record) for i, record in enumerate(records)])
+    return {(one.option, one.measure): one for one in main_effects(summary)}
+
+
+def design(seeds: int = 5, skip: int | None = None) -> list[RunRecord]:
+    """Half of the grid of four options: success 0.5, +0.2 with LayerNorm, -0.1 with 4 updates."""
+    records = []
+    for index, (utd, norm, tau) in enumerate(itertools.product((0, 1), repeat=3)):
+        if index == skip:
+            continue
+        options = {
+            "utd": (1.0, 4.0)[utd],
+            "layer_norm": bool(norm),
+            "tau": (0.005, 0.05)[tau],
+            "soft_backup": bool(utd ^ norm ^ tau),
+            "width": 128,
+        }
+        rate = 0.5 + 0.2 * norm - 0.1 * utd
+        for variant in ("none", "wind:1"):
+            records += make_cell({"standard": rate}, seeds, variant=variant, agent_options=options)
+    return records
+
+
+def test_a_fraction_of_the_grid_gives_the_main_effects() -> None:
+    found = effects(design())
+    assert {option for option, _ in found} == {"utd", "layer_norm", "tau", "soft_backup"}
+    norm = found["layer_norm", "success"]
+    assert norm.effect.value == pytest.approx(0.2)
+    assert (norm.levels, norm.runs) == (("false", "true"), 80)
+    assert found["utd", "success"].effect.value == pytest.approx(-0.1)
+    assert found["utd", "success"].levels == ("1.0", "4.0")
+    assert found["tau", "success"].levels == ("0.005", "0.05")
+    for option in ("tau", "soft_backup"):
+        assert found[option, "success"].effect.value == pytest.approx(0, abs=1e-9)
+    assert found["tau", "magnitude"].effect.value == pytest.approx(0)
+
+
+def test_what_is_not_balanced_is_no_design() -> None:
+    assert not effects(design(skip=3))
+    assert not effects(make_cell({"standard": 0.5}, agent_options={"tau": 0.1}))
+    two = [0.1, 0.2]
+    assert not effects(
+        [r for tau in two for r in make_cell({"standard": 0.5}, agent_options={"tau": tau})]
+    )
