@@ -93,6 +93,9 @@ def generate(
     _copy(copies)
     if reading.built:
         build_documentation(out / FOLDER)
+    else:
+        # That of an earlier site, which no page links any more.
+        shutil.rmtree(out / FOLDER, ignore_errors=True)
     number = sum(path.suffix == ".html" for path in files)
     return Written(out / "index.html", number, len(board.runs), reading.built)
 

@@ -237,12 +237,15 @@ def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
         str(path.relative_to(site)): path.read_bytes() for path in site.rglob("*") if path.is_file()
     }
     (out / "runs" / "mine.txt").write_text("kept")
+    (out / "docs").mkdir()
+    (out / "docs" / "index.html").write_text("of an earlier site")
     shutil.copytree(site.parent / "runs", runs)
     for path in sorted(runs.iterdir())[3:]:
         shutil.rmtree(path)
     generate([runs], out, PAPER, docs=False)
     assert len(list((out / "runs").glob("*.html"))) == 3
     assert (out / "runs" / "mine.txt").read_text() == "kept"
+    assert not (out / "docs").exists()
     assert not dead_links(read_pages(out))
 
 
