@@ -2,9 +2,11 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
+from symsteer.agents import AGENTS
 from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import build_config
 from symsteer.bench.sweep.command import preview
@@ -111,6 +113,17 @@ def test_the_suite_second_runs_what_its_study_claims():
     # No policy and no seed on which settings were chosen, and every policy for all agents.
     assert {run.seed for run in runs} == set(range(20, 30))
     assert not {"StackCube-v1", "PokeCube-v1"} & {run.task for run in runs}
+
+
+def test_the_zoo_is_compared_in_cells_of_the_suite_second():
+    zoo, second = load_suite("zoo").runs, load_suite("second").runs
+
+    def cell(run):
+        return replace(run, agent="standard", agent_options=AGENTS.get("standard").Options())
+
+    assert {cell(run) for run in zoo} <= {run for run in second if run.agent == "standard"}
+    claimed = {agent for claim in read_study("zoo").claims for agent in claim.agents}
+    assert {run.agent for run in zoo} == claimed - {"standard", "equivariant", "residual-pathway"}
 
 
 def test_agents_and_variants_of_a_seed_share_its_base_policy(tmp_path):
