@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass
 
 from symsteer.errors import UserError
@@ -60,29 +60,18 @@ def kinds(summary: Summary) -> dict[str, list[Table]]:
     Cells with another budget than most, with fewer demonstrations than the most of their place, or
     whose break begins in mid-run are kinds of their own.
     """
-    keys = [table.key for table in summary.tables]
-    budgets = Counter(key.env_steps for key in keys)
-    usual = max(budgets, key=lambda steps: (budgets[steps], steps), default=0)
-    most: dict[tuple[str, ...], int] = {}
-    for key in keys:
-        most[_place(key)] = max(key.demonstrations, most.get(_place(key), 0))
     found: dict[str, list[Table]] = defaultdict(list)
 
     def others(key: Key) -> tuple[bool, bool]:
-        return key.env_steps != usual, key.demonstrations < most[_place(key)]
+        return key.env_steps != summary.usual_budget, summary.has_few_demonstrations(key)
 
     for table in sorted(summary.tables, key=lambda table: (others(table.key), _order(table.key))):
-        key = table.key
-        longer, fewer = others(key)
-        words = [_break(key)]
-        words += [f"{count(key.env_steps)} steps"] if longer else []
+        longer, fewer = others(table.key)
+        words = [_break(table.key)]
+        words += [f"{count(table.key.env_steps)} steps"] if longer else []
         words += ["few demonstrations"] if fewer else []
         found[", ".join(words)].append(table)
     return dict(found)
-
-
-def _place(key: Key) -> tuple[str, ...]:
-    return key.task, key.embodiment, key.base, key.group, key.mode
 
 
 def _order(key: Key) -> tuple[bool, bool, str]:

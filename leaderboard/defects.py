@@ -404,9 +404,12 @@ def defect_map(summary: Summary, audit: Audit) -> DefectMap:
 def points_of(
     summary: Summary, audit: Audit, embodiment: str, agent: str, measure: str
 ) -> list[Point]:
-    """The audited tables of an embodiment with paired runs of an agent and of `STANDARD`."""
+    """The audited tables of an embodiment with paired runs of an agent and of `STANDARD`.
+
+    Only those with the usual budget and number of demonstrations (`Summary.usual_tables`).
+    """
     points = []
-    for table in summary.tables:
+    for table in summary.usual_tables:
         defect = defect_of(table.key, audit)
         if defect is None or table.key.embodiment != embodiment:
             continue

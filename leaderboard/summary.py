@@ -244,6 +244,11 @@ class Key:
         return self.breaking[1]
 
     @property
+    def place(self) -> tuple[str, ...]:
+        """What tables share that differ in variant, budget and number of demonstrations."""
+        return self.task, self.embodiment, self.base, self.group, self.mode
+
+    @property
     def broken_by(self) -> tuple[str, ...]:
         """What breaks the symmetry; empty for the unbroken control.
 
@@ -391,6 +396,35 @@ class Summary:
     @property
     def runs(self) -> list[Run]:
         return [run for table in self.tables for run in table.runs]
+
+    @cached_property
+    def usual_budget(self) -> int:
+        """The budget of most tables."""
+        budgets = Counter(table.key.env_steps for table in self.tables)
+        return max(budgets, key=lambda steps: (budgets[steps], steps), default=0)
+
+    @cached_property
+    def _demonstrations(self) -> dict[tuple[str, ...], int]:
+        """The largest number of demonstrations of each place."""
+        most: dict[tuple[str, ...], int] = {}
+        for table in self.tables:
+            key = table.key
+            most[key.place] = max(key.demonstrations, most.get(key.place, 0))
+        return most
+
+    def has_few_demonstrations(self, key: Key) -> bool:
+        """Whether other tables of the same place have more."""
+        return key.demonstrations < self._demonstrations[key.place]
+
+    @cached_property
+    def usual_tables(self) -> list[Table]:
+        """Those with the budget of most, and the most demonstrations of their place."""
+        return [
+            table
+            for table in self.tables
+            if table.key.env_steps == self.usual_budget
+            and not self.has_few_demonstrations(table.key)
+        ]
 
     @property
     def has_reproductions(self) -> bool:

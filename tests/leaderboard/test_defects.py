@@ -209,6 +209,21 @@ def test_the_area_is_measured_along_the_whole_curve() -> None:
     assert values["success"].advantage.value == pytest.approx(0.0)
 
 
+def test_the_map_has_cells_of_the_usual_budget_and_demonstrations() -> None:
+    rates = {"standard": 0.5, "equivariant": 0.7}
+    few = {"mode": "diverse", "count": 5, "seed": 0}
+    records = [
+        *make_cell(rates),
+        *make_cell(rates, variant="wind:1"),
+        *make_cell(rates, variant="wind:1", env_steps=500_000),
+        *make_cell(rates, demonstrations=few),
+    ]
+    found = defect_map(summary_of(records), audit_of({"none": 0.0, "wind:1": 0.4}))
+    points = found.panel("floating", "equivariant", "success").points
+    assert {(p.table.key.env_steps, p.table.key.demonstrations) for p in points} == {(50_000, 50)}
+    assert {p.table.key.variant for p in points} == {"none", "wind:1"}
+
+
 def test_a_slope_is_recovered() -> None:
     """0.3 - 1 x defect, with five base policies."""
     defects = dict(zip(VARIANTS, (0.0, 0.1, 0.2, 0.4, 0.5), strict=True))
