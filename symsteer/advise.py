@@ -63,13 +63,17 @@ def advise(
             "the committed records exist only in a checkout of the repository; name folders of "
             "runs with --records"
         )
-    summaries = [summarize(load_runs([folder])) for folder in folders]
+    # Mistakes first: to read the records takes seconds, to measure a world minutes.
+    settings = None
     if audit is not None:
         worlds = [(world, f"measured, {audit}") for world in _audited(audit)]
     else:
         if detection is not None:
             task, embodiment, variant, group = _detected(detection)
-        worlds = [_world(task or "", embodiment, variant, group, states, runs)]
+        settings = _named(task or "", embodiment, variant, group, states)
+    summaries = [summarize(load_runs([folder])) for folder in folders]
+    if settings is not None:
+        worlds = [_world(settings, runs)]
     defects = read_audit()
     embodiments = list(dict.fromkeys(world.embodiment for world, _ in worlds))
     tests = [leave_tasks_out(summaries, defects, name) for name in embodiments]
@@ -95,14 +99,10 @@ def advise(
     return 0
 
 
-def _world(
-    task: str, embodiment: str, variant: str, group: str, states: int, runs: Path
-) -> tuple[World, str]:
-    """A world by name, with its committed or measured defect, and where that is from."""
+def _named(task: str, embodiment: str, variant: str, group: str, states: int) -> AuditSettings:
+    """The settings of an audit of a world that is named."""
     from symsteer.bench.audit.result import AuditSettings
     from symsteer.bench.audit.study import grid
-    from symsteer.leaderboard.advice import World
-    from symsteer.leaderboard.defects import in_order, read_audit
 
     template = AuditSettings(group=group, count=states)
     found = grid([task], [embodiment], [variant], [], template)
@@ -110,10 +110,18 @@ def _world(
         raise UserError("name one task, one embodiment and one variant, not all")
     (settings,) = found
     settings.check()
+    return settings
+
+
+def _world(settings: AuditSettings, runs: Path) -> tuple[World, str]:
+    """A world with its committed or measured defect, and where that is from."""
+    from symsteer.leaderboard.advice import World
+    from symsteer.leaderboard.defects import in_order, read_audit
+
     place = settings.task, settings.embodiment, in_order(settings.variant), settings.group
     if defect := read_audit().get(place):
         return World(*place, defect), "committed audit"
-    return _measure(settings, runs), f"measured now, {states} states"
+    return _measure(settings, runs), f"measured now, {settings.count} states"
 
 
 def _measure(settings: AuditSettings, runs: Path) -> World:

@@ -110,6 +110,7 @@ def with_strict_layers(agent, strict):
     return state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_without_a_penalty_they_solve_a_broken_problem(problem, name):
     """Best is 0, the strict agent reaches less than -0.8."""

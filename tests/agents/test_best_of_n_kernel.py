@@ -135,6 +135,7 @@ def test_the_critic_has_the_symmetry_of_its_group(group, invariant):
     assert torch.allclose(q, turned, atol=1e-9) == invariant
 
 
+@pytest.mark.slow
 def test_it_is_the_base_policy_before_its_first_fit_and_much_better_later():
     agent = made(candidates=16, refit=320)
     obs = states(512, torch.Generator().manual_seed(2)).double()

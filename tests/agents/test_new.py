@@ -22,6 +22,7 @@ def test_the_tests_of_new_agents_pass(tmp_path, capsys):
     assert "9 passed" in done.stdout
 
 
+@pytest.mark.slow
 def test_the_tests_of_a_new_agent_fail_if_it_is_broken(tmp_path):
     new("agent", "my-agent", out=tmp_path)
     file = tmp_path / "my_agent.py"

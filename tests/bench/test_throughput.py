@@ -202,6 +202,7 @@ def test_decoders_are_timed_beside_their_products():
     assert " 1.00 " in second
 
 
+@pytest.mark.slow
 def test_whole_runs_are_timed_alone_and_in_teams(tmp_path):
     config = tiny_config("standard", env_steps=160)
     lines = []

@@ -134,6 +134,7 @@ def problems(text):
     return found
 
 
+@pytest.mark.slow
 def test_run_sweep_report_and_admission(site, tmp_path):
     names = symsteer(tmp_path, "list", site=site)
     for name in NAMES.values():

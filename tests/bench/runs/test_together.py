@@ -146,6 +146,7 @@ def test_an_error_of_one_run_does_not_stop_the_others(alone, tmp_path, monkeypat
     assert "not finite" in record.failure
 
 
+@pytest.mark.slow
 def test_an_error_of_an_update_ends_its_team_alone(tmp_path, monkeypatch):
     """The run of another kind, which shares the process, goes on."""
 
@@ -162,6 +163,7 @@ def test_an_error_of_an_update_ends_its_team_alone(tmp_path, monkeypatch):
     assert found == ["failed", "failed", "finished"]
 
 
+@pytest.mark.slow
 def test_runs_that_cannot_be_a_team_share_a_process_all_the_same(tmp_path):
     mixed = [
         *configs("zero", seeds=(0,)),

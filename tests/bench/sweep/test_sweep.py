@@ -59,6 +59,7 @@ def workers() -> list[int]:
     return [process.pid for process in multiprocessing.active_children()]
 
 
+@pytest.mark.slow
 def test_of_a_team_only_the_run_that_fails_is_tried_again(tmp_path):
     configs = tuple(tiny_config("standard", seed=seed) for seed in (0, 1))
     plan = make_plan(Suite("team", "", configs), tmp_path / "runs")
@@ -75,6 +76,7 @@ def test_of_a_team_only_the_run_that_fails_is_tried_again(tmp_path):
     assert (record.status, record.provenance.together) == ("finished", 2)
 
 
+@pytest.mark.slow
 def test_a_team_goes_on_without_the_runs_whose_base_policy_failed(tmp_path):
     configs = tuple(tiny_config("standard", seed=seed) for seed in range(3))
     plan = make_plan(Suite("baseless", "", configs), tmp_path / "runs")

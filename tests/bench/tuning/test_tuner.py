@@ -241,6 +241,7 @@ lr = { low = 1e-4, high = 1e-2, log = true }
 """
 
 
+@pytest.mark.slow
 def test_the_command_tunes_with_real_runs(tmp_path, monkeypatch, capsys):
     path, out = write_plan(tmp_path, REAL), str(tmp_path / "runs")
     arguments = ["symsteer", "tune", path, "--out", out, "--workers", "1"]
