@@ -70,9 +70,10 @@ class Tuner:
 
     def play(self) -> tuple[list[TrialResult], list[Chosen]]:
         """Execute all that is left: trials, single options, comparison on fresh cells."""
-        while batch := [(a, trial) for a, s in self.searches.items() for trial in s.batch()]:
-            self._round(batch)
-            self._write([])
+        self._rounds()
+        if self.plan.exchange:
+            self._exchange()
+            self._rounds(self.plan.exchange)
         chosen = [found for a in self.plan.agents if (found := self._best(a))]
         chosen = self._confirm(self._try_singles(chosen))
         self._write(chosen)
@@ -96,6 +97,23 @@ class Tuner:
             "preset": folder / f"{name}-preset.toml",
             "journal": storage_path(self.out, name),
         }
+
+    def _rounds(self, further: int = 0) -> None:
+        """Execute rounds until every agent has its trials, and ``further`` ones."""
+        searches = self.searches.items()
+        while batch := [(a, trial) for a, s in searches for trial in s.batch(further)]:
+            self._round(batch)
+            self._write([])
+
+    def _exchange(self) -> None:
+        """Let every agent try the settings of the others, with its best own options."""
+        best = {
+            agent: choice.options for agent in self.plan.agents if (choice := self._best(agent))
+        }
+        for agent, own in best.items():
+            others = [options for other, options in best.items() if other != agent]
+            shared = [{k: v for k, v in options.items() if k in own} for options in others]
+            self.searches[agent].exchange([{**own, **options} for options in shared])
 
     def _round(self, batch: Sequence[tuple[str, Trial]]) -> None:
         """Execute trials: first a few cells of each, then the others of those that are good."""
@@ -150,7 +168,7 @@ class Tuner:
         value = mean_auc(scores) if state == TrialState.COMPLETE else None
         self.searches[agent].study.tell(trial, value, state)
         area = f"AUC {mean_auc(scores):.3f} over {len(scores)} cells" if scores else "no cell"
-        of = f"{trial.number + 1} of {self.plan.trials}"
+        of = f"{trial.number + 1} of {self.plan.trials + self.plan.exchange}"
         print(f"trial     {agent} {of}: {STATES[state]}, {area}", flush=True)
 
     def _best(self, agent: str) -> Chosen | None:
@@ -221,7 +239,8 @@ class Tuner:
         write_json(places["trials"], {**about, **to_json(self.results, chosen)})
         if chosen:
             words = (
-                f"Chosen by `symsteer tune {self.plan.name}`, {self.plan.trials} trials an agent."
+                f"Chosen by `symsteer tune {self.plan.name}`, "
+                f"{self.plan.trials + self.plan.exchange} trials an agent."
             )
             write_atomically(places["preset"], to_preset(chosen, words).encode())
 
@@ -232,12 +251,13 @@ def preview(plan: TuningPlan) -> str:
     cells = len(plan.cells(first, plan.defaults(first)))
     fresh = len(plan.cells(first, plan.defaults(first), "confirm"))
     lines = [f"{plan.name}: {plan.description}" if plan.description else plan.name, ""]
+    trials = plan.trials + plan.exchange
     lines += [
-        f"{agent}: {plan.trials} trials of {len(space)} options: {', '.join(space)}"
+        f"{agent}: {trials} trials of {len(space)} options: {', '.join(space)}"
         for agent, space in plan.spaces.items()
     ]
     runs = sum(
-        plan.trials * cells + 3 * fresh + (agent in plan.singles) * (len(space) * cells + fresh)
+        trials * cells + 3 * fresh + (agent in plan.singles) * (len(space) * cells + fresh)
         for agent, space in plan.spaces.items()
     )
     lines += [

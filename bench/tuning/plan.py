@@ -26,10 +26,10 @@ from symsteer.bench.tuning import FOLDER
 from symsteer.errors import UserError
 from symsteer.names import unknown
 
-NUMBERS = {"trials": 20, "batch": 4, "probe": 2, "seed": 0}
+NUMBERS = {"trials": 20, "exchange": 0, "batch": 4, "probe": 2, "seed": 0}
 """Whole numbers of a plan and their defaults."""
 
-LATER = ("trials", "batch", "singles")
+LATER = ("trials", "exchange", "batch", "singles")
 """What may change after the first trial."""
 
 KEYS = ("description", "agents", "singles", *NUMBERS, "grid", "run", "confirm", "space")
@@ -64,6 +64,7 @@ class TuningPlan:
         source: file name; messages begin with it.
         description: what is tuned, and where.
         trials: of each agent.
+        exchange: further trials of each agent, which begin with the settings of the others.
         batch: trials of an agent in one round; later rounds learn from earlier ones.
         probe: cells after which a trial may be given up.
         seed: of the search.
@@ -76,6 +77,7 @@ class TuningPlan:
     source: str
     description: str
     trials: int
+    exchange: int
     batch: int
     probe: int
     seed: int
@@ -158,7 +160,11 @@ def read_plan(name_or_path: str) -> TuningPlan:
 
 
 def _number(value: Any, key: str, source: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < (key != "seed"):
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int)
+        or value < (key not in ("seed", "exchange"))
+    ):
         raise UserError(f"{source}: {key} must be a positive whole number, not {value!r}")
     return value
 

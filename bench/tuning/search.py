@@ -6,7 +6,9 @@ left unfinished are continued with the same options.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optuna
@@ -65,14 +67,30 @@ class Search:
                 f"{', '.join(LATER)} may change), or name another folder with --out"
             )
 
-    def batch(self) -> list[Trial]:
-        """The trials to execute next: those left unfinished, or new ones; empty at the end."""
+    def exchange(self, settings: Sequence[Mapping[str, Any]]) -> None:
+        """Let the first further trials have these settings, if none had them; does so once."""
+        known = self.study.get_trials(deepcopy=False)
+        if len(known) > self.plan.trials:
+            return
+        tried = [trial.params for trial in known]
+        for options in settings:
+            if options not in tried and len(tried) < self.plan.trials + self.plan.exchange:
+                tried.append(dict(options))
+                self.study.enqueue_trial(dict(options))
+
+    def batch(self, further: int = 0) -> list[Trial]:
+        """The trials to execute next: those left unfinished, or new ones; empty at the end.
+
+        Args:
+            further: trials beyond those of the plan.
+        """
         begun = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
         if begun:
             return [Trial(self.study, trial._trial_id) for trial in begun]
         ended = len(self.study.get_trials(deepcopy=False, states=ENDED))
         trials = []
-        for number in range(ended, min(ended + self.plan.batch, self.plan.trials)):
+        last = self.plan.trials + further
+        for number in range(ended, min(ended + self.plan.batch, last)):
             # A continued search draws what an uninterrupted one would.
             self.study.sampler = optuna.samplers.TPESampler(
                 seed=_seed(self.plan.seed, self.agent, number),

@@ -46,6 +46,23 @@ def scores_of(*areas):
     return [Score(f"task-{i % 2} cell", area, area, 60.0) for i, area in enumerate(areas)]
 
 
+def test_agents_try_the_settings_of_the_others(play):
+    results, _, _ = play()
+    best = {a: choose([t for t in results if t.agent == a]).options for a in BEST}
+    further, chosen, _ = play("more", TEXT.replace("trials = 12", "trials = 12\nexchange = 2"))
+    assert further[:12] == results[:12]
+    for agent, other in (("standard", "equivariant"), ("equivariant", "standard")):
+        own = [t for t in further if t.agent == agent]
+        assert [t.number for t in own] == list(range(14))
+        shared = {k: v for k, v in best[other].items() if k in best[agent]}
+        assert own[12].options == {**best[agent], **shared}
+        assert own[13].options not in [t.options for t in own[:13]]
+    # Once: the same call finds nothing left.
+    again, same, runs = play("more", TEXT.replace("trials = 12", "trials = 12\nexchange = 2"))
+    assert (again, same) == (further, chosen)
+    assert runs.played == []
+
+
 def trial(number, *areas, state="complete"):
     scores = scores_of(*areas)
     return TrialResult("standard", number, state, {"lr": number}, scores)
@@ -158,7 +175,7 @@ def test_more_trials_can_be_added_later(play):
 def test_trials_of_another_plan_are_refused(play):
     play()
     with pytest.raises(
-        UserError, match=r"tiny.toml is not as it was .*only trials, batch, singles"
+        UserError, match=r"tiny.toml is not as it was .*only trials, exchange, batch, singles"
     ):
         play(text=TEXT.replace("high = 1e-1", "high = 1e-2"))
 
