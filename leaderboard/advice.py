@@ -27,7 +27,6 @@ from symsteer.leaderboard.defects import (
     in_order,
     points_of,
     steered,
-    weighted,
 )
 from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.statistics import (
@@ -52,9 +51,6 @@ LEAST_FREEDOM = 2
 
 LEAST_DIALS = 2
 """Dials that the line of a part needs: how much dials differ cannot be known from one."""
-
-SEPARATOR = "; "
-"""Between reasons."""
 
 RESAMPLES_LEFT_OUT = 1000
 
@@ -96,11 +92,10 @@ class Expected:
         source: what it is expected from.
         kind: which cells the line is through: a dial, or a part of the defect.
         cells, policies, tasks: how many it rests on.
-        reason: why it decides nothing, whatever the interval; empty if it may.
+        reasons: why it decides nothing, whatever the interval; empty if it may.
+        agent, measure: whose and of what; empty before it is known.
     """
 
-    agent: str
-    measure: str
     value: float | None
     interval: Interval | None
     source: Source
@@ -108,12 +103,14 @@ class Expected:
     cells: int
     policies: int
     tasks: int
-    reason: str
+    reasons: tuple[str, ...]
+    agent: str = ""
+    measure: str = ""
 
     @property
     def sign(self) -> int:
         """+1 or -1 if it is clearly above or below 0, else 0."""
-        return self.interval.sign if self.interval and not self.reason else 0
+        return self.interval.sign if self.interval and not self.reasons else 0
 
 
 @dataclass(frozen=True)
@@ -207,14 +204,14 @@ def choose(measure: str, expected: Sequence[Expected]) -> Choice:
         return Choice(measure, (STANDARD,), "")
     if not expected:
         return Choice(measure, (), f"no audited cell has paired runs of a learner and {STANDARD}")
-    if any(not e.reason for e in expected):
+    if any(not e.reasons for e in expected):
         return Choice(measure, (), "no interval lies above 0, and not all lie below it")
-    reasons = dict.fromkeys(reason for e in expected for reason in e.reason.split(SEPARATOR))
-    return Choice(measure, (), SEPARATOR.join(reasons))
+    reasons = dict.fromkeys(reason for e in expected for reason in e.reasons)
+    return Choice(measure, (), "; ".join(reasons))
 
 
 def expect(world: World, lines: Lines, known: bool = True) -> Expected:
-    """The expectation from one agent's points (agent and measure are empty).
+    """The expectation from one agent's points.
 
     The first one that may decide something; else the first one, with the reason why it may not.
 
@@ -225,11 +222,11 @@ def expect(world: World, lines: Lines, known: bool = True) -> Expected:
     """
     found = []
     for one in _expectations(world, lines, known):
-        if not one.reason:
+        if not one.reasons:
             return one
         found.append(one)
     nothing = f"no mapped cell is like it: {' or '.join(world.kinds)}"
-    return found[0] if found else Expected("", "", None, None, "", "", 0, 0, 0, nothing)
+    return found[0] if found else Expected(None, None, "", "", 0, 0, 0, (nothing,))
 
 
 def _expectations(world: World, lines: Lines, known: bool) -> Iterator[Expected]:
@@ -242,7 +239,7 @@ def _expectations(world: World, lines: Lines, known: bool) -> Iterator[Expected]
 
 
 def _measured(world: World, lines: Lines) -> Expected | None:
-    """From the records of this very cell; of several budgets or studies, the mean over them."""
+    """From the records of this very cell; of several studies, the mean over them."""
     place = world.task, in_order(world.variant), world.group
     cells = [
         point
@@ -255,13 +252,13 @@ def _measured(world: World, lines: Lines) -> Expected | None:
     interval = combined(cell_estimates(pairs, resamples=lines.resamples)).interval()
     policies = max(point.policies for point in cells)
     return Expected(
-        *("", "", interval.value, interval, "this cell", dial_of(world.variant)),
+        *(interval.value, interval, "this cell", dial_of(world.variant)),
         *(len(cells), policies, 1, _too_few(policies)),
     )
 
 
-def _too_few(policies: int) -> str:
-    return "" if policies >= MIN_SEEDS else f"base policies: {policies}, {MIN_SEEDS} are needed"
+def _too_few(policies: int) -> tuple[str, ...]:
+    return () if policies >= MIN_SEEDS else (f"base policies: {policies}, {MIN_SEEDS} are needed",)
 
 
 @dataclass(frozen=True)
@@ -313,7 +310,7 @@ class _Line:
     @property
     def reasons(self) -> list[str]:
         """Why it decides nothing; none if it may."""
-        found = [_too_few(len(self.policies))]
+        found = [*_too_few(len(self.policies))]
         if self.own and self.freedom < LEAST_FREEDOM:
             found.append("too few cells to say how far they lie from their line")
         if self.kind.startswith(PART) and len(self.dials) < LEAST_DIALS:
@@ -324,7 +321,7 @@ class _Line:
             found.append(
                 f"other tasks with such cells: {len(self.tasks)}, {LEAST_TASKS} are needed"
             )
-        return [reason for reason in found if reason]
+        return found
 
     def at(self, world: World) -> Expected:
         """What it says of a world."""
@@ -346,8 +343,8 @@ class _Line:
             reasons.append(f"its defect lies beyond those of the map, {low:.2f} to {high:.2f}")
         source: Source = "this task" if self.own else "other tasks"
         return Expected(
-            *("", "", line.value, interval, source, self.kind),
-            *(self.cells, len(self.policies), len(self.tasks), SEPARATOR.join(reasons)),
+            *(line.value, interval, source, self.kind),
+            *(self.cells, len(self.policies), len(self.tasks), tuple(reasons)),
         )
 
 
@@ -412,10 +409,7 @@ class Lines:
         defects = np.array([point.defect.value for point in points])
         drawn = drawn_defects(points, self.resamples)
         means = cell_estimates(
-            [
-                [weighted(unit, np.full(len(unit), 1 / len(unit))) for unit in units]
-                for units in settings.values()
-            ],
+            [[Sample.mean(list(unit.values())) for unit in units] for units in settings.values()],
             resamples=self.resamples,
         )
         levels = []

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass
 
-from symsteer.errors import UserError
-from symsteer.leaderboard.defects import MEASURES, advantage
+from symsteer.leaderboard.defects import MEASURES, advantage, dial_of, parts_of
 from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
 from symsteer.leaderboard.statistics import Interval, cell_estimates, combined
 from symsteer.leaderboard.summary import MIN_SEEDS, SYMMETRIC_EMBODIMENT, Key, Summary, Table
 from symsteer.leaderboard.text import code, count
-from symsteer.variant import parse_variant
+from symsteer.variant import UNBROKEN
 
 AGENTS = ("augmented", *WITH_SYMMETRY)
 """Those that use the symmetry: the fair rival, which has it from data, and those of the map."""
@@ -76,18 +75,13 @@ def kinds(summary: Summary) -> dict[str, list[Table]]:
 
 def _order(key: Key) -> tuple[bool, bool, str]:
     """Without an arm first, unbroken first."""
-    return key.embodiment != SYMMETRIC_EMBODIMENT, key.variant != "none", key.variant
+    return key.embodiment != SYMMETRIC_EMBODIMENT, key.variant != UNBROKEN, key.variant
 
 
 def _break(key: Key) -> str:
     """What breaks the symmetry, without strengths."""
-    arm = "" if key.embodiment == SYMMETRIC_EMBODIMENT else "arm"
-    if key.variant == "none":
-        return arm or "unbroken"
-    try:
-        specs = parse_variant(key.variant)
-    except UserError:
-        return f"{arm}, {code(key.variant)}" if arm else code(key.variant)
-    dials = " and ".join(code(spec.name) for spec in specs)
-    late = "" if all(spec.is_constant for spec in specs) else ", changing"
-    return (f"{arm}, {dials}" if arm else dials) + late
+    arm = [] if key.embodiment == SYMMETRIC_EMBODIMENT else ["arm"]
+    if key.variant == UNBROKEN:
+        return "".join(arm) or "unbroken"
+    constant = all(spec.is_constant for spec in parts_of(key.variant) or ())
+    return ", ".join([*arm, code(dial_of(key.variant)), *([] if constant else ["changing"])])

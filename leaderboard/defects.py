@@ -169,21 +169,21 @@ def fingerprint(audit: Audit) -> str:
 
 def in_order(variant: str) -> str:
     """One spelling for one variant, its parts in alphabetical order; other texts as they are."""
-    specs = sorted(_parsed(variant), key=lambda spec: spec.text)
+    specs = sorted(parts_of(variant) or (), key=lambda spec: spec.text)
     return variant_text(specs) if specs else variant
 
 
-def _parsed(variant: str) -> tuple[VariantSpec, ...]:
-    """The parts of a variant; none for other texts."""
+def parts_of(variant: str) -> tuple[VariantSpec, ...] | None:
+    """The parts of a variant in canonical form; None for other texts, which a record may have."""
     try:
         return parse_variant(variant)
     except UserError:
-        return ()
+        return None
 
 
 def dial_of(variant: str) -> str:
     """A variant without strengths, its parts in alphabetical order; other texts as they are."""
-    names = sorted(spec.name for spec in _parsed(variant))
+    names = sorted(spec.name for spec in parts_of(variant) or ())
     return "+".join(names) or variant
 
 
@@ -201,7 +201,7 @@ def audit_commands(keys: Sequence[Key]) -> list[str]:
     wanted: dict[tuple[str, str, str], list[str]] = {}
     for key in sorted(keys):
         words = (key.task, key.embodiment, key.variant, key.group)
-        constant = all(spec.is_constant for spec in _parsed(key.variant))
+        constant = all(spec.is_constant for spec in parts_of(key.variant) or ())
         if (
             key.group
             and constant
@@ -442,7 +442,7 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> F
         return None
     total = sum(float((_centred(defects[list(unit)]) ** 2).sum()) for unit in every)
     cells = [
-        [weighted(unit, _centred(defects[list(unit)])) for unit in units]
+        [_weighted(unit, _centred(defects[list(unit)])) for unit in units]
         for units in settings.values()
     ]
     estimates = cell_estimates(cells, resamples=resamples)
@@ -460,10 +460,7 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> F
         y = [sample.value for unit in units for sample in unit.values()]
         centre = float(x.mean()), float(np.mean(y))
         lines.append(Line(setting, centre, (float(x.min()), float(x.max()))))
-    means = [
-        [weighted(unit, np.full(len(unit), 1 / len(unit))) for unit in units]
-        for units in settings.values()
-    ]
+    means = [[Sample.mean(list(unit.values())) for unit in units] for units in settings.values()]
     shares = [len(units) / len(every) for units in settings.values()]
     return Fit(
         level=combined(cell_estimates(means, resamples=resamples), shares),
@@ -515,7 +512,7 @@ def _centred(values: Array) -> Array:
     return values - values.mean(axis=0)
 
 
-def weighted(unit: Unit, factors: Array) -> Sample:
+def _weighted(unit: Unit, factors: Array) -> Sample:
     """The sum of samples of one base policy, each times its factor."""
     samples = list(unit.values())
     blocks = tuple(block for sample in samples for block in sample.blocks)

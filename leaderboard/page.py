@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from symsteer.leaderboard.answer import Gain, gains
+from symsteer.leaderboard.answer_page import answer_section
 from symsteer.leaderboard.claims import SLOPE_UNIT, Outcome, where
 from symsteer.leaderboard.comparisons import Comparisons
 from symsteer.leaderboard.factors import MEASURES as EFFECT_MEASURES
 from symsteer.leaderboard.factors import MainEffect, main_effects
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.map_page import Figures, map_section
-from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
 from symsteer.leaderboard.soundness import MAX_BIAS, MAX_FALL, MIN_CORRELATION, soundness
 from symsteer.leaderboard.statistics import Spread
@@ -25,7 +24,6 @@ from symsteer.leaderboard.text import (
     SPACE,
     code,
     compact,
-    difference,
     grid,
     image,
     interval,
@@ -70,12 +68,6 @@ demonstrations, the budget and the held-out episodes.
   reward allows; a cross there ends a run whose Q was not finite.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
   **Status**. The seeds below the number of seeds and episodes are links to the records.
-"""
-
-ANSWER = f"""\
-Advantage over `{STANDARD}` by what breaks the symmetry: mean over cells of the difference in
-success (final window) and in the area under its curve, paired by base policy and episode, with 95 %
-intervals. \u25b2 and \u25bc: the interval excludes 0, in cells with {MIN_SEEDS} pairs of runs.
 """
 
 MADE_AGAIN = """\
@@ -168,37 +160,6 @@ def folded(title: str, blocks: Sequence[str]) -> list[str]:
     return [f"<details>\n<summary>{title}</summary>", *blocks, "</details>"]
 
 
-def answer_section(
-    summary: Summary, findings: Findings, figures: Mapping[str, tuple[str, str]]
-) -> list[str]:
-    """The picture, the gains by kind of break, and what became of the claims."""
-    found = gains(summary)
-    parts = []
-    if found:
-        parts += ["## What symmetry gains", ANSWER.strip()]
-        if "answer" in figures:
-            parts.append(image(*figures["answer"]))
-        parts.append(_gains_table(found))
-    verdicts = _verdicts(findings)
-    return [*parts, *(["## Verdicts", verdicts] if verdicts else [])]
-
-
-def _gains_table(found: Sequence[Gain]) -> str:
-    agents = list(dict.fromkeys(gain.agent for gain in found))
-    texts: dict[str, dict[str, list[str]]] = {}
-    cells: dict[str, int] = {}
-    for gain in found:
-        text = difference(gain.effect) if gain.enough else interval(gain.effect, sign=True)
-        texts.setdefault(gain.kind, {}).setdefault(gain.agent, []).append(text)
-        cells[gain.kind] = max(gain.cells, cells.get(gain.kind, 0))
-    rows = [
-        [kind, str(cells[kind]), *("<br>".join(own.get(agent, [NOTHING])) for agent in agents)]
-        for kind, own in texts.items()
-    ]
-    header = [f"{code(agent)}: AUC,<br>success" for agent in agents]
-    return grid(["World", "Cells", *header], rows, left=1)
-
-
 def _effects_table(found: Sequence[MainEffect]) -> str:
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for one in found:
@@ -212,19 +173,6 @@ def _effects_table(found: Sequence[MainEffect]) -> str:
     header = ["Agent", "Change", "Success", "Largest \\|Q\\|", "Diverged", "Runs, policies"]
     body = [[*place, *(own.get(name, NOTHING) for name in names)] for place, own in rows.items()]
     return grid(header, body, left=2)
-
-
-def _verdicts(findings: Findings) -> str:
-    """Names of the claims by their verdicts, as a list."""
-    named: dict[str, list[str]] = {}
-    for outcome in findings.claims:
-        named.setdefault(outcome.verdict, []).append(outcome.claim.name)
-    order = ("supported", "contradicted", "equivalent", "undecided", "not tested")
-    return "\n".join(
-        f"- **{verdict.capitalize()}** ({len(named[verdict])}): {'; '.join(named[verdict])}."
-        for verdict in order
-        if verdict in named
-    )
 
 
 def seed_notice(summary: Summary) -> str:

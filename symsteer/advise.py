@@ -14,6 +14,7 @@ from symsteer.terminal import printable
 if TYPE_CHECKING:
     from symsteer.bench.audit.result import AuditSettings
     from symsteer.leaderboard.advice import Advice, Choice, Expected, LeaveOut, World
+    from symsteer.leaderboard.defects import Audit
 
 DETECTION = (
     "A detection has no defect: its AUROC and its share of broken copies are no numbers of the "
@@ -72,9 +73,9 @@ def advise(
             task, embodiment, variant, group = _detected(detection)
         settings = _named(task or "", embodiment, variant, group, states)
     summaries = [summarize(load_runs([folder])) for folder in folders]
-    if settings is not None:
-        worlds = [_world(settings, runs)]
     defects = read_audit()
+    if settings is not None:
+        worlds = [_world(settings, runs, defects)]
     embodiments = list(dict.fromkeys(world.embodiment for world, _ in worlds))
     tests = [leave_tasks_out(summaries, defects, name) for name in embodiments]
     advices = [advise(summaries, defects, world) for world, _ in worlds]
@@ -113,13 +114,13 @@ def _named(task: str, embodiment: str, variant: str, group: str, states: int) ->
     return settings
 
 
-def _world(settings: AuditSettings, runs: Path) -> tuple[World, str]:
+def _world(settings: AuditSettings, runs: Path, audit: Audit) -> tuple[World, str]:
     """A world with its committed or measured defect, and where that is from."""
     from symsteer.leaderboard.advice import World
-    from symsteer.leaderboard.defects import in_order, read_audit
+    from symsteer.leaderboard.defects import in_order
 
     place = settings.task, settings.embodiment, in_order(settings.variant), settings.group
-    if defect := read_audit().get(place):
+    if defect := audit.get(place):
         return World(*place, defect), "committed audit"
     return _measure(settings, runs), f"measured now, {settings.count} states"
 
@@ -206,7 +207,7 @@ def _expected(one: Expected) -> str:
     shown = "-" if one.value is None else f"{one.value:+.3f}"
     if one.interval:
         shown = _interval(one.interval, "+.3f")
-    mark = " ?" if one.reason else "  "
+    mark = " ?" if one.reasons else "  "
     numbers = (str(one.cells), str(one.policies), str(one.tasks))
     return _row(one.agent, one.measure, shown + mark, one.source, one.kind, *numbers)
 

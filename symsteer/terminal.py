@@ -20,7 +20,7 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
 
 
-def typed(name: str, value: Any) -> list[str]:
+def option_words(name: str, value: Any) -> list[str]:
     """An option as the words that one types: flags have no value, lists have several.
 
     Args:

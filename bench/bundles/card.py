@@ -11,7 +11,7 @@ from symsteer.bench.bundles.manifest import BundledFile, Code, next_commands
 from symsteer.bench.bundles.measure import Measured
 from symsteer.bench.tasks import TASKS
 from symsteer.leaderboard.records import flat
-from symsteer.terminal import typed
+from symsteer.terminal import option_words
 
 LICENCE = "Apache-2.0"
 """Of SymSteer, and so of the demonstrations and policies that it makes."""
@@ -100,7 +100,7 @@ def how_made(contents: Contents) -> str:
         return f"The run that it was taken from began with files of its user: {files}."
     defaults = flat(type(config.policy)().to_json())
     options = [
-        f" {shlex.join(typed(f'policy.{key}', value))}"
+        f" {shlex.join(option_words(f'policy.{key}', value))}"
         for key, value in flat(config.policy.to_json()).items()
         if value != defaults[key]
     ]

@@ -9,6 +9,7 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 
+from symsteer.bench.caption import captioned
 from symsteer.bench.runs.evaluator import Evaluator
 from symsteer.bench.runs.pictures import (
     FAILURE,
@@ -21,7 +22,6 @@ from symsteer.bench.runs.pictures import (
 )
 from symsteer.bench.runs.stored import Restored, restored
 from symsteer.bench.runs.trainer import feasible_return
-from symsteer.bench.sim.caption import captioned
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.variants import evaluation_variants, read

@@ -17,7 +17,7 @@ import sapien
 from mani_skill.utils.sapien_utils import look_at
 from PIL import Image
 
-from symsteer.bench.sim.caption import captioned
+from symsteer.bench.caption import captioned
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.tasks.tilted import Tilted

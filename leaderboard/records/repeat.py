@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from symsteer.leaderboard.records.values import flat
-from symsteer.terminal import typed
+from symsteer.terminal import option_words
 
 DERIVED = ("evaluation_variant", "files")
 """Keys that the run adds to its configuration."""
@@ -51,7 +51,7 @@ def repeat_command(config: Mapping[str, Any]) -> str | None:
         name = key.replace("agent_options.", "agent.", 1)
         if not OPTION.fullmatch(name):
             return None
-        option = typed(name, value)
+        option = option_words(name, value)
         if not all(VALUE.fullmatch(word) for word in option[1:]):
             return None
         words += option

@@ -8,26 +8,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from symsteer.errors import UserError
-from symsteer.leaderboard.defects import Audit
+from symsteer.leaderboard.defects import Audit, parts_of
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.report import slug
 from symsteer.leaderboard.site.docs import Documentation
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import ARM, SYMMETRIC_EMBODIMENT, Key, Row, Run, Summary, Table
 from symsteer.leaderboard.tables import cell_name
-from symsteer.variant import UNBROKEN, VariantSpec, parse_variant
+from symsteer.variant import UNBROKEN
 
 DIGITS = 10
 """Hexadecimal digits at the end of a page's name: names that are cut or written alike differ."""
-
-
-def parts_of(variant: str) -> tuple[VariantSpec, ...] | None:
-    """The parts of a variant; None for a text that is none."""
-    try:
-        return parse_variant(variant)
-    except UserError:
-        return None
 
 
 def dials(variant: str) -> list[str]:

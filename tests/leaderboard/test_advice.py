@@ -68,12 +68,12 @@ def test_the_crossing_is_found_for_a_new_task(map_of_five: tuple[Summary, Audit]
         assert of(far, "equivariant", measure).value == pytest.approx(-0.15, abs=0.02)
         assert of(far, "approximate", measure).value == pytest.approx(0.1, abs=0.02)
     one = of(near, "equivariant")
-    assert (one.source, one.kind, one.reason) == ("other tasks", "wind", "")
+    assert (one.source, one.kind, one.reasons) == ("other tasks", "wind", ())
     # Four cells of each task, without the obstacle.
     assert (one.cells, one.policies, one.tasks) == (20, 25, 5)
     # A dial that nobody has mapped: by the part of its defect, which two dials have.
     other = of(advise([summary], audit, world("friction_patch:1", 0.05)), "equivariant")
-    assert (other.kind, other.cells, other.reason) == ("part tool", 25, "")
+    assert (other.kind, other.cells, other.reasons) == ("part tool", 25, ())
     assert other.value == pytest.approx(0.25, abs=0.02)
 
 
@@ -159,7 +159,7 @@ def test_few_cells_do_not_say_how_far_they_lie_from_a_line() -> None:
     few = {place: d for place, d in audit.items() if place[2] in ("none", "wind:1")}
     one = of(advise([summary], few, world("wind:0.3", 0.1, "A-v1")), "equivariant")
     assert (one.source, one.cells) == ("this task", 4)
-    assert one.reason == "too few cells to say how far they lie from their line"
+    assert one.reasons == ("too few cells to say how far they lie from their line",)
     assert one.sign == 0
 
 
@@ -173,10 +173,10 @@ def test_studies_are_paired_apart_and_few_policies_do_not_count(
     assert of(both, "equivariant") == of(mine, "equivariant")
 
 
-def expected(agent: str, low: float, high: float, reason: str = "") -> Expected:
+def expected(agent: str, low: float, high: float, *reasons: str) -> Expected:
     middle = (low + high) / 2
     interval = Interval(middle, low, high)
-    return Expected(agent, "auc", middle, interval, "other tasks", "wind", 9, 9, 9, reason)
+    return Expected(middle, interval, "other tasks", "wind", 9, 9, 9, reasons, agent, "auc")
 
 
 def test_the_choice() -> None:
@@ -185,9 +185,9 @@ def test_the_choice() -> None:
     assert choose("auc", [below, above, best, open_]).agents == ("c", "b")
     assert choose("auc", [below, below]).agents == ("standard",)
     assert choose("auc", [below, open_]).agents == ()
-    poor = expected("e", 0.5, 0.6, "base policies: 1; tasks: 1")
+    poor = expected("e", 0.5, 0.6, "base policies: 1", "tasks: 1")
     assert choose("auc", [poor]).agents == ()
-    assert choose("auc", [poor, replace(poor, reason="tasks: 1")]).reason == (
+    assert choose("auc", [poor, replace(poor, reasons=("tasks: 1",))]).reason == (
         "base policies: 1; tasks: 1"
     )
     # An agent of which too little is known does not make the others worse.
@@ -276,7 +276,7 @@ def test_intervals_cover_what_is_measured(known: bool) -> None:
         unseen = points[-2]
         lines = Lines([point for point in points if point is not unseen], resamples=300)
         found = expect(World.of(unseen), lines, known=known)
-        assert (found.source, found.reason) == ("this task" if known else "other tasks", "")
+        assert (found.source, found.reasons) == ("this task" if known else "other tasks", ())
         assert found.interval is not None
         value = float(np.mean([sample.value for sample in unseen.pairs.values()]))
         inside += found.interval.low <= value <= found.interval.high
