@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from symsteer.leaderboard.answer import Gain, gains
+from symsteer.leaderboard.claims_page import standing, statements
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.summary import MIN_SEEDS, Summary
@@ -21,15 +22,19 @@ def answer_section(
     summary: Summary, findings: Findings, figures: Mapping[str, tuple[str, str]]
 ) -> list[str]:
     """The picture, the gains by kind of break, and what became of the claims."""
-    found = gains(summary)
     parts = []
-    if found:
-        parts += ["## What symmetry gains", ANSWER.strip()]
-        if "answer" in figures:
-            parts.append(image(*figures["answer"]))
-        parts.append(_gains_table(found))
+    if gained := gains_section(summary):
+        explained, table = gained
+        drawn = [image(*figures["answer"])] if "answer" in figures else []
+        parts += ["## What symmetry gains", explained, *drawn, table]
     verdicts = _verdicts(findings)
     return [*parts, *(["## Verdicts", verdicts] if verdicts else [])]
+
+
+def gains_section(summary: Summary) -> list[str]:
+    """What the numbers are, and their table; empty if no runs can be paired."""
+    found = gains(summary)
+    return [ANSWER.strip(), _gains_table(found)] if found else []
 
 
 def _gains_table(found: Sequence[Gain]) -> str:
@@ -49,7 +54,10 @@ def _gains_table(found: Sequence[Gain]) -> str:
 
 
 def _verdicts(findings: Findings) -> str:
-    """Names of the claims by their verdicts, as a list."""
+    """What became of the paper's statements, or else of all claims by name, as a list."""
+    if said := statements(findings):
+        lines = [f"- {text}: {standing(outcomes)}." for text, outcomes in said.items()]
+        return "\n".join(lines) + "\n\nEach with its tests: [the paper's claims](PAPER.md)."
     named: dict[str, list[str]] = {}
     for outcome in findings.claims:
         named.setdefault(outcome.verdict, []).append(outcome.claim.name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from symsteer.leaderboard.advice import LeaveOut, leave_tasks_out
 from symsteer.leaderboard.claims import Outcome, claims
 from symsteer.leaderboard.comparisons import Comparisons, compare_agents
 from symsteer.leaderboard.defects import Audit, DefectMap, defect_map, fingerprint
@@ -18,6 +19,8 @@ class Findings:
 
     map: DefectMap
     """Advantage of symmetry against the audited defect."""
+    left_out: list[LeaveOut]
+    """How often the map is right about a task that it does not know, by embodiment."""
     comparisons: Comparisons
     study: Study
     claims: list[Outcome]
@@ -33,8 +36,10 @@ def analyse(summary: Summary, audit: Audit, study: Study) -> Findings:
 
     Raises UserError for names in the study that nothing has (`claims`).
     """
+    found = defect_map(summary, audit)
     return Findings(
-        defect_map(summary, audit),
+        found,
+        [leave_tasks_out([summary], audit, embodiment) for embodiment in found.embodiments],
         compare_agents(summary),
         study,
         claims(study, summary, audit),

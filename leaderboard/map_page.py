@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel, audit_commands
+from symsteer.leaderboard.advice import LeaveOut
+from symsteer.leaderboard.defects import MEASURES, Fit, Panel, audit_commands
+from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.summary import MIN_SEEDS, Summary
 from symsteer.leaderboard.tables import cell_name
@@ -46,8 +48,18 @@ Fieller's method), and a dash there means: up to the end of the measured range.
 """
 
 
-def map_section(summary: Summary, found: DefectMap, figures: Figures) -> list[str]:
+LEFT_OUT = f"""\
+Is the map right about a task that it does not know? Each cell was expected from the other tasks
+alone (`symsteer advise`) and compared with what was measured there, in cells with {MIN_SEEDS} base
+policies: whether the sign of the advantage was right, also of those cells alone whose measured
+interval excludes 0; whether the measured advantage lay inside the expected interval; the mean
+absolute error.
+"""
+
+
+def map_section(summary: Summary, findings: Findings, figures: Figures) -> list[str]:
     """Paragraphs of the section, without its heading."""
+    found = findings.map
     parts = [MAP.strip()]
     for embodiment in found.embodiments:
         agents = found.agents(embodiment)
@@ -56,6 +68,9 @@ def map_section(summary: Summary, found: DefectMap, figures: Figures) -> list[st
         if drawn := figures.get((embodiment,)):
             parts += [image(*figure) for figure in drawn.values()]
         parts += [_slopes(panels), _numbers(summary, panels)]
+    if tested := [one for one in findings.left_out if one.agents]:
+        parts += ["### A task that the map does not know", LEFT_OUT.strip(), _left_out(tested)]
+        parts += [text for one in tested if (text := _best_left_out(one))]
     if not found.embodiments:
         parts.append("There is no map yet: no audited cell has paired runs of these agents.")
     if found.unaudited:
@@ -73,8 +88,57 @@ def map_section(summary: Summary, found: DefectMap, figures: Figures) -> list[st
     return parts
 
 
+def _left_out(tested: Sequence[LeaveOut]) -> str:
+    rows = [
+        [
+            code(one.embodiment),
+            code(row.agent),
+            _measure(row.measure),
+            _share(row.right, row.cells),
+            _share(row.clear_right, row.clear),
+            _share(row.inside, row.with_interval),
+            number(row.error),
+        ]
+        for one in tested
+        for row in one.agents
+    ]
+    header = [
+        "Embodiment",
+        "Agent",
+        "Advantage in",
+        "Sign right",
+        "Of clear ones",
+        "Inside",
+        "Error",
+    ]
+    return grid(header, rows, left=3)
+
+
+def _best_left_out(tested: LeaveOut) -> str:
+    """How often the expected best agent was the best one, in a sentence."""
+    texts = [
+        f"by {_measure(best.measure)} in {_share(best.right, best.cells)} cells (the agent that is "
+        f"best on average elsewhere: {_share(best.usual, best.cells)})"
+        for best in tested.best
+    ]
+    if not texts:
+        return ""
+    return (
+        f"{code(tested.embodiment)}, {len(tested.tasks)} tasks: the expected best agent was the "
+        f"best {', '.join(texts)}."
+    )
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part}/{whole}" if whole else NOTHING
+
+
+def _measure(name: str) -> str:
+    return "AUC" if name == "auc" else name
+
+
 def _name(panel: Panel) -> list[str]:
-    return [code(panel.agent), "AUC" if panel.measure == "auc" else panel.measure]
+    return [code(panel.agent), _measure(panel.measure)]
 
 
 def _slopes(panels: Sequence[Panel]) -> str:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from symsteer.leaderboard.answer_page import answer_section
-from symsteer.leaderboard.claims import SLOPE_UNIT, Outcome, where
+from symsteer.leaderboard.claims_page import CLAIMS, claims_section
 from symsteer.leaderboard.comparisons import Comparisons
 from symsteer.leaderboard.factors import MEASURES as EFFECT_MEASURES
 from symsteer.leaderboard.factors import MainEffect, main_effects
@@ -15,7 +15,6 @@ from symsteer.leaderboard.map_page import Figures, map_section
 from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
 from symsteer.leaderboard.soundness import MAX_BIAS, MAX_FALL, MIN_CORRELATION, soundness
 from symsteer.leaderboard.statistics import Spread
-from symsteer.leaderboard.study import Claim
 from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary, Table
 from symsteer.leaderboard.tables import Links, cell_name, section, status
 from symsteer.leaderboard.text import (
@@ -84,14 +83,6 @@ final success, largest |Q| as a multiple of the largest feasible one, share of d
 need {MIN_SEEDS} base policies.
 """
 
-CLAIMS = f"""\
-Effects are differences of two agents, paired by base policy and seed (success and its area by
-episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNIT:g} of defect,
-within base policies. *Supported* and *contradicted* need p < 0.05 for "no effect", *equivalent*
-needs it for "an effect of at least the smallest one of interest"; otherwise a claim is *undecided*.
-Both p-values are corrected for the number of tests of a family (Holm), the intervals are not.
-"""
-
 SOUND = f"""\
 A comparison of agents needs learners that work: success must not collapse on the way, and Q must
 agree with the returns of the same decisions. *Fall* is how far success falls below the better of
@@ -130,12 +121,12 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     parts += folded("Claims, effects and p-values", [CLAIMS.strip(), *claims_section(findings)])
     beaten = _beaten(summary)
     parts += folded("Success in every cell", [_overview(summary), *([beaten] if beaten else [])])
-    against = map_section(summary, findings.map, figures)
+    against = map_section(summary, findings, figures)
     parts += folded("The advantage of symmetry against the defect", against)
     if findings.comparisons.cells:
         parts += folded("All cells together", comparisons_section(findings.comparisons, overall))
-    if effects := main_effects(summary):
-        parts += folded("Effects of options", [EFFECTS.strip(), _effects_table(effects)])
+    if effects := effects_section(summary):
+        parts += folded("Effects of options", effects)
     if sound := soundness_table(summary):
         parts += folded("Are the learners sound", [SOUND.strip(), sound])
     if findings.spreads:
@@ -158,6 +149,12 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
 def folded(title: str, blocks: Sequence[str]) -> list[str]:
     """Blocks of markdown that a reader opens; the title is our own."""
     return [f"<details>\n<summary>{title}</summary>", *blocks, "</details>"]
+
+
+def effects_section(summary: Summary) -> list[str]:
+    """Main effects of options in balanced grids, as blocks of markdown; empty without a grid."""
+    found = main_effects(summary)
+    return [EFFECTS.strip(), _effects_table(found)] if found else []
 
 
 def _effects_table(found: Sequence[MainEffect]) -> str:
@@ -298,82 +295,6 @@ def soundness_table(summary: Summary) -> str:
             )
     header = ["Task", "Agent", "Runs", "Fall", "Correlation", "Bias (reward)", "Verdict"]
     return grid(header, rows, left=2) if rows else ""
-
-
-MEASURE_WORDS = {
-    "auc": "area under the curve",
-    "success": "success",
-    "diverged": "share of diverged runs",
-    "magnitude": "largest \\|Q\\| over the largest feasible",
-    "bias": "\\|Q bias\\| (reward)",
-}
-
-
-def claims_section(findings: Findings) -> list[str]:
-    """The study's claims and their verdicts, as blocks of markdown."""
-    study = findings.study
-    origin = f"They are declared in {code(study.source)} (sha256 {code(study.sha256[:12])}"
-    if study.declared:
-        origin += f", commit {code(study.declared)})."
-    else:
-        origin += "). The study names no commit that declared them before its runs."
-    rows: list[list[str]] = []
-    untested: dict[str, list[str]] = {}
-    for outcome in findings.claims:
-        claim, effect = outcome.claim, outcome.effect
-        if effect is None:
-            untested.setdefault(outcome.reason, []).append(claim.name)
-            continue
-        rows.append(
-            [
-                f"{claim.name} ({claim.family})",
-                _test(claim),
-                stacked(effect.interval(), sign=True, digits=3)
-                + (f"<br>{outcome.counts}" if outcome.counts else ""),
-                f"{claim.smallest:g}",
-                NOTHING if outcome.reason else f"{_p(outcome.p)}<br>{_p(outcome.p_equal)}",
-                f"{outcome.cells}, {outcome.pairs}, {outcome.policies}",
-                _verdict(outcome),
-            ]
-        )
-    parts = [origin]
-    if rows:
-        header = [
-            "Claim (family)",
-            "Effect",
-            "Size, 95 % interval",
-            "Smallest of interest",
-            "p: none; at least that",
-            "Cells, pairs, policies",
-            "Verdict",
-        ]
-        parts.append(grid(header, rows, left=2))
-    if untested:
-        lines = [f"- {reason}: {'; '.join(names)}" for reason, names in untested.items()]
-        parts.append("Not tested:\n\n" + "\n".join(lines))
-    return parts
-
-
-def _verdict(outcome: Outcome) -> str:
-    text = f"**{outcome.verdict}**"
-    if outcome.reason:
-        return f"{text}: {outcome.reason}"
-    if outcome.policies >= MIN_SEEDS or outcome.verdict == "undecided":
-        return text
-    policies = "one base policy" if outcome.policies == 1 else f"{outcome.policies} base policies"
-    return f"{text}, for {policies} alone"
-
-
-def _test(claim: Claim) -> str:
-    first, second = map(code, claim.agents)
-    text = f"{MEASURE_WORDS[claim.measure]}, {first} minus {second}, {where(claim.cells)}"
-    if claim.minus is not None:
-        text += f" minus the same in {where(claim.minus)}"
-    return f"slope of {text}" if claim.effect == "slope" else text
-
-
-def _p(value: float) -> str:
-    return "< 0.001".replace(" ", SPACE) if value < 0.001 else number(value, 3)
 
 
 def comparisons_section(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> list[str]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.leaderboard.claims_page import PAPER_TITLE, paper_page
 from symsteer.leaderboard.defects import Audit, read_audit
 from symsteer.leaderboard.figures import render_figures, to_svg
 from symsteer.leaderboard.findings import analyse
@@ -35,9 +36,10 @@ def generate(
     study: str = PAPER,
     reproductions: Path | None = None,
 ) -> list[Path]:
-    """Write LEADERBOARD.md, leaderboard.csv, records.csv and figures/ into `out`.
+    """Write LEADERBOARD.md, PAPER.md, leaderboard.csv, records.csv and figures/ into `out`.
 
-    Figures of an earlier call that no longer belong to a table are removed.
+    Figures of an earlier call that no longer belong to a table are removed; so is PAPER.md if the
+    study names no statements of the paper.
 
     Args:
         records: record files, run folders, or folders of these.
@@ -100,6 +102,8 @@ def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[s
     files["records.csv"] = render_records(summary, links).encode()
     files["leaderboard.csv"] = render_csv(summary).encode()
     files["LEADERBOARD.md"] = render_page(summary, findings, shown, links).encode()
+    if paper := paper_page(findings):
+        files["PAPER.md"] = paper.encode()
     return files
 
 
@@ -123,6 +127,10 @@ def _folder(out: Path) -> Path:
 
 
 def _stale(out: Path, files: Mapping[str, bytes]) -> list[str]:
-    """Figures in `out` that carry a name of ours but belong to no table of `files`."""
-    names = (f"figures/{path.name}" for path in (out / "figures").glob("*.svg"))
-    return sorted(n for n in names if n not in files and FIGURE_NAME.fullmatch(Path(n).name))
+    """Files in `out` that carry a name of ours and are not of `files`."""
+    names = [path.name for path in (out / "figures").glob("*.svg")]
+    own = [f"figures/{name}" for name in names if FIGURE_NAME.fullmatch(name)]
+    paper = out / "PAPER.md"
+    if paper.is_file() and paper.read_bytes().startswith(PAPER_TITLE.encode()):
+        own.append(paper.name)
+    return sorted(name for name in own if name not in files)

@@ -83,6 +83,14 @@ class Claim(_Table):
         return self
 
 
+class Statement(_Table):
+    """What the paper says, and the claims that test it."""
+
+    says: Words
+    claims: Names
+    """Names of claims of the same file."""
+
+
 class _File(_Table):
     description: str = ""
     notice: str = ""
@@ -90,6 +98,16 @@ class _File(_Table):
     claims: str = ""
     """Another file of the same folder, which holds the claims."""
     claim: tuple[Claim, ...] = ()
+    statement: tuple[Statement, ...] = ()
+
+    @model_validator(mode="after")
+    def _statements_name_claims(self) -> _File:
+        names = [claim.name for claim in self.claim]
+        for statement in self.statement:
+            for name in statement.claims:
+                if name not in names:
+                    raise ValueError(str(unknown("claim", name, names, repr(statement.says))))
+        return self
 
 
 @dataclass(frozen=True)
@@ -100,6 +118,7 @@ class Study:
         notice: markdown that the page shows above all results.
         declared: the commit that declared the claims, if the study names one.
         claims: in the order of the file.
+        statements: of the paper, each with the claims that test it.
         source: name of the file that declares the claims.
         sha256: of its content.
     """
@@ -107,6 +126,7 @@ class Study:
     notice: str
     declared: str
     claims: tuple[Claim, ...]
+    statements: tuple[Statement, ...]
     source: str
     sha256: str
 
@@ -138,7 +158,9 @@ def read_study(name_or_path: str) -> Study:
     if file.declared:
         _check_commit(source, file.declared)
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    return Study(file.notice.strip(), file.declared, file.claim, source.name, digest)
+    return Study(
+        file.notice.strip(), file.declared, file.claim, file.statement, source.name, digest
+    )
 
 
 def _read(path: Path) -> _File:
@@ -179,8 +201,9 @@ def _problem(error: ValidationError) -> str:
     words = [str(part + 1) if isinstance(part, int) else part for part in first["loc"]]
     where, last = " ".join(words[:-1]), words[-1] if words else ""
     if first["type"] == "extra_forbidden":
-        tables: dict[int, type[_Table]] = {1: _File, 3: Claim}
-        return str(unknown("key", last, tables.get(len(words), Cells).model_fields, where))
+        tables: dict[str, type[_Table]] = {"": _File, "claim": Claim, "statement": Statement}
+        table = tables[words[0] if where else ""] if len(words) < 4 else Cells
+        return str(unknown("key", last, table.model_fields, where))
     if last == "measure" and isinstance(first["input"], str):
         return str(unknown("measure", first["input"], MEASURES, where))
-    return f"{' '.join(words)}: {first['msg'].removeprefix('Value error, ')}"
+    return ": ".join(filter(None, [" ".join(words), first["msg"].removeprefix("Value error, ")]))

@@ -8,6 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from symsteer.leaderboard import page
+from symsteer.leaderboard.answer_page import gains_section
+from symsteer.leaderboard.claims_page import CLAIMS, claims_section, paper_section
 from symsteer.leaderboard.defects import MEASURES, defect_of
 from symsteer.leaderboard.map_page import COLOUR, map_section
 from symsteer.leaderboard.records import flat
@@ -78,6 +80,7 @@ def overview(board: Board) -> Values:
             }
             for name, (above, below, cells) in page.against_references(summary).items()
         ],
+        "gains": markup.html(gains_section(summary)),
         "claims": Counter(outcome.verdict for outcome in board.findings.claims),
         "agents": [(name, board.agent(name)) for name in summary.agents],
         "matrix": [_matrix_row(board, table) for table in summary.tables],
@@ -198,16 +201,18 @@ def findings(board: Board) -> Values:
     by_embodiment: dict[str, list[charts.Chart]] = {}
     for (embodiment, _), chart in maps.items():
         by_embodiment.setdefault(embodiment, []).append(chart)
-    explained, *blocks = map_section(summary, found.map, {})
+    explained, *blocks = map_section(summary, found, {})
     explained = explained.replace(COLOUR, "The text at a point says which.")
     spreads = page.spreads_section(summary, found.spreads) if found.spreads else []
     return {
         "notice": _notice(board),
         "reading": markup.html([page.READING, page.MADE_AGAIN][: 1 + summary.has_reproductions]),
-        "claims": markup.html([page.CLAIMS, *page.claims_section(found)]),
+        "claims": markup.html([CLAIMS, *claims_section(found)]),
         "sound": markup.html([page.SOUND, sound])
         if (sound := page.soundness_table(summary))
         else "",
+        "paper": markup.html(paper_section(found)) if found.study.statements else "",
+        "effects": markup.html(page.effects_section(summary)),
         "spreads": markup.html(spreads),
         "maps": by_embodiment,
         "map": markup.html([explained, *blocks]),

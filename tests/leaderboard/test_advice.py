@@ -19,8 +19,11 @@ from symsteer.leaderboard.advice import (
     leave_tasks_out,
 )
 from symsteer.leaderboard.defects import Audit, Defect, Part, Point
+from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.map_page import map_section
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.statistics import Interval, Sample
+from symsteer.leaderboard.study import read_study
 from symsteer.leaderboard.summary import Summary, Table
 from tests.leaderboard.test_defects import audit_of, cells, summary_of
 
@@ -283,3 +286,26 @@ def test_intervals_cover_what_is_measured(known: bool) -> None:
         widths.append(found.interval.high - found.interval.low)
     assert inside >= 0.9 * trials
     assert np.median(widths) < (0.45 if known else 0.9)
+
+
+def test_the_page_says_how_often_the_map_is_right(map_of_five: tuple[Summary, Audit]) -> None:
+    summary, audit = map_of_five
+    found = analyse(summary, audit, read_study("paper"))
+    (tested,) = found.left_out
+    assert tested == leave_tasks_out([summary], audit, "floating")
+    blocks = map_section(summary, found, {})
+    start = blocks.index("### A task that the map does not know")
+    rows = [line.split(" | ") for line in blocks[start + 2].splitlines()[2:]]
+    assert [row[1:3] for row in rows[:2]] == [["`equivariant`", "AUC"], ["`approximate`", "AUC"]]
+    for row, one in zip(rows, tested.agents, strict=True):
+        shares = (
+            (one.right, one.cells),
+            (one.clear_right, one.clear),
+            (one.inside, one.with_interval),
+        )
+        assert row[3:6] == [f"{part}/{whole}" if whole else "\u2013" for part, whole in shares]
+    best = tested.best[0]
+    assert f"by AUC in {best.right}/{best.cells} cells (the agent" in blocks[start + 3]
+    alone, audit = crossing({"A-v1": 0.0})
+    blocks = map_section(alone, analyse(alone, audit, read_study("paper")), {})
+    assert not any("does not know" in block for block in blocks)

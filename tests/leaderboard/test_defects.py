@@ -22,9 +22,11 @@ from symsteer.leaderboard.defects import (
     fit,
     read_audit,
 )
+from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.map_page import map_section
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.statistics import Interval, Sample
+from symsteer.leaderboard.study import PAPER, read_study
 from symsteer.leaderboard.summary import Run, Summary, Table, summarize
 from tests.leaderboard.record_factory import make_cell
 
@@ -398,6 +400,17 @@ def test_the_interval_covers_the_crossing() -> None:
     assert np.median(widths) < 0.4
 
 
+def test_an_end_that_0_is_not_excluded_at_is_open() -> None:
+    """Undecided from the first defect on, then clearly below 0."""
+    rates = {"none": (0.5, 0.5, 0.5), "wind:0.5": (0.5, 0.4, 0.5), "wind:1": (0.5, 0.2, 0.5)}
+    audit = audit_of({"none": 0.0, "wind:0.5": 0.2, "wind:1": 0.5})
+    found = defect_map(summary_of(cells(rates)), audit).panel("floating", "equivariant", "success")
+    ends = found.fit.crossing()
+    assert (ends.before, ends.after) == (0, -1)
+    assert ends.low is None
+    assert 0 < ends.high < 0.5
+
+
 def test_the_audits_uncertainty_widens_the_slope() -> None:
     def slope(width: float) -> Interval:
         rates = {"none": (0.5, 0.9, 0.5), "wind:1": (0.5, 0.5, 0.5)}
@@ -415,11 +428,12 @@ def test_the_audits_uncertainty_widens_the_slope() -> None:
 
 def test_defects_that_are_alike_have_no_slope() -> None:
     rates = {"none": (0.5, 0.9, 0.5), "wind:1": (0.5, 0.5, 0.5)}
-    found = defect_map(summary_of(cells(rates)), audit_of({"none": 0.1, "wind:1": 0.1}))
-    panel = found.panel("floating", "equivariant", "success")
+    summary, audit = summary_of(cells(rates)), audit_of({"none": 0.1, "wind:1": 0.1})
+    found = analyse(summary, audit, read_study(PAPER))
+    panel = found.map.panel("floating", "equivariant", "success")
     assert (panel.slope, len(panel.points)) == (None, 2)
     assert panel.reason == "no base policy was steered at two audited defects"
-    text = "".join(map_section(summary_of(cells(rates)), found, {}))
+    text = "".join(map_section(summary, found, {}))
     assert panel.reason in text
 
 

@@ -189,6 +189,24 @@ def test_every_claim_has_a_verdict(board: Path) -> None:
     assert len(rows) + sum(map(len, reasons.values())) == len(read_study(PAPER).claims)
 
 
+def test_the_papers_statements_have_their_tests_and_what_they_lack(board: Path) -> None:
+    study = read_study(PAPER)
+    text = (board / "PAPER.md").read_text().replace("\u00a0", " ")
+    overall = {row[0]: row[1] for row in table_after(text, "What the paper says")[2:]}
+    assert list(overall) == [statement.says for statement in study.statements]
+    efficiency, divergence, *_ = study.statements
+    assert overall[efficiency.says] == "2 supported, 1 not tested"
+    assert overall[divergence.says] == "**not tested**"
+    assert f"- {efficiency.says}: 2 supported, 1 not tested.\n" in text_of(board)
+    for statement in study.statements:
+        rows = table_after(text, f"### {statement.says}")[2:]
+        assert [row[0] for row in rows] == list(statement.claims)
+        claims = {row[0].rsplit(" (", 1)[0]: row for row in table_after(text_of(board), "They are")}
+        for row in rows:
+            if row[0] in claims:
+                assert (row[2], row[4]) == (claims[row[0]][2], claims[row[0]][6])
+
+
 def test_a_study_can_say_what_a_reader_must_know(board: Path, tmp_path: Path) -> None:
     study = tmp_path / "mine.toml"
     study.write_text('notice = "> **Mind this.**"\ndeclared = "abcdef0"\nclaims = "other.toml"')
@@ -343,7 +361,10 @@ def test_hostile_names_stay_text_in_every_section(tmp_path: Path) -> None:
     raw = {t.content.strip() for t in tokens if t.type in ("html_block", "html_inline")}
     assert all(re.fullmatch(r"<br>|</?details>(\n<summary>[\w', -]+</summary>)?", r) for r in raw)
     links = {str(t.attrs.get("href") or t.attrs.get("src")) for t in tokens if t.attrs}
-    assert all(re.fullmatch(r"None|records.csv|(results|figures)/[\w.%-]+", link) for link in links)
+    assert all(
+        re.fullmatch(r"None|records.csv|PAPER.md|(results|figures)/[\w.%-]+", link)
+        for link in links
+    )
     plain = " ".join(t.content for t in tokens if t.type == "text")
     assert "alert" not in plain
     assert "symsteer audit --task" not in page

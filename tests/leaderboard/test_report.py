@@ -154,6 +154,14 @@ def test_stale_figures_go_and_foreign_files_stay(page: Path, tmp_path: Path) -> 
     generate([page / "runs"], out)
     assert not stale.exists()
     assert foreign.exists()
+    paper = out / "PAPER.md"
+    assert paper.exists()
+    # A study without statements has no such page; another file of this name is not ours.
+    generate([page / "runs"], out, study="first")
+    assert not paper.exists()
+    paper.write_text("# The paper")
+    generate([page / "runs"], out, study="first")
+    assert paper.read_text() == "# The paper"
 
 
 @pytest.mark.parametrize("seeds", [1, 5])
@@ -228,7 +236,7 @@ def test_hostile_text_stays_text(tmp_path: Path, text: str) -> None:
 
     names = {str(path.relative_to(tmp_path / "board")) for path in files}
     allowed = re.compile(
-        r"LEADERBOARD\.md|(leaderboard|records)\.csv|figures/((q|success)-[a-z0-9-]+|profiles)\.svg"
+        r"(LEADERBOARD|PAPER)\.md|(leaderboard|records)\.csv|figures/((q|success)-[a-z0-9-]+|profiles)\.svg"
     )
     assert all(allowed.fullmatch(name) for name in names)
     for path in files:
@@ -252,7 +260,8 @@ def test_hostile_text_stays_text(tmp_path: Path, text: str) -> None:
     links = {str(t.attrs.get("href") or t.attrs.get("src")) for t in tokens if t.attrs}
     links -= {"None"}
     assert all(
-        re.fullmatch(r"records.csv|(figures|\.\./(hostile|good))/[\w.%-]+", link) for link in links
+        re.fullmatch(r"records.csv|PAPER.md|(figures|\.\./(hostile|good))/[\w.%-]+", link)
+        for link in links
     )
     headings = [tokens[i + 1].content for i, t in enumerate(tokens) if t.type == "heading_open"]
     assert all(

@@ -59,6 +59,12 @@ def test_a_study_declares_claims_or_names_a_file_that_does(tmp_path: Path) -> No
         (CLAIM.replace('"faster"', '"<b>"'), "claim 1 name: "),
         (CLAIM + "minus = { broken = true }\neffect = 'slope'", "claim 1: minus belongs to"),
         (CLAIM.replace('"auc"', '"diverged"') + "effect = 'slope'", "no slope of diverged"),
+        (CLAIM + "[[statement]]\nsays = 'x'\nclaims = ['fster']", "'fster'; did you mean 'faster'"),
+        (
+            CLAIM + "[[statement]]\nsay = 'x'",
+            "statement 1: there is no key 'say'; did you mean 'says'",
+        ),
+        ("[[statement]]\nsays = 'x'\nclaims = []", "statement 1 claims: "),
         ("declared = 'yesterday'", "declared: "),
         ("claim = 3", "claim: "),
         ("claims = 'none.toml'", "there is no study 'none'"),

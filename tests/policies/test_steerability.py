@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from symsteer.errors import UserError
+from symsteer.policies import steerability
 from symsteer.policies.normalizer import clip_blocks
 from symsteer.policies.steerability import action_spread, jumps
 from symsteer.policies.training.demonstrations import make_chunks
@@ -69,6 +70,11 @@ def test_a_spread_needs_observations_and_draws(trained, world):
         action_spread(trained(group="C8"), world.observations(4), draws=1)
     with pytest.raises(UserError):
         action_spread(trained(group="C8"), torch.zeros(0, world.obs_layout.dim))
+
+
+def test_without_a_change_nothing_jumps(trained, world, monkeypatch):
+    monkeypatch.setattr(steerability, "NUDGE", 0.0)
+    assert jumps(trained(group="C8"), world.observations(8)) == {"median": 0, "high": 0, "share": 0}
 
 
 def test_jumps_are_where_the_frame_of_a_canonical_policy_jumps(trained, world):

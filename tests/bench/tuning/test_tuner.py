@@ -15,6 +15,7 @@ from symsteer.bench.sweep.schedule import Outcome
 from symsteer.bench.tuning import command
 from symsteer.bench.tuning.command import Tuner, preview
 from symsteer.bench.tuning.plan import read_plan
+from symsteer.bench.tuning.search import Search, open_storage, storage_path
 from symsteer.bench.tuning.trials import (
     Score,
     TrialResult,
@@ -61,6 +62,20 @@ def test_agents_try_the_settings_of_the_others(play):
     again, same, runs = play("more", TEXT.replace("trials = 12", "trials = 12\nexchange = 2"))
     assert (again, same) == (further, chosen)
     assert runs.played == []
+
+
+def test_exchanged_settings_are_tried_once(play, tmp_path):
+    plan = read_plan(write_plan(tmp_path, TEXT.replace("trials = 12", "trials = 12\nexchange = 2")))
+    play()
+    search = Search(plan, "standard", open_storage(storage_path(tmp_path / "runs", plan.name)))
+    known = search.ended[0].params
+    others = [{**known, "lr": lr} for lr in (0.011, 0.012, 0.013)]
+    search.exchange([known, others[0], others[0]])
+    # A later call, with what was chosen meanwhile, changes nothing.
+    search.exchange(others)
+    tried = [t.params for t in search.batch(further=2)]
+    assert tried[0] == others[0]
+    assert tried[1] not in [known, *others]
 
 
 def trial(number, *areas, state="complete"):

@@ -1,0 +1,62 @@
+"""How many more base policies a claim needs, against simulated studies of that size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from symsteer.leaderboard.claims import Outcome
+from symsteer.leaderboard.power import needed, standard_error
+from symsteer.leaderboard.statistics import Interval, p_difference, p_equivalence
+from tests.leaderboard.test_claims import claim_of
+
+ERROR, TESTS = 0.04, 4
+
+
+@dataclass(frozen=True)
+class Normal:
+    """An effect with a known standard error."""
+
+    value: float
+    error: float = ERROR
+
+    def interval(self, confidence: float = 0.95) -> Interval:
+        half = float(norm.isf((1 - confidence) / 2)) * self.error
+        return Interval(self.value, self.value - half, self.value + half)
+
+
+@pytest.mark.parametrize("tests", [1, TESTS])
+def test_studies_of_the_needed_size_find_and_exclude(tests: int) -> None:
+    measured = Outcome(claim_of(smallest=0.05), Normal(0.01))
+    found = needed(measured, tests)
+    assert found is not None
+    assert found.to_exclude is not None
+    draws = np.random.default_rng(0).standard_normal(500)
+
+    def share(truth: float, factor: float, excluded: bool) -> float:
+        error = ERROR / np.sqrt(factor)
+        effects = [Normal(truth + error * z, error) for z in draws]
+        level = 0.05 / tests
+        if excluded:
+            return float(np.mean([p_equivalence(e, 0.05) < level for e in effects]))
+        return float(np.mean([p_difference(e) < level for e in effects]))
+
+    assert share(0.05, found.to_find, False) == pytest.approx(0.8, abs=0.05)
+    # Its true effect need not be in the middle, so the size that is asked for may be too large.
+    assert 0.75 < share(0.01, found.to_exclude, True) < 0.95
+    assert share(0.0, found.to_exclude, True) > 0.8
+
+
+def test_what_is_as_large_as_the_smallest_effect_cannot_be_excluded() -> None:
+    found = needed(Outcome(claim_of(smallest=0.05), Normal(-0.06)), 1)
+    assert found is not None
+    assert found.to_exclude is None
+    assert standard_error(Normal(0.3).interval()) == pytest.approx(ERROR)
+
+
+def test_what_was_not_tested_has_no_size() -> None:
+    assert needed(Outcome(claim_of(), reason="no runs"), 1) is None
+    assert needed(Outcome(claim_of(), Normal(0.1), reason="few"), 1) is None
