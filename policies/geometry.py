@@ -17,7 +17,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
@@ -65,6 +65,27 @@ class Field:
     def dim(self) -> int:
         """Numbers in the whole field."""
         return self.block_dim * self.multiplicity
+
+
+CLOUD = "cloud_"
+"""Fields with this prefix are the coordinates of points, one block for each point."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Where the points of a cloud lie in a vector.
+
+    Attributes:
+        point: geometry of one point.
+        columns: ``[points, point.dim]`` int64.
+        rest: geometry of the other fields.
+        rest_columns: ``[rest.dim]`` int64.
+    """
+
+    point: Layout
+    columns: torch.Tensor
+    rest: Layout
+    rest_columns: torch.Tensor
 
 
 class Layout:
@@ -123,6 +144,31 @@ class Layout:
         """The index of each number's irrep block, ``[dim]`` int64."""
         sizes = torch.tensor([block.stop - block.start for block in self.blocks])
         return torch.repeat_interleave(torch.arange(len(self.blocks)), sizes)
+
+    @functools.cached_property
+    def cloud(self) -> Cloud | None:
+        """The cloud of points, if there is one: the fields ``cloud_...``.
+
+        Raises:
+            UserError: if these fields differ in their number of points, or there is nothing else.
+        """
+        own = [field for field in self.fields if field.name.startswith(CLOUD)]
+        if not own:
+            return None
+        (count, *others) = dict.fromkeys(field.multiplicity for field in own)
+        if others or len(own) == len(self.fields):
+            raise UserError(
+                "the fields cloud_... of a layout need the same number of points, and other fields "
+                "beside them"
+            )
+        rest = [field for field in self.fields if field not in own]
+        index = torch.arange(self.dim)
+        return Cloud(
+            Layout([replace(f, name=f.name.removeprefix(CLOUD), multiplicity=1) for f in own]),
+            torch.cat([index[self.slice(f.name)].view(count, -1) for f in own], dim=1),
+            Layout(rest),
+            torch.cat([index[self.slice(field.name)] for field in rest]),
+        )
 
     def spatial_vectors(self) -> list[tuple[str, str]]:
         """The pairs of fields that are vectors in space: horizontal part, then vertical part.

@@ -82,7 +82,11 @@ class AuditSettings:
             UserError: an unknown task, embodiment, variant or group, CUDA is missing, or a number
                 is out of range.
         """
-        task_class(self.task)
+        if task_class(self.task).needs_cameras:
+            raise UserError(
+                f"what cameras see of {self.task} cannot be compared point by point; audit the "
+                "task that tells the poses of its bodies: its physics are the same"
+            )
         check_embodiment(self.embodiment)
         for spec in read(self.variant):
             if not spec.is_constant:

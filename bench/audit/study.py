@@ -195,12 +195,15 @@ def grid(
 ) -> list[AuditSettings]:
     """Settings for tasks x embodiments x variants x strengths; ``all`` stands for every name.
 
+    Tasks that need cameras cannot be audited, and are no part of all.
+
     Raises:
         UserError: see :func:`variant_texts`.
     """
+    names = [name for name in TASKS.names() if not task_class(name).needs_cameras]
     return [
         dataclasses.replace(template, task=task, embodiment=body, variant=text)
-        for task in expand(tasks, TASKS.names())
+        for task in expand(tasks, names)
         for body in expand(bodies, list(EMBODIMENTS))
         for text in variant_texts([with_numbers(v, task, body) for v in variants], strengths)
     ]

@@ -105,7 +105,7 @@ class BatchedCpuMixin(BaseEnv):
         check_versions()
         patches.install()
         prepare_headless()
-        cameras = _needs_cameras(render_mode, obs_mode)
+        cameras = _needs_cameras(self, render_mode, obs_mode)
         self._camera_device = rendering.find_device(render_backend) if cameras else None
         super().__init__(
             *args,
@@ -254,7 +254,7 @@ class CudaMixin(BaseEnv):
         check_versions()
         prepare_headless()
         if render_backend is None:
-            render_backend = "gpu" if _needs_cameras(render_mode, obs_mode) else "none"
+            render_backend = "gpu" if _needs_cameras(self, render_mode, obs_mode) else "none"
         super().__init__(
             *args,
             num_envs=num_envs,
@@ -282,8 +282,9 @@ class CudaMixin(BaseEnv):
         super()._before_simulation_step()
 
 
-def _needs_cameras(render_mode: str | None, obs_mode: str | None) -> bool:
-    return render_mode is not None or obs_mode not in (None, "state", "state_dict", "none")
+def _needs_cameras(env: BaseEnv, render_mode: str | None, obs_mode: str | None) -> bool:
+    visual = obs_mode not in (None, "state", "state_dict", "none")
+    return visual or render_mode is not None or getattr(env, "needs_cameras", False)
 
 
 def check_cuda() -> None:

@@ -173,6 +173,8 @@ class LatentNoiseEnv:
         """
         if not hasattr(self.env, "step_chunk"):
             for t in range(actions.shape[1]):
+                # In between, only an episode's last observation is kept, from which nobody decides.
+                self.env.unwrapped.looks = t == actions.shape[1] - 1
                 obs, _, _, _, info = self.env.step(actions[:, t])
                 yield obs, info
             return

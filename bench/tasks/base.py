@@ -83,6 +83,11 @@ class SymmetricTask(GymEnv):
     mirrored_across_yz: ClassVar[frozenset[str]] = frozenset()
     """Names of actors that are their own mirror image across their body y-z plane but not across
     x-z, the plane by which a reflection mirrors all others."""
+    needs_cameras: ClassVar[bool] = False
+    """Whether the observation is rendered, for which there must be a Vulkan driver."""
+    looks: bool = True
+    """Whether the next observations are used. If not, a task that needs cameras may report what it
+    saw last: between two decisions nobody looks."""
     observation_layout: ClassVar[Layout]
     _main_seed: list[int]
 

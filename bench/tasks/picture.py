@@ -1,8 +1,9 @@
 """Pictures of the tasks, with both embodiments, for the documentation.
 
 - ``python -m symsteer.bench.tasks.picture docs/tasks.png``: all tasks in one picture, but for
-  those on a tilted table, whose scenes are the same.
+  those on a tilted table and those that cameras see, whose scenes are the same.
 - ``python -m symsteer.bench.tasks.picture docs/tasks/pull-cube.png PullCube-v1``: one task.
+- ``... docs/tasks/seen-push-cube.png SeenPushCube-v1``: what the cameras see, and the cloud.
 
 Needs a Vulkan driver; ``symsteer doctor`` says whether there is one.
 """
@@ -15,10 +16,11 @@ from pathlib import Path
 import numpy as np
 import sapien
 from mani_skill.utils.sapien_utils import look_at
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from symsteer.bench.caption import captioned
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
+from symsteer.bench.tasks.clouds import CAMERAS, PIXELS
 from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.tasks.tilted import Tilted
 from symsteer.errors import UserError
@@ -32,6 +34,10 @@ CAMERA = {
 }
 TASKS_PER_ROW = 4
 COLOURS = 128
+VIEW = 192
+"""Width and height of a camera's picture and of a view of a cloud, pixels."""
+SHOWN = 0.2
+"""Half of the width of what a view of a cloud shows, and the height that is white, metres."""
 
 
 def snapshot(task: str, embodiment: str, seed: int, steps: int) -> np.ndarray:
@@ -74,9 +80,39 @@ def task_picture(task: str, axis: int = 1, seed: int = 1, steps: int = 8) -> np.
     return np.concatenate(frames, axis=axis)
 
 
+def seen_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
+    """The heights that the cameras of a task see, and its cloud from above and from the side."""
+    env = make(task, num_envs=1)
+    env.reset(seed=[seed])
+    expert = Expert(env)
+    for _ in range(steps):
+        env.step(expert.act())
+    cloud, heights = env.cloud()[0].numpy(), env.look()[0][0, :, 2].view(CAMERAS, PIXELS, PIXELS)
+    env.close()
+    grey = (40 + 215 * (heights / SHOWN).clamp(0, 1)).byte().numpy()
+    parts = []
+    for k, picture in enumerate(grey):
+        large = Image.fromarray(picture).resize((VIEW, VIEW), Image.Resampling.NEAREST)
+        parts.append(captioned(np.asarray(large.convert("RGB")), f"camera {k + 1}: height"))
+    parts.append(captioned(_view(cloud[:, :2]), f"{len(cloud)} points, from above"))
+    parts.append(captioned(_view(cloud[:, [0, 2]] - [0, 0.75 * SHOWN]), "from the side"))
+    return np.concatenate(parts, axis=1)
+
+
+def _view(places: np.ndarray) -> np.ndarray:
+    """Points ``[P, 2]`` metres, to the right and upwards, uint8."""
+    picture = Image.new("RGB", (VIEW, VIEW), "white")
+    draw = ImageDraw.Draw(picture)
+    for x, y in VIEW / 2 * (1 + places / SHOWN * [1, -1]):
+        draw.ellipse((x - 2, y - 2, x + 2, y + 2), fill="#1f5fa8")
+    draw.rectangle((0, 0, VIEW - 1, VIEW - 1), outline="#999999")
+    return np.asarray(picture)
+
+
 def contact_sheet() -> np.ndarray:
     """Tasks in rows; each with its embodiments from top to bottom; uint8."""
-    flat = [task for task in TASKS if not issubclass(task_class(task), Tilted)]
+    known = [(task, task_class(task)) for task in TASKS]
+    flat = [task for task, cls in known if not (issubclass(cls, Tilted) or cls.needs_cameras)]
     pictures = [task_picture(task, axis=0) for task in flat]
     blank = [np.full_like(pictures[0], 255)] * (-len(pictures) % TASKS_PER_ROW)
     pictures += blank
@@ -93,7 +129,11 @@ def main() -> int:
         print("usage: python -m symsteer.bench.tasks.picture FILE.png [TASK]", file=sys.stderr)
         return 2
     try:
-        picture = task_picture(sys.argv[2]) if len(sys.argv) == 3 else contact_sheet()
+        if len(sys.argv) == 2:
+            picture = contact_sheet()
+        else:
+            seen = task_class(sys.argv[2]).needs_cameras
+            picture = (seen_picture if seen else task_picture)(sys.argv[2])
         # The texture of the table would take most of the bytes.
         small = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
         small.save(Path(sys.argv[1]), optimize=True)

@@ -170,3 +170,25 @@ def _mean_over_group(bias: torch.Tensor, order: int) -> torch.Tensor:
     """``[..., order * channels]`` with the mean over the group in every place."""
     fields = bias.unflatten(-1, (order, -1))
     return fields.mean(-2, keepdim=True).expand_as(fields).flatten(-2)
+
+
+class Dense(nn.Module):
+    """A fixed equivariant layer as one matrix; the last ``in_rank`` axes are its input.
+
+    The matrix is computed in float64 and rounded once, so that it is as equivariant as the layer.
+    """
+
+    weight: torch.Tensor
+    bias: torch.Tensor
+
+    def __init__(self, layer: EquivariantLayer, in_rank: int, out_shape: tuple[int, ...]):
+        super().__init__()
+        self.in_rank, self.out_shape = in_rank, out_shape
+        with torch.no_grad():
+            weight, bias = copy.deepcopy(layer).double().dense()
+        self.register_buffer("weight", weight.to(layer.weight.dtype).contiguous())
+        self.register_buffer("bias", bias.to(layer.weight.dtype))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        out = nn.functional.linear(x.flatten(-self.in_rank), self.weight, self.bias)
+        return out.unflatten(-1, self.out_shape)

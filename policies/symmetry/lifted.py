@@ -12,9 +12,7 @@ in the middle. With the trivial group C1 there is one slice: an ordinary diffusi
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import nn
@@ -22,7 +20,14 @@ from torch.nn import functional
 
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
-from symsteer.policies.networks.equivariant import EquivariantLayer, Lift, Project, RegularLinear
+from symsteer.policies.networks.equivariant import (
+    Dense,
+    EquivariantLayer,
+    Lift,
+    Project,
+    RegularLinear,
+)
+from symsteer.policies.networks.points import PointEncoder
 from symsteer.policies.networks.slices import ResidualMLP, TemporalUNet
 from symsteer.policies.networks.times import TIME_FEATURES, time_features
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
@@ -37,7 +42,8 @@ class LiftedDenoiser(Denoiser):
         horizon: actions in a chunk, Tp.
         group: a finite group.
         network: ``mlp`` (residual MLP on the whole chunk) or ``unet`` (temporal U-Net).
-        channels: regular fields of the observation embedding.
+        channels: regular fields of the observation embedding. A cloud of points in the observation
+            has an encoder of its own.
         width: features in each slice of the chunk.
         depth: residual blocks of the MLP.
     """
@@ -59,8 +65,11 @@ class LiftedDenoiser(Denoiser):
         self.flat = network == "mlp"
         layout = act_layout.repeat(horizon) if self.flat else act_layout
         make = self.make_layer
-        self.obs_lift = make(Lift(obs_layout, group, channels))
+        self.cloud = obs_layout.cloud
+        told = self.cloud.rest if self.cloud else obs_layout
+        self.obs_lift = make(Lift(told, group, channels))
         self.obs_mix = make(RegularLinear(group, channels, channels))
+        self.points = PointEncoder(self.cloud.point, group, channels) if self.cloud else None
         self.chunk_lift = make(Lift(layout, group, width))
         self.slice_network = ResidualMLP(width, depth) if self.flat else TemporalUNet(width)
         self.project = make(Project(group, width, layout))
@@ -74,7 +83,11 @@ class LiftedDenoiser(Denoiser):
 
     def embed(self, obs: torch.Tensor) -> torch.Tensor:
         """Embedding of an observation; ``[B, obs_dim] -> [B, order, channels]``."""
-        return self.obs_mix(functional.silu(self.obs_lift(obs)))
+        if self.points is None or self.cloud is None:
+            return self.obs_mix(functional.silu(self.obs_lift(obs)))
+        known = self.obs_lift(obs[..., self.cloud.rest_columns.to(obs.device)])
+        seen = self.points(obs[..., self.cloud.columns.to(obs.device)], functional.silu(known))
+        return self.obs_mix(functional.silu(known + seen))
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         """What the network sees of it; ``[B, obs_dim] -> [B, order, condition]``."""
@@ -104,30 +117,10 @@ class LiftedDenoiser(Denoiser):
             if not hasattr(layer, "dense"):
                 continue
             outputs = (layer.layout.dim,) if name == "project" else (order, -1)
-            fast.register_module(name, _Dense(layer, inputs, outputs))
+            fast.register_module(name, Dense(layer, inputs, outputs))
+        if self.points is not None:
+            fast.points = self.points.expanded()
         return fast
-
-
-class _Dense(nn.Module):
-    """A fixed equivariant layer as one matrix; the last ``in_rank`` axes are its input.
-
-    The matrix is computed in float64 and rounded once, so that it is as equivariant as the layer.
-    """
-
-    weight: torch.Tensor
-    bias: torch.Tensor
-
-    def __init__(self, layer: Any, in_rank: int, out_shape: tuple[int, ...]):
-        super().__init__()
-        self.in_rank, self.out_shape = in_rank, out_shape
-        with torch.no_grad():
-            weight, bias = copy.deepcopy(layer).double().dense()
-        self.register_buffer("weight", weight.to(layer.weight.dtype).contiguous())
-        self.register_buffer("bias", bias.to(layer.weight.dtype))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        out = functional.linear(x.flatten(-self.in_rank), self.weight, self.bias)
-        return out.unflatten(-1, self.out_shape)
 
 
 @dataclass(frozen=True)

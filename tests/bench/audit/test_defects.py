@@ -19,8 +19,8 @@ from symsteer.bench.audit.report import (
 )
 from symsteer.bench.audit.result import VERSION, AuditResult, AuditSettings
 from symsteer.bench.audit.states import map_trees
-from symsteer.bench.tasks import TASKS
 from symsteer.bench.variants import VARIANTS
+from tests.bench.state_tasks import STATE_TASKS
 
 QUICK = AuditSettings(task="PickCube-v1", states="expert", count=16, resets=64)
 
@@ -226,7 +226,7 @@ def test_map_shows_where(place):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", STATE_TASKS)
 def test_unbroken_tasks(task):
     place = Place(dataclasses.replace(QUICK, task=task, count=32, resets=256))
     for group in ("C8", "D4"):

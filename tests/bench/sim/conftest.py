@@ -10,8 +10,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
 from symsteer.bench.sim import create, prepare_headless
-from symsteer.bench.tasks import TASKS
 from symsteer.bench.throughput import stock_class
+from tests.bench.state_tasks import STATE_TASKS
 
 
 class Kit:
@@ -19,7 +19,7 @@ class Kit:
 
     tasks: ClassVar[dict[str, type[BaseEnv]]] = {
         name.removesuffix("-v1"): stock_class(name)
-        for name in TASKS
+        for name in STATE_TASKS
         if not name.startswith("Tilted")
     }
     robots: ClassVar[dict[str, str]] = {"PushT": "panda_stick"}

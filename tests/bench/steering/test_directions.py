@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from symsteer.bench.steering.directions import directions, positions
-from symsteer.bench.tasks import TASKS, task_class
+from symsteer.bench.tasks import task_class
 from symsteer.policies.geometry import Field, Layout
+from tests.bench.state_tasks import STATE_TASKS
 
 LAYOUT = Layout(
     [
@@ -18,7 +19,7 @@ LAYOUT = Layout(
 )
 
 
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", STATE_TASKS)
 def test_every_task_names_a_tool_and_something_to_move(task):
     names = positions(task_class(task).observation_layout)
     assert names[0] == "tcp_xy"

@@ -14,20 +14,19 @@ from sapien.physx import (
     PhysxRigidBaseComponent,
 )
 
-from symsteer.bench.tasks import EMBODIMENTS, make, task_class
-from symsteer.bench.tasks import TASKS as REGISTRY
+from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
+from tests.bench.state_tasks import STATE_TASKS
 
-TASKS = REGISTRY.names()
 # Their observations are those of the world (test_tilted.py has the others).
-FLAT = [name for name in TASKS if not name.startswith("Tilted")]
+FLAT = [name for name in STATE_TASKS if not name.startswith("Tilted")]
 # Stock evaluates these with Euler angles; their own tests compare.
 OWN_EVALUATE = {"LiftPegUpright-v1", "PokeCube-v1"}
 ELEMENTS = [*Group.parse("D4").elements, (0.3, False), (-2.0, True)]
 
 
-@pytest.fixture(scope="module", params=TASKS)
+@pytest.fixture(scope="module", params=STATE_TASKS)
 def floating(request):
     env = make(request.param, num_envs=6, reward_mode="dense")
     yield env
@@ -57,7 +56,7 @@ def rows(tree, index):
 
 
 def test_names():
-    assert REGISTRY.names() == [
+    assert TASKS.names() == [
         "PushCube-v1",
         "PullCube-v1",
         "PickCube-v1",
@@ -68,6 +67,8 @@ def test_names():
         "PushT-v1",
         "TiltedPushCube-v1",
         "TiltedPickCube-v1",
+        "SeenPushCube-v1",
+        "SeenPickCube-v1",
     ]
     assert list(EMBODIMENTS) == ["floating", "panda"]
 
@@ -120,11 +121,11 @@ def test_observation_follows_the_layout(task, embodiment):
 @pytest.mark.parametrize(
     ("task", "embodiment"),
     [
-        *((task, "floating") for task in TASKS),
+        *((task, "floating") for task in STATE_TASKS),
         ("PickCube-v1", "panda"),
         *(
             pytest.param(task, "panda", marks=pytest.mark.slow)
-            for task in TASKS
+            for task in STATE_TASKS
             if task != "PickCube-v1"
         ),
     ],
@@ -168,7 +169,7 @@ def test_wrong_number_of_seeds_is_explained():
         env.reset(seed=[1, 2, 3], options={"env_idx": [0, 1]})
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", STATE_TASKS)
 def test_resets_have_no_preferred_direction(task):
     """In a distribution that rotations leave alone, E z^k = 0 for every vector z = x + i y.
 
@@ -227,7 +228,7 @@ def reach(actor):
     return placed[..., :2].norm(dim=2).amax(dim=1)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", STATE_TASKS)
 def test_everything_that_can_collide_stands_within_the_spawn_extent(task):
     env = make(task, num_envs=64)
     env.reset(seed=list(range(64)))
@@ -403,7 +404,7 @@ def test_feasible_return():
         task.feasible_return(-0.1)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", STATE_TASKS)
 def test_observation_is_a_function_of_the_state(task):
     """Nothing in the observation depends on how the state came about (contacts, velocities)."""
     env = make(task, num_envs=4)

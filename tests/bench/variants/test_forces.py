@@ -6,9 +6,10 @@ import pytest
 import sapien.physx as physx
 import torch
 
-from symsteer.bench.tasks import TASKS, make, task_class
+from symsteer.bench.tasks import make, task_class
 from symsteer.bench.variants.friction_patch import CENTER
 from symsteer.bench.variants.obstacle import GAP, HALF_WIDTH
+from tests.bench.state_tasks import STATE_TASKS
 from tests.bench.variants.scenes import CONTROL_STEP, G, act, place, scene
 
 STRENGTHS = torch.tensor([0.0, 0.5, 1.0])
@@ -84,7 +85,7 @@ def test_tilt_drags_what_is_let_go():
         pytest.param("wind:1+gravity_tilt:1", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", STATE_TASKS)
 def test_untouched_objects_stay(task, variant):
     """Within 1 mm over a whole episode; also a sphere, which does not roll there."""
     env = make(task, num_envs=4, variant=variant)
@@ -190,7 +191,7 @@ def test_post_is_no_part_of_the_state():
         assert torch.allclose(post.pose.p[:, :2], expected.expand(len(post.pose.p), 2))
 
 
-@pytest.mark.parametrize("task", TASKS.names())
+@pytest.mark.parametrize("task", STATE_TASKS)
 def test_objects_start_inside_the_spawn_extent(task):
     """As a whole, in many resets: the post stands outside of it."""
     env = make(task, num_envs=24)

@@ -1,0 +1,178 @@
+"""Tasks that depth cameras see: the observation has points on surfaces in place of poses.
+
+Four cameras look at the workspace from the corners of a square, so that what they see turns with
+the scene, exactly under quarter turns up to their pixels. Their depth pictures become one cloud of
+points in the workspace's frame. The table and the robot are cut off (a lab knows both), and the
+rest is thinned out to a fixed number of points.
+
+A cloud is two fields of the layout, ``cloud_xy`` and ``cloud_z``, each with one block per point: it
+is rotated like every other observation, without interpolation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.sapien_utils import look_at
+from mani_skill.utils.structs import Link
+
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.pick_cube import PickCube
+from symsteer.bench.tasks.push_cube import PushCube
+from symsteer.policies.geometry import Field
+
+POINTS = 64
+"""Points of a cloud."""
+
+CAMERAS = 4
+
+PIXELS = 64
+"""Height and width of a picture; a pixel is 1 cm wide in the workspace's centre."""
+
+FIELD_OF_VIEW = 0.8
+"""Radians."""
+
+DISTANCE = 0.55
+"""Of the cameras from the centre's vertical, and their height, metres."""
+
+REACH = 0.4
+"""Points farther from the centre's vertical are cut off, metres."""
+
+TABLE = 0.002
+"""Points below are the table's, metres; the pictures' depth is in millimetres."""
+
+
+def cloud_fields(kept: Sequence[Field]) -> tuple[Field, ...]:
+    """Fields of a task that is seen: what no camera shows, and the cloud."""
+    return *kept, Field("cloud_xy", 1, POINTS), Field("cloud_z", 0, POINTS)
+
+
+class Seen(SymmetricTask):
+    """Mixin; list it before the class of a task whose bodies are seen.
+
+    Of the task's fields only those that are in ``task_fields`` are told, such as the goal. Variants
+    of perception move the cloud as they move the pose of the manipulated body.
+
+    Rendering needs a Vulkan driver; a software one is enough.
+    """
+
+    needs_cameras: ClassVar[bool] = True
+    _last_cloud: Sequence[Any] | torch.Tensor = ()
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        found = []
+        for k in range(CAMERAS):
+            bearing = 2 * math.pi * (k + 0.5) / CAMERAS
+            eye = [DISTANCE * math.cos(bearing), DISTANCE * math.sin(bearing), DISTANCE]
+            found.append(
+                CameraConfig(
+                    uid=f"corner_{k}",
+                    pose=look_at(eye, [0.0, 0.0, 0.0]),
+                    width=PIXELS,
+                    height=PIXELS,
+                    fov=FIELD_OF_VIEW,
+                    near=0.01,
+                    far=5.0,
+                )
+            )
+        return found
+
+    def _observe_task(self) -> dict[str, torch.Tensor]:
+        flat = super()._observe_task()
+        true = self.manipulated.pose
+        shift = (self.seen(true, "object").p - true.p)[:, None]
+        if self.looks or len(self._last_cloud) != len(true.p):
+            self._last_cloud = self.cloud()
+        cloud = self._last_cloud + shift
+        points = {"cloud_xy": cloud[:, :, :2].flatten(1), "cloud_z": cloud[:, :, 2]}
+        return {field.name: (flat | points)[field.name] for field in self.task_fields}
+
+    def cloud(self) -> torch.Tensor:
+        """What the cameras see now, ``[N, POINTS, 3]`` metres in the world's frame."""
+        points, label = self.look()
+        unseen = [
+            index
+            for index, body in self.segmentation_id_map.items()
+            if isinstance(body, Link) or body in self._hidden_objects
+        ]
+        valid = (points[:, :, 2] > TABLE) & (points[:, :, :2].norm(dim=2) < REACH)
+        valid &= ~torch.isin(label, torch.tensor([0, *unseen], device=self.device))
+        return thinned(points, valid, POINTS)
+
+    def look(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Take the pictures.
+
+        Returns:
+            The points of all pixels, ``[N, CAMERAS * PIXELS * PIXELS, 3]`` metres in the world's
+            frame, and ManiSkill's segmentation ids of what they belong to.
+        """
+        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        self.capture_sensor_data()
+        points, labels = [], []
+        for sensor in self._sensors.values():
+            picture = sensor.get_obs(rgb=False, depth=False, position=True, segmentation=True)
+            local = picture["position"].flatten(1, 2).to(self.device, torch.float32) / 1000
+            to_world = sensor.get_params()["cam2world_gl"].to(local)
+            points.append(local @ to_world[:, :3, :3].transpose(1, 2) + to_world[:, None, :3, 3])
+            labels.append(picture["segmentation"].flatten(1).to(self.device))
+        return torch.cat(points, dim=1), torch.cat(labels, dim=1)
+
+
+def thinned(points: torch.Tensor, valid: torch.Tensor, count: int) -> torch.Tensor:
+    """Some of the valid points, far from each other (farthest point sampling).
+
+    The first one is the farthest from the origin's vertical, so that the choice turns with the
+    points. Where there are fewer than ``count``, some occur several times; where there are none,
+    all are the origin.
+
+    Args:
+        points: ``[N, M, 3]``.
+        valid: ``[N, M]`` bool.
+        count: how many.
+
+    Returns:
+        ``[N, count, 3]``.
+    """
+    # Most pixels show the table.
+    most = max(1, int(valid.sum(dim=1).max()))
+    kept = valid.int().argsort(dim=1, descending=True, stable=True)[:, :most]
+    valid = valid.gather(1, kept)
+    points = points.gather(1, kept[:, :, None].expand(-1, -1, 3)) * valid[:, :, None]
+    rows = torch.arange(len(points), device=points.device)
+    # Invalid points are never the farthest, unless there is no other.
+    distance = torch.where(valid, points[:, :, :2].norm(dim=2), -1.0)
+    nearest = torch.where(valid, torch.inf, -1.0)
+    chosen = []
+    for _ in range(count):
+        last = points[rows, distance.argmax(dim=1)]
+        chosen.append(last)
+        nearest = torch.minimum(nearest, (points - last[:, None]).norm(dim=2))
+        distance = nearest
+    return torch.stack(chosen, dim=1)
+
+
+def _named(fields: Sequence[Field], *names: str) -> list[Field]:
+    return [field for field in fields if field.name in names]
+
+
+class SeenPushCube(Seen, PushCube):
+    """Push a cube that four depth cameras see into a disc on the table, in any direction."""
+
+    task_id = "SeenPushCube-v1"
+    task_fields: ClassVar[tuple[Field, ...]] = cloud_fields(
+        _named(PushCube.task_fields, "goal_xy", "tcp_to_goal_xy")
+    )
+
+
+class SeenPickCube(Seen, PickCube):
+    """Pick up a cube that four depth cameras see, and hold it at a goal in the air."""
+
+    task_id = "SeenPickCube-v1"
+    task_fields: ClassVar[tuple[Field, ...]] = cloud_fields(
+        _named(PickCube.task_fields, "goal_xy", "goal_z")
+    )

@@ -1,0 +1,165 @@
+"""Tasks that cameras see: clouds of points turn with the scene, and a policy learns from them."""
+
+import math
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from symsteer.bench.audit.result import AuditSettings
+from symsteer.bench.demos import collect, load
+from symsteer.bench.runs.run import execute
+from symsteer.bench.sim import rendering_works
+from symsteer.bench.tasks import make, task_class
+from symsteer.bench.tasks.clouds import POINTS, thinned
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import read_record
+from tests.bench.tiny_run import tiny_config
+
+needs_vulkan = pytest.mark.skipif(not rendering_works(), reason="needs a Vulkan driver")
+SEEN = ["SeenPushCube-v1", "SeenPickCube-v1"]
+
+
+def random_points(count=3, points=200, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(count, points, 3, generator=generator, dtype=torch.float64)
+
+
+def apart(a, b):
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def test_thinned_points_are_valid_ones_far_from_each_other():
+    points = random_points()
+    valid = torch.rand(3, 200, generator=torch.Generator().manual_seed(1)) < 0.5
+    found = thinned(points, valid, 20)
+    for row in range(3):
+        there = points[row, valid[row]]
+        distances = apart(found[row], there)
+        assert (distances.min(dim=1).values == 0).all()
+        # No other point is farther from all chosen ones than these are from each other.
+        between = apart(found[row], found[row]).fill_diagonal_(torch.inf).min()
+        assert distances.min(dim=0).values.max() <= between
+        assert (found[row, 0, :2].norm() == there[:, :2].norm(dim=1)).any()
+        assert found[row, 0, :2].norm() == there[:, :2].norm(dim=1).max()
+
+
+def test_the_choice_turns_with_the_points():
+    points, valid = random_points(), torch.ones(3, 200, dtype=torch.bool)
+    c, s = math.cos(0.7), math.sin(0.7)
+    turn = torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=torch.float64)
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(
+        thinned(points[:, order] @ turn, valid, 30), thinned(points, valid, 30) @ turn
+    )
+
+
+def test_few_points_occur_several_times_and_none_are_the_origin():
+    points, valid = random_points(), torch.zeros(3, 200, dtype=torch.bool)
+    valid[1, 5] = valid[2, 7] = valid[2, 9] = True
+    found = thinned(points, valid, 4)
+    assert torch.equal(found[0], torch.zeros(4, 3, dtype=torch.float64))
+    assert torch.equal(found[1], points[1, [5, 5, 5, 5]])
+    assert {tuple(p.tolist()) for p in found[2]} == {tuple(p.tolist()) for p in points[2, [7, 9]]}
+
+
+@pytest.mark.parametrize("task", SEEN)
+def test_the_layout_has_no_pose_of_what_is_seen(task):
+    names = [field.name for field in task_class(task).observation_layout.fields]
+    assert names[-2:] == ["cloud_xy", "cloud_z"]
+    assert not any("cube" in name for name in names)
+    assert task_class(task).observation_layout.cloud.columns.shape == (POINTS, 3)
+
+
+def test_an_audit_names_the_task_to_take():
+    with pytest.raises(UserError, match="audit the task that tells the poses of its bodies"):
+        AuditSettings(task=SEEN[0]).check()
+
+
+def test_without_a_driver_a_sentence_says_what_is_missing():
+    code = f"from symsteer.bench.tasks import make; make({SEEN[0]!r}, num_envs=1)"
+    none = dict.fromkeys(("VK_ICD_FILENAMES", "VK_DRIVER_FILES"), "/nonexistent.json")
+    found = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **none}, capture_output=True, text=True
+    )
+    assert found.stderr.splitlines()[-1].startswith(
+        "symsteer.errors.UserError: Rendering needs a Vulkan driver"
+    )
+
+
+@pytest.fixture(scope="module", params=SEEN)
+def seen(request):
+    env = make(request.param, num_envs=2)
+    yield env
+    env.close()
+
+
+def in_cube(env, points):
+    """How far each point ``[N, P]`` lies outside of the cube, metres."""
+    to_body = env.manipulated.pose.inv().to_transformation_matrix()
+    local = points @ to_body[:, :3, :3].transpose(1, 2) + to_body[:, None, :3, 3]
+    return (local.abs() - 0.02).clamp_min(0).norm(dim=2)
+
+
+@needs_vulkan
+@pytest.mark.slow
+def test_points_lie_on_the_cube(seen):
+    obs, _ = seen.reset(seed=[3, 4])
+    cloud = seen.cloud()
+    # A picture's depth is in millimetres.
+    assert in_cube(seen, cloud).max() < 0.003
+    assert (cloud.amax(1) - cloud.amin(1)).min() > 0.02
+    layout = seen.observation_layout
+    assert torch.equal(obs[:, layout.cloud.columns], cloud)
+
+
+@needs_vulkan
+@pytest.mark.slow
+def test_what_is_seen_turns_with_the_scene(seen):
+    """Exactly under quarter turns, up to a picture's rounding; else up to its pixels."""
+    seen.reset(seed=[3, 4])
+    state, cloud = seen.get_state_dict(), seen.cloud()
+    for angle, bound in ((math.pi / 2, 0.001), (math.pi / 4, 0.008), (0.3, 0.008)):
+        seen.set_state_dict(seen.transform_state(state, angle))
+        c, s = math.cos(angle), math.sin(angle)
+        turned = cloud @ torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+        nearest = apart(seen.cloud(), turned).min(dim=2).values
+        assert nearest.mean() < bound
+
+
+@needs_vulkan
+@pytest.mark.slow
+def test_variants_of_perception_move_the_cloud():
+    flat = make(SEEN[0], num_envs=1)
+    biased = make(SEEN[0], num_envs=1, variant="perception_bias:1")
+    columns = flat.observation_layout.cloud.columns
+    (plain, _), (moved, _) = flat.reset(seed=[5]), biased.reset(seed=[5])
+    shift = moved[:, columns] - plain[:, columns]
+    torch.testing.assert_close(shift, torch.tensor([0.02, 0, 0]).expand_as(shift))
+
+
+@needs_vulkan
+@pytest.mark.slow
+def test_between_decisions_nobody_looks(seen):
+    columns = seen.observation_layout.cloud.columns
+    first, _ = seen.reset(seed=[3, 4])
+    seen.set_state_dict(seen.transform_state(seen.get_state_dict(), 0.5))
+    seen.looks = False
+    assert torch.equal(seen.get_obs()[:, columns], first[:, columns])
+    seen.looks = True
+    assert not torch.equal(seen.get_obs()[:, columns], first[:, columns])
+
+
+@needs_vulkan
+@pytest.mark.slow
+def test_a_policy_is_trained_on_clouds_and_steered(tmp_path):
+    path = collect(SEEN[0], "floating", 2, "diverse", 0, tmp_path / "demos.h5", num_envs=2)
+    demos = load(path, SEEN[0], "floating")
+    assert demos.episodes[0][0].shape[1] == demos.observation_layout.dim
+    config = tiny_config(task=SEEN[0], env_steps=80, num_envs=2)
+    folder = execute(config, tmp_path / "runs", progress=False)
+    record = read_record(folder / "record.json")
+    assert record.status == "finished"
+    assert record.base_policy.solvable is not None
