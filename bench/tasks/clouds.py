@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from mani_skill.sensors.camera import CameraConfig
@@ -61,7 +61,7 @@ class Seen(SymmetricTask):
     """
 
     needs_cameras: ClassVar[bool] = True
-    _last_cloud: Sequence[Any] | torch.Tensor = ()
+    _last_cloud: torch.Tensor | None = None
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -86,7 +86,7 @@ class Seen(SymmetricTask):
         flat = super()._observe_task()
         true = self.manipulated.pose
         shift = (self.seen(true, "object").p - true.p)[:, None]
-        if self.looks or len(self._last_cloud) != len(true.p):
+        if self.looks or self._last_cloud is None:
             self._last_cloud = self.cloud()
         cloud = self._last_cloud + shift
         points = {"cloud_xy": cloud[:, :, :2].flatten(1), "cloud_z": cloud[:, :, 2]}
