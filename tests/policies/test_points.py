@@ -9,6 +9,7 @@ from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
+from symsteer.policies.networks.points import PointEncoder
 from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.symmetry.joint import merged_layout
 from tests.policies.conftest import ACT, SMALL
@@ -104,6 +105,20 @@ def test_decoding_commutes_with_the_group_and_with_every_order(group, dtype, bou
     assert (policy.decode(mixed.to(dtype), noise.to(dtype)) - chunk).abs().max() < bound
     mixed[:, columns] = obs[:, columns].flip(0)
     assert (policy.decode(mixed.to(dtype), noise.to(dtype)) - chunk).abs().max() > 1e-4
+
+
+def test_a_point_that_occurs_twice_counts_once_and_is_met_with_the_rest() -> None:
+    """Where few points are visible, some are repeated."""
+    encoder = PointEncoder(SEEN.cloud.point, Group.parse("C4"), 8)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(3, 5, 3, generator=generator)
+    known = torch.randn(3, 4, 8, generator=generator)
+    seen = encoder(points, known)
+    torch.testing.assert_close(encoder(points[:, [0, 1, 2, 3, 4, 4, 4]], known), seen)
+    assert not torch.allclose(encoder(points, 2 * known), seen)
+    fast = encoder.expanded()
+    torch.testing.assert_close(fast(points, known), seen)
+    assert not list(fast.parameters())
 
 
 def test_the_place_of_the_points_is_learned() -> None:
