@@ -173,7 +173,7 @@ class LatentNoiseEnv:
         """
         if not hasattr(self.env, "step_chunk"):
             for t in range(actions.shape[1]):
-                # In between, only an episode's last observation is kept, from which nobody decides.
+                # In between nobody decides; cameras need not look.
                 self.env.unwrapped.looks = t == actions.shape[1] - 1
                 obs, _, _, _, info = self.env.step(actions[:, t])
                 yield obs, info

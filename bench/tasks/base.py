@@ -86,8 +86,8 @@ class SymmetricTask(GymEnv):
     needs_cameras: ClassVar[bool] = False
     """Whether the observation is rendered, for which there must be a Vulkan driver."""
     looks: bool = True
-    """Whether the next observations are used. If not, a task that needs cameras may report what it
-    saw last: between two decisions nobody looks."""
+    """Whether a decision follows the next observation. If not, a task that needs cameras may report
+    what it saw last, but for episodes at their time limit."""
     observation_layout: ClassVar[Layout]
     _main_seed: list[int]
 

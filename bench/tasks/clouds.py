@@ -86,11 +86,25 @@ class Seen(SymmetricTask):
         flat = super()._observe_task()
         true = self.manipulated.pose
         shift = (self.seen(true, "object").p - true.p)[:, None]
-        if self.looks or self._last_cloud is None:
-            self._last_cloud = self.cloud()
-        cloud = self._last_cloud + shift
+        cloud = self._seen_cloud() + shift
         points = {"cloud_xy": cloud[:, :, :2].flatten(1), "cloud_z": cloud[:, :, 2]}
         return {field.name: (flat | points)[field.name] for field in self.task_fields}
+
+    def _seen_cloud(self) -> torch.Tensor:
+        """The present cloud; if nobody looks, the last one, but for episodes at their time limit.
+
+        From their last observation the critic bootstraps. Row by row, so that environments do not
+        depend on their neighbours.
+        """
+        last = self._last_cloud
+        due = self.elapsed_steps >= self.max_episode_steps
+        if self.looks or last is None or due.any():
+            now = self.cloud()
+            self._last_cloud = (
+                now if self.looks or last is None else torch.where(due[:, None, None], now, last)
+            )
+        assert self._last_cloud is not None
+        return self._last_cloud
 
     def cloud(self) -> torch.Tensor:
         """What the cameras see now, ``[N, POINTS, 3]`` metres in the world's frame."""

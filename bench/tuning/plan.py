@@ -160,12 +160,11 @@ def read_plan(name_or_path: str) -> TuningPlan:
 
 
 def _number(value: Any, key: str, source: str) -> int:
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int)
-        or value < (key not in ("seed", "exchange"))
-    ):
-        raise UserError(f"{source}: {key} must be a positive whole number, not {value!r}")
+    least = 0 if key in ("seed", "exchange") else 1
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise UserError(
+            f"{source}: {key} must be a whole number of at least {least}, not {value!r}"
+        )
     return value
 
 

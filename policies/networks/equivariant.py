@@ -1,4 +1,4 @@
-"""Dense layers that commute with a finite planar group, exact by construction.
+"""ExpandedLayer layers that commute with a finite planar group, exact by construction.
 
 Features live in regular fields: tensors ``[..., order, channels]`` on which the group permutes
 the ``order`` axis, (u f)(g) = f(u^-1 g). Any linear equivariant map between irreps and regular
@@ -172,7 +172,7 @@ def _mean_over_group(bias: torch.Tensor, order: int) -> torch.Tensor:
     return fields.mean(-2, keepdim=True).expand_as(fields).flatten(-2)
 
 
-class Dense(nn.Module):
+class ExpandedLayer(nn.Module):
     """A fixed equivariant layer as one matrix; the last ``in_rank`` axes are its input.
 
     The matrix is computed in float64 and rounded once, so that it is as equivariant as the layer.

@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn import functional
 
 from symsteer.policies.geometry import Group, Layout
-from symsteer.policies.networks.equivariant import Dense, Lift, RegularLinear
+from symsteer.policies.networks.equivariant import ExpandedLayer, Lift, RegularLinear
 
 CHANNELS = 16
 """Regular fields of a point."""
@@ -47,6 +47,6 @@ class PointEncoder(nn.Module):
         """A copy for inference whose layers hold their dense matrices ready."""
         fast = copy.deepcopy(self)
         for name, inputs in (("lift", 1), ("known", 2), ("mix", 2), ("out", 2)):
-            layer = Dense(getattr(self, name), inputs, (self.group.order, -1))
+            layer = ExpandedLayer(getattr(self, name), inputs, (self.group.order, -1))
             fast.register_module(name, layer)
         return fast

@@ -21,8 +21,8 @@ from torch.nn import functional
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.networks.equivariant import (
-    Dense,
     EquivariantLayer,
+    ExpandedLayer,
     Lift,
     Project,
     RegularLinear,
@@ -117,7 +117,7 @@ class LiftedDenoiser(Denoiser):
             if not hasattr(layer, "dense"):
                 continue
             outputs = (layer.layout.dim,) if name == "project" else (order, -1)
-            fast.register_module(name, Dense(layer, inputs, outputs))
+            fast.register_module(name, ExpandedLayer(layer, inputs, outputs))
         if self.points is not None:
             fast.points = self.points.expanded()
         return fast

@@ -110,6 +110,7 @@ class EscnnDenoiser(LiftedDenoiser):
         self.encoder = encoder
         if encoder is not None:
             self.obs_lift = self.obs_mix = nn.Identity()
+            self.points = None
 
     def make_layer(self, layer: EquivariantLayer) -> nn.Module:
         """escnn's layer in the place of ours."""

@@ -127,6 +127,7 @@ class Worker:
         actions = self._received(given)
         parts = []
         for t in range(actions.shape[1]):
+            # As in one process (`LatentNoiseEnv`).
             self.env.unwrapped.looks = t == actions.shape[1] - 1
             rows: list[torch.Tensor] = []
             skeleton = take_apart(self.env.step(actions[:, t]), self.count, rows)

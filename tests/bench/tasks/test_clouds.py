@@ -148,8 +148,33 @@ def test_between_decisions_nobody_looks(seen):
     seen.set_state_dict(seen.transform_state(seen.get_state_dict(), 0.5))
     seen.looks = False
     assert torch.equal(seen.get_obs()[:, columns], first[:, columns])
+    # At the time limit the critic looks.
+    seen._elapsed_steps[1] = seen.max_episode_steps
+    due = seen.get_obs()[:, columns]
+    assert torch.equal(due[0], first[0, columns])
+    assert torch.equal(due[1], seen.cloud()[1])
     seen.looks = True
-    assert not torch.equal(seen.get_obs()[:, columns], first[:, columns])
+    assert torch.equal(seen.get_obs()[:, columns], seen.cloud())
+
+
+@needs_vulkan
+@pytest.mark.slow
+@pytest.mark.parametrize("task", SEEN)
+def test_the_physics_are_those_of_the_flat_task(task):
+    actions = torch.rand(12, 2, 7, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    states = []
+    for name in (task, task.removeprefix("Seen")):
+        env = make(name, num_envs=2)
+        env.reset(seed=[3, 4])
+        env.looks = False
+        states.append([env.get_state().clone()])
+        for action in actions:
+            env.step(action)
+            states[-1].append(env.get_state().clone())
+        env.close()
+    for seen_state, flat_state in zip(*states, strict=True):
+        assert torch.equal(seen_state, flat_state)
+    assert not torch.equal(states[0][0], states[0][-1])
 
 
 @needs_vulkan

@@ -67,8 +67,8 @@ def test_no_cell_of_a_plan_is_on_a_leaderboard():
     ("old", "new", "message"),
     [
         ("trials = 12", "trails = 12", "'trails'.*did you mean 'trials'"),
-        ("trials = 12", "trials = 0", "trials must be a positive whole number, not 0"),
-        ("trials = 12", "trials = true", "trials must be a positive whole number, not True"),
+        ("trials = 12", "trials = 0", "trials must be a whole number of at least 1, not 0"),
+        ("trials = 12", "trials = true", "trials must be a whole number of at least 1, not True"),
         ("[confirm]\nseed = [2, 3]", "", "confirm is missing"),
         ('"standard", ', '"standrad", ', "did you mean 'standard'"),
         ("batch_size =", "batchsize =", "did you mean 'batch_size'"),
