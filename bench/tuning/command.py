@@ -11,14 +11,14 @@ from typing import Any
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.folder import write_json
+from symsteer.bench.runs.folder import run_id, write_json
 from symsteer.bench.sweep.command import run_plan
 from symsteer.bench.sweep.plan import make_plan
 from symsteer.bench.sweep.suite import Suite
 from symsteer.bench.tuning.plan import TuningPlan
 from symsteer.bench.tuning.search import Search, open_storage, storage_path
 from symsteer.bench.tuning.trials import (
-    DEFAULTS,
+    START,
     Chosen,
     Score,
     Setting,
@@ -27,6 +27,7 @@ from symsteer.bench.tuning.trials import (
     best_single,
     choose,
     mean_auc,
+    read_scores,
     score_of,
     to_json,
     to_preset,
@@ -65,6 +66,7 @@ class Tuner:
     ):
         self.plan, self.out = plan, out
         self.workers, self.ray, self.together = workers, ray, together
+        self._known = read_scores(self.places["scores"])
         storage = open_storage(storage_path(out, plan.name))
         self.searches = {agent: Search(plan, agent, storage) for agent in plan.agents}
 
@@ -95,6 +97,7 @@ class Tuner:
         return {
             "trials": folder / f"{name}.json",
             "preset": folder / f"{name}-preset.toml",
+            "scores": folder / f"{name}-scores.json",
             "journal": storage_path(self.out, name),
         }
 
@@ -144,11 +147,10 @@ class Tuner:
         Raises:
             UserError: if another process works on a run; its trial is not lost.
         """
-        if not configs:
+        runs = tuple(run for run in dict.fromkeys(configs) if not self._score(run))
+        if not runs:
             return
-        suite = Suite(
-            f"tune-{self.plan.name}", self.plan.description, tuple(dict.fromkeys(configs))
-        )
+        suite = Suite(f"tune-{self.plan.name}", self.plan.description, runs)
         plan = make_plan(suite, self.out, self.ray is not None)
         outcomes = run_plan(plan, self.workers, self.ray, self.together)
         for outcome in outcomes:
@@ -159,9 +161,19 @@ class Tuner:
                 )
             if outcome.status == "failed":
                 print(f"failed: {outcome.run.label}: {outcome.reason}", file=sys.stderr)
+        self._scores(runs)
+        scores = {name: vars(score) for name, score in self._known.items()}
+        write_json(self.places["scores"], scores)
+
+    def _score(self, config: RunConfig) -> Score | None:
+        """The score of a run, which is kept: the folders of finished runs may be deleted."""
+        name = run_id(config, {})
+        if name not in self._known and (score := score_of(config, self.out)):
+            self._known[name] = score
+        return self._known.get(name)
 
     def _scores(self, configs: Sequence[RunConfig]) -> list[Score]:
-        return [score for config in configs if (score := score_of(config, self.out))]
+        return [score for config in configs if (score := self._score(config))]
 
     def _end(self, agent: str, trial: Trial, state: TrialState, scores: list[Score]) -> None:
         trial.set_user_attr("scores", [vars(score) for score in scores])
@@ -175,7 +187,7 @@ class Tuner:
         return choose([trial for trial in self.results if trial.agent == agent])
 
     def _try_singles(self, chosen: Sequence[Chosen]) -> list[Chosen]:
-        """The same choices with scores of the defaults with one of their options."""
+        """The same choices with scores of the first trial with one of their options."""
         tried = [
             {name: self.plan.cells(c.agent, single) for name, single in self._singles(c).items()}
             for c in chosen
@@ -191,14 +203,14 @@ class Tuner:
         ]
 
     def _singles(self, chosen: Chosen) -> dict[str, dict[str, Any]]:
-        """The defaults with one option of the choice, by option."""
+        """The first trial's options with one of the choice, by option."""
         if chosen.agent not in self.plan.singles:
             return {}
-        defaults = self.plan.defaults(chosen.agent)
+        first = self.plan.start(chosen.agent)
         return {
-            name: {**defaults, name: value}
+            name: {**first, name: value}
             for name, value in chosen.options.items()
-            if value != defaults[name]
+            if value != first[name]
         }
 
     def _confirm(self, chosen: Sequence[Chosen]) -> list[Chosen]:
@@ -212,16 +224,16 @@ class Tuner:
 
     def _fresh_cells(self, chosen: Chosen) -> dict[Setting, list[RunConfig]]:
         """The runs of every setting on the fresh cells."""
-        agent, defaults = chosen.agent, self.plan.defaults(chosen.agent)
+        agent, first = chosen.agent, self.plan.start(chosen.agent)
         trials = {trial.number: trial for trial in self.results if trial.agent == agent}
         settings: dict[Setting, Mapping[str, Any]] = {
-            "defaults": defaults,
+            "start": first,
             "chosen": chosen.options,
         }
         if agent in self.plan.singles:
-            name = best_single(chosen, trials[DEFAULTS].scores)
+            name = best_single(chosen, trials[START].scores)
             single = {name: chosen.options[name]} if name else {}
-            settings["one_option"] = {**defaults, **single}
+            settings["one_option"] = {**first, **single}
         cells = {
             name: self.plan.cells(agent, options, "confirm") for name, options in settings.items()
         }
@@ -248,8 +260,8 @@ class Tuner:
 def preview(plan: TuningPlan) -> str:
     """What a plan asks for."""
     first = plan.agents[0]
-    cells = len(plan.cells(first, plan.defaults(first)))
-    fresh = len(plan.cells(first, plan.defaults(first), "confirm"))
+    cells = len(plan.cells(first, plan.start(first)))
+    fresh = len(plan.cells(first, plan.start(first), "confirm"))
     lines = [f"{plan.name}: {plan.description}" if plan.description else plan.name, ""]
     trials = plan.trials + plan.exchange
     lines += [
@@ -263,7 +275,7 @@ def preview(plan: TuningPlan) -> str:
     lines += [
         "",
         f"{cells} runs a trial, {plan.probe} of a trial that is given up; then {fresh} runs each "
-        "with the defaults, the chosen settings, and those chosen for each task",
+        "with the first trial's options, the chosen settings, and those chosen for each task",
     ]
     if plan.singles:
         lines.append(f"options by themselves, {cells} runs each: {', '.join(plan.singles)}")

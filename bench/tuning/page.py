@@ -18,7 +18,7 @@ import numpy as np
 
 from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.bench.tuning.trials import (
-    DEFAULTS,
+    START,
     Chosen,
     Setting,
     TrialResult,
@@ -81,48 +81,48 @@ def effort(trials: Sequence[TrialResult]) -> str:
 
 
 def choices(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
-    """The options that were chosen; those that are not the default are bold."""
+    """The options that were chosen; those that differ from the first trial's are bold."""
     names = dict.fromkeys(name for choice in chosen for name in choice.options)
-    defaults = {t.agent: t.options for t in trials if t.number == DEFAULTS}
+    start = {t.agent: t.options for t in trials if t.number == START}
 
     def cell(choice: Chosen, name: str) -> str:
         if name not in choice.options:
             return ""
         text = _value(choice.options[name])
-        return text if choice.options[name] == defaults[choice.agent][name] else f"**{text}**"
+        return text if choice.options[name] == start[choice.agent][name] else f"**{text}**"
 
     rows = [[f"`{name}`", *(cell(choice, name) for choice in chosen)] for name in names]
     rows.append(["mean rank", *(f"{choice.rank:.1f}" for choice in chosen)])
-    rows.append(["of the defaults", *(f"{choice.default_rank:.1f}" for choice in chosen)])
+    rows.append(["of the start", *(f"{choice.start_rank:.1f}" for choice in chosen)])
     return _table(["option", *(f"`{choice.agent}`" for choice in chosen)], rows) if chosen else ""
 
 
 def comparison(chosen: Sequence[Chosen]) -> str:
-    """Mean area on fresh cells, and how often a setting beats the defaults there."""
+    """Mean area on fresh cells, and how often a setting beats the start there."""
     rows = []
     for choice in chosen:
-        defaults = {score.cell: score.auc for score in choice.fresh.get("defaults", ())}
+        start = {score.cell: score.auc for score in choice.fresh.get("start", ())}
         row = [f"`{choice.agent}`"]
         for setting in get_args(Setting):
             scores = choice.fresh.get(setting, ())
             if not scores:
                 row.append("-")
-            elif setting == "defaults":
+            elif setting == "start":
                 row.append(f"{mean_auc(scores):.3f}")
             else:
-                gaps = [s.auc - defaults[s.cell] for s in scores if s.cell in defaults]
+                gaps = [s.auc - start[s.cell] for s in scores if s.cell in start]
                 better = sum(gap > 0 for gap in gaps)
                 row.append(
                     f"{mean_auc(scores):.3f} ({np.mean(gaps):+.3f} [{min(gaps):+.2f}, "
                     f"{max(gaps):+.2f}], better in {better} of {len(gaps)})"
                 )
         rows.append(row)
-    head = ["agent", "defaults", "one option", "chosen", "chosen for each task"]
+    head = ["agent", "start", "one option", "chosen", "chosen for each task"]
     return _table(head, rows) if rows else ""
 
 
 def singles(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
-    """Mean area of the defaults with one option of the choice, on the cells of the trials."""
+    """Mean area of the start with one option of the choice, on the cells of the trials."""
     rows = []
     for choice in chosen:
         if not choice.singles:
@@ -134,10 +134,8 @@ def singles(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
         }
         each = dict(sorted(each.items(), key=lambda item: -item[1]))
         texts = ", ".join(f"{name}: {area:.3f}" for name, area in each.items())
-        rows.append(
-            [f"`{choice.agent}`", f"{own[DEFAULTS]:.3f}", f"{own[choice.trial]:.3f}", texts]
-        )
-    head = ["agent", "defaults", "chosen", "defaults with one option of the choice"]
+        rows.append([f"`{choice.agent}`", f"{own[START]:.3f}", f"{own[choice.trial]:.3f}", texts])
+    head = ["agent", "start", "chosen", "start with one option of the choice"]
     return _table(head, rows) if rows else ""
 
 

@@ -1,10 +1,11 @@
 """What is tuned: agents, cells, numbers of trials and search spaces, as a TOML file.
 
 ``[grid]`` and ``[run]`` describe the cells as in a suite, one run per trial each. ``[confirm]`` is
-the grid of fresh cells on which the chosen settings are compared with the defaults. Every option of
-the agents in ``singles`` is also tried by itself. ``[space]`` has
-the options of all agents that have them, ``[space.AGENT]`` those of one agent. An option has a list
-of choices, or ``{ low = 1e-4, high = 1e-2, log = true }``; an empty list takes it from an agent.
+the grid of fresh cells on which the chosen settings are compared with the first ones. Every option
+of the agents in ``singles`` is also tried by itself. ``[space]`` has the options of all agents that
+have them, ``[space.AGENT]`` those of one agent. An option has a list of choices, or
+``{ low = 1e-4, high = 1e-2, log = true }``; an empty list takes it from an agent. ``[start]`` has
+options of every first trial; the others begin with the agent's defaults.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from symsteer.names import unknown
 NUMBERS = {"trials": 20, "exchange": 0, "batch": 4, "probe": 2, "seed": 0}
 """Whole numbers of a plan and their defaults."""
 
-LATER = ("trials", "exchange", "batch", "singles")
+LATER = ("description", "trials", "exchange", "batch", "singles")
 """What may change after the first trial."""
 
-KEYS = ("description", "agents", "singles", *NUMBERS, "grid", "run", "confirm", "space")
+KEYS = ("description", "agents", "singles", *NUMBERS, "grid", "run", "confirm", "start", "space")
 
 
 @dataclass(frozen=True)
@@ -96,10 +97,9 @@ class TuningPlan:
         kept = {key: value for key, value in self.data.items() if key not in LATER}
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
-    def defaults(self, agent: str) -> dict[str, Any]:
-        """The agent's own values of the options that are tuned."""
-        options = AGENTS.get(agent).Options()
-        return {name: getattr(options, name) for name in self.spaces[agent]}
+    def start(self, agent: str) -> dict[str, Any]:
+        """Options of the agent's first trial."""
+        return {name: _first(self.data, agent, name) for name in self.spaces[agent]}
 
     def cells(self, agent: str, options: Mapping[str, Any], grid: str = "grid") -> list[RunConfig]:
         """One run per cell with these options, in the order of the file.
@@ -122,7 +122,7 @@ def read_plan(name_or_path: str) -> TuningPlan:
 
     Raises:
         UserError: if there is no such plan, it is not complete, a search space does not fit its
-            agent, or it leaves out the agent's default.
+            agent, or it leaves out a value of the first trial.
     """
     data, path = read_toml(name_or_path, "tuning plan", FOLDER)
     source = path.name
@@ -144,17 +144,21 @@ def read_plan(name_or_path: str) -> TuningPlan:
         name=path.stem,
         source=source,
         description=str(data.get("description", "")),
-        spaces={agent: _space(agent, data["space"], agents, source) for agent in agents},
+        spaces={agent: _space(agent, data, agents, source) for agent in agents},
         singles=tuple(data.get("singles", ())),
         data=data,
         **numbers,
     )
+    shared = {name for space in plan.spaces.values() for name in space}
+    for name in data.get("start", {}):
+        if name not in shared:
+            raise unknown("tuned option", name, sorted(shared), f"{source}, start")
     for agent in plan.singles:
         if agent not in plan.spaces:
             raise unknown("agent", agent, plan.agents, f"{source}, singles")
     for agent in plan.agents:
-        plan.cells(agent, plan.defaults(agent), "confirm")
-        if plan.probe > (count := len(plan.cells(agent, plan.defaults(agent)))):
+        plan.cells(agent, plan.start(agent), "confirm")
+        if plan.probe > (count := len(plan.cells(agent, plan.start(agent)))):
             raise UserError(f"{source}: probe is {plan.probe}, but there are only {count} cells")
     return plan
 
@@ -168,7 +172,13 @@ def _number(value: Any, key: str, source: str) -> int:
     return value
 
 
-def _space(agent: str, tables: Mapping[str, Any], agents: Sequence[str], source: str) -> Space:
+def _first(data: Mapping[str, Any], agent: str, name: str) -> Any:
+    default = getattr(AGENTS.get(agent).Options(), name)
+    return data.get("start", {}).get(name, default)
+
+
+def _space(agent: str, data: Mapping[str, Any], agents: Sequence[str], source: str) -> Space:
+    tables = data["space"]
     options = AGENTS.get(agent).Options
     fields = _option_names(agent)
     own = tables.get(agent, {})
@@ -184,10 +194,10 @@ def _space(agent: str, tables: Mapping[str, Any], agents: Sequence[str], source:
         ends = found.values if isinstance(found, Choices) else (found.low, found.high)
         for end in ends:
             options(**{name: end})
-        if not _contains(found, default := getattr(options(), name)):
+        if not _contains(found, first := _first(data, agent, name)):
             raise UserError(
-                f"{source}: space.{name} does not contain the default of {agent}, {default!r}; "
-                "the first trial has the defaults, so widen it"
+                f"{source}: space.{name} does not contain {first!r}, with which the first trial of "
+                f"{agent} begins; widen it, or give start.{name}"
             )
     return space
 

@@ -60,7 +60,7 @@ class Search:
         )
         if not self.study.get_trials(deepcopy=False):
             self.study.set_user_attr("plan", plan.digest)
-            self.study.enqueue_trial(plan.defaults(agent))
+            self.study.enqueue_trial(plan.start(agent))
         elif self.study.user_attrs.get("plan") != plan.digest:
             raise UserError(
                 f"{plan.source} is not as it was when its trials began; restore it (only "

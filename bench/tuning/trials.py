@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +18,8 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.records.curves import area_under_curve
 
-DEFAULTS = 0
-"""Number of the trial with the agent's defaults."""
+START = 0
+"""Number of the trial with which each search begins."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ class Score:
 
 State = Literal["complete", "pruned", "failed"]
 
-Setting = Literal["defaults", "one_option", "chosen", "by_task"]
-"""Settings that are compared on fresh cells: the agent's defaults, these with one option of the
+Setting = Literal["start", "one_option", "chosen", "by_task"]
+"""Settings that are compared on fresh cells: the first trial's, these with one option of the
 choice, the choice, and a choice for each task."""
 
 
@@ -55,7 +56,7 @@ class TrialResult:
     """One trial of an agent.
 
     Attributes:
-        number: from 0; trial 0 has the agent's defaults.
+        number: from 0; trial 0 has those of the plan's start.
         state: ``pruned`` trials were given up after the first cells.
         options: those that were tuned.
         scores: of its finished runs, in the order of the cells.
@@ -80,9 +81,9 @@ class Chosen:
     Attributes:
         trial: its number.
         rank: mean over the cells of its rank among the complete trials; 1 is best.
-        default_rank: the same of the defaults.
+        start_rank: the same of the first trial.
         by_task: number of the trial that is best on the cells of one task.
-        singles: scores on the cells of trials of the defaults with one option of the choice.
+        singles: scores on the cells of trials of the first trial with one option of the choice.
         fresh: scores on fresh cells.
     """
 
@@ -90,7 +91,7 @@ class Chosen:
     trial: int
     options: Mapping[str, Any]
     rank: float
-    default_rank: float
+    start_rank: float
     by_task: Mapping[str, int]
     singles: Mapping[str, Sequence[Score]] = field(default_factory=dict)
     fresh: Mapping[Setting, Sequence[Score]] = field(default_factory=dict)
@@ -114,6 +115,23 @@ def score_of(config: RunConfig, out: Path) -> Score | None:
     )
 
 
+def read_scores(path: Path) -> dict[str, Score]:
+    """Scores by run, as ``symsteer tune`` keeps them; none if there is no such file.
+
+    Raises:
+        UserError: if the file cannot be read as scores.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        return {name: Score(**score) for name, score in json.loads(path.read_text()).items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} is not a file of scores ({error}); delete it, and the search goes on with the "
+            "runs whose folders are there"
+        ) from None
+
+
 def mean_auc(scores: Sequence[Score]) -> float:
     """Mean area under the curve over runs."""
     return float(np.mean([score.auc for score in scores]))
@@ -126,12 +144,12 @@ def mean_ranks(settings: Sequence[Sequence[Score]]) -> list[float]:
 
 
 def choose(trials: Sequence[TrialResult]) -> Chosen | None:
-    """The complete trial of an agent with the best mean rank; None if the defaults failed.
+    """The complete trial of an agent with the best mean rank; None if the first trial failed.
 
     Ranks, because areas of an easy and of a hard cell have different ranges.
     """
     complete = [trial for trial in trials if trial.state == "complete"]
-    if not complete or complete[0].number != DEFAULTS:
+    if not complete or complete[0].number != START:
         return None
     ranks = mean_ranks([trial.scores for trial in complete])
     best = int(np.argmin(ranks))
@@ -143,15 +161,15 @@ def choose(trials: Sequence[TrialResult]) -> Chosen | None:
     return Chosen(found.agent, found.number, found.options, ranks[best], ranks[0], by_task)
 
 
-def best_single(chosen: Chosen, defaults: Sequence[Score]) -> str | None:
-    """The option whose chosen value alone has the best mean rank; None: the defaults have.
+def best_single(chosen: Chosen, start: Sequence[Score]) -> str | None:
+    """The option whose chosen value alone has the best mean rank; None: the first trial has.
 
     Args:
         chosen: with ``singles``.
-        defaults: scores of the agent's defaults on the same cells.
+        start: scores of the first trial on the same cells.
     """
     names = [None, *chosen.singles]
-    return names[int(np.argmin(mean_ranks([defaults, *chosen.singles.values()])))]
+    return names[int(np.argmin(mean_ranks([start, *chosen.singles.values()])))]
 
 
 def to_json(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> dict[str, Any]:
@@ -193,8 +211,8 @@ def from_json(data: Mapping[str, Any]) -> tuple[list[TrialResult], list[Chosen]]
 
 def to_text(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
     """A table with a row for each agent that has a chosen setting."""
-    header = ["agent", "trials", "pruned", "failed", "chosen", "rank", "of defaults"]
-    header += ["AUC", "of defaults", "fresh: defaults", "one option", "chosen", "by task"]
+    header = ["agent", "trials", "pruned", "failed", "chosen", "rank", "of start"]
+    header += ["AUC", "of start", "fresh: start", "one option", "chosen", "by task"]
     rows = [header]
     for choice in chosen:
         own = [trial for trial in trials if trial.agent == choice.agent]
@@ -210,9 +228,9 @@ def to_text(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
                 *(str(n) for n in (len(own), states.count("pruned"), states.count("failed"))),
                 str(choice.trial),
                 f"{choice.rank:.2f}",
-                f"{choice.default_rank:.2f}",
+                f"{choice.start_rank:.2f}",
                 f"{by_number[choice.trial].auc:.3f}",
-                f"{by_number[DEFAULTS].auc:.3f}",
+                f"{by_number[START].auc:.3f}",
                 *fresh,
             ]
         )

@@ -37,7 +37,7 @@ CHOSEN = [
         {"task": 3},
         {"lr": scores(0.5, 0.5)},
         {
-            "defaults": scores(0.3, 0.5),
+            "start": scores(0.3, 0.5),
             "one_option": scores(0.4, 0.5),
             "chosen": scores(0.7, 0.4),
             "by_task": scores(0.7, 0.4),

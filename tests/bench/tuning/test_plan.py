@@ -22,7 +22,7 @@ def test_agents_share_a_space_and_have_their_own_options(tmp_path):
     shared = {"lr": Range(1e-4, 1e-1, log=True), "batch_size": Choices((32, 64))}
     assert plan.spaces["standard"] == shared
     assert plan.spaces["equivariant"] == {**shared, "critics": Range(2, 6)}
-    assert plan.defaults("equivariant") == {"lr": 6e-4, "batch_size": 64, "critics": 2}
+    assert plan.start("equivariant") == {"lr": 6e-4, "batch_size": 64, "critics": 2}
 
 
 def test_a_shared_option_is_for_those_who_have_it_and_can_be_taken_from_one(tmp_path):
@@ -60,7 +60,7 @@ def test_no_cell_of_a_plan_is_on_a_leaderboard():
         plan = read_plan(name)
         for agent in plan.agents:
             for grid in ("grid", "confirm"):
-                assert not shown & policies(plan.cells(agent, plan.defaults(agent), grid))
+                assert not shown & policies(plan.cells(agent, plan.start(agent), grid))
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,11 @@ def test_no_cell_of_a_plan_is_on_a_leaderboard():
         ('"standard", ', '"standrad", ', "did you mean 'standard'"),
         ("batch_size =", "batchsize =", "did you mean 'batch_size'"),
         ("[32, 64]", "64", "space.batch_size must be a list of choices, or { low"),
-        ("[32, 64]", "[16, 32]", "space.batch_size does not contain the default of standard, 64"),
+        (
+            "[32, 64]",
+            "[16, 32]",
+            "space.batch_size does not contain 64, with which the first trial of standard",
+        ),
         ("low = 1e-4, high = 1e-1", "low = 1e-1, high = 1e-4", "with low below high"),
         ("low = 1e-4", "low = 0.0", "above 0 with log"),
         ("low = 1e-4", "lowest = 1e-4", "space.lr must be a list of choices"),

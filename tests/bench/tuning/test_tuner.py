@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def test_the_best_mean_rank_is_chosen_not_the_best_mean():
     found = choose(trials)
     assert np.argmax([t.auc for t in trials]) == 1
     assert (found.trial, found.rank) == (2, pytest.approx(4 / 3))
-    assert found.default_rank == pytest.approx((3 + 2 + 2) / 3)
+    assert found.start_rank == pytest.approx((3 + 2 + 2) / 3)
 
 
 def test_every_task_has_a_best_trial_of_its_own():
@@ -137,7 +138,7 @@ def test_the_search_comes_closer_to_the_known_optimum_than_the_defaults(play):
     for choice in chosen:
         best = BEST[choice.agent]
         assert abs(math.log(choice.options["lr"] / best)) < abs(math.log(6e-4 / best))
-        fresh, default = ([s.auc for s in choice.fresh[x]] for x in ("chosen", "defaults"))
+        fresh, default = ([s.auc for s in choice.fresh[x]] for x in ("chosen", "start"))
         assert len(fresh) == len(default) == 2
         assert min(fresh) > max(default)
 
@@ -163,8 +164,8 @@ def test_options_are_tried_by_themselves_where_the_plan_says_so(play):
     assert mean_auc(standard.singles["lr"]) > mean_auc(trials[0].scores)
     assert equivariant.singles == {}
     areas = {setting: [s.auc for s in scores] for setting, scores in standard.fresh.items()}
-    assert areas["one_option"] == areas["chosen"] > areas["defaults"]
-    assert set(equivariant.fresh) == {"defaults", "chosen", "by_task"}
+    assert areas["one_option"] == areas["chosen"] > areas["start"]
+    assert set(equivariant.fresh) == {"start", "chosen", "by_task"}
 
 
 def test_a_search_that_was_killed_continues_with_the_same_trials(play):
@@ -217,6 +218,32 @@ def test_a_run_of_another_process_costs_no_trial(play, tmp_path, monkeypatch):
     trials, _, _ = play()
     assert len(trials) == 24
     assert trials[0].state == "complete"
+
+
+def test_a_search_goes_on_from_its_journal_and_scores_alone(play, tmp_path):
+    trials, chosen, _ = play()
+    with pytest.raises(KeyboardInterrupt):
+        play("moved", stop_after=31)
+    for folder in (tmp_path / "moved").iterdir():
+        if folder.name != "tuning":
+            shutil.rmtree(folder)
+    kept = json.loads((tmp_path / "moved" / "tuning" / "tiny-scores.json").read_text())
+    assert 20 < len(kept) <= 31
+    moved, same, runs = play("moved")
+    assert (moved, same) == (trials, chosen)
+    assert not set(runs.played) & set(kept)
+    # All runs are known: nothing is left to do.
+    *_, runs = play("moved")
+    assert runs.played == []
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", '{"a": {"auc": 1}}'])
+def test_a_file_that_has_no_scores_is_refused(play, tmp_path, text):
+    path = tmp_path / "runs" / "tuning" / "tiny-scores.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"tiny-scores.json is not a file of scores"):
+        play()
 
 
 def test_what_is_written_can_be_read_again(play, tmp_path):
