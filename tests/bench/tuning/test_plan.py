@@ -23,6 +23,10 @@ def test_agents_share_a_space_and_have_their_own_options(tmp_path):
     assert plan.spaces["standard"] == shared
     assert plan.spaces["equivariant"] == {**shared, "critics": Range(2, 6)}
     assert plan.start("equivariant") == {"lr": 6e-4, "batch_size": 64, "critics": 2}
+    given = TEXT.replace("[space]", "[start]\nlr = 1e-3\n[space]")
+    plan = read_plan(write_plan(tmp_path, given))
+    assert plan.start("equivariant") == {"lr": 1e-3, "batch_size": 64, "critics": 2}
+    assert plan.start("standard") == {"lr": 1e-3, "batch_size": 64}
 
 
 def test_a_shared_option_is_for_those_who_have_it_and_can_be_taken_from_one(tmp_path):

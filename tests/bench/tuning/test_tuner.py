@@ -191,7 +191,7 @@ def test_more_trials_can_be_added_later(play):
 def test_trials_of_another_plan_are_refused(play):
     play()
     with pytest.raises(
-        UserError, match=r"tiny.toml is not as it was .*only trials, exchange, batch, singles"
+        UserError, match=r"tiny.toml is not as it was .*only description, trials, exchange"
     ):
         play(text=TEXT.replace("high = 1e-1", "high = 1e-2"))
 
