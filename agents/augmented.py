@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from symsteer.agents.options import SacOptions
+from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent
 from symsteer.policies.geometry import Group
@@ -29,6 +30,7 @@ class AugmentedOptions(SacOptions):
         Group.parse(self.augmentation)
 
 
+@tuned
 class AugmentedAgent(StandardAgent):
     """Plain actor, plain critics, every transition of a batch rotated at random."""
 

@@ -15,6 +15,7 @@ from torch import nn
 
 from symsteer.agents.networks import shrink_
 from symsteer.agents.options import SacOptions
+from symsteer.agents.presets import tuned
 from symsteer.agents.sac import SacAgent
 from symsteer.policies.geometry import Field, Group, Layout
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
@@ -42,6 +43,7 @@ class Pool(Project):
         return weight * self.group.order, bias
 
 
+@tuned
 class EquivariantAgent(SacAgent):
     """Equivariant actor and invariant critics, exact for every element of ``group``."""
 

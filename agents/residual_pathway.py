@@ -12,6 +12,7 @@ from torch import nn
 
 from symsteer.agents.asymmetry import LayersOf, Parameters, PenaltyAgent, PulledLayer, TwoPaths
 from symsteer.agents.networks import dense
+from symsteer.agents.presets import tuned
 
 
 class ResidualPathway(TwoPaths, PulledLayer):
@@ -26,6 +27,7 @@ class ResidualPathway(TwoPaths, PulledLayer):
             parameters[name].mul_(factor)
 
 
+@tuned
 class ResidualPathwayAgent(PenaltyAgent):
     """The equivariant agent with a penalised plain path beside every layer."""
 

@@ -8,10 +8,12 @@ from torch import nn
 
 from symsteer.agents.equivariant import equivariant_actor_layers, equivariant_critic_layers
 from symsteer.agents.networks import Dense, count, shrink_
+from symsteer.agents.presets import tuned
 from symsteer.agents.sac import SacAgent
 from symsteer.policies.geometry import Layout
 
 
+@tuned
 class StandardAgent(SacAgent):
     """SAC with a plain actor and plain critics."""
 
@@ -37,6 +39,7 @@ class StandardAgent(SacAgent):
         return self.options.width
 
 
+@tuned
 class MatchedStandardAgent(StandardAgent):
     """The standard agent with as many parameters as the equivariant one.
 

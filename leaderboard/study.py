@@ -101,8 +101,10 @@ class _File(_Table):
     statement: tuple[Statement, ...] = ()
 
     @model_validator(mode="after")
-    def _statements_name_claims(self) -> _File:
+    def _names_fit(self) -> _File:
         names = [claim.name for claim in self.claim]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"two claims have the name {twice[0]!r}; rename one")
         for statement in self.statement:
             for name in statement.claims:
                 if name not in names:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from symsteer.errors import UserError
 from symsteer.names import unknown
+
+T = TypeVar("T", bound=Any)
 
 FOLDER = Path(__file__).parent
 
@@ -47,3 +49,28 @@ def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
         if key not in valid:
             raise unknown(f"option of {agent}", key, valid, path.name)
     return {key: value for key, value in tables.get("all", {}).items() if key in valid} | own
+
+
+def tuned(agent: type[T]) -> type[T]:
+    """Class decorator: the agent's options have the defaults that tuning chose, ``tuned.toml``.
+
+    Agents without a table there keep their defaults.
+    """
+    base, found = agent.Options, preset_options("tuned", agent.name, agent.Options)
+    agent.Options = dataclasses.make_dataclass(
+        "Options",
+        [
+            (field.name, field.type, found[field.name])
+            for field in dataclasses.fields(base)
+            if field.name in found
+        ],
+        bases=(base,),
+        frozen=True,
+        # The name by which options that are sent to another process find their class.
+        namespace={
+            "__doc__": base.__doc__,
+            "__module__": agent.__module__,
+            "__qualname__": f"{agent.__qualname__}.Options",
+        },
+    )
+    return agent

@@ -2,16 +2,18 @@
 
 import dataclasses
 import math
+import pickle
 from pathlib import Path
 
 import pytest
 import torch
 
-from symsteer.agents import AGENTS
+from symsteer.agents import AGENTS, presets
 from symsteer.agents.agent import Budget
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import preset_names, preset_options
 from symsteer.agents.sac import SacAgent
+from symsteer.agents.standard import StandardAgent
 from symsteer.errors import UserError
 
 PAGE = (Path(__file__).parents[2] / "docs" / "agents.md").read_text()
@@ -249,6 +251,49 @@ def test_presets_are_the_published_settings(name, preset, own):
     assert found == DSRL | own
     assert options.first_update == options.warmup
     assert math.isclose(options.utd * 4, 20)
+
+
+@pytest.fixture
+def tuned_folder(tmp_path, monkeypatch):
+    """Where ``tuned.toml`` is read from."""
+    monkeypatch.setattr(presets, "FOLDER", tmp_path)
+    return tmp_path
+
+
+class Quick(StandardAgent):
+    name = "quick"
+    Options = SacOptions
+
+
+def test_tuned_options_are_the_defaults(tuned_folder):
+    (tuned_folder / "tuned.toml").write_text("[quick]\nlr = 0.125\ncritics = 3\n")
+    kind = presets.tuned(type("Quick", (Quick,), {"__module__": __name__, "__qualname__": "Quick"}))
+    options = kind.Options()
+    assert isinstance(options, SacOptions)
+    assert vars(options) == {**vars(SacOptions()), "lr": 0.125, "critics": 3}
+    assert kind.Options(lr=0.5).lr == 0.5
+    assert Quick.Options().lr == SacOptions().lr
+    with pytest.raises(UserError, match="lr must be positive"):
+        kind.Options(lr=0)
+
+
+def test_tuned_refuses_an_option_that_the_agent_does_not_have(tuned_folder):
+    (tuned_folder / "tuned.toml").write_text("[quick]\nlearning_rate = 0.125\n")
+    with pytest.raises(UserError, match="no option of quick 'learning_rate'"):
+        presets.tuned(Quick)
+
+
+@pytest.mark.parametrize("name", AGENTS.builtin)
+def test_agents_have_what_was_chosen_for_them_and_travel_to_other_processes(name):
+    options = AGENTS.get(name).Options()
+    chosen = preset_options("tuned", name, type(options))
+    assert {key: getattr(options, key) for key in chosen} == chosen
+    assert pickle.loads(pickle.dumps(options)) == options
+
+
+def test_the_control_has_the_settings_of_the_agent_that_it_controls():
+    wrong, right = (AGENTS.get(name).Options() for name in ("wrong-group", "equivariant"))
+    assert vars(wrong) == vars(right)
 
 
 def test_the_page_names_every_agent_option_and_preset():

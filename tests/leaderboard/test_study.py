@@ -65,6 +65,7 @@ def test_a_study_declares_claims_or_names_a_file_that_does(tmp_path: Path) -> No
             "statement 1: there is no key 'say'; did you mean 'says'",
         ),
         ("[[statement]]\nsays = 'x'\nclaims = []", "statement 1 claims: "),
+        (CLAIM + CLAIM, "two claims have the name 'faster'; rename one"),
         ("declared = 'yesterday'", "declared: "),
         ("claim = 3", "claim: "),
         ("claims = 'none.toml'", "there is no study 'none'"),
