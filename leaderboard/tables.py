@@ -123,6 +123,10 @@ def _base_line(table: Table) -> str:
         f"Steerability{plural}: base success {over('base_success')}, spread of actions over the "
         f"noise {over('action_std')}, initial states solved in {draws} draws {over('solvable')}."
     )
+    errors = [e for p in policies.values() if (e := p.equivariance_error) is not None]
+    if errors:
+        ends = dict.fromkeys((compact(min(errors)), compact(max(errors))))
+        text[-1] += f" Equivariance error of its actions: {' to '.join(ends)}."
     if table.threshold is not None:
         base = table.row_of(BASE)
         there = base and base.success and base.success.value >= table.threshold

@@ -14,6 +14,7 @@ import torch
 
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.geometry import Group, equivariance_error
 
 DESIRED_ACTION_STD = 0.3
 """Below this spread of normalised actions steering gained little in pilot runs."""
@@ -26,6 +27,29 @@ NUDGE = 1e-3
 """Length of the change of an observation in :func:`jumps`: a millimetre, if it moves a position."""
 
 NUDGES = 16
+
+
+def evenly(rows: torch.Tensor, count: int) -> torch.Tensor:
+    """At most ``count`` of the rows, at even distances."""
+    return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows))).long()]
+
+
+@torch.no_grad()
+def decode_error(
+    policy: ChunkPolicy, observations: torch.Tensor, group: Group, seed: int = 0
+) -> float:
+    """Equivariance error of decoding N(0, I) noise.
+
+    Args:
+        policy: the base policy.
+        observations: ``[N, obs_dim]``, environment units.
+        group: its elements turn observations, noise and chunks.
+        seed: of the noise.
+    """
+    shape = (len(observations), policy.horizon, policy.act_layout.dim)
+    noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed)).to(observations)
+    layouts, chunk = (policy.obs_layout, policy.act_layout), policy.act_layout
+    return equivariance_error(policy.decode, (observations, noise), layouts, chunk, group)
 
 
 @torch.no_grad()

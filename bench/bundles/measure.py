@@ -9,7 +9,6 @@ import torch
 from scipy.stats import binomtest
 
 from symsteer.bench.runs.base_study import (
-    decode_error,
     held_out_episodes,
     unbroken,
     visited_states,
@@ -17,6 +16,7 @@ from symsteer.bench.runs.base_study import (
 from symsteer.bench.runs.config import RunConfig
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
+from symsteer.policies.steerability import decode_error
 
 
 @dataclass(frozen=True)

@@ -201,6 +201,8 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
         action_std=report["action_std"],
         solvable=report["solvable"],
         draws=report["draws"],
+        equivariance_error=report.get("equivariance_error"),
+        jump=report.get("jump"),
         training_seconds=policy.training_record.get("seconds"),
         parameters=policy.parameter_count(),
         warning=report["warning"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import multiprocessing
 import statistics
 from collections.abc import Generator, Mapping, Sequence
@@ -18,23 +19,22 @@ from tqdm import tqdm
 from symsteer.agents.episodes import Rollout
 from symsteer.bench.demos import load
 from symsteer.bench.runs.base_policy import demonstration_file
-from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+from symsteer.bench.runs.config import DemonstrationConfig, RunConfig, content_key
 from symsteer.bench.runs.folder import write_json
-from symsteer.bench.steering.evaluation import rollout, steerability
+from symsteer.bench.steering.evaluation import VISITED, rollout, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.geometry import Group, equivariance_error
-from symsteer.policies.steerability import jumps
+from symsteer.policies.geometry import Group
+from symsteer.policies.steerability import decode_error, evenly, jumps
+from symsteer.variant import file_name
 
 EVALUATION_ENVS = 100
 STATES = 32
 """Initial states that are tried with 16 draws of the noise each."""
-VISITED = 256
-"""Visited states at which symmetry and jumps are measured."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ def study(
         configs: embodiment, kind of demonstrations, and options of one policy; they differ in the
             task alone. The other policies use the same values of the options that they have, too.
             Policies for several tasks are trained on all of them together, the others on each.
-        out: folder that keeps demonstrations in ``out/base``.
+        out: folder that keeps demonstrations in ``out/base`` and what was measured of each policy
+            in ``out/base/study``: a study that was stopped goes on there.
         names: of the policies.
         counts: numbers of demonstrations.
         seeds: number of seeds, from 0.
@@ -94,7 +95,10 @@ def study(
     cells = [BaseCell(n, c, s) for c in counts for n in names for s in range(seeds)]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = [pool.submit(_play, configs[0], cell, files[cell.seed], episodes) for cell in cells]
+        jobs = [
+            pool.submit(_play_once, configs[0], cell, files[cell.seed], episodes, out)
+            for cell in cells
+        ]
         parts = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
     return [row for rows in parts for row in rows]
 
@@ -146,16 +150,7 @@ def unbroken(
 
 def visited_states(played: Rollout) -> torch.Tensor:
     """At most ``VISITED`` observations before success, evenly over episodes and their steps."""
-    visited = played.obs[played.running]
-    return visited[torch.linspace(0, len(visited) - 1, min(VISITED, len(visited))).long()]
-
-
-def decode_error(policy: ChunkPolicy, states: torch.Tensor, group: Group, seed: int) -> float:
-    """Equivariance error of decoding N(0, I) noise at observations ``[N, obs_dim]``."""
-    shape = (len(states), policy.horizon, policy.act_layout.dim)
-    noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-    layouts = (policy.obs_layout, policy.act_layout)
-    return equivariance_error(policy.decode, (states, noise), layouts, policy.act_layout, group)
+    return evenly(played.obs[played.running], VISITED)
 
 
 def held_out_episodes(
@@ -177,6 +172,21 @@ def held_out_episodes(
         return scale * torch.randn(shape, generator=generator)
 
     return rollout(env, act, held_out_seeds(episodes))
+
+
+def _play_once(
+    config: RunConfig, cell: BaseCell, demos: Mapping[str, Path], episodes: int, out: Path
+) -> list[dict[str, Any]]:
+    files = {task: path.name for task, path in demos.items()}
+    key = content_key(config.to_json(), dataclasses.asdict(cell), files, episodes)
+    name = f"{file_name(cell.name)}-{cell.count}-s{cell.seed}-{key}.json"
+    path = out / "base" / "study" / name
+    if path.is_file():
+        found: list[dict[str, Any]] = json.loads(path.read_text())
+        return found
+    rows = _play(config, cell, demos, episodes)
+    write_json(path, rows)
+    return rows
 
 
 def _play(

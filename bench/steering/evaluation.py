@@ -14,7 +14,14 @@ from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import steerability_seeds
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.steerability import DESIRED_ACTION_STD, action_spread
+from symsteer.policies.geometry import Group
+from symsteer.policies.steerability import (
+    DESIRED_ACTION_STD,
+    action_spread,
+    decode_error,
+    evenly,
+    jumps,
+)
 
 Act = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """``(obs [N, obs_dim], rows [N]) -> noise [N, Tp, Da]``; ``rows`` index the list of seeds."""
@@ -219,6 +226,10 @@ class Steerability:
         draws: noise draws per state.
         action_std: spread of the normalised actions over the noise on visited states; see
             :func:`symsteer.policies.steerability.action_spread`.
+        equivariance_error: of decoding on visited states, under C8; see
+            :func:`symsteer.policies.steerability.decode_error`.
+        jump: largest change of the executed actions, but for one in a thousand, if a visited state
+            moves by a millimetre; see :func:`symsteer.policies.steerability.jumps`.
         warning: why steering is unlikely to work, or None.
     """
 
@@ -228,8 +239,13 @@ class Steerability:
     states: int
     draws: int
     action_std: float
+    equivariance_error: float
+    jump: float
     warning: str | None
 
+
+VISITED = 256
+"""Visited states at which symmetry and jumps are measured."""
 
 DRAWS = 16
 """Noise draws for each initial state of a steerability report."""
@@ -257,6 +273,7 @@ def steerability(
     # The states that the first draw of every initial state visits before its first success.
     visited = result.obs[:, ::draws][result.running[:, ::draws]]
     action_std = action_spread(policy, visited, draws, seed)["action_std"]
+    some = evenly(visited, VISITED)
     solvable = (success.amax(dim=1) > 0).float().mean().item()
     reasons = []
     if solvable < MIN_SOLVABLE:
@@ -270,5 +287,7 @@ def steerability(
         states=states,
         draws=draws,
         action_std=action_std,
+        equivariance_error=decode_error(policy, some, Group.parse("C8"), seed),
+        jump=jumps(policy, some, seed)["high"],
         warning=f"little to steer: {' and '.join(reasons)}" if reasons else None,
     )

@@ -16,7 +16,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
+from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
 from symsteer.bench.tuning.trials import (
     START,
     Chosen,
@@ -77,7 +77,7 @@ def effort(trials: Sequence[TrialResult]) -> str:
         counts = [len(own), *(states.count(s) for s in ("complete", "pruned", "failed"))]
         rows.append([f"`{agent}`", *map(str, counts), str(len(scores)), f"{hours:.1f}"])
     head = ["agent", "trials", "complete", "given up", "failed", "runs", "hours of one core"]
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def choices(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
@@ -94,7 +94,7 @@ def choices(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
     rows = [[f"`{name}`", *(cell(choice, name) for choice in chosen)] for name in names]
     rows.append(["mean rank", *(f"{choice.rank:.1f}" for choice in chosen)])
     rows.append(["of the start", *(f"{choice.start_rank:.1f}" for choice in chosen)])
-    return _table(["option", *(f"`{choice.agent}`" for choice in chosen)], rows) if chosen else ""
+    return table(["option", *(f"`{choice.agent}`" for choice in chosen)], rows) if chosen else ""
 
 
 def comparison(chosen: Sequence[Chosen]) -> str:
@@ -118,7 +118,7 @@ def comparison(chosen: Sequence[Chosen]) -> str:
                 )
         rows.append(row)
     head = ["agent", "start", "one option", "chosen", "chosen for each task"]
-    return _table(head, rows) if rows else ""
+    return table(head, rows) if rows else ""
 
 
 def singles(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
@@ -136,7 +136,7 @@ def singles(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
         texts = ", ".join(f"{name}: {area:.3f}" for name, area in each.items())
         rows.append([f"`{choice.agent}`", f"{own[START]:.3f}", f"{own[choice.trial]:.3f}", texts])
     head = ["agent", "start", "chosen", "start with one option of the choice"]
-    return _table(head, rows) if rows else ""
+    return table(head, rows) if rows else ""
 
 
 def response(trials: Sequence[TrialResult], probe: int) -> str:
@@ -167,7 +167,7 @@ def response(trials: Sequence[TrialResult], probe: int) -> str:
                 ]
                 row.append(f"{np.mean(inside):.0f} ({len(inside)})" if inside else "-")
             rows.append(row)
-    return _table(["option", *(f"`{agent}`" for agent in standings), "all"], rows)
+    return table(["option", *(f"`{agent}`" for agent in standings), "all"], rows)
 
 
 def _groups(values: Sequence[Any]) -> list[tuple[str, Any, Any]]:
@@ -185,11 +185,6 @@ def _agents(trials: Sequence[TrialResult]) -> list[str]:
 
 def _value(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---", *("--:" for _ in head[1:])], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -113,6 +113,12 @@ def _beyond(old: Data, bounds: Any) -> dict[str, float]:
     return {"q_magnitude": size / limit, "q_overshoot": outside / (high - low)}
 
 
+def _from_5(data: Data) -> Data:
+    """Version 6 added `equivariance_error` and `jump` of the base policy."""
+    _refuse(5, data.get("base_policy"), "equivariance_error", "jump")
+    return {**data, "schema_version": 6}
+
+
 def _refuse(version: int, block: Any, *names: str) -> None:
     for name in names:
         if isinstance(block, dict) and name in block:
@@ -124,5 +130,6 @@ MIGRATIONS: dict[int, Callable[[Data], Data]] = {
     2: _from_2,
     3: _from_3,
     4: _from_4,
+    5: _from_5,
 }
 """From each older version of the schema to the next one; applied when a record is read."""

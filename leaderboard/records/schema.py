@@ -39,7 +39,7 @@ from symsteer.leaderboard.records.values import (
     portable,
 )
 
-SCHEMA_VERSION: Literal[5] = 5
+SCHEMA_VERSION: Literal[6] = 6
 
 HELD_OUT_SEED = 1_000_000
 """Evaluation episode i starts from seed ``HELD_OUT_SEED + i``, the same for every agent, variant
@@ -127,7 +127,9 @@ class BasePolicy(Measured):
 
     `base_success`: success_once with Gaussian noise; `action_std`: standard deviation of normalised
     actions over noise draws, mean over states; `solvable`: share of initial states that at least
-    one of `draws` noise draws solves; `warning`: why steering cannot work, if it cannot.
+    one of `draws` noise draws solves; `equivariance_error`: of its actions, under C8; `jump`:
+    99.9 % quantile of the change of its actions if the observation moves by a millimetre;
+    `warning`: why steering cannot work, if it cannot.
     """
 
     name: Name
@@ -138,6 +140,8 @@ class BasePolicy(Measured):
     action_std: Annotated[Finite, Field(ge=0)] | None = None
     solvable: Share | None = None
     draws: Count = 16
+    equivariance_error: Annotated[Finite, Field(ge=0)] | None = None
+    jump: Annotated[Finite, Field(ge=0)] | None = None
     training_seconds: Seconds | None = None
     parameters: Count | None = None
     warning: Text | None = None
@@ -241,7 +245,7 @@ class Divergence:
 class RunRecord(Block):
     """Everything the leaderboard may know about one run."""
 
-    schema_version: Literal[5] = SCHEMA_VERSION
+    schema_version: Literal[6] = SCHEMA_VERSION
     run_id: RunId
     config: dict[str, JsonValue]
     config_hash: str = ""

@@ -116,6 +116,8 @@ def make_record(
             episodes=200,
             action_std=0.42,
             solvable=0.97,
+            equivariance_error=2e-7,
+            jump=0.03,
             training_seconds=61.0,
         ),
         feasible_q=FeasibleQ(low=-20.0, high=0.0),

@@ -49,8 +49,11 @@ def older(tmp_path: Path, version: int) -> tuple[RunRecord, Path, dict[str, Any]
     record = make_record([make_evaluation([1, 0, 1, 1], q_mean=-3.25)])
     data = json.loads(dump_record(record))
     data["schema_version"] = version
-    del data["wall_clock"]["diagnose"]
-    record.wall_clock.diagnose = None
+    del data["base_policy"]["equivariance_error"], data["base_policy"]["jump"]
+    record.base_policy.equivariance_error = record.base_policy.jump = None
+    if version < 5:
+        del data["wall_clock"]["diagnose"]
+        record.wall_clock.diagnose = None
     if version < 4:
         del data["role"]
         for key in ("version", "sha256", "extensions"):
@@ -103,7 +106,16 @@ def test_conditional_biases_of_version_4_are_never_read_as_those_of_version_5(
     }
     assert evaluation.nonfinite == {"diagnostics/q_bias_successful_std": "nan"}
     assert record.diverged is True
-    assert json.loads(dump_record(record))["schema_version"] == 5
+    assert json.loads(dump_record(record))["schema_version"] == 6
+
+
+def test_records_of_version_5_lack_the_symmetry_of_the_base_policy(tmp_path: Path) -> None:
+    record, path, data = older(tmp_path, 5)
+    assert read_record(path) == record
+    for name in ("equivariance_error", "jump"):
+        path.write_text(json.dumps(data | {"base_policy": data["base_policy"] | {name: 0.5}}))
+        with pytest.raises(UserError, match=f"{name} does not belong to schema_version 5"):
+            read_record(path)
 
 
 @pytest.mark.parametrize("value", [None, "5", {}, 10**400])
@@ -405,7 +417,7 @@ def change(data: dict[str, Any], where: str, value: Any) -> None:
 
 
 EDITS: list[tuple[str, Any, str]] = [
-    ("schema_version", 6, "schema_version"),
+    ("schema_version", 7, "schema_version"),
     ("schema_version", 0, "schema_version"),
     ("schema_version", "1", "schema_version"),
     ("schema_version", True, "schema_version"),

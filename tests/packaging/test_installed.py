@@ -56,7 +56,7 @@ def sweep_and_report(installed, folder: Path, suite: str) -> list[dict]:
 def check_provenance(record: dict, version: str) -> None:
     """Version and hash stand for the commit, though the environment lies in a repository."""
     provenance = record["provenance"]
-    assert record["schema_version"] == 5
+    assert record["schema_version"] == 6
     assert provenance["commit"] is None
     assert provenance["version"] == version
     assert provenance["sha256"] == code_hash("symsteer")  # of the checkout: the same files

@@ -23,6 +23,10 @@ def test_a_small_study(tmp_path):
         assert row["action_std"] > 0
         assert 0 < row["jumps"]["median"] < row["jumps"]["high"] < 1
     assert len(list((tmp_path / "base").glob("*.h5"))) == 1
+    # A policy is trained once: its times would differ.
+    more = study([tiny_config()], tmp_path, names, counts, seeds=2, episodes=4, workers=1)
+    assert [row for row in more if row["seed"] == 0] == rows
+    assert len(more) == 2 * len(rows)
     write_study(tmp_path / "study.json", tiny_config(), rows)
     assert (tmp_path / "study.json").stat().st_size > 500
 

@@ -1,0 +1,210 @@
+"""Writes the tables of docs/base-policies.md from the committed records of the suite `policies`.
+
+python -m symsteer.bench.runs.policies_page                # from the committed records
+python -m symsteer.bench.runs.policies_page RUNS           # copies the finished records first
+python -m symsteer.bench.runs.policies_page --decode FILE  # replaces the times of decoding first
+
+Records are in leaderboard/results/policies. FILE holds what `symsteer throughput --decode --json`
+prints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
+from symsteer.errors import UserError
+from symsteer.files import write_together
+from symsteer.leaderboard.records import BasePolicy, RunRecord, read_record
+from symsteer.leaderboard.statistics import Interval, Sample, success_interval
+from symsteer.policies import POLICIES
+
+PAGE = CHECKOUT / "docs" / "base-policies.md"
+RESULTS = CHECKOUT / "leaderboard" / "results"
+RECORDS = RESULTS / "policies"
+DECODE = RESULTS / "base-policies" / "decode.json"
+
+TRAINING = ("steps", "batch_size", "sampling_steps")
+"""Options that belong to how long a policy is trained or sampled: not part of its label."""
+
+MEASURES = {"equivariance_error": "{:.1g}", "jump": "{:.2g}", "action_std": "{:.2f}"}
+MEASURES |= {"solvable": "{:.2f}"}
+"""Of the base policy, as the record has them, and how they are written."""
+
+STEERED = 50
+"""Demonstrations of the policies that agents steer."""
+
+
+def label(record: RunRecord) -> str:
+    """The policy's name and those of its options that are not the default."""
+    given: Mapping[str, Any] = record.config["policy"]  # type: ignore[assignment]
+    name = str(given["name"])
+    defaults = POLICIES.get(name).Options().to_json()
+    own = [
+        value if isinstance(value := given[key], str) else f"{key} {value}".removesuffix(" True")
+        for key, default in sorted(defaults.items())
+        if key not in TRAINING and given.get(key, default) != default
+    ]
+    return " ".join([f"`{name}`", *own])
+
+
+def success(records: Sequence[RunRecord]) -> Interval:
+    """Success of runs in their final episodes, with an interval over policies and episodes."""
+    samples = [
+        Sample.pooled(
+            zip(run.final.episodes.seed, map(float, run.final.episodes.success_once), strict=True),
+            run.base_policy.content_hash,
+        )
+        for run in records
+        if run.final
+    ]
+    return success_interval(samples)
+
+
+def render(records: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str:
+    """All tables, in markdown.
+
+    Args:
+        records: finished runs of the suite.
+        decode: rows of `symsteer throughput --decode`.
+    """
+    base = [record for record in records if record.settings.agent == "base"]
+    tasks = list(dict.fromkeys(record.settings.task for record in base))
+    parts = [(f"{task}: success", demonstrations(base, task)) for task in tasks]
+    parts += [
+        (f"What they are ({STEERED} demonstrations)", properties(base, decode)),
+        ("What agents make of them", steered(records)),
+    ]
+    return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
+
+
+def demonstrations(base: Sequence[RunRecord], task: str) -> str:
+    """Success of each policy on a task by number of demonstrations."""
+    cells: dict[str, dict[int, list[RunRecord]]] = defaultdict(lambda: defaultdict(list))
+    for record in base:
+        if record.settings.task == task:
+            cells[label(record)][record.settings.demonstrations.count].append(record)
+    counts = sorted({count for found in cells.values() for count in found})
+    rows = [
+        [name, *(_interval(success(found[n])) if n in found else "-" for n in counts)]
+        for name, found in cells.items()
+    ]
+    return table(["policy", *map(str, counts)], rows)
+
+
+def properties(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str:
+    """Size, cost, symmetry and steerability of each policy, over tasks and trainings."""
+    groups: dict[str, list[RunRecord]] = defaultdict(list)
+    for record in base:
+        if record.settings.demonstrations.count == STEERED:
+            groups[label(record)].append(record)
+    largest = max((row["chunks"] for row in decode), default=0)
+    times = {f"`{row['policy']}`": row for row in decode if row["chunks"] == largest}
+    rows = []
+    for name, found in groups.items():
+        policies = [record.base_policy for record in found]
+        row = [name, str(len(found))]
+        for values in (_known(policies, "parameters"), _known(policies, "training_seconds")):
+            row.append(f"{statistics.median(values):,.0f}" if values else "-")
+        time = times.get(name)
+        share = f"({time['products'] / time['median']:.0%})" if time else ""
+        row.append(f"{time['median']:.1f} {share}" if time else "-")
+        for measure, form in MEASURES.items():
+            row.append(_range([form.format(value) for value in _known(policies, measure)]))
+        rows.append(row)
+    head = ["policy", "trainings", "parameters", "training, s", "decode, ms (its products)"]
+    head += ["equivariance error", "jump", "spread", "solvable"]
+    return table(head, rows)
+
+
+def steered(records: Sequence[RunRecord]) -> str:
+    """Success of the policy, of w = 0 and of agents, on the trainings that all of them have."""
+    cells: dict[tuple[str, str], dict[str, list[RunRecord]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for record in records:
+        if record.settings.demonstrations.count == STEERED:
+            cells[label(record), record.settings.task][record.settings.agent].append(record)
+    agents = dict.fromkeys(record.settings.agent for record in records)
+    rows = []
+    for (name, task), found in cells.items():
+        if len(found) < 2:
+            continue
+        shared = set.intersection(*({r.settings.seed for r in runs} for runs in found.values()))
+        row = [name, task.removesuffix("-v1"), str(len(shared))]
+        for agent in agents:
+            runs = [record for record in found.get(agent, ()) if record.settings.seed in shared]
+            row.append(_interval(success(runs)) if runs else "-")
+        rows.append(row)
+    return table(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""
+
+
+def _interval(found: Interval) -> str:
+    return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
+
+
+def _known(policies: Sequence[BasePolicy], measure: str) -> list[float]:
+    return sorted(v for policy in policies if (v := getattr(policy, measure)) is not None)
+
+
+def _range(values: Sequence[str]) -> str:
+    return " to ".join(dict.fromkeys((values[0], values[-1]))) if values else "-"
+
+
+def finished(folder: Path) -> dict[str, Path]:
+    """Paths of the finished runs' records below a folder, by run."""
+    found = {}
+    for path in sorted(folder.glob("*/record.json")):
+        record = read_record(path)
+        if record.status == "finished":
+            found[record.run_id] = path
+    return found
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write docs/base-policies.md; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument(
+        "runs", nargs="?", type=Path, help="folder of runs whose records are copied"
+    )
+    parser.add_argument(
+        "--decode", type=Path, help="what symsteer throughput --decode --json printed"
+    )
+    given = parser.parse_args(arguments)
+    files: dict[Path, bytes] = {}
+    try:
+        check_checkout(PAGE)
+        if given.runs:
+            new = finished(given.runs)
+            files = {RECORDS / f"{name}.json": path.read_bytes() for name, path in new.items()}
+            if not files:
+                raise UserError(f"{given.runs} holds no finished run; name the folder of the sweep")
+            write_together(files)
+        if given.decode:
+            write_together({DECODE: given.decode.read_bytes()})
+        try:
+            decode = json.loads(DECODE.read_text()) if DECODE.is_file() else []
+            records = [read_record(path) for path in sorted(RECORDS.glob("*.json"))]
+            text = with_tables(PAGE.read_text(), render(records, decode), "docs/base-policies.md")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(
+                f"{DECODE} cannot be read ({error}); write it again with `symsteer throughput "
+                "--decode --json`"
+            ) from None
+        write_together({PAGE: text.encode()})
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"wrote the tables of {len(records)} records to {PAGE}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,124 @@
+"""The tables of docs/base-policies.md, from records whose numbers are known."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import pytest
+
+from symsteer.bench.pages import BEGIN, END
+from symsteer.bench.runs import policies_page as page
+from symsteer.leaderboard.records import write_record
+from symsteer.policies import POLICIES
+from tests.leaderboard.record_factory import make_evaluation, make_record
+
+DECODE = [
+    {"policy": "edp", "chunks": 64, "median": 3.0, "products": 2.0},
+    {"policy": "edp", "chunks": 192, "median": 8.0, "products": 6.0},
+]
+
+
+def run(successes, name="edp", agent="base", seed=0, count=50, task="PickCube-v1", **options):
+    """A record of ten episodes, of which the first ones are solved."""
+    policy = {"name": name, **POLICIES.get(name).Options().to_json(), **options}
+    record = make_record(
+        [make_evaluation([1] * successes + [0] * (10 - successes))],
+        task=task,
+        agent=agent,
+        seed=seed,
+        policy=policy,
+        demonstrations={"mode": "diverse", "count": count, "seed": seed},
+    )
+    record.run_id = f"{name}-{agent}-{count}-{seed}"
+    record.base_policy.content_hash = hashlib.sha256(f"{name}{seed}{count}".encode()).hexdigest()
+    record.base_policy.parameters = 1000
+    return record
+
+
+def rows(text):
+    lines = [line.strip("| ").split(" | ") for line in text.splitlines()]
+    return {line[0]: line[1:] for line in lines}
+
+
+def test_a_policy_is_named_by_the_options_that_are_not_the_default():
+    assert page.label(run(1)) == "`edp`"
+    assert page.label(run(1, group="D4")) == "`edp` D4"
+    flow = run(1, process="flow", prediction="velocity", sampling_steps=4, steps=3000)
+    assert page.label(flow) == "`edp` velocity flow"
+    noisy = {"observation_noise": 0.1, "orbit_targets": True}
+    assert page.label(run(1, **noisy)) == "`edp` observation_noise 0.1 orbit_targets"
+    assert page.label(run(1, name="plain")) == "`plain`"
+
+
+def test_success_is_over_trainings_and_stands_below_its_number_of_demonstrations():
+    base = [run(s, seed=s, count=5) for s in (1, 2, 3)] + [run(9, name="plain", count=100)]
+    base += [run(10, count=5, task="PushCube-v1")]
+    found = rows(page.demonstrations(base, "PickCube-v1"))
+    assert found["policy"] == ["5", "100"]
+    few, many = found["`edp`"]
+    assert few.startswith("0.20 [0.")
+    assert many == "-"
+    assert found["`plain`"][1].startswith("0.90 [")
+
+
+def test_properties_are_those_of_the_policies_that_are_steered():
+    base = [run(5, seed=s) for s in range(3)] + [run(5, count=5)]
+    base[1].base_policy.equivariance_error = 4e-7
+    base[2].base_policy.solvable = None
+    found = rows(page.properties(base, DECODE))["`edp`"]
+    trainings, parameters, seconds, decode, error, jump, spread, solvable = found
+    assert (trainings, parameters, seconds) == ("3", "1,000", "61")
+    assert decode == "8.0 (75%)"
+    assert (error, jump, spread, solvable) == ("2e-07 to 4e-07", "0.03", "0.42", "0.97")
+
+
+def test_agents_are_compared_on_the_trainings_that_all_have():
+    records = [run(2, seed=s) for s in range(3)]
+    records += [run(8, agent="standard", seed=s) for s in (0, 1)]
+    records += [run(10, agent="standard", seed=2, count=5)]
+    text = page.steered(records)
+    assert "| policy | task | trainings | `base` | `standard` |" in text
+    (row,) = [line for line in text.splitlines() if line.startswith("| `edp`")]
+    cells = row.strip("| ").split(" | ")
+    assert cells[:3] == ["`edp`", "PickCube", "2"]
+    assert cells[3].startswith("0.20 [")
+    assert cells[4].startswith("0.80 [")
+    # Policies that no agent steers have no row.
+    assert page.steered([run(2)]) == ""
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A checkout with an empty page and no records."""
+    (tmp_path / "page.md").write_text(f"before\n{BEGIN}old\n{END}after\n")
+    monkeypatch.setattr(page, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(page, "RECORDS", tmp_path / "records")
+    monkeypatch.setattr(page, "DECODE", tmp_path / "decode.json")
+    return tmp_path
+
+
+def test_finished_records_are_copied_and_the_page_is_written(checkout, capsys):
+    done, begun = run(4), make_record(status="running", seed=9)
+    for record in (done, begun):
+        write_record(record, checkout / "runs" / record.run_id / "record.json")
+    (checkout / "new.json").write_text(json.dumps(DECODE))
+    assert page.main([str(checkout / "runs"), "--decode", str(checkout / "new.json")]) == 0
+    assert "wrote the tables of 1 records" in capsys.readouterr().out
+    assert [p.name for p in (checkout / "records").iterdir()] == [f"{done.run_id}.json"]
+    written = (checkout / "page.md").read_text()
+    assert written.startswith(f"before\n{BEGIN}\n### PickCube-v1: success\n")
+    assert "8.0 (75%)" in written
+    assert "old" not in written
+    # Again, from what is committed.
+    assert page.main([]) == 0
+    assert (checkout / "page.md").read_text() == written
+
+
+def test_mistakes(checkout, capsys):
+    (checkout / "runs").mkdir()
+    assert page.main([str(checkout / "runs")]) == 2
+    assert "holds no finished run; name the folder of the sweep" in capsys.readouterr().err
+    (checkout / "decode.json").write_text("{")
+    assert page.main([]) == 2
+    assert "decode.json cannot be read" in capsys.readouterr().err
