@@ -112,7 +112,8 @@ class Layout:
         return isinstance(other, Layout) and self.fields == other.fields
 
     def __hash__(self) -> int:
-        return hash(self.fields)
+        # Looked up several times in each update: hashing all fields takes longer than comparing.
+        return hash((self.dim, len(self.fields)))
 
     def __repr__(self) -> str:
         parts = (f"{f.name}:{f.multiplicity}x{f.frequency}{'-' * f.odd}" for f in self.fields)
