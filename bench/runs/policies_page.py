@@ -170,13 +170,9 @@ def finished(folder: Path) -> dict[str, Path]:
 
 def main(arguments: Sequence[str]) -> int:
     """Write docs/base-policies.md; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument(
-        "runs", nargs="?", type=Path, help="folder of runs whose records are copied"
-    )
-    parser.add_argument(
-        "--decode", type=Path, help="what symsteer throughput --decode --json printed"
-    )
+    parser = argparse.ArgumentParser(description="Write the tables of docs/base-policies.md.")
+    parser.add_argument("runs", nargs="?", type=Path, help="runs whose records are copied")
+    parser.add_argument("--decode", type=Path, help="output of symsteer throughput --decode --json")
     given = parser.parse_args(arguments)
     files: dict[Path, bytes] = {}
     try:
