@@ -1,8 +1,8 @@
 """Writes the tables of docs/base-policies.md from the committed records of the suite `policies`.
 
-python -m symsteer.bench.runs.policies_page                # from the committed records
-python -m symsteer.bench.runs.policies_page RUNS           # copies the finished records first
-python -m symsteer.bench.runs.policies_page --decode FILE  # replaces the times of decoding first
+python -m symsteer.policies_page                # from the committed records
+python -m symsteer.policies_page RUNS           # copies the finished records first
+python -m symsteer.policies_page --decode FILE  # replaces the times of decoding first
 
 Records are in leaderboard/results/policies. FILE holds what `symsteer throughput --decode --json`
 prints.

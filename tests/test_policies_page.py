@@ -7,8 +7,8 @@ import json
 
 import pytest
 
+from symsteer import policies_page as page
 from symsteer.bench.pages import BEGIN, END
-from symsteer.bench.runs import policies_page as page
 from symsteer.leaderboard.records import write_record
 from symsteer.policies import POLICIES
 from tests.leaderboard.record_factory import make_evaluation, make_record
