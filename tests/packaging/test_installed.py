@@ -81,6 +81,7 @@ def test_list_sweep_and_report_in_an_empty_folder(installed, version, tmp_path):
     check_provenance(record, version)
 
 
+@pytest.mark.slow
 def test_a_foreign_package_of_the_same_name_is_never_imported(installed, tmp_path):
     """Packages ``agents`` exist: that of ``openai-agents``, for one."""
     foreign, folder = tmp_path / "foreign", tmp_path / "empty"

@@ -306,6 +306,7 @@ def test_steerability_stays_below_the_held_out_seeds(monkeypatch):
     assert seen[0] == HELD_OUT_SEED // 2
 
 
+@pytest.mark.slow
 def test_demonstrations_have_a_share_in_the_batches_and_a_stopped_run_repeats(
     tmp_path, monkeypatch
 ):

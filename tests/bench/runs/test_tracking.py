@@ -161,6 +161,7 @@ def test_runs_of_one_process_are_runs_of_their_own_in_wandb(out):
     assert len(ids) == 2
 
 
+@pytest.mark.slow
 def test_a_sweep_tracks_its_runs_as_a_group(out):
     config = tiny_config(agent="zero")
     assert sweep(write_suite(out, config, "seed = [0]"), out=out, workers=1, track="wandb") == 0
