@@ -28,8 +28,7 @@ from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.geometry import Group
-from symsteer.policies.steerability import decode_error, evenly, jumps
+from symsteer.policies.steerability import evenly, jumps
 from symsteer.variant import file_name
 
 EVALUATION_ENVS = 100
@@ -232,7 +231,7 @@ def _row(
         "zero": float(zero.episodes["success_once"].float().mean()),
         "solvable": report.solvable,
         "action_std": report.action_std,
-        "equivariance_error": decode_error(policy, visited, Group.parse("C8"), cell.seed),
+        "equivariance_error": report.equivariance_error,
         "jumps": jumps(policy, visited, cell.seed),
         "parameters": policy.parameter_count(),
         "training_seconds": round(policy.training_record["seconds"], 1),

@@ -291,6 +291,12 @@ def test_agents_have_what_was_chosen_for_them_and_travel_to_other_processes(name
     assert pickle.loads(pickle.dumps(options)) == options
 
 
+def test_the_agents_of_the_plan_core_have_defaults_of_their_own():
+    for name in ("standard", "standard-matched", "augmented", "equivariant", "residual-pathway"):
+        kind = AGENTS.get(name)
+        assert kind.Options.__qualname__ == f"{kind.__qualname__}.Options", name
+
+
 def test_the_control_has_the_settings_of_the_agent_that_it_controls():
     wrong, right = (AGENTS.get(name).Options() for name in ("wrong-group", "equivariant"))
     assert vars(wrong) == vars(right)

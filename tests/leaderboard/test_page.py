@@ -159,6 +159,19 @@ def test_the_second_table_shows_q_and_cost(board: Path) -> None:
     assert "TD error" not in header
 
 
+def test_the_page_says_how_symmetric_the_base_policies_are() -> None:
+    records = make_cell({"base": 0.3, "standard": 0.5}, episodes=20)
+    said = "Equivariance error of its actions: "
+    assert f"{said}2.0e-7." in page_of(records).replace("\u2212", "-")
+    for number, record in enumerate(records):
+        record.base_policy.content_hash = f"{number:064x}"
+        record.base_policy.equivariance_error = 2e-7 if number else 0.5
+    assert f"{said}2.0e-7 to 0.5." in page_of(records).replace("\u2212", "-")
+    for record in records:
+        record.base_policy.equivariance_error = None
+    assert said not in page_of(records)
+
+
 def test_every_claim_has_a_verdict(board: Path) -> None:
     text = text_of(board)
     header, _, *rows = table_after(text, "<summary>Claims")

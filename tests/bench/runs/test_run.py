@@ -64,6 +64,14 @@ def test_no_path_of_this_machine_is_recorded(finished):
     assert "/" not in json.loads(text.split("}\n{")[0] + ("}" if "}\n{" in text else ""))["run_id"]
 
 
+def test_the_record_has_symmetry_and_jumps_of_the_base_policy(finished):
+    _, folder = finished
+    base = read_record(folder / "record.json").base_policy
+    assert base.name == "edp"
+    assert 0 < base.equivariance_error < 1e-5
+    assert 0 < base.jump < 1
+
+
 def test_the_checkpoint_restores_the_agent(finished):
     config, folder = finished
     state = load_checkpoint(folder)
