@@ -72,11 +72,16 @@ class Tuner:
 
     def play(self) -> tuple[list[TrialResult], list[Chosen]]:
         """Execute all that is left: trials, single options, comparison on fresh cells."""
-        self._rounds()
-        if self.plan.exchange:
+        plan = self.plan
+        self._rounds(plan.trials)
+        if plan.listed > plan.trials:
+            for agent, search in self.searches.items():
+                search.enqueue(plan.further(agent), plan.trials, plan.listed - plan.trials)
+            self._rounds(plan.listed)
+        if plan.exchange:
             self._exchange()
-            self._rounds(self.plan.exchange)
-        chosen = [found for a in self.plan.agents if (found := self._best(a))]
+            self._rounds(plan.listed + plan.exchange)
+        chosen = [found for a in plan.agents if (found := self._best(a))]
         chosen = self._confirm(self._try_singles(chosen))
         self._write(chosen)
         return self.results, chosen
@@ -101,10 +106,10 @@ class Tuner:
             "journal": storage_path(self.out, name),
         }
 
-    def _rounds(self, further: int = 0) -> None:
-        """Execute rounds until every agent has its trials, and ``further`` ones."""
+    def _rounds(self, last: int) -> None:
+        """Execute rounds until every agent has so many trials."""
         searches = self.searches.items()
-        while batch := [(a, trial) for a, s in searches for trial in s.batch(further)]:
+        while batch := [(a, trial) for a, s in searches for trial in s.batch(last)]:
             self._round(batch)
             self._write([])
 
@@ -116,7 +121,8 @@ class Tuner:
         for agent, own in best.items():
             others = [options for other, options in best.items() if other != agent]
             shared = [{k: v for k, v in options.items() if k in own} for options in others]
-            self.searches[agent].exchange([{**own, **options} for options in shared])
+            settings = [{**own, **options} for options in shared]
+            self.searches[agent].enqueue(settings, self.plan.listed, self.plan.exchange)
 
     def _round(self, batch: Sequence[tuple[str, Trial]]) -> None:
         """Execute trials: first a few cells of each, then the others of those that are good."""
@@ -180,7 +186,7 @@ class Tuner:
         value = mean_auc(scores) if state == TrialState.COMPLETE else None
         self.searches[agent].study.tell(trial, value, state)
         area = f"AUC {mean_auc(scores):.3f} over {len(scores)} cells" if scores else "no cell"
-        of = f"{trial.number + 1} of {self.plan.trials + self.plan.exchange}"
+        of = f"{trial.number + 1} of {self.plan.listed + self.plan.exchange}"
         print(f"trial     {agent} {of}: {STATES[state]}, {area}", flush=True)
 
     def _best(self, agent: str) -> Chosen | None:
@@ -252,7 +258,7 @@ class Tuner:
         if chosen:
             words = (
                 f"Chosen by `symsteer tune {self.plan.name}`, "
-                f"{self.plan.trials + self.plan.exchange} trials an agent."
+                f"{self.plan.listed + self.plan.exchange} trials an agent."
             )
             write_atomically(places["preset"], to_preset(chosen, words).encode())
 
@@ -263,7 +269,7 @@ def preview(plan: TuningPlan) -> str:
     cells = len(plan.cells(first, plan.start(first)))
     fresh = len(plan.cells(first, plan.start(first), "confirm"))
     lines = [f"{plan.name}: {plan.description}" if plan.description else plan.name, ""]
-    trials = plan.trials + plan.exchange
+    trials = plan.listed + plan.exchange
     lines += [
         f"{agent}: {trials} trials of {len(space)} options: {', '.join(space)}"
         for agent, space in plan.spaces.items()

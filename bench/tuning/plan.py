@@ -5,7 +5,8 @@ the grid of fresh cells on which the chosen settings are compared with the first
 of the agents in ``singles`` is also tried by itself. ``[space]`` has the options of all agents that
 have them, ``[space.AGENT]`` those of one agent. An option has a list of choices, or
 ``{ low = 1e-4, high = 1e-2, log = true }``; an empty list takes it from an agent. ``[start]`` has
-options of every first trial; the others begin with the agent's defaults.
+options of every first trial; the others begin with the agent's defaults. Every ``[[further]]`` is
+a setting that all agents try after their trials; what it leaves out is that of the first trial.
 """
 
 from __future__ import annotations
@@ -30,10 +31,13 @@ from symsteer.names import unknown
 NUMBERS = {"trials": 20, "exchange": 0, "batch": 4, "probe": 2, "seed": 0}
 """Whole numbers of a plan and their defaults."""
 
-LATER = ("description", "trials", "exchange", "batch", "singles")
+LATER = ("description", "trials", "further", "exchange", "batch", "singles")
 """What may change after the first trial."""
 
-KEYS = ("description", "agents", "singles", *NUMBERS, "grid", "run", "confirm", "start", "space")
+KEYS = (
+    *("description", "agents", "singles", *NUMBERS),
+    *("grid", "run", "confirm", "start", "further", "space"),
+)
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class TuningPlan:
         name: of the file, without its ending.
         source: file name; messages begin with it.
         description: what is tuned, and where.
-        trials: of each agent.
+        trials: of each agent, drawn by the search.
         exchange: further trials of each agent, which begin with the settings of the others.
         batch: trials of an agent in one round; later rounds learn from earlier ones.
         probe: cells after which a trial may be given up.
@@ -97,9 +101,22 @@ class TuningPlan:
         kept = {key: value for key, value in self.data.items() if key not in LATER}
         return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
+    @property
+    def listed(self) -> int:
+        """Trials of each agent before the exchange: those drawn, and the further settings."""
+        return self.trials + len(self.data.get("further", ()))
+
     def start(self, agent: str) -> dict[str, Any]:
         """Options of the agent's first trial."""
         return {name: _first(self.data, agent, name) for name in self.spaces[agent]}
+
+    def further(self, agent: str) -> list[dict[str, Any]]:
+        """Options of the settings that the agent tries after its trials."""
+        start = self.start(agent)
+        return [
+            {name: options.get(name, first) for name, first in start.items()}
+            for options in self.data.get("further", ())
+        ]
 
     def cells(self, agent: str, options: Mapping[str, Any], grid: str = "grid") -> list[RunConfig]:
         """One run per cell with these options, in the order of the file.
@@ -150,14 +167,21 @@ def read_plan(name_or_path: str) -> TuningPlan:
         **numbers,
     )
     shared = {name for space in plan.spaces.values() for name in space}
-    for name in data.get("start", {}):
+    tables = [("start", data.get("start", {})), *(("further", f) for f in data.get("further", ()))]
+    for key, name in ((key, name) for key, table in tables for name in table):
         if name not in shared:
-            raise unknown("tuned option", name, sorted(shared), f"{source}, start")
+            raise unknown("tuned option", name, sorted(shared), f"{source}, {key}")
     for agent in plan.singles:
         if agent not in plan.spaces:
             raise unknown("agent", agent, plan.agents, f"{source}, singles")
     for agent in plan.agents:
         plan.cells(agent, plan.start(agent), "confirm")
+        for name, value in (item for options in plan.further(agent) for item in options.items()):
+            if not _contains(plan.spaces[agent][name], value):
+                raise UserError(
+                    f"{source}: space.{name} does not contain {value!r} of a further setting; "
+                    f"widen it, or change further.{name}"
+                )
         if plan.probe > (count := len(plan.cells(agent, plan.start(agent)))):
             raise UserError(f"{source}: probe is {plan.probe}, but there are only {count} cells")
     return plan

@@ -67,29 +67,34 @@ class Search:
                 f"{', '.join(LATER)} may change), or name another folder with --out"
             )
 
-    def exchange(self, settings: Sequence[Mapping[str, Any]]) -> None:
-        """Let the first further trials have these settings, if none had them; does so once."""
+    def enqueue(self, settings: Sequence[Mapping[str, Any]], begin: int, count: int) -> None:
+        """Let the first trials from number ``begin`` on have these settings, but for those tried.
+
+        Args:
+            settings: options of the agent.
+            begin: trials before them; if there are more, nothing is done.
+            count: the most trials that get one.
+        """
         known = self.study.get_trials(deepcopy=False)
-        if len(known) > self.plan.trials:
+        if len(known) > begin:
             return
         tried = [trial.params for trial in known]
         for options in settings:
-            if options not in tried and len(tried) < self.plan.trials + self.plan.exchange:
+            if options not in tried and len(tried) < begin + count:
                 tried.append(dict(options))
                 self.study.enqueue_trial(dict(options))
 
-    def batch(self, further: int = 0) -> list[Trial]:
+    def batch(self, last: int) -> list[Trial]:
         """The trials to execute next: those left unfinished, or new ones; empty at the end.
 
         Args:
-            further: trials beyond those of the plan.
+            last: trials in all.
         """
         begun = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
         if begun:
             return [Trial(self.study, trial._trial_id) for trial in begun]
         ended = len(self.study.get_trials(deepcopy=False, states=ENDED))
         trials = []
-        last = self.plan.trials + further
         for number in range(ended, min(ended + self.plan.batch, last)):
             # A continued search draws what an uninterrupted one would.
             self.study.sampler = optuna.samplers.TPESampler(

@@ -27,6 +27,10 @@ def test_agents_share_a_space_and_have_their_own_options(tmp_path):
     plan = read_plan(write_plan(tmp_path, given))
     assert plan.start("equivariant") == {"lr": 1e-3, "batch_size": 64, "critics": 2}
     assert plan.start("standard") == {"lr": 1e-3, "batch_size": 64}
+    given = TEXT + "\n[[further]]\nlr = 1e-2\ncritics = 4\n"
+    plan = read_plan(write_plan(tmp_path, given))
+    assert plan.further("standard") == [{"lr": 1e-2, "batch_size": 64}]
+    assert plan.further("equivariant") == [{"lr": 1e-2, "batch_size": 64, "critics": 4}]
 
 
 def test_a_shared_option_is_for_those_who_have_it_and_can_be_taken_from_one(tmp_path):
@@ -93,6 +97,8 @@ def test_no_cell_of_a_plan_is_on_a_leaderboard():
             'singles = ["standart"]',
             "singles: there is no agent 'standart'; did you mean 'standard'",
         ),
+        ("[space]", "[[further]]\nlr = 1.0\n[space]", "does not contain 1.0 of a further setting"),
+        ("[space]", "[[further]]\nlrr = 1.0\n[space]", "further.*'lrr'; did you mean 'lr'"),
     ],
 )
 def test_mistakes(tmp_path, old, new, message):

@@ -65,16 +65,27 @@ def test_agents_try_the_settings_of_the_others(play):
     assert runs.played == []
 
 
+def test_further_settings_come_before_the_exchange(play, tmp_path):
+    text = TEXT.replace("trials = 12", "trials = 12\nexchange = 1")
+    results, _, _ = play(text=text + "\n[[further]]\nlr = 0.011\n")
+    plan = read_plan(tmp_path / "tiny.toml")
+    for agent in BEST:
+        own = [t for t in results if t.agent == agent]
+        assert len(own) == 14
+        assert own[12].options == {**plan.start(agent), "lr": 0.011}
+        assert own[13].options["lr"] != 0.011
+
+
 def test_exchanged_settings_are_tried_once(play, tmp_path):
     plan = read_plan(write_plan(tmp_path, TEXT.replace("trials = 12", "trials = 12\nexchange = 2")))
     play()
     search = Search(plan, "standard", open_storage(storage_path(tmp_path / "runs", plan.name)))
     known = search.ended[0].params
     others = [{**known, "lr": lr} for lr in (0.011, 0.012, 0.013)]
-    search.exchange([known, others[0], others[0]])
+    search.enqueue([known, others[0], others[0]], 12, 2)
     # A later call, with what was chosen meanwhile, changes nothing.
-    search.exchange(others)
-    tried = [t.params for t in search.batch(further=2)]
+    search.enqueue(others, 12, 2)
+    tried = [t.params for t in search.batch(14)]
     assert tried[0] == others[0]
     assert tried[1] not in [known, *others]
 
@@ -191,7 +202,7 @@ def test_more_trials_can_be_added_later(play):
 def test_trials_of_another_plan_are_refused(play):
     play()
     with pytest.raises(
-        UserError, match=r"tiny.toml is not as it was .*only description, trials, exchange"
+        UserError, match=r"tiny.toml is not as it was .*only description, trials, further"
     ):
         play(text=TEXT.replace("high = 1e-1", "high = 1e-2"))
 
