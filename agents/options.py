@@ -24,8 +24,8 @@ Distill = Literal["gaussian", "squashed", "actor", "mixture"]
 class SacOptions(AgentOptions):
     """Options of all SAC agents.
 
-    The defaults were chosen by hand on PickCube and PushCube, floating, unbroken, with the standard
-    and the equivariant agent on the base policies of seeds 100 and 101.
+    The defaults are the setting that tuning chose for most of the core agents (docs/tuning.md);
+    :func:`~symsteer.agents.presets.tuned` gives each of those agents its own.
     """
 
     critic: Critic = "aliased"
@@ -34,17 +34,17 @@ class SacOptions(AgentOptions):
     actor's gradient passes through the sampler."""
     gamma: float = 0.95
     """Discount per decision (not per environment step)."""
-    lr: float = 6e-4
+    lr: float = 2.4e-3
     """Adam's learning rate of actor and critics."""
     alpha_lr: float = 3e-4
     """Adam's learning rate of log alpha."""
-    batch_size: int = 64
+    batch_size: int = 128
     """Transitions per update."""
-    tau: float = 0.015
+    tau: float = 0.016
     """Weight of the online critics when the target critics are updated."""
-    critics: int = 2
+    critics: int = 4
     """Number of critics."""
-    reduce: Reduce = "min"
+    reduce: Reduce = "mean"
     """One value of several critics: the smallest, the mean, or the smallest of a random subset
     (REDQ; the actor then follows the mean)."""
     subset: int = 2
@@ -55,24 +55,24 @@ class SacOptions(AgentOptions):
     """Do not bootstrap where the time limit ended an episode (as in the published code of DSRL)."""
     soft_backup: bool = False
     """Add the entropy bonus to the critics' target, as in the SAC paper."""
-    target_entropy: float = 0.0
+    target_entropy: float = 0.5
     """Target of the entropy, nats per dimension of the noise."""
-    initial_alpha: float = 0.3
+    initial_alpha: float = 0.1
     """Entropy weight at the start."""
-    noise_bound: float = 1.5
+    noise_bound: float = 1.0
     """Largest norm of an irrep block of the noise."""
     bound_penalty: float = 0.0
     """0: the noise is squashed into the bound. Above 0: no squash; the actor pays this weight for
     the squared excess over the bound, summed over blocks."""
-    distill: Distill = "mixture"
+    distill: Distill = "squashed"
     """Noise at which `aliased` distils: N(0, I), N(0, I) squashed into the bound, the actor's, or a
     mixture of squashed and actor's in equal parts."""
-    distill_steps: float = 1.0
+    distill_steps: float = 0.5
     """Gradient steps of the noise critics per update."""
     noise_bank: int = 4
     """Random noises that `aliased` decodes once per stored decision and distils from; 0: decode new
     ones in every step."""
-    utd: float = 1.0
+    utd: float = 0.5
     """Updates per collected decision, for any number of environments."""
     warmup: int = 1280
     """Decisions with random noise at the start."""

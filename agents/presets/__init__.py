@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 from symsteer.errors import UserError
 from symsteer.names import unknown
@@ -57,10 +57,12 @@ def tuned(agent: type[T]) -> type[T]:
     Agents without a table there keep their defaults.
     """
     base, found = agent.Options, preset_options("tuned", agent.name, agent.Options)
+    # As types: names of types mean nothing in the agent's module.
+    types = get_type_hints(base)
     agent.Options = dataclasses.make_dataclass(
         "Options",
         [
-            (field.name, field.type, found[field.name])
+            (field.name, types[field.name], found[field.name])
             for field in dataclasses.fields(base)
             if field.name in found
         ],

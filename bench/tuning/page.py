@@ -101,6 +101,8 @@ def comparison(chosen: Sequence[Chosen]) -> str:
     """Mean area on fresh cells, and how often a setting beats the start there."""
     rows = []
     for choice in chosen:
+        if not choice.fresh:
+            continue
         start = {score.cell: score.auc for score in choice.fresh.get("start", ())}
         row = [f"`{choice.agent}`"]
         for setting in get_args(Setting):

@@ -27,7 +27,14 @@ LEARNERS = [
     for name in AGENTS.builtin
     if AGENTS.get(name).role == "learner" and issubclass(AGENTS.get(name), SacAgent)
 ]
-KINDS = [(name, AGENTS.get(name).Options().critic) for name in LEARNERS]
+CORE = ("standard", "standard-matched", "augmented", "equivariant", "residual-pathway")
+KINDS = [
+    # The others need some minutes of one core.
+    pytest.param(
+        name, AGENTS.get(name).Options().critic, marks=() if name in CORE else pytest.mark.slow
+    )
+    for name in LEARNERS
+]
 KINDS += itertools.product(("standard", "equivariant"), ("noise", "sampler"))
 OWN = {
     # The critics of size-matched agents are narrow; they need larger steps.

@@ -1,6 +1,7 @@
 """Options of the learners: when they learn, how far noise may go, and the presets."""
 
 import dataclasses
+import json
 import math
 import pickle
 from pathlib import Path
@@ -16,7 +17,9 @@ from symsteer.agents.sac import SacAgent
 from symsteer.agents.standard import StandardAgent
 from symsteer.errors import UserError
 
-PAGE = (Path(__file__).parents[2] / "docs" / "agents.md").read_text()
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "agents.md").read_text()
+RESULTS = ROOT / "leaderboard" / "results"
 TRAINED = [name for name in AGENTS.builtin if issubclass(AGENTS.get(name), SacAgent)]
 
 
@@ -295,6 +298,18 @@ def test_the_agents_of_the_plan_core_have_defaults_of_their_own():
     for name in ("standard", "standard-matched", "augmented", "equivariant", "residual-pathway"):
         kind = AGENTS.get(name)
         assert kind.Options.__qualname__ == f"{kind.__qualname__}.Options", name
+
+
+def test_what_tuning_chose_is_the_committed_choice():
+    """Of all agents that a plan tuned, and to the digits that the preset has."""
+    trials = json.loads((RESULTS / "tuning" / "core.json").read_text())
+    for choice in trials["chosen"]:
+        chosen = preset_options("tuned", choice["agent"], AGENTS.get(choice["agent"]).Options)
+        assert chosen.keys() == choice["options"].keys()
+        for name, value in choice["options"].items():
+            wanted = pytest.approx(value, rel=1e-3) if isinstance(value, float) else value
+            assert chosen[name] == wanted, name
+    assert len(trials["chosen"]) == 5
 
 
 def test_the_control_has_the_settings_of_the_agent_that_it_controls():

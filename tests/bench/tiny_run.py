@@ -14,6 +14,7 @@ from symsteer.policies import POLICIES
 
 AGENT = {
     **{"width": 16, "batch_size": 16, "warmup": 16, "utd": 1.0, "group": "C4"},
+    **{"critics": 2, "distill": "mixture", "distill_steps": 1.0},
     "refit": 16,
     # Episodes that Q is compared with are longer the larger the discount is.
     "gamma": 0.5,

@@ -4,8 +4,10 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.folder import is_finished, run_id
 from tests.bench.tiny_run import tiny_config
 
 
@@ -19,15 +21,21 @@ def finished(tmp_path_factory) -> tuple[RunConfig, Path]:
 
 
 @pytest.fixture(scope="session")
-def broken(finished) -> dict[str, Path]:
-    """A finished run of every agent in a broken world: folders by agent."""
+def broken(tmp_path_factory, worker_id) -> dict[str, Path]:
+    """A finished run of every agent in a broken world, beside an unbroken one: folders by agent.
+
+    Pytest's first process that needs them executes them for all.
+    """
     from symsteer.agents import AGENTS
     from symsteer.bench.runs.run import execute
 
-    _, folder = finished
+    base = tmp_path_factory.getbasetemp()
+    out = (base if worker_id == "master" else base.parent) / "every-agent"
     evaluation = dataclasses.replace(tiny_config().evaluation, every=240)
     change = {"variant": "action_gain:0.5", "env_steps": 240, "evaluation": evaluation}
-    return {
-        name: execute(tiny_config(agent=name, **change), folder.parent, progress=False)
-        for name in AGENTS.builtin
-    }
+    configs = {name: tiny_config(agent=name, **change) for name in AGENTS.builtin}
+    with FileLock(f"{out}.lock"):
+        for config in (tiny_config(), *configs.values()):
+            if not is_finished(out / run_id(config, {})):
+                execute(config, out, progress=False)
+    return {name: out / run_id(config, {}) for name, config in configs.items()}

@@ -295,7 +295,7 @@ def test_the_text_says_what_was_run(broken):
         assert f"{record.base_policy.action_std:.2f}" in rows["its steerability"]
         assert rows["its warning"] == record.base_policy.warning
         own = record.config["agent_options"]
-        assert rows.get("agent_options.lr") == ("0.0006" if "lr" in own else None)
+        assert rows.get("agent_options.lr") == (str(own["lr"]) if "lr" in own else None)
         assert rows["evaluation.final_episodes"] == "5"
 
 

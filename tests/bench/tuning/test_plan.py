@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from symsteer.agents import AGENTS
 from symsteer.bench.tuning import plan_summaries
 from symsteer.bench.tuning.plan import Choices, Range, read_plan
 from symsteer.errors import UserError
@@ -23,10 +24,10 @@ def test_agents_share_a_space_and_have_their_own_options(tmp_path):
     assert plan.spaces["standard"] == shared
     assert plan.spaces["equivariant"] == {**shared, "critics": Range(2, 6)}
     assert plan.start("equivariant") == {"lr": 6e-4, "batch_size": 64, "critics": 2}
-    given = TEXT.replace("[space]", "[start]\nlr = 1e-3\n[space]")
-    plan = read_plan(write_plan(tmp_path, given))
-    assert plan.start("equivariant") == {"lr": 1e-3, "batch_size": 64, "critics": 2}
-    assert plan.start("standard") == {"lr": 1e-3, "batch_size": 64}
+    default = AGENTS.get("equivariant").Options().lr
+    assert default != 6e-4
+    plan = read_plan(write_plan(tmp_path, TEXT.replace("lr = 6e-4\n", "")))
+    assert plan.start("equivariant") == {"lr": default, "batch_size": 64, "critics": 2}
     given = TEXT + "\n[[further]]\nlr = 1e-2\ncritics = 4\n"
     plan = read_plan(write_plan(tmp_path, given))
     assert plan.further("standard") == [{"lr": 1e-2, "batch_size": 64}]

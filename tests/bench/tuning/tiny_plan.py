@@ -30,6 +30,11 @@ seed = [2, 3]
 [run]
 env_steps = 20_000
 
+[start]
+lr = 6e-4
+batch_size = 64
+critics = 2
+
 [space]
 lr = { low = 1e-4, high = 1e-1, log = true }
 batch_size = [32, 64]
