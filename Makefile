@@ -31,7 +31,7 @@ demo: setup
 	$(BIN)/symsteer demo
 
 test: setup
-	$(BIN)/python -m pytest -n 2 -m "not slow and not gpu"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not gpu"
 
 test-slow: setup
 	$(BIN)/python -m pytest -n 2 -m "slow"

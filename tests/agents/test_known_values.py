@@ -27,11 +27,11 @@ LEARNERS = [
     for name in AGENTS.builtin
     if AGENTS.get(name).role == "learner" and issubclass(AGENTS.get(name), SacAgent)
 ]
-CORE = ("standard", "standard-matched", "augmented", "equivariant", "residual-pathway")
+KEPT = ("standard", "equivariant", "residual-pathway")
 KINDS = [
-    # The others need some minutes of one core.
+    # Those of the others need some minutes of one core.
     pytest.param(
-        name, AGENTS.get(name).Options().critic, marks=() if name in CORE else pytest.mark.slow
+        name, AGENTS.get(name).Options().critic, marks=() if name in KEPT else pytest.mark.slow
     )
     for name in LEARNERS
 ]

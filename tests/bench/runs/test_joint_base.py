@@ -13,6 +13,7 @@ from symsteer.leaderboard.records import read_record
 from symsteer.policies import POLICIES
 from symsteer.policies.files import policy_path
 from tests.bench.tiny_run import POLICY, tiny_config
+from tests.marks import first
 
 TASKS = ("PickCube-v1", "PushCube-v1", "PlaceSphere-v1")
 
@@ -22,7 +23,7 @@ def config(task, tasks=TASKS, name="edp-joint", **changes):
     return tiny_config(task=task, policy_name=name, policy=policy, **changes)
 
 
-@pytest.mark.parametrize("name", ["edp-joint", "plain-joint"])
+@pytest.mark.parametrize("name", first(["edp-joint", "plain-joint"], "edp-joint"))
 def test_it_is_trained_once_for_the_runs_on_all_tasks(name, tmp_path, monkeypatch):
     first = config("PushCube-v1", name=name)
     assert find_base(first, tmp_path) is None
@@ -83,9 +84,7 @@ def test_tasks_that_cannot_be_joined_are_refused():
         check(config("PickCube-v1", (other,)))
 
 
-@pytest.mark.parametrize(
-    "task", [TASKS[0], *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS[1:])]
-)
+@pytest.mark.parametrize("task", first(TASKS, TASKS[0]))
 def test_it_is_steered_on_each_task(task, tmp_path):
     wanted = config(task, env_steps=160)
     record = read_record(execute(wanted, tmp_path, progress=False) / "record.json")

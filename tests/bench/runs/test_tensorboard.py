@@ -267,7 +267,8 @@ def test_hyperparameters_can_be_compared_across_runs(broken):
         assert values["demonstrations.count"].number_value == 3
         if "layer_norm" in own:
             assert values["agent_options.layer_norm"].bool_value is True
-            assert values["agent_options.target_entropy"].number_value == 0
+            found = values["agent_options.target_entropy"].number_value
+            assert found == own["target_entropy"]
             assert values["agent_options.learning_starts"].string_value == "none"
         assert folder.name.endswith(start.group_name)
         experiment = metadata.parse_experiment_plugin_data(content(metadata.EXPERIMENT_TAG))
