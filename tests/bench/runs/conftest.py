@@ -1,10 +1,11 @@
 """Finished runs for the tests of this folder."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import is_finished, run_id
@@ -24,7 +25,7 @@ def finished(tmp_path_factory) -> tuple[RunConfig, Path]:
 def broken(tmp_path_factory, worker_id) -> dict[str, Path]:
     """A finished run of every agent in a broken world, beside an unbroken one: folders by agent.
 
-    Pytest's first process that needs them executes them for all.
+    Pytest's processes share them, and the work.
     """
     from symsteer.agents import AGENTS
     from symsteer.bench.runs.run import execute
@@ -34,8 +35,14 @@ def broken(tmp_path_factory, worker_id) -> dict[str, Path]:
     evaluation = dataclasses.replace(tiny_config().evaluation, every=240)
     change = {"variant": "action_gain:0.5", "env_steps": 240, "evaluation": evaluation}
     configs = {name: tiny_config(agent=name, **change) for name in AGENTS.builtin}
-    with FileLock(f"{out}.lock"):
-        for config in (tiny_config(), *configs.values()):
+
+    def ensure(config, patience):
+        with contextlib.suppress(Timeout), FileLock(f"{out}-{run_id(config, {})}.lock", patience):
             if not is_finished(out / run_id(config, {})):
                 execute(config, out, progress=False)
+
+    ensure(tiny_config(), patience=-1)  # with the base policy of all
+    for patience in (0, -1):  # first those that no other process executes
+        for config in configs.values():
+            ensure(config, patience)
     return {name: out / run_id(config, {}) for name, config in configs.items()}
