@@ -5,6 +5,6 @@ from collections.abc import Sequence
 import pytest
 
 
-def first(names: Sequence[str], *kept: str) -> list:
-    """Parameters of which all but ``kept`` are slow: one stands for the others."""
+def slow_except(names: Sequence, *kept) -> list:
+    """Parameters of which only ``kept`` belong to the default run; they stand for the others."""
     return [pytest.param(n, marks=() if n in kept else pytest.mark.slow) for n in names]

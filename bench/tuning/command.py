@@ -74,13 +74,11 @@ class Tuner:
         """Execute all that is left: trials, single options, comparison on fresh cells."""
         plan = self.plan
         self._rounds(plan.trials)
-        if plan.listed > plan.trials:
-            for agent, search in self.searches.items():
-                search.enqueue(plan.further(agent), plan.trials, plan.listed - plan.trials)
-            self._rounds(plan.listed)
-        if plan.exchange:
-            self._exchange()
-            self._rounds(plan.listed + plan.exchange)
+        for agent, search in self.searches.items():
+            search.enqueue(plan.further(agent), plan.trials, plan.listed - plan.trials)
+        self._rounds(plan.listed)
+        self._exchange()
+        self._rounds(plan.listed + plan.exchange)
         chosen = [found for a in plan.agents if (found := self._best(a))]
         chosen = self._confirm(self._try_singles(chosen))
         self._write(chosen)

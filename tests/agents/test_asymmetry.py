@@ -16,7 +16,7 @@ from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
 from tests.agents.conftest import ACT, OBS
 from tests.agents.test_equivariance import errors, trained
 from tests.agents.test_sac import solve
-from tests.marks import first
+from tests.marks import slow_except
 
 WITH_DIAL = ("residual-pathway", "relaxed", "projected")
 ALL = (*WITH_DIAL, "constrained")
@@ -161,7 +161,7 @@ def test_actor_and_critics_may_have_penalties_of_their_own(problem):
     assert asymmetry(agent.actor) > 1e-4
 
 
-@pytest.mark.parametrize("name", first(ALL, "residual-pathway"))
+@pytest.mark.parametrize("name", slow_except(ALL, "residual-pathway"))
 def test_in_a_symmetric_problem_the_measured_error_falls(problem, name, monkeypatch):
     """From layers that are far from the symmetry."""
     options = {"dual_lr": 0.3} if name == "constrained" else {"penalty": 10.0}

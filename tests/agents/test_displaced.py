@@ -6,6 +6,7 @@ import torch
 from symsteer.errors import UserError
 from tests.agents.test_equivariance import errors, trained
 from tests.agents.test_known_values import best, play, reach, states
+from tests.marks import slow_except
 
 
 def test_it_starts_as_the_base_policy(problem):
@@ -21,7 +22,7 @@ def test_it_starts_as_the_base_policy(problem):
     torch.testing.assert_close(price, shift.square().sum(1))
 
 
-@pytest.mark.parametrize("displacement", [pytest.param(0.05, marks=pytest.mark.slow), 0.5])
+@pytest.mark.parametrize("displacement", slow_except([0.05, 0.5], 0.5))
 def test_the_multiplier_keeps_the_mean_displacement(displacement):
     """A plain climb of Q would go farther: see the next test."""
     agent = reach(

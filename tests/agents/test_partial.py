@@ -10,7 +10,7 @@ from symsteer.agents.replay import Transition
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Layout
 from tests.agents.test_equivariance import errors, trained
-from tests.marks import first
+from tests.marks import slow_except
 
 DOUBLE = {"dtype": torch.float64, "initial_output": 1.0}
 
@@ -110,7 +110,7 @@ def auroc(score, label):
     return (wins / (positive * (len(label) - positive))).item()
 
 
-@pytest.mark.parametrize("broken", first(["dynamics", "reward"], "dynamics"))
+@pytest.mark.parametrize("broken", slow_except(["dynamics", "reward"], "dynamics"))
 def test_the_gates_find_where_the_symmetry_is_broken(broken):
     agent, seen, windy = learned(broken)
     share = agent.share(seen.obs, seen.actions)

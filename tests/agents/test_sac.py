@@ -15,7 +15,7 @@ from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Group, Layout
-from tests.marks import first
+from tests.marks import slow_except
 
 LEARNERS = ["standard", "standard-matched", "augmented", "equivariant", "residual-pathway"]
 SAC = ["standard", "augmented", "equivariant", "residual-pathway"]
@@ -532,7 +532,7 @@ def solve(problem, name, broken, rounds=400, **options):
     return reward, error
 
 
-@pytest.mark.parametrize("name", first(SAC, "standard", "equivariant"))
+@pytest.mark.parametrize("name", slow_except(SAC, "standard", "equivariant"))
 def test_learns_a_symmetric_problem(problem, name):
     """Best is 0, standing still about -2.1, the base policy about -8."""
     reward, error = solve(problem, name, broken=False)

@@ -13,7 +13,7 @@ from symsteer.leaderboard.records import read_record
 from symsteer.policies import POLICIES
 from symsteer.policies.files import policy_path
 from tests.bench.tiny_run import POLICY, tiny_config
-from tests.marks import first
+from tests.marks import slow_except
 
 TASKS = ("PickCube-v1", "PushCube-v1", "PlaceSphere-v1")
 
@@ -23,7 +23,7 @@ def config(task, tasks=TASKS, name="edp-joint", **changes):
     return tiny_config(task=task, policy_name=name, policy=policy, **changes)
 
 
-@pytest.mark.parametrize("name", first(["edp-joint", "plain-joint"], "edp-joint"))
+@pytest.mark.parametrize("name", slow_except(["edp-joint", "plain-joint"], "edp-joint"))
 def test_it_is_trained_once_for_the_runs_on_all_tasks(name, tmp_path, monkeypatch):
     first = config("PushCube-v1", name=name)
     assert find_base(first, tmp_path) is None
@@ -84,7 +84,7 @@ def test_tasks_that_cannot_be_joined_are_refused():
         check(config("PickCube-v1", (other,)))
 
 
-@pytest.mark.parametrize("task", first(TASKS, TASKS[0]))
+@pytest.mark.parametrize("task", slow_except(TASKS, TASKS[0]))
 def test_it_is_steered_on_each_task(task, tmp_path):
     wanted = config(task, env_steps=160)
     record = read_record(execute(wanted, tmp_path, progress=False) / "record.json")
