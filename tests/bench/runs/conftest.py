@@ -1,7 +1,9 @@
-"""Finished runs for the tests of this folder."""
+"""Finished runs for the tests of this folder. Pytest's processes share them, and the work."""
 
 import contextlib
 import dataclasses
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,36 +15,62 @@ from tests.bench.tiny_run import tiny_config
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory) -> tuple[RunConfig, Path]:
-    """A finished run: its configuration and folder."""
+def shared(tmp_path_factory, worker_id) -> Path:
+    """A folder that all processes share."""
+    base = tmp_path_factory.getbasetemp()
+    return (base if worker_id == "master" else base.parent) / "shared"
+
+
+def ensure(config: RunConfig, out: Path, patience: float = -1) -> Path:
+    """Execute a run if it is not finished; leave it to another process that does so already.
+
+    Args:
+        config: the run.
+        out: the shared folder.
+        patience: seconds to wait for the other process; -1 for no limit.
+    """
     from symsteer.bench.runs.run import execute
 
-    config = tiny_config()
-    return config, execute(config, tmp_path_factory.mktemp("runs"), progress=False)
+    folder = out / run_id(config, {})
+    out.mkdir(exist_ok=True)
+    with contextlib.suppress(Timeout), FileLock(f"{folder}.lock", patience):
+        if not is_finished(folder):
+            execute(config, out, progress=False)
+    return folder
 
 
 @pytest.fixture(scope="session")
-def broken(tmp_path_factory, worker_id) -> dict[str, Path]:
-    """A finished run of every agent in a broken world, beside an unbroken one: folders by agent.
+def finished(shared, tmp_path_factory) -> tuple[RunConfig, Path]:
+    """A finished run: its configuration and folder, which is the process's own."""
+    config, own = tiny_config(), tmp_path_factory.mktemp("runs")
+    folder = ensure(config, shared)
+    for name in ("base", folder.name):
+        shutil.copytree(shared / name, own / name)
+    return config, own / folder.name
 
-    Pytest's processes share them, and the work.
-    """
+
+@pytest.fixture(scope="session")
+def lend(shared) -> Callable[[Path], Path]:
+    """Copies the base policies of tiny runs with seeds 0 and 1 into a folder."""
+    from symsteer.bench.runs.base_policy import prepare_base
+
+    bases = shared.with_name("bases")
+    with FileLock(f"{bases}.lock"):
+        for seed in (0, 1):
+            prepare_base(tiny_config(seed=seed), bases, progress=False)
+    return lambda out: shutil.copytree(bases / "base", out / "base")
+
+
+@pytest.fixture(scope="session")
+def broken(shared) -> dict[str, Path]:
+    """A finished run of every agent in a broken world, beside an unbroken one: folders by agent."""
     from symsteer.agents import AGENTS
-    from symsteer.bench.runs.run import execute
 
-    base = tmp_path_factory.getbasetemp()
-    out = (base if worker_id == "master" else base.parent) / "every-agent"
     evaluation = dataclasses.replace(tiny_config().evaluation, every=240)
     change = {"variant": "action_gain:0.5", "env_steps": 240, "evaluation": evaluation}
     configs = {name: tiny_config(agent=name, **change) for name in AGENTS.builtin}
-
-    def ensure(config, patience):
-        with contextlib.suppress(Timeout), FileLock(f"{out}-{run_id(config, {})}.lock", patience):
-            if not is_finished(out / run_id(config, {})):
-                execute(config, out, progress=False)
-
-    ensure(tiny_config(), patience=-1)  # with the base policy of all
+    ensure(tiny_config(), shared)  # with the base policy of all
     for patience in (0, -1):  # first those that no other process executes
         for config in configs.values():
-            ensure(config, patience)
-    return {name: out / run_id(config, {}) for name, config in configs.items()}
+            ensure(config, shared, patience)
+    return {name: shared / run_id(config, {}) for name, config in configs.items()}

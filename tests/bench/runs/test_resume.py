@@ -22,9 +22,10 @@ from symsteer.bench.runs.folder import (
     read_progress,
     state_of,
 )
-from symsteer.bench.runs.run import evaluate, execute, resume
+from symsteer.bench.runs.run import evaluate, resume
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
+from tests.bench.runs.conftest import ensure
 from tests.bench.tiny_run import tiny_config, without_clock
 
 # Processes that have finished their imports: the kill then happens during the run.
@@ -33,7 +34,7 @@ PROCESSES.set_forkserver_preload(["tests.bench.runs.test_resume", "torch._dynamo
 
 # Fractions of an update are carried over to the next decision.
 CONFIG = tiny_config(
-    env_steps=960,
+    env_steps=640,
     checkpoint_every=60,
     # The world changes in the course of the run.
     variant="action_gain:1@0.2..0.6+perception_bias:0..1",
@@ -53,8 +54,9 @@ def start(folder):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    return execute(CONFIG, tmp_path_factory.mktemp("undisturbed"), progress=False)
+def undisturbed(shared):
+    ensure(tiny_config(), shared)  # with the base policy of both
+    return ensure(CONFIG, shared)
 
 
 @pytest.fixture

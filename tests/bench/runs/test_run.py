@@ -22,6 +22,7 @@ from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config, without_clock
+from tests.marks import slow_except
 
 REFERENCES = ("base", "zero", "golden-ticket")
 
@@ -84,7 +85,7 @@ def test_the_checkpoint_restores_the_agent(finished):
     assert not torch.equal(before, agent.act(obs, deterministic=True))
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", slow_except((1, 2), 2))
 def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_path):
     config, folder = finished
     again = execute(config, tmp_path, progress=False, workers=workers)
@@ -92,8 +93,9 @@ def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_pat
     assert without_clock(again) == without_clock(folder)
 
 
-def test_evaluating_more_often_does_not_change_training(finished, tmp_path):
+def test_evaluating_more_often_does_not_change_training(finished, lend, tmp_path):
     config, folder = finished
+    lend(tmp_path)
     evaluation = dataclasses.replace(config.evaluation, every=80)
     often = execute(tiny_config(evaluation=evaluation), tmp_path, progress=False)
     assert len(read_record(often / "record.json").evaluations) == 5

@@ -34,9 +34,10 @@ def outcome(folder):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory):
+def alone(tmp_path_factory, lend):
     """The folder of runs that were executed one after the other."""
     out = tmp_path_factory.mktemp("alone")
+    lend(out)
     for config in configs():
         execute(config, out, progress=False)
     return out
@@ -100,10 +101,11 @@ def test_runs_that_are_behind_are_served_first():
     assert _next([ahead]) == [ahead]
 
 
-def test_a_killed_team_continues(alone, tmp_path, monkeypatch):
+def test_a_killed_team_continues(lend, tmp_path, monkeypatch):
     """One run got further than the others before the process was killed."""
     from symsteer.bench.runs import trainer
 
+    lend(tmp_path)
     written = []
     stock = trainer.save_checkpoint
 
@@ -122,12 +124,14 @@ def test_a_killed_team_continues(alone, tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "save_checkpoint", stock)
     assert execute_together(changed, tmp_path) == [None] * len(SEEDS)
     out = tmp_path / "undisturbed"
+    lend(out)
     assert execute_together(changed, out) == [None] * len(SEEDS)
     for config in changed:
         assert_same(tmp_path / run_id(config, {}), out / run_id(config, {}))
 
 
-def test_an_error_of_one_run_does_not_stop_the_others(alone, tmp_path, monkeypatch):
+def test_an_error_of_one_run_does_not_stop_the_others(alone, lend, tmp_path, monkeypatch):
+    lend(tmp_path)
     stock = StandardAgent.observe
 
     def observe(self, transition):
