@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from scipy.stats import ttest_1samp
 
 from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
 from symsteer.bench.tuning.trials import (
     START,
     Chosen,
+    Score,
     Setting,
     TrialResult,
     from_json,
@@ -98,7 +100,7 @@ def choices(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
 
 
 def comparison(chosen: Sequence[Chosen]) -> str:
-    """Mean area on fresh cells, and how often a setting beats the start there."""
+    """Mean area on fresh cells, and the difference to the start, paired by cell."""
     rows = []
     for choice in chosen:
         if not choice.fresh:
@@ -112,15 +114,28 @@ def comparison(chosen: Sequence[Chosen]) -> str:
             elif setting == "start":
                 row.append(f"{mean_auc(scores):.3f}")
             else:
-                gaps = [s.auc - start[s.cell] for s in scores if s.cell in start]
-                better = sum(gap > 0 for gap in gaps)
+                gaps = {s: s.auc - start[s.cell] for s in scores if s.cell in start}
+                better = sum(gap > 0 for gap in gaps.values())
                 row.append(
-                    f"{mean_auc(scores):.3f} ({np.mean(gaps):+.3f} [{min(gaps):+.2f}, "
-                    f"{max(gaps):+.2f}], better in {better} of {len(gaps)})"
+                    f"{mean_auc(scores):.3f} ({_difference(gaps)}, better in {better} of "
+                    f"{len(gaps)})"
                 )
         rows.append(row)
     head = ["agent", "start", "one option", "chosen", "chosen for each task"]
     return table(head, rows) if rows else ""
+
+
+def _difference(gaps: Mapping[Score, float]) -> str:
+    """Mean of the gaps and its 95 % t-interval over base policies."""
+    policies: dict[str, list[float]] = {}
+    for score, gap in gaps.items():
+        policies.setdefault(score.policy, []).append(gap)
+    means = [np.mean(own) for own in policies.values()]
+    text = f"{np.mean(list(gaps.values())):+.3f}"
+    if len(means) < 2:
+        return text
+    interval = ttest_1samp(means, 0).confidence_interval()
+    return f"{text} [{interval.low:+.2f}, {interval.high:+.2f}]"
 
 
 def singles(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:

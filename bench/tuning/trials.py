@@ -43,6 +43,12 @@ class Score:
         """Name of the task."""
         return self.cell.split()[0]
 
+    @property
+    def policy(self) -> str:
+        """The base policy: that of a task, an embodiment and a seed."""
+        task, embodiment, _, seed = self.cell.split()
+        return f"{task} {embodiment} {seed}"
+
 
 State = Literal["complete", "pruned", "failed"]
 

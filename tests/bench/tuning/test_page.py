@@ -12,7 +12,9 @@ from symsteer.bench.tuning.trials import Chosen, Score, TrialResult, to_json
 
 
 def scores(*areas):
-    return [Score(f"task {i}", area, area, 1800.0) for i, area in enumerate(areas)]
+    """Of the first base policy in two worlds, then of the second one."""
+    cells = [f"task floating {v} s{i}" for i in (0, 1) for v in ("none", "wind:1")]
+    return [Score(cell, area, area, 1800.0) for cell, area in zip(cells, areas, strict=False)]
 
 
 def trial(number, lr, *areas, state="complete"):
@@ -37,10 +39,10 @@ CHOSEN = [
         {"task": 3},
         {"lr": scores(0.5, 0.5)},
         {
-            "start": scores(0.3, 0.5),
+            "start": scores(0.3, 0.5, 0.3, 0.5),
             "one_option": scores(0.4, 0.5),
-            "chosen": scores(0.7, 0.4),
-            "by_task": scores(0.7, 0.4),
+            "chosen": scores(0.7, 0.4, 0.3, 0.6),
+            "by_task": scores(0.7, 0.4, 0.3, 0.6),
         },
     )
 ]
@@ -62,8 +64,10 @@ def test_choices_that_are_not_the_default_are_bold():
 
 def test_settings_are_compared_cell_by_cell():
     (row,) = rows(page.comparison(CHOSEN)).values()
-    assert "| 0.400 | 0.450 (+0.050 [+0.00, +0.10], better in 1 of 2) |" in row
-    assert "0.550 (+0.150 [-0.10, +0.40], better in 1 of 2)" in row
+    # One base policy has no interval.
+    assert "| 0.400 | 0.450 (+0.050, better in 1 of 2) |" in row
+    # Means of two policies: .15 and .05; t with one degree of freedom is 12.706.
+    assert "0.500 (+0.100 [-0.54, +0.74], better in 2 of 4)" in row
 
 
 def test_single_options_stand_beside_the_choice():
