@@ -209,7 +209,10 @@ def _sb3(context: AgentContext) -> Callable[[], None]:
         "MlpPolicy",
         Spaces(),
         batch_size=options.batch_size,
-        policy_kwargs={"net_arch": [options.width] * options.depth},
+        policy_kwargs={
+            "net_arch": [options.width] * options.depth,
+            "n_critics": options.critics,
+        },
         device="cpu",
     )
     model.set_logger(Logger(folder=None, output_formats=[]))
