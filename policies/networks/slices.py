@@ -42,9 +42,9 @@ class ResidualMLP(nn.Module):
         for norm, inner, outer in zip(self.norms, self.inner, self.outer, strict=True):
             (scale, time_scale), (shift, time_shift) = next(pairs), next(pairs)
             u = inner(norm(h))
-            by_time = torch.addcmul(time_shift, u, 1 + time_scale)
-            h = h + outer(functional.silu(torch.addcmul(by_time + shift, u, scale)))
-        return functional.silu(self.out_norm(h))
+            u = torch.addcmul(time_shift, u, 1 + time_scale).add_(shift).addcmul_(u, scale)
+            h = outer(_silu(u)).add_(h)
+        return _silu(self.out_norm(h))
 
 
 class _TemporalBlock(nn.Module):
@@ -99,6 +99,11 @@ class TemporalUNet(nn.Module):
             half = block(half, film)
         out = self.up(torch.cat([self.grow(half), full], dim=1), films[-1])
         return out.transpose(1, 2)
+
+
+def _silu(x: torch.Tensor) -> torch.Tensor:
+    """In place where no gradient needs the argument: decoding spends its time on memory."""
+    return functional.silu(x, inplace=not x.requires_grad)
 
 
 def _norm_groups(channels: int) -> int:
