@@ -21,7 +21,8 @@ class ResidualMLP(nn.Module):
     h <- h + V silu((1 + scale) U norm(h) + shift), ``depth`` times.
 
     Scale and shift are sums of what ``context`` and ``time`` say. They are not added up beforehand:
-    for each noise level that would write and read an array as large as ``context``.
+    for each noise level that would write and read an array as large as ``context``. For the same
+    reason hidden features are overwritten; autograd copies what it needs.
 
     Shapes: ``h [B, slices, width]``, ``context [B, slices, condition_dim]``, ``time [B or 1, 1,
     condition_dim]`` -> ``[B, slices, width]``.
@@ -43,8 +44,8 @@ class ResidualMLP(nn.Module):
             (scale, time_scale), (shift, time_shift) = next(pairs), next(pairs)
             u = inner(norm(h))
             u = torch.addcmul(time_shift, u, 1 + time_scale).add_(shift).addcmul_(u, scale)
-            h = outer(_silu(u)).add_(h)
-        return _silu(self.out_norm(h))
+            h = outer(functional.silu(u, inplace=True)).add_(h)
+        return functional.silu(self.out_norm(h), inplace=True)
 
 
 class _TemporalBlock(nn.Module):
@@ -99,11 +100,6 @@ class TemporalUNet(nn.Module):
             half = block(half, film)
         out = self.up(torch.cat([self.grow(half), full], dim=1), films[-1])
         return out.transpose(1, 2)
-
-
-def _silu(x: torch.Tensor) -> torch.Tensor:
-    """In place where no gradient needs the argument: decoding spends its time on memory."""
-    return functional.silu(x, inplace=not x.requires_grad)
 
 
 def _norm_groups(channels: int) -> int:
