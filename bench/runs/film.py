@@ -33,7 +33,7 @@ COLUMNS = 4
 """Films side by side, at most; more of them begin another row."""
 
 PAUSE = 12
-"""Frames that an episode stays when all films of it have ended."""
+"""Control steps that an episode stays when all films of it have ended."""
 
 GIF_EVERY = 2
 """Control steps between two frames of a GIF, which would be large otherwise."""
@@ -100,13 +100,15 @@ def film(
         out = out.with_suffix(".png")
         imageio.imwrite(out, _in_rows([_paths(run, variants, episodes) for run in runs]))
         return out
+    moving = out.suffix == ".gif"
+    every = GIF_EVERY if moving else 1
     frames: list[Any] = [
         frame
         for seed in held_out_seeds(episodes)
-        for frame in _episode(runs, _captions(runs), variants, seed)
+        for frame in _episode(runs, _captions(runs), variants, seed, every)
     ]
-    if out.suffix == ".gif":
-        write_atomically(out, to_gif(frames[::GIF_EVERY], FRAMES_PER_SECOND / GIF_EVERY))
+    if moving:
+        write_atomically(out, to_gif(frames, FRAMES_PER_SECOND / every))
     else:
         imageio.mimwrite(out, frames, fps=FRAMES_PER_SECOND, macro_block_size=1)
     return out
@@ -122,13 +124,17 @@ def _captions(runs: Sequence[Restored]) -> list[str]:
 
 
 def _episode(
-    runs: Sequence[Restored], captions: Sequence[str], variants: Sequence[VariantSpec], seed: int
+    runs: Sequence[Restored],
+    captions: Sequence[str],
+    variants: Sequence[VariantSpec],
+    seed: int,
+    every: int,
 ) -> list[np.ndarray]:
     """Frames of one episode, those of several runs side by side."""
-    played = [filmed(run.config, run.policy, run.agent, variants, seed) for run in runs]
+    played = [filmed(run.config, run.policy, run.agent, variants, seed, every) for run in runs]
     if len(runs) == 1:
         return played[0].frames
-    length = max(len(one.frames) for one in played) + PAUSE
+    length = max(len(one.frames) for one in played) + PAUSE // every
     return [
         _in_rows([_panel(one, text, t) for one, text in zip(played, captions, strict=True)])
         for t in range(length)
@@ -140,7 +146,7 @@ def _panel(played: Filmed, caption: str, step: int) -> np.ndarray:
     last = len(played.frames) - 1
     text, color, ground = caption, "black", "white"
     if step >= last:
-        seconds = last / FRAMES_PER_SECOND
+        seconds = played.steps / FRAMES_PER_SECOND
         text += f": solved in {seconds:.1f} s" if played.solved else ": not solved"
         color, ground = "white", SUCCESS if played.solved else FAILURE
     return captioned(played.frames[min(step, last)], text, color, ground)

@@ -42,10 +42,13 @@ SECTORS = 12
 """Number of sectors in which successes are counted."""
 
 FRAMES = 6
-"""Frames of an episode, in two rows."""
+"""Frames of an episode, in two rows; a GIF has its colours from as many."""
 
 FRAMES_PER_SECOND = 20
 """ManiSkill's control frequency: films with a frame for each control step run in real time."""
+
+COLOURS = 128
+"""Colours of a GIF."""
 
 # Colours that colour-blind readers can distinguish, from Okabe and Ito.
 SUCCESS, FAILURE, TOOL = "#0072B2", "#D55E00", "#999999"
@@ -171,13 +174,12 @@ def first_episode(config: RunConfig, policy: ChunkPolicy, agent: Agent) -> list[
         UserError: if there is no Vulkan driver.
     """
     variants, seed = evaluation_variants(config.variants), held_out_seeds(1)[0]
-    return filmed(config, policy, agent, variants, seed, every_step=False).frames
+    return filmed(config, policy, agent, variants, seed, every=policy.execute).frames
 
 
 def contact_sheet(frames: Sequence[np.ndarray]) -> np.ndarray:
     """Six frames in two rows, evenly spaced in time, ``[height, width, 3]`` uint8."""
-    chosen = np.linspace(0, len(frames) - 1, FRAMES).round().astype(int)
-    rows = np.split(np.stack([frames[i] for i in chosen]), 2)
+    rows = np.split(_spaced(frames), 2)
     return np.concatenate([np.concatenate(row, axis=1) for row in rows])
 
 
@@ -188,12 +190,22 @@ def to_gif(frames: Sequence[np.ndarray], rate: float) -> bytes:
         frames: ``[height, width, 3]`` uint8.
         rate: frames per second.
     """
-    first, *others = map(Image.fromarray, frames)
+    pictures = [Image.fromarray(frame) for frame in frames]
+    # One palette, and no dithering: parts that stay the same then take no space.
+    some = Image.fromarray(np.concatenate(_spaced(frames)))
+    palette = some.quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
+    first, *others = (p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
     file = io.BytesIO()
     first.save(
         file, "GIF", save_all=True, append_images=others, duration=round(1000 / rate), loop=0
     )
     return file.getvalue()
+
+
+def _spaced(frames: Sequence[np.ndarray]) -> np.ndarray:
+    """Six frames, evenly spaced in time."""
+    chosen = np.linspace(0, len(frames) - 1, FRAMES).round().astype(int)
+    return np.stack([frames[i] for i in chosen])
 
 
 @dataclass(frozen=True)
@@ -202,10 +214,12 @@ class Filmed:
 
     Attributes:
         frames: ``[height, width, 3]`` uint8, the first one before the first action.
+        steps: control steps.
         solved: whether it ended with success.
     """
 
     frames: list[np.ndarray]
+    steps: int
     solved: bool
 
 
@@ -215,7 +229,7 @@ def filmed(
     agent: Agent,
     variants: Sequence[VariantSpec],
     seed: int,
-    every_step: bool = True,
+    every: int = 1,
 ) -> Filmed:
     """Play an episode, and render it.
 
@@ -224,7 +238,7 @@ def filmed(
         policy, agent: the deterministic actor plays.
         variants: how the symmetry is broken.
         seed: of the episode.
-        every_step: a frame after each control step, else one after each decision.
+        every: control steps between two frames; the last one is always rendered.
 
     Raises:
         UserError: if there is no Vulkan driver.
@@ -243,18 +257,19 @@ def filmed(
     try:
         obs, _ = env.reset(seed=[seed])
         frames = [_frame(env)]
-        done, info = False, {}
+        steps, done, info = 0, False, {}
         while not done:
             obs = obs.to(config.device)
             actions = agent.decode(obs, agent.act(obs, deterministic=True)).to(env.device)
             for t in range(policy.execute):
                 obs, _, _, truncated, info = env.step(actions[:, t])
+                steps += 1
                 done = bool(info["success"] | truncated)
-                if every_step or done or t == policy.execute - 1:
+                if done or steps % every == 0:
                     frames.append(_frame(env))
                 if done:
                     break
-        return Filmed(frames, bool(info["success"]))
+        return Filmed(frames, steps, bool(info["success"]))
     finally:
         env.close()
 
