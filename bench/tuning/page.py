@@ -1,9 +1,9 @@
 """Writes the tables of docs/tuning.md from the committed trials.
 
 python -m symsteer.bench.tuning.page                            # from the committed trials
-python -m symsteer.bench.tuning.page RUNS/tuning/core.json      # replaces them first
+python -m symsteer.bench.tuning.page RUNS/tuning/PLAN.json      # adds or replaces those of a plan
 
-The committed trials are leaderboard/results/tuning/core.json.
+The committed trials are leaderboard/results/tuning/PLAN.json.
 """
 
 from __future__ import annotations
@@ -31,41 +31,44 @@ from symsteer.errors import UserError
 from symsteer.files import write_together
 
 PAGE = CHECKOUT / "docs" / "tuning.md"
-TRIALS = CHECKOUT / "leaderboard" / "results" / "tuning" / "core.json"
+TRIALS = CHECKOUT / "leaderboard" / "results" / "tuning"
 MANY = 4
 """Numbers of a range are shown in thirds if there are more of them."""
 
 
-def generate(page: str, data: dict[str, Any]) -> str:
+def generate(page: str, plans: Mapping[str, Mapping[str, Any]]) -> str:
     """Replace the tables of docs/tuning.md.
 
     Args:
         page: its text.
-        data: of ``PLAN.json``.
+        plans: by name, the data of ``PLAN.json``.
 
     Raises:
         UserError: the page lacks the marks around the tables.
     """
-    trials, chosen = from_json(data)
-    return with_tables(page, render(trials, chosen, data["data"]["probe"]), "docs/tuning.md")
+    tables = [
+        render(name, *from_json(data), data["data"]["probe"]) for name, data in plans.items()
+    ]
+    return with_tables(page, "\n\n".join(tables), "docs/tuning.md")
 
 
-def render(trials: Sequence[TrialResult], chosen: Sequence[Chosen], probe: int) -> str:
-    """All tables, in markdown.
+def render(name: str, trials: Sequence[TrialResult], chosen: Sequence[Chosen], probe: int) -> str:
+    """All tables of a plan, in markdown.
 
     Args:
+        name: of the plan.
         trials: of all agents.
         chosen: their settings; empty before all trials have ended.
         probe: cells that every trial has.
     """
     parts = [
-        ("What was tried", effort(trials)),
-        ("What was chosen", choices(trials, chosen)),
-        ("On fresh cells", comparison(chosen)),
-        ("One option alone", singles(trials, chosen)),
-        ("Response to each option", response(trials, probe)),
+        ("what was tried", effort(trials)),
+        ("what was chosen", choices(trials, chosen)),
+        ("on fresh cells", comparison(chosen)),
+        ("one option alone", singles(trials, chosen)),
+        ("response to each option", response(trials, probe)),
     ]
-    return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
+    return "\n\n".join(f"### `{name}`: {title}\n\n{text}" for title, text in parts if text)
 
 
 def effort(trials: Sequence[TrialResult]) -> str:
@@ -205,22 +208,28 @@ def _value(value: Any) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write docs/tuning.md, from new trials if a path is given; returns the exit code."""
-    path = Path(arguments[0]) if arguments else TRIALS
+    """Write docs/tuning.md, with a plan's new trials if a path is given; returns the exit code."""
     try:
         check_checkout(PAGE)
-        try:
-            text = path.read_text()
-            data = json.loads(text)
-        except (OSError, ValueError) as error:
-            raise UserError(f"{path} cannot be read as trials: {error}") from None
-        page = generate(PAGE.read_text(), data)
-        write_together({TRIALS: text.encode(), PAGE: page.encode()})
+        paths = {p.stem: p for p in TRIALS.glob("*.json") if not p.stem.endswith("-scores")}
+        new = [Path(argument) for argument in arguments[:1]]
+        paths |= {path.stem: path for path in new}
+        plans = {name: _read(path) for name, path in sorted(paths.items())}
+        page = generate(PAGE.read_text(), plans)
+        copies = {TRIALS / path.name: path.read_bytes() for path in new}
+        write_together({**copies, PAGE: page.encode()})
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"wrote the tables of {len(data['trials'])} trials to {PAGE}")
+    print(f"wrote the tables of {', '.join(plans)} to {PAGE}")
     return 0
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read as trials: {error}") from None
 
 
 if __name__ == "__main__":

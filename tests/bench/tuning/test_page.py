@@ -84,17 +84,21 @@ def test_the_response_is_the_share_of_other_trials_that_are_beaten():
 
 
 def test_the_page_is_written_between_its_marks(tmp_path, monkeypatch, capsys):
-    text, trials = tmp_path / "tuning.md", tmp_path / "results" / "core.json"
+    text, committed = tmp_path / "tuning.md", tmp_path / "results"
     text.write_text(f"before\n{BEGIN}old\n{END}after\n")
-    source = tmp_path / "new.json"
-    source.write_text(json.dumps({"data": {"probe": 1}, **to_json(TRIALS, CHOSEN)}))
     monkeypatch.setattr(page, "PAGE", text)
-    monkeypatch.setattr(page, "TRIALS", trials)
-    assert page.main([str(source)]) == 0
-    assert trials.read_text() == source.read_text()
+    monkeypatch.setattr(page, "TRIALS", committed)
+    for name in ("zoo", "core"):
+        source = tmp_path / f"{name}.json"
+        source.write_text(json.dumps({"data": {"probe": 1}, **to_json(TRIALS, CHOSEN)}))
+        assert page.main([str(source)]) == 0
+        assert (committed / source.name).read_text() == source.read_text()
+        # Stands beside the trials, and is not a plan's.
+        (committed / f"{name}-scores.json").write_text("{}")
     written = text.read_text()
-    assert written.startswith(f"before\n{BEGIN}\n### What was tried\n")
+    assert written.startswith(f"before\n{BEGIN}\n### `core`: what was tried\n")
     assert written.endswith(f"{END}after\n")
+    assert written.count("### `zoo`: what was tried\n") == 1
     assert "old" not in written
     assert page.main([]) == 0
     assert text.read_text() == written
@@ -107,6 +111,7 @@ def test_other_files_are_refused(tmp_path, monkeypatch, capsys, content, message
     path = tmp_path / "other.json"
     path.write_text(content)
     monkeypatch.setattr(page, "PAGE", tmp_path / "tuning.md")
+    monkeypatch.setattr(page, "TRIALS", tmp_path)
     (tmp_path / "tuning.md").write_text(f"{BEGIN}{END}")
     assert page.main([str(path)]) == 2
     assert message in capsys.readouterr().err
