@@ -6,12 +6,12 @@ BIN := .venv/bin
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
-.PHONY: help setup demo test test-slow lint requirements clean
+.PHONY: help setup demo test test-long test-slow lint requirements clean
 
 help:
 	@echo "make setup         create .venv with the pinned packages"
 	@echo "make demo          demonstrations -> policy -> steering -> leaderboard, on the CPU, in minutes"
-	@echo "make test          the test suite (make test-slow: the long tests)"
+	@echo "make test          the default tests, minutes (the others: make test-long, make test-slow)"
 	@echo "make lint          ruff, format check, types, import contracts"
 	@echo "make requirements  compile requirements.txt from pyproject.toml"
 
@@ -31,7 +31,10 @@ demo: setup
 	$(BIN)/symsteer demo
 
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow and not gpu"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not long and not slow and not gpu"
+
+test-long: setup
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "long and not slow and not gpu"
 
 test-slow: setup
 	$(BIN)/python -m pytest -n 2 -m "slow"

@@ -46,9 +46,7 @@ def generate(page: str, plans: Mapping[str, Mapping[str, Any]]) -> str:
     Raises:
         UserError: the page lacks the marks around the tables.
     """
-    tables = [
-        render(name, *from_json(data), data["data"]["probe"]) for name, data in plans.items()
-    ]
+    tables = [render(name, *from_json(data), data["data"]["probe"]) for name, data in plans.items()]
     return with_tables(page, "\n\n".join(tables), "docs/tuning.md")
 
 

@@ -120,6 +120,7 @@ def test_without_a_penalty_they_solve_a_broken_problem(problem, name):
     assert error > 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", WITH_DIAL)
 def test_with_a_large_penalty_they_do_not(problem, name):
     reward, error = solve(problem, name, broken=True, rounds=150, penalty=1e8)

@@ -48,6 +48,7 @@ def test_the_target_takes_the_best_candidate_of_the_next_state(problem):
     torch.testing.assert_close(target, expected)
 
 
+@pytest.mark.long
 def test_with_many_candidates_it_is_almost_the_best():
     agent = reach("best-of-n", noise_bank=64)
     obs = states(512, torch.Generator().manual_seed(2))

@@ -71,6 +71,7 @@ def test_they_find_the_place_where_the_symmetry_is_broken(name):
         assert auroc(found[score], test.blocked) > least, score
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(DETECTORS))
 def test_they_do_not_find_it_where_there_is_none(name):
     test = decisions(1000, seed=7)

@@ -35,7 +35,10 @@ KINDS = [
     )
     for name in LEARNERS
 ]
-KINDS += itertools.product(("standard", "equivariant"), ("noise", "sampler"))
+KINDS += [
+    pytest.param(*kind, marks=pytest.mark.long)
+    for kind in itertools.product(("standard", "equivariant"), ("noise", "sampler"))
+]
 OWN = {
     # The critics of size-matched agents are narrow; they need larger steps.
     "standard-matched": {"lr": 5e-3},
@@ -213,6 +216,7 @@ def test_values_and_steps_are_almost_the_best(name, critic):
     assert play(obs, lambda obs: torch.zeros(len(obs), 2, ACT.dim)).mean() < most - 1.5
 
 
+@pytest.mark.long
 def test_with_the_wrong_symmetry_it_cannot_be_solved():
     """The control: a step towards the origin does not turn as its noise does."""
     agent = reach("wrong-group")

@@ -8,6 +8,8 @@ import pytest
 from symsteer.agents.new import new
 from symsteer.errors import UserError
 
+pytestmark = pytest.mark.long
+
 
 def test_the_tests_of_new_agents_pass(tmp_path, capsys):
     new("agent", "my-agent", out=tmp_path)

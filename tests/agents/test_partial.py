@@ -120,6 +120,7 @@ def test_the_gates_find_where_the_symmetry_is_broken(broken):
     assert of_states[windy].mean() > 0.3 > 0.15 > of_states[~windy].mean()
 
 
+@pytest.mark.long
 def test_in_a_symmetric_world_they_stay_closed():
     agent, seen, windy = learned("nothing")
     share = agent._share(agent._features(seen.obs), None)

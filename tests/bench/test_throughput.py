@@ -162,6 +162,7 @@ def test_the_whole_measurement():
     throughput.table(data)
 
 
+@pytest.mark.long
 def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
     # All critics, one kind of critics and rows of its own, no team, no learner.
     agents = ("standard", "residual", "partial", "zero")

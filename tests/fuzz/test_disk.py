@@ -26,6 +26,8 @@ from tests.bench.tiny_run import without_clock
 from tests.fuzz.conftest import CONFIG, options_of
 from tests.fuzz.judge import CURE, one_sentence
 
+pytestmark = pytest.mark.long
+
 SHORT = replace(CONFIG, env_steps=160)
 """A run with one checkpoint on the way and one at the end."""
 

@@ -101,6 +101,7 @@ def test_a_known_task_has_its_own_level() -> None:
     assert new.interval.high > 0.4
 
 
+@pytest.mark.long
 def test_too_little_decides_nothing(map_of_five: tuple[Summary, Audit]) -> None:
     def undecided(summary: Summary, audit: Audit, where: World) -> str:
         advice = advise([summary], audit, where)
@@ -268,6 +269,7 @@ def drawn_map(
     return points
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known", [True, False])
 def test_intervals_cover_what_is_measured(known: bool) -> None:
     """The measured advantage of a cell that the line has not seen, of a known and of a new task."""
@@ -288,6 +290,7 @@ def test_intervals_cover_what_is_measured(known: bool) -> None:
     assert np.median(widths) < (0.45 if known else 0.9)
 
 
+@pytest.mark.long
 def test_the_page_says_how_often_the_map_is_right(map_of_five: tuple[Summary, Audit]) -> None:
     summary, audit = map_of_five
     found = analyse(summary, audit, read_study("paper"))

@@ -34,6 +34,7 @@ class Normal:
         return Interval(self.value, self.value - half, self.value + half)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("tests", [1, TESTS])
 def test_studies_of_the_needed_size_find_and_exclude(tests: int) -> None:
     measured = Outcome(CLAIM, Normal(0.01))

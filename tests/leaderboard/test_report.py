@@ -164,6 +164,7 @@ def test_stale_figures_go_and_foreign_files_stay(page: Path, tmp_path: Path) -> 
     assert paper.read_text() == "# The paper"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seeds", [1, 5])
 def test_any_number_of_seeds_is_shown(tmp_path: Path, seeds: int) -> None:
     write_runs(tmp_path / "runs", seeds)

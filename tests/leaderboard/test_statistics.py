@@ -181,7 +181,7 @@ MOST = stats.binom(TRIALS, 0.05).ppf(0.999)
     ("policies", "runs", "of_policies", "of_runs"),
     [(1, 5, 0.3, 0.0), (1, 5, 0.3, 0.2), (5, 1, 0.1, 0.1), (5, 3, 0.0, 0.2), (5, 3, 0.2, 0.1)],
 )
-@pytest.mark.parametrize("episodes", [0.0, 0.3])
+@pytest.mark.parametrize("episodes", [pytest.param(0.0, marks=pytest.mark.long), 0.3])
 def test_the_interval_misses_the_truth_in_at_most_one_of_twenty(
     statistic: Callable[..., Array],
     policies: int,

@@ -8,6 +8,8 @@ import pytest
 
 from symsteer.registry import code_hash
 
+pytestmark = pytest.mark.long
+
 SUITE = """
 description = "one frozen policy"
 

@@ -104,6 +104,7 @@ def test_a_planar_policy_does_not(spherical):
         assert ((moved - turned(own, ACTION, matrix)).abs().max() < 1e-4) == exact
 
 
+@pytest.mark.long
 def test_both_learn(spherical):
     for name in ("so2", "spherical"):
         options = small_options(name, steps=120, **SMALL)

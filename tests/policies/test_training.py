@@ -51,6 +51,7 @@ def test_augmentation_turns_rows_as_the_layout_does(world, name):
         assert torch.allclose(y[i], world.act_layout.transform(x[i], *element), atol=1e-6)
 
 
+@pytest.mark.long
 def test_augmented_training_sees_turned_pairs(world):
     """All demonstrations reach east; only the augmented policy learns what west means."""
     generator = torch.Generator().manual_seed(0)

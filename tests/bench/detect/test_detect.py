@@ -25,6 +25,8 @@ from symsteer.cli import main
 from symsteer.errors import UserError
 from tests.bench.tiny_run import tiny_config
 
+pytestmark = pytest.mark.long
+
 BROKEN = tiny_config("standard", task="PushCube-v1", variant="friction_patch:1", keep_replay=True)
 
 

@@ -9,6 +9,8 @@ from symsteer.bench.sim.headless import rendering_works
 from symsteer.errors import UserError
 from tests.bench.tiny_run import tiny_config
 
+pytestmark = pytest.mark.long
+
 RENDERS = pytest.mark.skipif(not rendering_works(), reason="needs a Vulkan driver")
 
 

@@ -15,6 +15,8 @@ from symsteer.policies.files import policy_path
 from tests.bench.tiny_run import POLICY, tiny_config
 from tests.marks import slow_except
 
+pytestmark = pytest.mark.long
+
 TASKS = ("PickCube-v1", "PushCube-v1", "PlaceSphere-v1")
 
 

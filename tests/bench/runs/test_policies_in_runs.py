@@ -10,9 +10,9 @@ from symsteer.policies import POLICIES
 from tests.bench.tiny_run import tiny_config
 from tests.marks import slow_except
 
-QUICK = ("canonical", "spherical")
+MARKS = {"canonical": (), "spherical": pytest.mark.long}
 NAMES = [
-    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+    pytest.param(name, marks=MARKS.get(name, pytest.mark.slow))
     for name in POLICIES.builtin
     if name != "edp"
 ]
@@ -31,6 +31,7 @@ def test_it_is_trained_and_steered(name, tmp_path):
 TILTED = ["TiltedPickCube-v1", "TiltedPushCube-v1"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", slow_except(TILTED, TILTED[0]))
 def test_the_spherical_policy_is_steered_on_a_tilted_table(task, tmp_path):
     """An equivariant agent uses the turns about the laboratory's vertical, all of them exact."""

@@ -112,6 +112,7 @@ def test_final_success_outside_of_the_interval_is_different(changed, tmp_path, m
     assert ", 0.000 here (-1.000)" in shown.out
 
 
+@pytest.mark.long
 def test_a_changed_hyperparameter_gives_another_run(repeated, tmp_path):
     folder, _ = repeated
     data = json.loads((folder / "record.json").read_text())

@@ -113,6 +113,7 @@ def _killed_anywhere(undisturbed, begun, kills, seed):
     raise AssertionError(f"only {len(resumed)} of {5 * kills} runs were killed before their end")
 
 
+@pytest.mark.long
 def test_killed_behind_every_checkpoint(undisturbed, begun):
     kills, seen = 0, None
     while not is_finished(begun):

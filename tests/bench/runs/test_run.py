@@ -93,6 +93,7 @@ def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_pat
     assert without_clock(again) == without_clock(folder)
 
 
+@pytest.mark.long
 def test_evaluating_more_often_does_not_change_training(finished, lend, tmp_path):
     config, folder = finished
     lend(tmp_path)
@@ -128,6 +129,7 @@ def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
     assert jumps.tolist() == [1] * config.num_envs
 
 
+@pytest.mark.long
 def test_every_agent_runs_on_a_broken_world(broken):
     """The base policy is shared with the unbroken run, not trained again."""
     for agent, folder in broken.items():

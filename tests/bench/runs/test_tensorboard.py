@@ -27,6 +27,8 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import stop, tiny_config
 
+pytestmark = pytest.mark.long
+
 DOCUMENTATION = Path(__file__).parents[3] / "docs" / "metrics.md"
 NAMESPACES = {"eval", "train", "losses", "time", "diag", "log10", "reference"}
 CORRELATIONS = {"diag/q_correlation", "diag/q_rank_correlation"}

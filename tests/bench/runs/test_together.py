@@ -17,6 +17,8 @@ from symsteer.bench.runs.together import _next, execute_together
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config
 
+pytestmark = pytest.mark.long
+
 SEEDS = (0, 1)
 
 

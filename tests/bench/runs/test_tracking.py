@@ -21,6 +21,8 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import stop, tiny_config, without_clock, write_suite
 
+pytestmark = pytest.mark.long
+
 wandb = pytest.importorskip("wandb")
 
 BLOCK = 32768

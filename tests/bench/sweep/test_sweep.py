@@ -94,6 +94,7 @@ def test_a_team_goes_on_without_the_runs_whose_base_policy_failed(tmp_path):
     ]
 
 
+@pytest.mark.long
 def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tmp_path):
     # Both pass every check on the configuration, and something is in their way: of the run's own
     # checkpoint, and of its demonstrations.
@@ -155,6 +156,7 @@ def symsteer(monkeypatch, *arguments) -> int:
     return main()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
 )

@@ -329,6 +329,7 @@ def test_the_flat_tasks_demonstrations_are_refused(tmp_path):
         load(path, "TiltedPickCube-v1", "floating")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("embodiment", ["floating", pytest.param("panda", marks=pytest.mark.slow)])
 def test_the_audit_measures_the_flat_tasks_physics(embodiment):
     """Turns about the laboratory's vertical turn the bodies about the normal."""

@@ -179,6 +179,7 @@ def test_options_are_tried_by_themselves_where_the_plan_says_so(play):
     assert set(equivariant.fresh) == {"start", "chosen", "by_task"}
 
 
+@pytest.mark.long
 def test_a_search_that_was_killed_continues_with_the_same_trials(play):
     whole, chosen, runs = play("undisturbed")
     for stop in (1, 8, 25, len(runs.played) - 1):

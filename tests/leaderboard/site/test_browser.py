@@ -13,6 +13,7 @@ from tests.leaderboard.site.browser import Visit, chromium, opened
 from tests.leaderboard.site.conftest import EVIL
 
 pytestmark = [
+    pytest.mark.long,
     pytest.mark.browser,
     pytest.mark.skipif(chromium() is None, reason="there is no Chromium on the PATH"),
 ]
