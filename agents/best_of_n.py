@@ -22,6 +22,7 @@ from symsteer.agents.either import EitherAgent, EitherOptions
 from symsteer.agents.episodes import Played
 from symsteer.agents.networks import Ensemble, Weights
 from symsteer.agents.options import Critic, NoiseSource
+from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import Drawn
 from symsteer.errors import UserError
@@ -53,6 +54,7 @@ class BestOfNOptions(EitherOptions):
             )
 
 
+@tuned
 class BestOfNAgent(EitherAgent):
     """Plays the best of n chunks of the base policy, by its critics."""
 

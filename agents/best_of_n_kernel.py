@@ -34,6 +34,7 @@ from symsteer.agents.diagnostics import (
     value_errors,
 )
 from symsteer.agents.episodes import Played
+from symsteer.agents.presets import tuned
 from symsteer.agents.replay import ReplayBuffer, Transition
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group, Layout
@@ -77,6 +78,7 @@ class KernelOptions(AgentOptions):
         _ = Group.parse(self.group).order
 
 
+@tuned
 class KernelBestOfNAgent(Agent):
     """Plays the best of n chunks of the base policy, by regressed returns."""
 

@@ -25,6 +25,7 @@ from symsteer.agents.agent import Deterministic
 from symsteer.agents.asymmetry import AsymmetricAgent, LayersOf, TwoPaths
 from symsteer.agents.networks import dense
 from symsteer.agents.options import SacOptions
+from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
@@ -60,6 +61,7 @@ class Constrained(TwoPaths):
         return weight + self.gamma * self.free.weight, bias + self.gamma * self.free.bias
 
 
+@tuned
 class ConstrainedAgent(AsymmetricAgent):
     """The equivariant agent with a plain part in every layer, which dual ascent removes."""
 

@@ -21,6 +21,7 @@ from symsteer.agents.agent import AgentContext, Deterministic
 from symsteer.agents.either import EitherAgent, EitherOptions
 from symsteer.agents.networks import Weights
 from symsteer.agents.options import NoiseSource
+from symsteer.agents.presets import tuned
 from symsteer.errors import UserError
 
 
@@ -38,6 +39,7 @@ class DisplacedOptions(EitherOptions):
             raise UserError("the displaced agent has no entropy bonus: leave out soft_backup")
 
 
+@tuned
 class DisplacedAgent(EitherAgent):
     """Moves the base policy's noise by a displacement whose size is limited."""
 

@@ -22,6 +22,7 @@ import torch
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.networks import Weights
 from symsteer.agents.options import SacOptions
+from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent
 from symsteer.policies.geometry import Group, Layout
@@ -43,6 +44,7 @@ class GroupEnsembleOptions(SacOptions):
         )
 
 
+@tuned
 class GroupEnsembleAgent(StandardAgent):
     """Plain networks whose outputs are averaged over the group."""
 

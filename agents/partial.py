@@ -44,6 +44,7 @@ from symsteer.agents.equivariant import (
 from symsteer.agents.networks import Ensemble, Weights
 from symsteer.agents.optimization import adam
 from symsteer.agents.options import SacOptions
+from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent, plain_layers
 from symsteer.errors import UserError
@@ -88,6 +89,7 @@ class PartialOptions(SacOptions):
             )
 
 
+@tuned
 class PartialAgent(StandardAgent):
     """Equivariant and plain networks, mixed by a gate that sees where the symmetry is broken."""
 

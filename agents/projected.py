@@ -12,6 +12,7 @@ from torch import nn
 
 from symsteer.agents.asymmetry import LayersOf, Parameters, PenaltyAgent, PulledLayer
 from symsteer.agents.networks import dense
+from symsteer.agents.presets import tuned
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
 
@@ -32,6 +33,7 @@ class Projected(PulledLayer):
             part.lerp_(near, 1 - factor)
 
 
+@tuned
 class ProjectedAgent(PenaltyAgent):
     """Plain layers that start equivariant and are pulled to their projections."""
 

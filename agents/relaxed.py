@@ -29,6 +29,7 @@ from symsteer.agents.asymmetry import (
     PulledLayer,
 )
 from symsteer.agents.networks import dense, shrink_
+from symsteer.agents.presets import tuned
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift
 
 
@@ -72,6 +73,7 @@ class Relaxed(PulledLayer):
         weights.lerp_(weights.mean(-1, keepdim=True), 1 - factor)
 
 
+@tuned
 class RelaxedAgent(PenaltyAgent):
     """The equivariant agent with a weight for each filter and group element."""
 

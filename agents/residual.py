@@ -23,6 +23,7 @@ from symsteer.agents.distributions import SquashedGaussian
 from symsteer.agents.either import EitherAgent, EitherOptions
 from symsteer.agents.networks import Weights
 from symsteer.agents.options import Critic, NoiseSource
+from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import Drawn
 from symsteer.errors import UserError
@@ -53,6 +54,7 @@ class ResidualOptions(EitherOptions):
         self._require("not be negative", lambda value: value >= 0, "ramp")
 
 
+@tuned
 class ResidualAgent(EitherAgent):
     """Corrects the actions of the base policy, within a bound."""
 

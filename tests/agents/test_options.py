@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import pickle
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -294,22 +295,23 @@ def test_agents_have_what_was_chosen_for_them_and_travel_to_other_processes(name
     assert pickle.loads(pickle.dumps(options)) == options
 
 
-def test_the_agents_of_the_plan_core_have_defaults_of_their_own():
-    for name in ("standard", "standard-matched", "augmented", "equivariant", "residual-pathway"):
+def test_tuned_agents_have_defaults_of_their_own():
+    for name in tomllib.loads((presets.FOLDER / "tuned.toml").read_text()):
         kind = AGENTS.get(name)
         assert kind.Options.__qualname__ == f"{kind.__qualname__}.Options", name
 
 
-def test_what_tuning_chose_is_the_committed_choice():
+@pytest.mark.parametrize(("plan", "agents"), [("core", 5)])
+def test_what_tuning_chose_is_the_committed_choice(plan, agents):
     """Of all agents that a plan tuned, and to the digits that the preset has."""
-    trials = json.loads((RESULTS / "tuning" / "core.json").read_text())
+    trials = json.loads((RESULTS / "tuning" / f"{plan}.json").read_text())
     for choice in trials["chosen"]:
         chosen = preset_options("tuned", choice["agent"], AGENTS.get(choice["agent"]).Options)
         assert chosen.keys() == choice["options"].keys()
         for name, value in choice["options"].items():
             wanted = pytest.approx(value, rel=1e-3) if isinstance(value, float) else value
             assert chosen[name] == wanted, name
-    assert len(trials["chosen"]) == 5
+    assert len(trials["chosen"]) == agents
 
 
 def test_the_control_has_the_settings_of_the_agent_that_it_controls():
