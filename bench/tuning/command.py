@@ -80,6 +80,8 @@ class Tuner:
         self._exchange()
         self._rounds(plan.listed + plan.exchange)
         chosen = [found for a in plan.agents if (found := self._best(a))]
+        # Fresh cells take long: trials and choice are there if the comparison is stopped.
+        self._write(chosen)
         chosen = self._confirm(self._try_singles(chosen))
         self._write(chosen)
         return self.results, chosen

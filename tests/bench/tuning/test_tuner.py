@@ -192,6 +192,19 @@ def test_a_search_that_was_killed_continues_with_the_same_trials(play):
         assert len(rest.played) == len(runs.played) - stop
 
 
+def test_the_choice_is_written_before_it_is_compared(play, tmp_path):
+    _, chosen, runs = play()
+    with pytest.raises(KeyboardInterrupt):
+        play("stopped", stop_after=len(runs.played) - 1)
+    folders = [tmp_path / out / "tuning" for out in ("runs", "stopped")]
+    whole, stopped = (json.loads((folder / "tiny.json").read_text()) for folder in folders)
+    assert stopped["trials"] == whole["trials"]
+    assert [choice["trial"] for choice in stopped["chosen"]] == [choice.trial for choice in chosen]
+    assert all(choice["fresh"] == {} for choice in stopped["chosen"])
+    presets = [(folder / "tiny-preset.toml").read_text() for folder in folders]
+    assert presets[0] == presets[1]
+
+
 def test_more_trials_can_be_added_later(play):
     first, _, _ = play()
     more, _, runs = play(text=TEXT.replace("trials = 12", "trials = 14"))
