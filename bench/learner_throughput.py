@@ -1,7 +1,8 @@
 """CPU time of an update of each learner, side by side with what bounds it.
 
 The base policy has the default size and is untrained, transitions are random: neither changes the
-cost.
+cost. The agent `best-of-n-kernel` has fits in place of updates: its time is that of a fit, divided
+by the updates that the plain agent makes in as many decisions.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from typing import Any
 import torch
 
 from symsteer.agents import AGENTS
-from symsteer.agents.agent import AgentContext
-from symsteer.agents.options import critics_of
+from symsteer.agents.agent import Agent, AgentContext
+from symsteer.agents.best_of_n_kernel import KernelBestOfNAgent
+from symsteer.agents.options import SacOptions, critics_of
 from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
@@ -37,10 +39,12 @@ class Contender:
     """What is timed.
 
     Attributes:
-        what: the update, its matrix products alone, or another library.
+        what: the update, its matrix products alone, or a fit.
         critic: of a learner.
         members: learners that are updated at once.
-        run: one update.
+        batch_size: transitions in an update of one learner; 0 without batches.
+        run: what is timed.
+        updates: that ``run`` stands for.
     """
 
     agent: str
@@ -48,7 +52,9 @@ class Contender:
     critic: str
     members: int
     parameters: int
+    batch_size: int
     run: Callable[[], Any]
+    updates: float = 1
 
 
 def measure(
@@ -68,12 +74,12 @@ def measure(
         agents: names; those that are no learners are left out.
 
     Returns:
-        One row each: the fields of :class:`Contender`, ``batch_size``, and CPU milliseconds of one
+        One row each: the fields of :class:`Contender` but ``run``, and CPU milliseconds of one
         update of one member: ``median``, ``min``, ``max``.
     """
     contenders = _contenders(task, agents)
     times = [
-        [spent / contender.members for spent in found]
+        [spent / contender.updates for spent in found]
         for contender, found in zip(
             contenders,
             in_turns([contender.run for contender in contenders], updates, repeats, report),
@@ -83,7 +89,6 @@ def measure(
     return [
         {
             **{key: value for key, value in vars(contender).items() if key != "run"},
-            "batch_size": _batch_size(),
             **{"median": statistics.median(found), "min": min(found), "max": max(found)},
         }
         for contender, found in zip(contenders, times, strict=True)
@@ -98,10 +103,11 @@ def table(rows: list[dict[str, Any]]) -> str:
         if (row["agent"], row["what"], row["critic"]) == ("standard", "update", "noise")
     )
     lines = [
-        f"CPU time of one update of one learner, batch {_batch_size()}, one thread; median of "
-        "the measurements (smallest to largest)",
+        "CPU time of one update of one learner, one thread; median of the measurements (smallest "
+        "to largest)",
         "",
-        f"{'agent':18s} {'what':16s} {'critic':9s} {'parameters':>10s} {'ms':>7s} {'':18s} ratio",
+        f"{'agent':18s} {'what':16s} {'critic':9s} {'parameters':>10s} {'batch':>6s} {'ms':>7s} "
+        f"{'':18s} ratio",
     ]
     for row in rows:
         spread = f"({row['min']:.1f} to {row['max']:.1f})"
@@ -109,7 +115,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         what = row["what"] if row["members"] == 1 else f"in a team of {row['members']}"
         lines.append(
             f"{row['agent']:18s} {what:16s} {row['critic']:9s} {parameters:>10s} "
-            f"{row['median']:7.2f} {spread:18s} {row['median'] / unit:5.2f}"
+            f"{row['batch_size'] or '':>6} {row['median']:7.2f} {spread:18s} "
+            f"{row['median'] / unit:5.2f}"
         )
     return "\n".join(lines)
 
@@ -118,22 +125,25 @@ def _contenders(task: str, agents: Sequence[str]) -> list[Contender]:
     found = []
     for name in agents:
         agent_class = AGENTS.get(name)
+        if agent_class is KernelBestOfNAgent:
+            found.append(_kernel(task, name))
         if not issubclass(agent_class, SacAgent):
             continue
         for critic in critics_of(agent_class.Options):
-            alone, *team = (_agent(task, name, critic, seed) for seed in range(1 + TEAM))
-            size = alone.parameter_counts()["total"]
+            alone, *team = (_learner(task, name, critic, seed) for seed in range(1 + TEAM))
+            sizes = (alone.parameter_counts()["total"], alone.options.batch_size)
             update = functools.partial(_update, alone)
-            found.append(Contender(name, "update", critic, 1, size, update))
+            found.append(Contender(name, "update", critic, 1, *sizes, update))
             if name == "standard":
                 products = products_of(update)
-                found.append(Contender(name, "products alone", critic, 1, size, products))
+                found.append(Contender(name, "products alone", critic, 1, *sizes, products))
             if can_join(agent_class):
                 run = functools.partial(_update_team, Team(team))
-                found.append(Contender(name, "update", critic, TEAM, size, run))
+                found.append(Contender(name, "update", critic, TEAM, *sizes, run, TEAM))
     context = _context(task, 0)
     if importlib.util.find_spec("stable_baselines3"):
-        found.append(Contender("stable-baselines3", "update", "noise", 1, 0, _sb3(context)))
+        size = _standard_options().batch_size
+        found.append(Contender("stable-baselines3", "update", "noise", 1, 0, size, _sb3(context)))
     return found
 
 
@@ -145,23 +155,35 @@ def _context(task: str, seed: int) -> AgentContext:
     return AgentContext.of(base, seed=seed)
 
 
-def _agent(task: str, name: str, critic: str, seed: int) -> SacAgent:
-    agent_class, context = AGENTS.get(name), _context(task, seed)
-    agent = agent_class(context, agent_class.Options(critic=critic))
+def _agent(task: str, name: str, seed: int, **options: Any) -> Agent:
+    agent_class = AGENTS.get(name)
+    return agent_class(_context(task, seed), agent_class.Options(**options))
+
+
+def _learner(task: str, name: str, critic: str, seed: int) -> SacAgent:
+    agent = _agent(task, name, seed, critic=critic)
     assert isinstance(agent, SacAgent)
-    agent.observe(_decisions(context, agent.rows))
+    agent.observe(_decisions(agent.context, agent.rows, DECISIONS))
     return agent
 
 
-def _batch_size() -> int:
-    return AGENTS.get("standard").Options().batch_size
+def _kernel(task: str, name: str) -> Contender:
+    agent = _agent(task, name, 0)
+    assert isinstance(agent, KernelBestOfNAgent)
+    agent.observe(_decisions(agent.context, agent.rows, agent.options.points))
+    updates = agent.options.refit * _standard_options().utd
+    return Contender(name, "fit, per update", "", 1, 0, 0, agent.fit, updates)
 
 
-def _decisions(context: AgentContext, rows: int) -> Transition:
+def _standard_options() -> SacOptions:
+    return AGENTS.get("standard").Options()
+
+
+def _decisions(context: AgentContext, rows: int, count: int) -> Transition:
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape: int) -> torch.Tensor:
-        return torch.randn(DECISIONS, *shape, generator=generator)
+        return torch.randn(count, *shape, generator=generator)
 
     obs_dim, act_dim = context.obs_layout.dim, context.act_layout.dim
     return Transition(
@@ -170,8 +192,8 @@ def _decisions(context: AgentContext, rows: int) -> Transition:
         actions=draw(context.execute, act_dim).tanh(),
         reward=draw(),
         next_obs=0.1 * draw(obs_dim),
-        terminal=torch.zeros(DECISIONS),
-        truncated=torch.zeros(DECISIONS),
+        terminal=torch.zeros(count),
+        truncated=torch.zeros(count),
     )
 
 
@@ -195,7 +217,7 @@ def _sb3(context: AgentContext) -> Callable[[], None]:
     from stable_baselines3 import SAC
     from stable_baselines3.common.logger import Logger
 
-    options = AGENTS.get("standard").Options()
+    options = _standard_options()
     obs, noise = context.obs_layout.dim, context.noise_layout.dim
 
     class Spaces(gymnasium.Env):

@@ -165,7 +165,7 @@ def test_the_whole_measurement():
 @pytest.mark.long
 def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
     # All critics, one kind of critics and rows of its own, no team, no learner.
-    agents = ("standard", "residual", "partial", "zero")
+    agents = ("standard", "residual", "partial", "zero", "best-of-n-kernel")
     rows = learner_throughput.measure(TASK, 1, 2, lambda text: None, agents)
     kinds = {(row["agent"], row["what"], row["members"], row["critic"]) for row in rows}
     for row in rows:
@@ -178,6 +178,11 @@ def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
     others = {kind for kind in kinds if kind[0] not in learners}
     assert others == {
         ("stable-baselines3", "update", 1, "noise"),
+        ("best-of-n-kernel", "fit, per update", 1, ""),
+    }
+    sizes = {row["agent"]: row["batch_size"] for row in rows}
+    assert {name: sizes[name] for name in learners} == {
+        name: AGENTS.get(name).Options().batch_size for name in learners
     }
     text = learner_throughput.table(rows)
     (line,) = (
