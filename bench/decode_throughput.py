@@ -1,14 +1,15 @@
 """CPU time in which base policies decode noise, beside that of their matrix products alone.
 
-The policies have their default sizes and are untrained, which does not change the cost. All take
-turns. Action critics decode in every update, so this is a large part of a run's time.
+The policies are untrained, which does not change the cost, and have their default sizes; the
+default policy also has others. All take turns. Action critics decode in every update, so this is a
+large part of a run's time.
 """
 
 from __future__ import annotations
 
 import functools
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -22,6 +23,16 @@ from symsteer.policies.networks.denoiser import parameter_count
 
 CHUNKS = (64, 192)
 """Chunks that are decoded at once: those of 64 environments, those of a batch of an update."""
+
+DEFAULT = "edp"
+VARIATIONS: Sequence[Mapping[str, Any]] = (
+    {"sampling_steps": 1},
+    {"sampling_steps": 4},
+    {"width": 32},
+    {"channels": 32},
+    {"width": 32, "channels": 32},
+)
+"""Options of the default policy that change its cost."""
 
 
 def measure(
@@ -41,15 +52,18 @@ def measure(
         policies: names.
 
     Returns:
-        A row for each policy and number of ``chunks``: ``policy``, ``parameters``,
-        ``sampling_steps`` (None for policies without them), milliseconds of one call ``median``,
-        ``min``, ``max``, and ``products``, the median of the matrix products alone.
+        A row for each policy and number of ``chunks``: ``policy``, ``options`` (those that are not
+        the default), ``parameters``, ``sampling_steps`` (None for policies without them),
+        milliseconds of one call ``median``, ``min``, ``max``, and ``products``, the median of the
+        matrix products alone.
     """
     rows: list[dict[str, Any]] = []
     contenders: list[Callable[[], Any]] = []
-    for name in policies:
+    timed = [(name, {}) for name in policies]
+    timed += [(DEFAULT, options) for options in VARIATIONS if DEFAULT in policies]
+    for name, options in timed:
         try:
-            policy = _policy(task, name)
+            policy = _policy(task, name, options)
         except UserError as error:
             report(f"without {name}: {error}")
             continue
@@ -58,6 +72,7 @@ def measure(
             rows.append(
                 {
                     "policy": name,
+                    "options": dict(options),
                     "parameters": parameter_count(policy),
                     "sampling_steps": getattr(policy.options, "sampling_steps", None),
                     "chunks": chunks,
@@ -78,13 +93,16 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         "CPU time of one call of decode, one thread; median of the measurements (smallest to "
         "largest), and of its matrix products alone",
         "",
-        f"{'policy':16s} {'parameters':>10s} {'steps':>5s} {'chunks':>6s} {'ms':>7s} {'':18s} "
+        f"{'policy':30s} {'parameters':>10s} {'steps':>5s} {'chunks':>6s} {'ms':>7s} {'':18s} "
         f"{'ratio':>5s} {'products':>8s} {'share':>5s}",
     ]
     for row in rows:
         spread = f"({row['min']:.1f} to {row['max']:.1f})"
+        name = " ".join(
+            [row["policy"], *(f"{key} {value}" for key, value in row["options"].items())]
+        )
         lines.append(
-            f"{row['policy']:16s} {row['parameters']:10,d} {row['sampling_steps'] or '':>5} "
+            f"{name:30s} {row['parameters']:10,d} {row['sampling_steps'] or '':>5} "
             f"{row['chunks']:6d} {row['median']:7.2f} {spread:18s} "
             f"{row['median'] / units[row['chunks']]:5.2f} {row['products']:8.2f} "
             f"{row['products'] / row['median']:5.0%}"
@@ -92,11 +110,11 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _policy(task: str, name: str) -> ChunkPolicy:
+def _policy(task: str, name: str, options: Mapping[str, Any]) -> ChunkPolicy:
     kind, policy = task_class(task), POLICIES.get(name)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        found = policy(policy.Options(), kind.observation_layout, kind.action_layout)
+        found = policy(policy.Options(**options), kind.observation_layout, kind.action_layout)
     found.freeze()
     return found
 

@@ -31,8 +31,8 @@ RESULTS = CHECKOUT / "leaderboard" / "results"
 RECORDS = RESULTS / "policies"
 DECODE = RESULTS / "base-policies" / "decode.json"
 
-TRAINING = ("steps", "batch_size", "sampling_steps")
-"""Options that belong to how long a policy is trained or sampled: not part of its label."""
+TRAINING = ("steps", "batch_size")
+"""Options that say how long a policy is trained: not part of its label."""
 
 MEASURES = {"equivariance_error": "{:.1g}", "jump": "{:.2g}", "action_std": "{:.2f}"}
 MEASURES |= {"solvable": "{:.2f}"}
@@ -42,17 +42,21 @@ STEERED = 50
 """Demonstrations of the policies that agents steer."""
 
 
-def label(record: RunRecord) -> str:
+def label(name: str, options: Mapping[str, Any]) -> str:
     """The policy's name and those of its options that are not the default."""
-    given: Mapping[str, Any] = record.config["policy"]  # type: ignore[assignment]
-    name = str(given["name"])
     defaults = POLICIES.get(name).Options().to_json()
     own = [
-        value if isinstance(value := given[key], str) else f"{key} {value}".removesuffix(" True")
+        value if isinstance(value := options[key], str) else f"{key} {value}".removesuffix(" True")
         for key, default in sorted(defaults.items())
-        if key not in TRAINING and given.get(key, default) != default
+        if key not in TRAINING and options.get(key, default) != default
     ]
     return " ".join([f"`{name}`", *own])
+
+
+def label_of(record: RunRecord) -> str:
+    """The label of a run's base policy."""
+    options: Mapping[str, Any] = record.config["policy"]  # type: ignore[assignment]
+    return label(str(options["name"]), options)
 
 
 def success(records: Sequence[RunRecord]) -> Interval:
@@ -79,7 +83,8 @@ def render(records: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) ->
     tasks = list(dict.fromkeys(record.settings.task for record in base))
     parts = [(f"{task}: success", demonstrations(base, task)) for task in tasks]
     parts += [
-        (f"What they are ({STEERED} demonstrations)", properties(base, decode)),
+        (f"What they are ({STEERED} demonstrations)", properties(base)),
+        (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
     ]
     return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
@@ -90,7 +95,7 @@ def demonstrations(base: Sequence[RunRecord], task: str) -> str:
     cells: dict[str, dict[int, list[RunRecord]]] = defaultdict(lambda: defaultdict(list))
     for record in base:
         if record.settings.task == task:
-            cells[label(record)][record.settings.demonstrations.count].append(record)
+            cells[label_of(record)][record.settings.demonstrations.count].append(record)
     counts = sorted({count for found in cells.values() for count in found})
     rows = [
         [name, *(_interval(success(found[n])) if n in found else "-" for n in counts)]
@@ -99,29 +104,46 @@ def demonstrations(base: Sequence[RunRecord], task: str) -> str:
     return table(["policy", *map(str, counts)], rows)
 
 
-def properties(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str:
-    """Size, cost, symmetry and steerability of each policy, over tasks and trainings."""
-    groups: dict[str, list[RunRecord]] = defaultdict(list)
-    for record in base:
-        if record.settings.demonstrations.count == STEERED:
-            groups[label(record)].append(record)
-    largest = max((row["chunks"] for row in decode), default=0)
-    times = {f"`{row['policy']}`": row for row in decode if row["chunks"] == largest}
+def properties(base: Sequence[RunRecord]) -> str:
+    """Size, symmetry and steerability of each policy, over tasks and trainings."""
     rows = []
-    for name, found in groups.items():
+    for name, found in _trained(base).items():
         policies = [record.base_policy for record in found]
         row = [name, str(len(found))]
         for values in (_known(policies, "parameters"), _known(policies, "training_seconds")):
             row.append(f"{statistics.median(values):,.0f}" if values else "-")
-        time = times.get(name)
-        share = f"({time['products'] / time['median']:.0%})" if time else ""
-        row.append(f"{time['median']:.1f} {share}" if time else "-")
         for measure, form in MEASURES.items():
             row.append(_range([form.format(value) for value in _known(policies, measure)]))
         rows.append(row)
-    head = ["policy", "trainings", "parameters", "training, s", "decode, ms (its products)"]
-    head += ["equivariance error", "jump", "spread", "solvable"]
-    return table(head, rows)
+    head = ["policy", "trainings", "parameters", "training, s"]
+    return table([*head, "equivariance error", "jump", "spread", "solvable"], rows)
+
+
+def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str:
+    """Success of each policy on each task beside the time in which it decodes, cheapest first."""
+    largest = max((row["chunks"] for row in decode), default=0)
+    times = {label(r["policy"], r["options"]): r for r in decode if r["chunks"] == largest}
+    tasks = list(dict.fromkeys(record.settings.task for record in base))
+    groups = _trained(base)
+    rows = []
+    for name in sorted(groups.keys() & times.keys(), key=lambda name: times[name]["median"]):
+        time = times[name]
+        row = [name, f"{time['median']:.1f}", f"{time['products'] / time['median']:.0%}"]
+        for task in tasks:
+            found = [record for record in groups[name] if record.settings.task == task]
+            row.append(_interval(success(found)) if found else "-")
+        rows.append(row)
+    head = ["policy", "decode, ms", "its products", *(task.removesuffix("-v1") for task in tasks)]
+    return table(head, rows) if rows else ""
+
+
+def _trained(base: Sequence[RunRecord]) -> Mapping[str, list[RunRecord]]:
+    """The runs whose policies have as many demonstrations as the steered ones, by label."""
+    groups: dict[str, list[RunRecord]] = defaultdict(list)
+    for record in base:
+        if record.settings.demonstrations.count == STEERED:
+            groups[label_of(record)].append(record)
+    return groups
 
 
 def steered(records: Sequence[RunRecord]) -> str:
@@ -131,7 +153,7 @@ def steered(records: Sequence[RunRecord]) -> str:
     )
     for record in records:
         if record.settings.demonstrations.count == STEERED:
-            cells[label(record), record.settings.task][record.settings.agent].append(record)
+            cells[label_of(record), record.settings.task][record.settings.agent].append(record)
     agents = dict.fromkeys(record.settings.agent for record in records)
     rows = []
     for (name, task), found in cells.items():
@@ -186,7 +208,7 @@ def main(arguments: Sequence[str]) -> int:
         if given.decode:
             write_together({DECODE: given.decode.read_bytes()})
         try:
-            decode = json.loads(DECODE.read_text()) if DECODE.is_file() else []
+            decode = json.loads(DECODE.read_text())["rows"] if DECODE.is_file() else []
             records = [read_record(path) for path in sorted(RECORDS.glob("*.json"))]
             text = with_tables(PAGE.read_text(), render(records, decode), "docs/base-policies.md")
         except (OSError, ValueError, KeyError, TypeError) as error:

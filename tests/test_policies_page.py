@@ -14,8 +14,10 @@ from symsteer.policies import POLICIES
 from tests.leaderboard.record_factory import make_evaluation, make_record
 
 DECODE = [
-    {"policy": "edp", "chunks": 64, "median": 3.0, "products": 2.0},
-    {"policy": "edp", "chunks": 192, "median": 8.0, "products": 6.0},
+    {"policy": "edp", "options": {}, "chunks": 64, "median": 3.0, "products": 2.0},
+    {"policy": "edp", "options": {}, "chunks": 192, "median": 8.0, "products": 6.0},
+    {"policy": "edp", "options": {"width": 32}, "chunks": 192, "median": 4.0, "products": 2.0},
+    {"policy": "plain", "options": {}, "chunks": 192, "median": 1.0, "products": 0.5},
 ]
 
 
@@ -42,13 +44,13 @@ def rows(text):
 
 
 def test_a_policy_is_named_by_the_options_that_are_not_the_default():
-    assert page.label(run(1)) == "`edp`"
-    assert page.label(run(1, group="D4")) == "`edp` D4"
+    assert page.label_of(run(1)) == "`edp`"
+    assert page.label_of(run(1, group="D4")) == "`edp` D4"
     flow = run(1, process="flow", prediction="velocity", sampling_steps=4, steps=3000)
-    assert page.label(flow) == "`edp` velocity flow"
+    assert page.label_of(flow) == "`edp` velocity flow sampling_steps 4"
     noisy = {"observation_noise": 0.1, "orbit_targets": True}
-    assert page.label(run(1, **noisy)) == "`edp` observation_noise 0.1 orbit_targets"
-    assert page.label(run(1, name="plain")) == "`plain`"
+    assert page.label_of(run(1, **noisy)) == "`edp` observation_noise 0.1 orbit_targets"
+    assert page.label_of(run(1, name="plain")) == "`plain`"
 
 
 def test_success_is_over_trainings_and_stands_below_its_number_of_demonstrations():
@@ -66,11 +68,24 @@ def test_properties_are_those_of_the_policies_that_are_steered():
     base = [run(5, seed=s) for s in range(3)] + [run(5, count=5)]
     base[1].base_policy.equivariance_error = 4e-7
     base[2].base_policy.solvable = None
-    found = rows(page.properties(base, DECODE))["`edp`"]
-    trainings, parameters, seconds, decode, error, jump, spread, solvable = found
+    found = rows(page.properties(base))["`edp`"]
+    trainings, parameters, seconds, error, jump, spread, solvable = found
     assert (trainings, parameters, seconds) == ("3", "1,000", "61")
-    assert decode == "8.0 (75%)"
     assert (error, jump, spread, solvable) == ("2e-07 to 4e-07", "0.03", "0.42", "0.97")
+
+
+def test_success_stands_beside_the_time_of_decoding_and_the_cheapest_policy_is_first():
+    base = [run(8, seed=s, task=task) for s in (1, 2) for task in ("PickCube-v1", "PushCube-v1")]
+    base += [run(3, seed=s, width=32) for s in (1, 2)] + [run(5, count=5), run(5, group="D4")]
+    found = rows(page.costs(base, DECODE))
+    assert found["policy"] == ["decode, ms", "its products", "PickCube", "PushCube"]
+    # Neither policies that are not timed nor those that were not trained.
+    assert list(found)[2:] == ["`edp` width 32", "`edp`"]
+    time, share, pick, push = found["`edp` width 32"]
+    assert (time, share, pick[:6], push) == ("4.0", "50%", "0.30 [", "-")
+    assert found["`edp`"][:2] == ["8.0", "75%"]
+    assert found["`edp`"][3].startswith("0.80 [")
+    assert page.costs(base, []) == ""
 
 
 def test_agents_are_compared_on_the_trainings_that_all_have():
@@ -102,13 +117,13 @@ def test_finished_records_are_copied_and_the_page_is_written(checkout, capsys):
     done, begun = run(4), make_record(status="running", seed=9)
     for record in (done, begun):
         write_record(record, checkout / "runs" / record.run_id / "record.json")
-    (checkout / "new.json").write_text(json.dumps(DECODE))
+    (checkout / "new.json").write_text(json.dumps({"rows": DECODE}))
     assert page.main([str(checkout / "runs"), "--decode", str(checkout / "new.json")]) == 0
     assert "wrote the tables of 1 records" in capsys.readouterr().out
     assert [p.name for p in (checkout / "records").iterdir()] == [f"{done.run_id}.json"]
     written = (checkout / "page.md").read_text()
     assert written.startswith(f"before\n{BEGIN}\n### PickCube-v1: success\n")
-    assert "8.0 (75%)" in written
+    assert "| 8.0 | 75% |" in written
     assert "old" not in written
     # Again, from what is committed.
     assert page.main([]) == 0
@@ -119,6 +134,7 @@ def test_mistakes(checkout, capsys):
     (checkout / "runs").mkdir()
     assert page.main([str(checkout / "runs")]) == 2
     assert "holds no finished run; name the folder of the sweep" in capsys.readouterr().err
-    (checkout / "decode.json").write_text("{")
-    assert page.main([]) == 2
-    assert "decode.json cannot be read" in capsys.readouterr().err
+    for text in ("{", "[]"):
+        (checkout / "decode.json").write_text(text)
+        assert page.main([]) == 2
+        assert "decode.json cannot be read" in capsys.readouterr().err

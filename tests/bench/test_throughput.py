@@ -194,13 +194,16 @@ def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
 def test_decoders_are_timed_beside_their_products():
     names = ("edp", "plain", "so2")
     rows = decode_throughput.measure(TASK, 1, 2, lambda text: None, names)
-    assert [(row["policy"], row["chunks"]) for row in rows] == [
-        (name, chunks) for name in names for chunks in (64, 192)
+    timed = [(name, {}) for name in names]
+    timed += [("edp", options) for options in decode_throughput.VARIATIONS]
+    assert [(row["policy"], row["options"], row["chunks"]) for row in rows] == [
+        (*one, chunks) for one in timed for chunks in (64, 192)
     ]
     for row in rows:
         assert 0 < row["products"] < row["median"]
         assert 0 < row["min"] <= row["median"] <= row["max"]
-        assert row["sampling_steps"] == 2
+        assert row["sampling_steps"] == row["options"].get("sampling_steps", 2)
+    assert "\nedp width 32 channels 32 " in decode_throughput.table(rows)
     *_, first, second = decode_throughput.table(rows[:2]).splitlines()
     assert first.split()[:4] == ["edp", f"{rows[0]['parameters']:,}", "2", "64"]
     assert second.split()[0] == "edp"
