@@ -32,8 +32,9 @@ def clip_blocks(x: torch.Tensor, layout: Layout, radius: float) -> torch.Tensor:
     Scalars are clamped to [-radius, radius]. Vectors keep their direction. Blocks within the bound
     are returned unchanged, bit for bit.
     """
-    norm = ((x * x) @ _same_block(layout, x.dtype, x.device)).sqrt()
-    shortened = x * (radius / norm.clamp_min(radius))
+    squares = (x * x) @ _same_block(layout, x.dtype, x.device)
+    # The square root has no gradient at 0: clamp before it.
+    shortened = x * (radius / squares.clamp_min(radius * radius).sqrt())
     # Only for components that are a few ulps outside after rounding.
     return shortened.clamp(-radius, radius)
 

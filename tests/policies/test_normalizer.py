@@ -106,6 +106,15 @@ def test_clip_blocks_bounds_norms_and_leaves_the_rest_alone():
     assert torch.equal(clip_blocks(torch.zeros(1, LAYOUT.dim), LAYOUT, 1.0), torch.zeros(1, 8))
 
 
+def test_the_gradient_of_clip_blocks_is_finite_everywhere():
+    """An action that a correction brings to exactly 0 made all parameters not a number."""
+    x = torch.stack([torch.zeros(8), torch.full((8,), 0.1), torch.full((8,), 5.0)])
+    x.requires_grad_()
+    clip_blocks(x, LAYOUT, 1.0).sum().backward()
+    assert torch.equal(x.grad[:2], torch.ones(2, 8))
+    assert x.grad.isfinite().all()
+
+
 @pytest.mark.parametrize(
     "bad", [torch.zeros(0, 8), torch.zeros(5, 7), torch.full((5, 8), float("nan"))]
 )
