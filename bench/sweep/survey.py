@@ -32,7 +32,8 @@ class Sighting:
         if not self.record or not self.record.evaluations:
             return "no evaluation"
         last = self.record.evaluations[-1]
-        return f"success {last.success_once:4.0%} of {len(last.episodes.seed)}"
+        lost = ", Q not finite" if self.record.nonfinite_q else ""
+        return f"success {last.success_once:4.0%} of {len(last.episodes.seed)}{lost}"
 
 
 def look(folder: Path) -> Sighting:

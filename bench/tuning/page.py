@@ -78,9 +78,11 @@ def effort(trials: Sequence[TrialResult]) -> str:
         scores = [score for trial in own for score in trial.scores]
         hours = sum(score.seconds for score in scores) / 3600
         counts = [len(own), *(states.count(s) for s in ("complete", "pruned", "failed"))]
-        rows.append([f"`{agent}`", *map(str, counts), str(len(scores)), f"{hours:.1f}"])
-    head = ["agent", "trials", "complete", "given up", "failed", "runs", "hours of one core"]
-    return table(head, rows)
+        known = [score.finite for score in scores if score.finite is not None]
+        lost = str(known.count(False)) if known else "-"
+        rows.append([f"`{agent}`", *map(str, counts), str(len(scores)), lost, f"{hours:.1f}"])
+    head = ["agent", "trials", "complete", "given up", "failed", "runs", "Q not finite"]
+    return table([*head, "hours of one core"], rows)
 
 
 def choices(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:

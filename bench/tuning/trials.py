@@ -31,12 +31,14 @@ class Score:
         auc: area under the curve of held-out success, as a share of the budget.
         success: in the final evaluation.
         seconds: wall-clock time of the run.
+        finite: whether every Q-value was; None if that was not looked at.
     """
 
     cell: str
     auc: float
     success: float
     seconds: float
+    finite: bool | None = None
 
     @property
     def task(self) -> str:
@@ -118,6 +120,7 @@ def score_of(config: RunConfig, out: Path) -> Score | None:
         area_under_curve(steps, successes, config.env_steps),
         record.final.success_once,
         record.wall_clock.total,
+        not record.nonfinite_q,
     )
 
 

@@ -53,7 +53,17 @@ def rows(text):
 
 
 def test_effort_counts_trials_and_hours():
-    assert rows(page.effort(TRIALS))["`standard`"] == "| `standard` | 6 | 4 | 1 | 1 | 9 | 4.5 |"
+    assert rows(page.effort(TRIALS))["`standard`"] == "| `standard` | 6 | 4 | 1 | 1 | 9 | - | 4.5 |"
+
+
+def test_effort_counts_runs_with_a_q_that_was_not_finite():
+    """Of older scores it is not known."""
+    looked = [
+        Score("PickCube-v1 floating none s1", 0.1, 0.0, 1.0, finite) for finite in (True, False)
+    ]
+    trial = TrialResult("standard", 0, "complete", {"lr": 1.0}, [*looked, *TRIALS[0].scores])
+    (row,) = rows(page.effort([trial])).values()
+    assert row.split(" | ")[-2] == "1"
 
 
 def test_choices_that_are_not_the_default_are_bold():

@@ -12,7 +12,10 @@ import pytest
 
 from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.agents.presets import preset_options
+from symsteer.bench.runs.config import build_config
+from symsteer.bench.runs.folder import RECORD, run_id
 from symsteer.bench.sweep.schedule import Outcome
+from symsteer.bench.sweep.survey import look
 from symsteer.bench.tuning import command
 from symsteer.bench.tuning.command import Tuner, preview
 from symsteer.bench.tuning.plan import read_plan
@@ -24,11 +27,14 @@ from symsteer.bench.tuning.trials import (
     choose,
     mean_auc,
     mean_ranks,
+    score_of,
     to_text,
 )
 from symsteer.cli import main
 from symsteer.errors import UserError
+from symsteer.leaderboard.records import write_record
 from tests.bench.tuning.tiny_plan import BEST, TEXT, KnownRuns, write_plan
+from tests.leaderboard.record_factory import make_evaluation, make_record
 
 
 @pytest.fixture
@@ -88,6 +94,22 @@ def test_exchanged_settings_are_tried_once(play, tmp_path):
     tried = [t.params for t in search.batch(14)]
     assert tried[0] == others[0]
     assert tried[1] not in [known, *others]
+
+
+def test_a_score_says_whether_q_stayed_finite(tmp_path):
+    config = build_config({"env_steps": 20_000}, "test")
+    folder = tmp_path / run_id(config, {})
+    for q_mean, finite in ((-3.0, True), (math.nan, False)):
+        curve = [
+            make_evaluation([1, 0], 0, final=False),
+            make_evaluation([0, 0], 20_000, q_mean=q_mean),
+        ]
+        folder.mkdir(exist_ok=True)
+        (folder / RECORD).unlink(missing_ok=True)
+        write_record(make_record(curve, env_steps=20_000), folder / RECORD)
+        assert score_of(config, tmp_path).finite == finite
+        # The line of a sweep says it, too: success 0 may have this reason.
+        assert look(folder).success == f"success   0% of 2{'' if finite else ', Q not finite'}"
 
 
 def trial(number, *areas, state="complete"):
