@@ -59,7 +59,7 @@ def measure(
     """
     rows: list[dict[str, Any]] = []
     contenders: list[Callable[[], Any]] = []
-    timed = [(name, {}) for name in policies]
+    timed: list[tuple[str, Mapping[str, Any]]] = [(name, {}) for name in policies]
     timed += [(DEFAULT, options) for options in VARIATIONS if DEFAULT in policies]
     for name, options in timed:
         try:
