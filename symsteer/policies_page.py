@@ -126,7 +126,8 @@ def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str
     tasks = list(dict.fromkeys(record.settings.task for record in base))
     groups = _trained(base)
     rows = []
-    for name in sorted(groups.keys() & times.keys(), key=lambda name: times[name]["median"]):
+    timed = [name for name in groups if name in times]
+    for name in sorted(timed, key=lambda name: times[name]["median"]):
         time = times[name]
         row = [name, f"{time['median']:.1f}", f"{time['products'] / time['median']:.0%}"]
         for task in tasks:

@@ -180,6 +180,10 @@ def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
         ("stable-baselines3", "update", 1, "noise"),
         ("best-of-n-kernel", "fit, per update", 1, ""),
     }
+    # One fit for 320 decisions, in which the plain agent makes 160 updates.
+    (fit,) = (row for row in rows if row["agent"] == "best-of-n-kernel")
+    kernel, plain = (AGENTS.get(name).Options() for name in ("best-of-n-kernel", "standard"))
+    assert fit["updates"] == kernel.refit * plain.utd == 160
     sizes = {row["agent"]: row["batch_size"] for row in rows}
     assert {name: sizes[name] for name in learners} == {
         name: AGENTS.get(name).Options().batch_size for name in learners

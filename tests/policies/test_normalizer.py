@@ -107,7 +107,7 @@ def test_clip_blocks_bounds_norms_and_leaves_the_rest_alone():
 
 
 def test_the_gradient_of_clip_blocks_is_finite_everywhere():
-    """An action that a correction brings to exactly 0 made all parameters not a number."""
+    """An action that a correction brought to exactly 0 made all parameters NaN."""
     x = torch.stack([torch.zeros(8), torch.full((8,), 0.1), torch.full((8,), 5.0)])
     x.requires_grad_()
     clip_blocks(x, LAYOUT, 1.0).sum().backward()
