@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from symsteer.leaderboard.paper import BASE
+from symsteer.leaderboard.paper import BASE, STANDARD, WITH_SYMMETRY
 from symsteer.leaderboard.records import Role
 from symsteer.leaderboard.statistics import (
     Array,
@@ -23,6 +23,10 @@ from symsteer.leaderboard.statistics import (
 from symsteer.leaderboard.summary import Row, Summary, Table, reference_success
 
 GROUPS = ("unbroken", "broken")
+MANY_PAIRS = 28
+"""With more pairs of agents, only those with an agent of `AGAINST` are compared."""
+
+AGAINST = (STANDARD, WITH_SYMMETRY[0])
 THRESHOLDS = np.linspace(-0.5, 1.0, 151)
 """Where the profiles are drawn: shares of the gap between the frozen base and certain success."""
 
@@ -119,11 +123,15 @@ def profiles(tables: Sequence[Table], roles: Mapping[str, Role]) -> list[Profile
 def improvements(tables: Sequence[Table], roles: Mapping[str, Role]) -> list[Improvement]:
     """Every pair of agents that are no references, the later one of the page's order first.
 
-    In each table, over the base policies that both agents steered.
+    In each table, over the base policies that both agents steered. Of more than `MANY_PAIRS` only
+    those with an agent of `AGAINST`.
     """
     found = []
     learning = [agent for agent, role in roles.items() if role != "reference"]
-    for second, first in combinations(learning, 2):
+    pairs = list(combinations(learning, 2))
+    if len(pairs) > MANY_PAIRS:
+        pairs = [pair for pair in pairs if set(pair) & set(AGAINST)]
+    for second, first in pairs:
         cells = []
         for table in tables:
             rows = [table.row_of(agent) for agent in (first, second)]

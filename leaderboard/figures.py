@@ -42,6 +42,15 @@ STYLES: dict[str, Style] = {
     "equivariant": ("#0072B2", "o", "-"),
     "residual-pathway": ("#117733", "^", "-"),
     "approximate": ("#009E73", "^", "-"),
+    "relaxed": ("#44AA99", "P", "-"),
+    "projected": ("#999933", "<", "-"),
+    "constrained": ("#332288", "h", "-"),
+    "partial": ("#56B4E9", "*", "-"),
+    "ensemble": ("#7570B3", "p", "-"),
+    "displaced": ("#882255", ">", "-"),
+    "residual": ("#8C564B", "d", "-"),
+    "best-of-n": ("#EE3377", "X", "-"),
+    "best-of-n-kernel": ("#EE3377", "X", (0, (3, 1.5))),
     "wrong-group": ("#000000", "X", (0, (3, 1.5))),
 }
 OTHERS: tuple[Style, ...] = (("#56B4E9", "P", "-"), ("#882255", "<", "-"), ("#332288", "h", "-"))
@@ -63,6 +72,9 @@ WIDEST = 125
 """Characters of a line of the legend."""
 
 MAX_MARKERS = 15
+
+MANY = 8
+"""With so many learners a panel has no bands of learners, and no single finished runs."""
 
 RC: dict[str, Any] = {
     "svg.hashsalt": "symsteer",
@@ -136,7 +148,8 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
     """Success over environment steps: one panel a table, the IQM over seeds with its 95 % band.
 
     Thin lines are single seeds, drawn while these are few; those of unfinished runs are dotted and
-    end in a cross. References that were evaluated once are horizontal lines.
+    end in a cross. References that were evaluated once are horizontal lines. Panels with `MANY`
+    learners have no bands of these.
     """
     figure, axes = _panels(tables, "success_once on held-out episodes")
     handles: dict[str, Line2D] = {}
@@ -147,7 +160,7 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
                 continue
             style = style_of(row.agent)
             color, marker, line = style
-            _draw_success(ax, row, style, table.key.env_steps)
+            _draw_success(ax, row, style, table.key.env_steps, len(table.learners) < MANY)
             handles.setdefault(
                 plain(row.label),
                 Line2D([], [], color=color, marker=marker, linestyle=line, markersize=5),
@@ -156,7 +169,7 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
     return figure
 
 
-def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
+def _draw_success(ax: Axes, row: Row, style: Style, budget: int, band: bool) -> None:
     color, marker, line = style
     for run in row.runs:
         values = [evaluation.success_once for evaluation in run.curve.values()]
@@ -177,7 +190,8 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
         if row.agent == BASE:
             ax.axhspan(curve.low[0], curve.high[0], color=color, alpha=0.10, linewidth=0)
         return
-    ax.fill_between(curve.steps, curve.low, curve.high, color=color, alpha=0.14, linewidth=0)
+    if band:
+        ax.fill_between(curve.steps, curve.low, curve.high, color=color, alpha=0.14, linewidth=0)
     ax.plot(
         curve.steps,
         curve.values,
@@ -193,9 +207,9 @@ def _draw_success(ax: Axes, row: Row, style: Style, budget: int) -> None:
 def q_values(tables: Sequence[Table]) -> Figure:
     """Mean Q at the actor's own noise against the feasible band of the task's reward.
 
-    Thin lines are single seeds, the thick line is their mean; hollow markers are the fresh
-    discounted returns that Q should predict. Seeds whose Q is not finite end in a cross. The axis
-    turns logarithmic far outside the band.
+    Thin lines are single seeds (with `MANY` learners those whose Q is not finite, only), the thick
+    line is their mean; hollow markers are the fresh discounted returns that Q should predict. Seeds
+    whose Q is not finite end in a cross. The axis turns logarithmic far outside the band.
     """
     figure, axes = _panels(tables, "Q-value (discounted return)")
     handles: dict[str, Line2D | Patch] = {}
@@ -209,7 +223,8 @@ def q_values(tables: Sequence[Table]) -> Figure:
             color, marker, line = style_of(row.agent)
             for run in runs:
                 steps, values = series(run, "q_mean")
-                ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
+                if len(table.learners) < MANY or run.record.nonfinite_q:
+                    ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
                 extremes += values
                 if run.record.nonfinite_q:
                     ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7)
@@ -396,7 +411,7 @@ def performance_profiles(found: Comparisons) -> Figure:
         ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
         for profile in found.profiles[group]:
             color, _, line = style_of(profile.agent)
-            if profile.role != "reference":
+            if profile.role != "reference" and len(found.profiles[group]) <= MANY:
                 band: dict[str, Any] = {"color": color, "alpha": 0.13, "linewidth": 0}
                 ax.fill_between(THRESHOLDS, profile.low, profile.high, **band)
             ax.plot(THRESHOLDS, profile.share, color=color, linestyle=line, linewidth=1.7)

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from symsteer.leaderboard.answer_page import answer_section
 from symsteer.leaderboard.claims_page import CLAIMS, claims_section
-from symsteer.leaderboard.comparisons import Comparisons
+from symsteer.leaderboard.comparisons import AGAINST, MANY_PAIRS, Comparisons
 from symsteer.leaderboard.factors import MEASURES as EFFECT_MEASURES
 from symsteer.leaderboard.factors import MainEffect, main_effects
+from symsteer.leaderboard.figures import MANY
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.map_page import Figures, map_section
 from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
@@ -64,7 +65,8 @@ demonstrations, the budget and the held-out episodes.
 - In **learning curves**, thick lines are the IQM (success) or the mean (Q), bands the 95 % interval
   of the IQM, thin lines single runs, dotted lines with a cross unfinished runs. References are
   horizontal lines that start where their search ended. The green area shows the returns that the
-  reward allows; a cross there ends a run whose Q was not finite.
+  reward allows; a cross there ends a run whose Q was not finite. With {MANY} learners or more,
+  bands of learners and single runs are left out.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
   **Status**. The seeds below the number of seeds and episodes are links to the records.
 """
@@ -99,7 +101,8 @@ PROFILES = (
 )
 IMPROVEMENT = (
     "Probability of improvement: how likely a run of X beats a run of Y on the same base policy of "
-    "the same cell (ties count half), mean over cells, with 95 % intervals."
+    "the same cell (ties count half), mean over cells, with 95 % intervals. Of more than "
+    f"{MANY_PAIRS} pairs, only those with {' or '.join(map(code, AGAINST))} are shown."
 )
 
 

@@ -34,6 +34,10 @@ SYMBOLS = {
     "P": "cross",
     "<": "triangle-left",
     "h": "hexagon",
+    ">": "triangle-right",
+    "*": "star",
+    "p": "pentagon",
+    "d": "diamond-tall",
 }
 """Plotly's names of matplotlib's markers."""
 
