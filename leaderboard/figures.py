@@ -68,8 +68,10 @@ PARTS = {
 FIT = "#444444"
 
 COLUMNS = 3
-WIDEST = 125
-"""Characters of a line of the legend."""
+WIDEST = 13.3
+"""Characters of a line of the legend, per inch."""
+HANDLE = 7
+"""Characters as wide as the line and the space of one entry."""
 
 MAX_MARKERS = 15
 
@@ -509,15 +511,21 @@ def _title(table: Table, tables: Sequence[Table]) -> str:
 
 
 def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int = 7) -> None:
-    """Entries below the panels, in fewer columns where they are long."""
-    if handles:
-        figure.legend(
-            list(handles.values()),
-            list(handles),
-            loc="outside lower center",
-            ncols=max(1, min(len(handles), columns, WIDEST // max(map(len, handles)))),
-            frameon=False,
-        )
+    """Entries below the panels, in as many columns as fit."""
+    if not handles:
+        return
+    names, room = list(handles), WIDEST * figure.get_figwidth()
+    columns = min(columns, len(names))
+    while columns > 1 and _legend_width(names, columns) > room:
+        columns -= 1
+    place = "outside lower center"
+    figure.legend(list(handles.values()), names, loc=place, ncols=columns, frameon=False)
+
+
+def _legend_width(names: Sequence[str], columns: int) -> int:
+    """In characters; matplotlib fills column after column, the first ones with one entry more."""
+    parts = np.array_split([len(name) for name in names], columns)
+    return sum(int(part.max()) + HANDLE for part in parts)
 
 
 def style_of(agent: str) -> Style:

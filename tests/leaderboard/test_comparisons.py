@@ -61,6 +61,16 @@ def test_profiles_and_pairs_by_group() -> None:
     assert (pair.probability.value, pair.cells) == (0.0, 1)
 
 
+def test_of_many_agents_only_pairs_with_the_plain_and_the_strict_one_are_compared() -> None:
+    others = [f"other-{letter}" for letter in "abcdef"]
+    agents = dict.fromkeys(["standard", "equivariant", *others], 0.5)
+    every = compare_agents(summary_of(make_cell(agents))).improvements["unbroken"]
+    assert len(every) == 28
+    some = compare_agents(summary_of(make_cell(agents | {"other-g": 0.5}))).improvements["unbroken"]
+    assert len(some) == 15
+    assert all({"standard", "equivariant"} & {pair.first, pair.second} for pair in some)
+
+
 def test_runs_on_policies_that_only_one_agent_steered_are_left_out() -> None:
     standard, equivariant = (
         make_cell({agent: rate}) for agent, rate in (("standard", 0.5), ("equivariant", 0.25))
