@@ -518,8 +518,9 @@ def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int 
     columns = min(columns, len(names))
     while columns > 1 and _legend_width(names, columns) > room:
         columns -= 1
-    place = "outside lower center"
-    figure.legend(list(handles.values()), names, loc=place, ncols=columns, frameon=False)
+    figure.legend(
+        list(handles.values()), names, loc="outside lower center", ncols=columns, frameon=False
+    )
 
 
 def _legend_width(names: Sequence[str], columns: int) -> int:
