@@ -84,7 +84,7 @@ def test_a_dead_link_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     copy.mkdir()
     linked = ("examples", "leaderboard/site", "leaderboard/LEADERBOARD.md", "CITATION.cff")
     linked += ("leaderboard/learners/LEADERBOARD.md", "leaderboard/results/audit")
-    linked += ("leaderboard/results/base-policies",)
+    linked += ("leaderboard/zoo/LEADERBOARD.md", "leaderboard/results/base-policies")
     for name in ("docs", "README.md", "CHANGELOG.md", "mkdocs.yml", *linked):
         source = ROOT / name
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
