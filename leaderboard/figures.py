@@ -411,9 +411,10 @@ def performance_profiles(found: Comparisons) -> Figure:
     handles: dict[str, Line2D | Patch] = {}
     for ax, group in zip(axes, groups, strict=True):
         ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
+        learners = sum(profile.role != "reference" for profile in found.profiles[group])
         for profile in found.profiles[group]:
             color, _, line = style_of(profile.agent)
-            if profile.role != "reference" and len(found.profiles[group]) <= MANY:
+            if profile.role != "reference" and learners < MANY:
                 band: dict[str, Any] = {"color": color, "alpha": 0.13, "linewidth": 0}
                 ax.fill_between(THRESHOLDS, profile.low, profile.high, **band)
             ax.plot(THRESHOLDS, profile.share, color=color, linestyle=line, linewidth=1.7)
