@@ -14,9 +14,11 @@ from symsteer.bench.sweep.grid import read_suite, suite_names
 from symsteer.bench.sweep.plan import BASIC, make_plan
 from symsteer.bench.sweep.schedule import tasks_of
 from symsteer.bench.sweep.suite import load_suite
+from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
 from symsteer.leaderboard.paths import RECORDS
 from symsteer.leaderboard.study import read_study
+from symsteer.policies import POLICIES
 
 
 def write(tmp_path, text: str) -> str:
@@ -61,11 +63,15 @@ def test_the_grid_is_a_product_over_shared_settings(tmp_path):
     "name",
     [pytest.param(n, marks=[pytest.mark.slow] * (n in ("cpu", "full"))) for n in suite_names()],
 )
-def test_every_suite_that_ships_can_be_read(name):
+def test_every_suite_that_ships_can_be_read_and_its_policies_made(name):
     suite = load_suite(name)
     assert suite.description
     # `symsteer list` counts the runs without building them.
     assert len(suite.runs) == len(read_suite(name).runs) > 0
+    # A base policy that cannot be made would be found hours later.
+    for task_name, policy_name, options in {(c.task, c.policy_name, c.policy) for c in suite.runs}:
+        task = task_class(task_name)
+        POLICIES.get(policy_name)(options, task.observation_layout, task.action_layout)
 
 
 def test_the_suite_first_describes_the_committed_records():
