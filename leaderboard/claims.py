@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -111,7 +112,8 @@ def _check_names(study: Study, summary: Summary, audit: Audit) -> None:
             ]
         for kind, names in named:
             for name in names:
-                if name not in valid[kind]:
+                # A schedule such as "wind:1@0.5" needs no audit of its own.
+                if not {name, re.sub(r"@[^+]*", "", name)} & set(valid[kind]):
                     raise unknown(kind, name, valid[kind], f"{study.source}, {claim.name!r}")
 
 

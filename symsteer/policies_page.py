@@ -5,7 +5,8 @@ python -m symsteer.policies_page RUNS           # copies the finished records fi
 python -m symsteer.policies_page --decode FILE  # replaces the times of decoding first
 
 Records are in leaderboard/results/policies. FILE holds what `symsteer throughput --decode --json`
-prints.
+prints. leaderboard/results/base-policies/gradient.json holds what `python -m
+symsteer.bench.gradient_variance` prints.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ PAGE = CHECKOUT / "docs" / "base-policies.md"
 RESULTS = CHECKOUT / "leaderboard" / "results"
 RECORDS = RESULTS / "policies"
 DECODE = RESULTS / "base-policies" / "decode.json"
+GRADIENT = RESULTS / "base-policies" / "gradient.json"
 
 TRAINING = ("steps", "batch_size")
 """Options that say how long a policy is trained: not part of its label."""
@@ -72,12 +74,17 @@ def success(records: Sequence[RunRecord]) -> Interval:
     return success_interval(samples)
 
 
-def render(records: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str:
+def render(
+    records: Sequence[RunRecord],
+    decode: Sequence[Mapping[str, Any]],
+    gradient: Sequence[Mapping[str, Any]],
+) -> str:
     """All tables, in markdown.
 
     Args:
         records: finished runs of the suite.
         decode: rows of `symsteer throughput --decode`.
+        gradient: rows of `python -m symsteer.bench.gradient_variance`.
     """
     base = [record for record in records if record.settings.agent == "base"]
     tasks = list(dict.fromkeys(record.settings.task for record in base))
@@ -86,6 +93,7 @@ def render(records: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) ->
         (f"What they are ({STEERED} demonstrations)", properties(base)),
         (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
+        ("Variance of the gradient with orbit targets", variances(gradient)),
     ]
     return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
 
@@ -116,7 +124,8 @@ def properties(base: Sequence[RunRecord]) -> str:
             row.append(_range([form.format(value) for value in _known(policies, measure)]))
         rows.append(row)
     head = ["policy", "trainings", "parameters", "training, s"]
-    return table([*head, "equivariance error", "jump", "spread", "solvable"], rows)
+    head += ["equivariance error", "jump", "spread", "solvable"]
+    return table(head, rows) if rows else ""
 
 
 def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str:
@@ -169,6 +178,25 @@ def steered(records: Sequence[RunRecord]) -> str:
     return table(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""
 
 
+def variances(gradient: Sequence[Mapping[str, Any]]) -> str:
+    """Variance with orbit targets as a share of that without: mean [lowest, highest]."""
+    cells: dict[tuple[str, float], dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in gradient:
+        cell = cells[row["policy"], row["observation_noise"]]
+        cell[row["steps"]].append(row["orbit"] / row["own"])
+    steps = sorted({step for cell in cells.values() for step in cell})
+    rows = [
+        [f"`{policy}`", f"{deviation:g}", *(_spread(cell[step]) for step in steps)]
+        for (policy, deviation), cell in cells.items()
+    ]
+    head = [f"`steps` {step:,}" for step in steps]
+    return table(["policy", "observation noise", *head], rows) if rows else ""
+
+
+def _spread(values: Sequence[float]) -> str:
+    return f"{statistics.mean(values):.4f} [{min(values):.4f}, {max(values):.4f}]"
+
+
 def _interval(found: Interval) -> str:
     return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
 
@@ -191,6 +219,10 @@ def finished(folder: Path) -> dict[str, Path]:
     return found
 
 
+def _rows(path: Path) -> list[dict[str, Any]]:
+    return json.loads(path.read_text())["rows"] if path.is_file() else []
+
+
 def main(arguments: Sequence[str]) -> int:
     """Write docs/base-policies.md; returns the exit code."""
     parser = argparse.ArgumentParser(description="Write the tables of docs/base-policies.md.")
@@ -208,15 +240,16 @@ def main(arguments: Sequence[str]) -> int:
             write_together(files)
         if given.decode:
             write_together({DECODE: given.decode.read_bytes()})
+        records = [read_record(path) for path in sorted(RECORDS.glob("*.json"))]
         try:
-            decode = json.loads(DECODE.read_text())["rows"] if DECODE.is_file() else []
-            records = [read_record(path) for path in sorted(RECORDS.glob("*.json"))]
-            text = with_tables(PAGE.read_text(), render(records, decode), "docs/base-policies.md")
+            tables = render(records, _rows(DECODE), _rows(GRADIENT))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(
-                f"{DECODE} cannot be read ({error}); write it again with `symsteer throughput "
-                "--decode --json`"
+                f"{DECODE} or {GRADIENT} cannot be read ({error}); write them again with "
+                "`symsteer throughput --decode --json` and `python -m "
+                "symsteer.bench.gradient_variance`"
             ) from None
+        text = with_tables(PAGE.read_text(), tables, "docs/base-policies.md")
         write_together({PAGE: text.encode()})
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)

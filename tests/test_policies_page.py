@@ -103,6 +103,18 @@ def test_agents_are_compared_on_the_trainings_that_all_have():
     assert page.steered([run(2)]) == ""
 
 
+def test_the_variance_of_the_gradient_is_a_share_of_that_without_orbit_targets():
+    where = {"policy": "edp", "observation_noise": 1.0, "own": 4.0}
+    cells = [(0, 1, 4.0), (0, 1500, 3.0), (1, 1, 4.0), (1, 1500, 1.0)]
+    gradient = [where | {"seed": s, "steps": n, "orbit": v} for s, n, v in cells]
+    found = rows(page.variances(gradient))
+    assert found["policy"] == ["observation noise", "`steps` 1", "`steps` 1,500"]
+    assert found["`edp`"][0] == "1"
+    assert found["`edp`"][1] == "1.0000 [1.0000, 1.0000]"
+    assert found["`edp`"][2] == "0.5000 [0.2500, 0.7500]"
+    assert page.variances([]) == ""
+
+
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
     """A checkout with an empty page and no records."""
@@ -110,6 +122,7 @@ def checkout(tmp_path, monkeypatch):
     monkeypatch.setattr(page, "PAGE", tmp_path / "page.md")
     monkeypatch.setattr(page, "RECORDS", tmp_path / "records")
     monkeypatch.setattr(page, "DECODE", tmp_path / "decode.json")
+    monkeypatch.setattr(page, "GRADIENT", tmp_path / "gradient.json")
     return tmp_path
 
 
@@ -134,7 +147,11 @@ def test_mistakes(checkout, capsys):
     (checkout / "runs").mkdir()
     assert page.main([str(checkout / "runs")]) == 2
     assert "holds no finished run; name the folder of the sweep" in capsys.readouterr().err
-    for text in ("{", "[]"):
-        (checkout / "decode.json").write_text(text)
-        assert page.main([]) == 2
-        assert "decode.json cannot be read" in capsys.readouterr().err
+    for name in ("decode", "gradient"):
+        for text in ("{", "[]", '{"rows": [{}]}'):
+            (checkout / f"{name}.json").write_text(text)
+            assert page.main([]) == 2
+            error = capsys.readouterr().err
+            assert "gradient.json cannot be read (" in error
+            assert "write them again with `symsteer throughput --decode --json`" in error
+        (checkout / f"{name}.json").unlink()

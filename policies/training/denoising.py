@@ -96,7 +96,7 @@ class DenoisingOptions(GradientOptions):
             )
         if self.orbit_targets and not self.observation_noise:
             raise UserError(
-                "orbit_targets need observation_noise above 0, e.g. 0.1: an observation that is "
+                "orbit_targets need observation_noise above 0, e.g. 1: an observation that is "
                 "known exactly tells which turned copy it belongs to"
             )
         self.diffusion.timesteps(self.sampling_steps)

@@ -392,12 +392,20 @@ def test_the_slope_is_that_within_base_policies() -> None:
         ({"cells": {"task": ["PikCube-v1"]}}, "no task 'PikCube-v1'; did you mean 'PickCube-v1'"),
         ({"cells": {"embodiment": ["float"]}}, "did you mean 'floating'"),
         ({"minus": {"variant": ["win"]}}, "no variant 'win'; did you mean 'wind'"),
+        ({"cells": {"variant": ["win:1@0.5"]}}, "no variant 'win:1@0.5'; did you mean 'wind:"),
     ],
 )
 def test_unknown_names_are_refused_with_the_nearest(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(UserError, match=words) as refused:
         outcomes(cells({"none": {"standard": 0.5}}), claim_of(**changes))
     assert str(refused.value).startswith("study.toml, 'a claim': there is no ")
+
+
+def test_a_schedule_of_an_audited_variant_is_no_unknown_name() -> None:
+    """A study can be reported before its runs that break in the middle exist."""
+    later = claim_of(cells={"variant": ["wind:1@0.5", "wind:1@0.3..0.7"]})
+    (found,) = outcomes(cells({"none": {"standard": 0.5, "equivariant": 0.7}}), later)
+    assert found.verdict == "not tested"
 
 
 def test_the_committed_studies_can_be_tested() -> None:
