@@ -24,7 +24,14 @@ from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.records import BasePolicy, RunRecord, read_record
-from symsteer.leaderboard.statistics import Interval, Sample, success_interval
+from symsteer.leaderboard.statistics import (
+    Interval,
+    Sample,
+    cell_estimates,
+    combined,
+    success_interval,
+)
+from symsteer.leaderboard.text import difference
 from symsteer.policies import POLICIES
 
 PAGE = CHECKOUT / "docs" / "base-policies.md"
@@ -39,6 +46,9 @@ TRAINING = ("steps", "batch_size")
 MEASURES = {"equivariance_error": "{:.1g}", "jump": "{:.2g}", "action_std": "{:.2f}"}
 MEASURES |= {"solvable": "{:.2f}"}
 """Of the base policy, as the record has them, and how they are written."""
+
+DEFAULT = "`edp`"
+"""Label of the policy that the others are compared with."""
 
 STEERED = 50
 """Demonstrations of the policies that agents steer."""
@@ -74,6 +84,26 @@ def success(records: Sequence[RunRecord]) -> Interval:
     return success_interval(samples)
 
 
+def gain(runs: Sequence[RunRecord], others: Sequence[RunRecord]) -> Interval | None:
+    """Success of runs minus that of others, by task, training and episode; the mean over tasks.
+
+    None if no run has the task and the seed of another.
+    """
+    rivals = {(run.settings.task, run.settings.seed): run for run in others}
+    cells: dict[str, list[Sample]] = defaultdict(list)
+    for run in runs:
+        task, seed = run.settings.task, run.settings.seed
+        rival = rivals.get((task, seed))
+        if rival and rival.final and run.final:
+            theirs, own = (
+                dict(zip(found.seed, map(float, found.success_once), strict=True))
+                for found in (rival.final.episodes, run.final.episodes)
+            )
+            pairs = ((episode, own[episode] - theirs[episode]) for episode in own)
+            cells[task].append(Sample.pooled(pairs, f"{task} {seed}"))
+    return combined(cell_estimates(list(cells.values()))).interval() if cells else None
+
+
 def render(
     records: Sequence[RunRecord],
     decode: Sequence[Mapping[str, Any]],
@@ -90,6 +120,7 @@ def render(
     tasks = list(dict.fromkeys(record.settings.task for record in base))
     parts = [(f"{task}: success", demonstrations(base, task)) for task in tasks]
     parts += [
+        (f"Against {DEFAULT}", gains(base)),
         (f"What they are ({STEERED} demonstrations)", properties(base)),
         (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
@@ -110,6 +141,20 @@ def demonstrations(base: Sequence[RunRecord], task: str) -> str:
         for name, found in cells.items()
     ]
     return table(["policy", *map(str, counts)], rows)
+
+
+def gains(base: Sequence[RunRecord]) -> str:
+    """Success beside that of the default policy, by number of demonstrations, over all tasks."""
+    cells: dict[str, dict[int, list[RunRecord]]] = defaultdict(lambda: defaultdict(list))
+    for record in base:
+        cells[label_of(record)][record.settings.demonstrations.count].append(record)
+    rivals = cells.pop(DEFAULT, {})
+    counts = sorted({count for found in cells.values() for count in found})
+    rows = [
+        [name, *(difference(gain(found.get(n, ()), rivals.get(n, ()))) for n in counts)]
+        for name, found in cells.items()
+    ]
+    return table(["policy", *map(str, counts)], rows) if rows and rivals else ""
 
 
 def properties(base: Sequence[RunRecord]) -> str:
@@ -142,9 +187,11 @@ def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str
         for task in tasks:
             found = [record for record in groups[name] if record.settings.task == task]
             row.append(_interval(success(found)) if found else "-")
+        same = name == DEFAULT
+        row.append("" if same else difference(gain(groups[name], groups.get(DEFAULT, ()))))
         rows.append(row)
     head = ["policy", "decode, ms", "its products", *(task.removesuffix("-v1") for task in tasks)]
-    return table(head, rows) if rows else ""
+    return table([*head, f"against {DEFAULT}"], rows) if rows else ""
 
 
 def _trained(base: Sequence[RunRecord]) -> Mapping[str, list[RunRecord]]:

@@ -64,6 +64,27 @@ def test_success_is_over_trainings_and_stands_below_its_number_of_demonstrations
     assert found["`plain`"][1].startswith("0.90 [")
 
 
+def test_differences_are_paired_by_task_training_and_episode():
+    pick, push = (
+        [run(s, seed=s, task=t) for s in (2, 4, 6)] for t in ("PickCube-v1", "PushCube-v1")
+    )
+    better = [run(s + 3, "plain", seed=s) for s in (2, 4, 6)]
+    found = page.gain(better, pick)
+    # The trainings differ among each other, but not in what is gained.
+    assert found.value == pytest.approx(0.3)
+    assert found.low < 0.3 < found.high
+    worse = [run(s - 1, "plain", seed=s, task="PushCube-v1") for s in (2, 4, 6)]
+    assert page.gain([*better, *worse], [*pick, *push]).value == pytest.approx(0.1)
+    # Neither another training nor another task is a pair.
+    assert page.gain([run(9, "plain", seed=3)], pick) is None
+    assert page.gain(worse, pick) is None
+    table = rows(page.gains([*pick, *better, run(1, "plain", seed=2, count=5)]))
+    assert table["policy"] == ["5", "50"]
+    assert table["`plain`"][1].startswith("+0.30\xa0[")
+    assert "`edp`" not in table
+    assert page.gains(better) == ""
+
+
 def test_properties_are_those_of_the_policies_that_are_steered():
     base = [run(5, seed=s) for s in range(3)] + [run(5, count=5)]
     base[1].base_policy.equivariance_error = 4e-7
@@ -78,11 +99,18 @@ def test_success_stands_beside_the_time_of_decoding_and_the_cheapest_policy_is_f
     base = [run(8, seed=s, task=task) for s in (1, 2) for task in ("PickCube-v1", "PushCube-v1")]
     base += [run(3, seed=s, width=32) for s in (1, 2)] + [run(5, count=5), run(5, group="D4")]
     found = rows(page.costs(base, DECODE))
-    assert found["policy"] == ["decode, ms", "its products", "PickCube", "PushCube"]
+    assert found["policy"] == [
+        "decode, ms",
+        "its products",
+        "PickCube",
+        "PushCube",
+        "against `edp`",
+    ]
     # Neither policies that are not timed nor those that were not trained.
     assert list(found)[2:] == ["`edp` width 32", "`edp`"]
-    time, share, pick, push = found["`edp` width 32"]
+    time, share, pick, push, gain = found["`edp` width 32"]
     assert (time, share, pick[:6], push) == ("4.0", "50%", "0.30 [", "-")
+    assert gain.startswith("\N{MINUS SIGN}0.50\xa0[")
     assert found["`edp`"][:2] == ["8.0", "75%"]
     assert found["`edp`"][3].startswith("0.80 [")
     assert page.costs(base, []) == ""
