@@ -23,6 +23,7 @@ from typing import Any
 from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.leaderboard.paper import ROW_ORDER
 from symsteer.leaderboard.records import BasePolicy, RunRecord, read_record
 from symsteer.leaderboard.statistics import (
     Interval,
@@ -116,6 +117,7 @@ def render(
         decode: rows of `symsteer throughput --decode`.
         gradient: rows of `python -m symsteer.bench.gradient_variance`.
     """
+    records = sorted(records, key=_place)
     base = [record for record in records if record.settings.agent == "base"]
     tasks = list(dict.fromkeys(record.settings.task for record in base))
     parts = [(f"{task}: success", demonstrations(base, task)) for task in tasks]
@@ -127,6 +129,13 @@ def render(
         ("Variance of the gradient with orbit targets", variances(gradient)),
     ]
     return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
+
+
+def _place(record: RunRecord) -> tuple[int, str, str]:
+    """Where a run stands: policies as they are listed, then tasks."""
+    name = str(record.config["policy"]["name"])  # type: ignore[index,call-overload]
+    place = list(POLICIES.builtin).index(name)
+    return place, label_of(record), record.settings.task
 
 
 def demonstrations(base: Sequence[RunRecord], task: str) -> str:
@@ -211,7 +220,8 @@ def steered(records: Sequence[RunRecord]) -> str:
     for record in records:
         if record.settings.demonstrations.count == STEERED:
             cells[label_of(record), record.settings.task][record.settings.agent].append(record)
-    agents = dict.fromkeys(record.settings.agent for record in records)
+    found_agents = {record.settings.agent for record in records}
+    agents = [a for a in ROW_ORDER if a in found_agents] + sorted(found_agents - {*ROW_ORDER})
     rows = []
     for (name, task), found in cells.items():
         if len(found) < 2:

@@ -143,6 +143,15 @@ def test_the_variance_of_the_gradient_is_a_share_of_that_without_orbit_targets()
     assert page.variances([]) == ""
 
 
+def test_rows_stand_in_the_order_of_the_lists_of_policies_and_agents():
+    records = [run(3, agent="equivariant"), run(3, "plain"), run(3, agent="standard"), run(3)]
+    records += [run(3, width=32), run(3, "plain", agent="zero")]
+    text = page.render(records, [], [])
+    success = text.partition("### PickCube-v1: success")[2].partition("###")[0]
+    assert list(rows(success.strip()))[2:] == ["`edp`", "`edp` width 32", "`plain`"]
+    assert "| trainings | `base` | `zero` | `standard` | `equivariant` |" in text
+
+
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
     """A checkout with an empty page and no records."""
