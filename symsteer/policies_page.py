@@ -226,10 +226,12 @@ def steered(records: Sequence[RunRecord]) -> str:
     for (name, task), found in cells.items():
         if len(found) < 2:
             continue
-        shared = set.intersection(*({r.settings.seed for r in runs} for runs in found.values()))
+        shared = set.intersection(
+            *({run.base_policy.content_hash for run in runs} for runs in found.values())
+        )
         row = [name, task.removesuffix("-v1"), str(len(shared))]
         for agent in agents:
-            runs = [record for record in found.get(agent, ()) if record.settings.seed in shared]
+            runs = [r for r in found.get(agent, ()) if r.base_policy.content_hash in shared]
             row.append(_interval(success(runs)) if runs else "-")
         rows.append(row)
     return table(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""

@@ -120,6 +120,9 @@ def test_agents_are_compared_on_the_trainings_that_all_have():
     records = [run(2, seed=s) for s in range(3)]
     records += [run(8, agent="standard", seed=s) for s in (0, 1)]
     records += [run(10, agent="standard", seed=2, count=5)]
+    # The same seed, trained again on another machine.
+    records.append(run(10, agent="standard", seed=2))
+    records[-1].base_policy.content_hash = "f" * 64
     text = page.steered(records)
     assert "| policy | task | trainings | `base` | `standard` |" in text
     (row,) = [line for line in text.splitlines() if line.startswith("| `edp`")]
