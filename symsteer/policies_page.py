@@ -126,6 +126,7 @@ def render(
         (f"What they are ({STEERED} demonstrations)", properties(base)),
         (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
+        (f"Agents against the same ones on {DEFAULT}", steered_gains(records)),
         ("Variance of the gradient with orbit targets", variances(gradient)),
     ]
     return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
@@ -220,8 +221,7 @@ def steered(records: Sequence[RunRecord]) -> str:
     for record in records:
         if record.settings.demonstrations.count == STEERED:
             cells[label_of(record), record.settings.task][record.settings.agent].append(record)
-    found_agents = {record.settings.agent for record in records}
-    agents = [a for a in ROW_ORDER if a in found_agents] + sorted(found_agents - {*ROW_ORDER})
+    agents = _agents(records)
     rows = []
     for (name, task), found in cells.items():
         if len(found) < 2:
@@ -235,6 +235,28 @@ def steered(records: Sequence[RunRecord]) -> str:
             row.append(_interval(success(runs)) if runs else "-")
         rows.append(row)
     return table(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""
+
+
+def steered_gains(records: Sequence[RunRecord]) -> str:
+    """Success of each agent on a policy beside that of the same agent on the default policy."""
+    cells: dict[str, dict[str, list[RunRecord]]] = defaultdict(lambda: defaultdict(list))
+    for record in records:
+        if record.settings.demonstrations.count == STEERED:
+            cells[label_of(record)][record.settings.agent].append(record)
+    rivals = cells.pop(DEFAULT, {})
+    agents = _agents(records)
+    rows = [
+        [name, *(difference(gain(found.get(a, ()), rivals.get(a, ()))) for a in agents)]
+        for name, found in cells.items()
+        if len(found) > 1
+    ]
+    return table(["policy", *(f"`{a}`" for a in agents)], rows) if rows and rivals else ""
+
+
+def _agents(records: Sequence[RunRecord]) -> list[str]:
+    """Agents in the order of the leaderboard's rows."""
+    found = {record.settings.agent for record in records}
+    return [a for a in ROW_ORDER if a in found] + sorted(found - {*ROW_ORDER})
 
 
 def variances(gradient: Sequence[Mapping[str, Any]]) -> str:

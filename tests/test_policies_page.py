@@ -146,6 +146,21 @@ def test_the_variance_of_the_gradient_is_a_share_of_that_without_orbit_targets()
     assert page.variances([]) == ""
 
 
+def test_agents_on_a_policy_are_compared_with_the_same_agents_on_the_default():
+    records = [run(2, seed=s) for s in range(3)]
+    records += [run(8, agent="standard", seed=s) for s in range(3)]
+    records += [run(5, "plain", seed=s) for s in range(3)]
+    records += [run(6, "plain", agent="standard", seed=s) for s in range(3)]
+    # Without an agent.
+    records += [run(1, "canonical", seed=s) for s in range(3)]
+    found = rows(page.steered_gains(records))
+    assert found["policy"] == ["`base`", "`standard`"]
+    assert found["`plain`"][0].startswith("+0.30\xa0[")
+    assert found["`plain`"][1].startswith("\N{MINUS SIGN}0.20\xa0[")
+    assert list(found)[2:] == ["`plain`"]
+    assert page.steered_gains(records[6:]) == ""
+
+
 def test_rows_stand_in_the_order_of_the_lists_of_policies_and_agents():
     records = [run(3, agent="equivariant"), run(3, "plain"), run(3, agent="standard"), run(3)]
     records += [run(3, width=32), run(3, "plain", agent="zero")]
