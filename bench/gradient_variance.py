@@ -28,8 +28,6 @@ from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import Episode
 from symsteer.policies.geometry import Layout
-from symsteer.policies.normalizer import clip_blocks
-from symsteer.policies.training.demonstrations import make_chunks
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
 
 NAMES = ("edp", "plain-augmented")
@@ -64,12 +62,11 @@ def measure(
         UserError: if the policy has no group.
     """
     kind: Any = POLICIES.get(name)
-    kind(dataclasses.replace(options, orbit_targets=True), *layouts)
+    orbit = kind(dataclasses.replace(options, orbit_targets=True), *layouts)
     own: DiffusionPolicy = kind.fit(options, episodes, *layouts, seed)
-    orbit = kind(dataclasses.replace(own.options, orbit_targets=True), *layouts)
     orbit.load_state_dict(own.state_dict())
-    obs, chunks = make_chunks(episodes, layouts[1], own.options.horizon, own.options.hold)
-    chunks = own.act_normalizer.normalize(clip_blocks(chunks, own.bounded_layout(layouts[1]), 1.0))
+    obs, chunks = own.pairs(own.options, episodes, layouts[1])
+    chunks = own.act_normalizer.normalize(chunks)
     picks = torch.Generator().manual_seed(seed)
     sums: dict[str, list[Any]] = {key: [0.0, 0.0] for key in ("own", "orbit", "difference")}
     for number in range(batches):
@@ -102,14 +99,29 @@ def _gradient(
 
 def main(arguments: Sequence[str]) -> int:
     """Measure and print; returns the exit code."""
-    parser = argparse.ArgumentParser(description="Variance of the gradient with orbit targets.")
-    parser.add_argument("--task", default="PickCube-v1")
-    parser.add_argument("--demonstrations", type=int, default=50)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--steps", type=int, nargs="+", default=[1, 1500])
-    parser.add_argument("--batches", type=int, default=100)
-    parser.add_argument("--policies", nargs="+", default=list(NAMES))
-    parser.add_argument("--deviations", type=float, nargs="+", default=list(DEVIATIONS))
+    parser = argparse.ArgumentParser(
+        description="Variance of the training gradient with orbit targets.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--task", default="PickCube-v1", help="whose demonstrations are used")
+    parser.add_argument("--demonstrations", type=int, default=50, help="number of demonstrations")
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="trainings, each with demonstrations of its own"
+    )
+    parser.add_argument(
+        "--steps",
+        type=int,
+        nargs="+",
+        default=[1, 1500],
+        help="option of the policies: gradient steps before the measurement",
+    )
+    parser.add_argument("--batches", type=int, default=100, help="gradients of each policy")
+    parser.add_argument(
+        "--policies", nargs="+", default=list(NAMES), help="policies that have a group"
+    )
+    parser.add_argument(
+        "--deviations", type=float, nargs="+", default=list(DEVIATIONS), help="observation noise"
+    )
     given = parser.parse_args(arguments)
     rows = []
     try:

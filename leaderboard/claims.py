@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from symsteer.leaderboard.defects import Audit, Point, advantage, defect_of, fit
+from symsteer.leaderboard.defects import Audit, Point, advantage, defect_of, fit, parts_of
 from symsteer.leaderboard.paper import ROW_ORDER
 from symsteer.leaderboard.statistics import (
     CONFIDENCE,
@@ -28,6 +27,7 @@ from symsteer.leaderboard.study import Cells, Claim, Study
 from symsteer.leaderboard.summary import MIN_SEEDS, Key, Pair, Run, Summary, Table
 from symsteer.leaderboard.text import code
 from symsteer.names import unknown
+from symsteer.variant import specs_at, variant_text
 
 SLOPE_UNIT = 0.1
 """Slopes are given for this much more defect."""
@@ -112,9 +112,15 @@ def _check_names(study: Study, summary: Summary, audit: Audit) -> None:
             ]
         for kind, names in named:
             for name in names:
-                # A schedule such as "wind:1@0.5" needs no audit of its own.
-                if not {name, re.sub(r"@[^+]*", "", name)} & set(valid[kind]):
+                # What has a schedule is known by what it is at the end of a run.
+                if not {name, _at_the_end(name)} & set(valid[kind]):
                     raise unknown(kind, name, valid[kind], f"{study.source}, {claim.name!r}")
+
+
+def _at_the_end(name: str) -> str:
+    """A variant with a schedule as it is at the end: ``wind:1`` of ``wind:1@0.5``; others stay."""
+    parts = parts_of(name)
+    return variant_text(specs_at(parts, 1.0)) if parts else name
 
 
 def _parts(variant: str) -> list[str]:

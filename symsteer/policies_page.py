@@ -16,9 +16,9 @@ import json
 import statistics
 import sys
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
 from symsteer.errors import UserError
@@ -139,12 +139,25 @@ def _place(record: RunRecord) -> tuple[int, str, str]:
     return place, label_of(record), record.settings.task
 
 
+Column = TypeVar("Column", bound=int | str)
+"""Numbers of demonstrations, or agents."""
+
+Cells = Mapping[str, Mapping[Column, list[RunRecord]]]
+"""Runs by label of the policy and column."""
+
+
+def _cells(
+    records: Sequence[RunRecord], column: Callable[[RunRecord], Column]
+) -> dict[str, dict[Column, list[RunRecord]]]:
+    cells: dict[str, dict[Column, list[RunRecord]]] = {}
+    for record in records:
+        cells.setdefault(label_of(record), {}).setdefault(column(record), []).append(record)
+    return cells
+
+
 def demonstrations(base: Sequence[RunRecord], task: str) -> str:
     """Success of each policy on a task by number of demonstrations."""
-    cells: dict[str, dict[int, list[RunRecord]]] = defaultdict(lambda: defaultdict(list))
-    for record in base:
-        if record.settings.task == task:
-            cells[label_of(record)][record.settings.demonstrations.count].append(record)
+    cells = _cells([record for record in base if record.settings.task == task], _count)
     counts = sorted({count for found in cells.values() for count in found})
     rows = [
         [name, *(_interval(success(found[n])) if n in found else "-" for n in counts)]
@@ -154,17 +167,33 @@ def demonstrations(base: Sequence[RunRecord], task: str) -> str:
 
 
 def gains(base: Sequence[RunRecord]) -> str:
-    """Success beside that of the default policy, by number of demonstrations, over all tasks."""
-    cells: dict[str, dict[int, list[RunRecord]]] = defaultdict(lambda: defaultdict(list))
-    for record in base:
-        cells[label_of(record)][record.settings.demonstrations.count].append(record)
-    rivals = cells.pop(DEFAULT, {})
+    """Success of each policy beside that of the default one, by number of demonstrations."""
+    cells = _cells(base, _count)
     counts = sorted({count for found in cells.values() for count in found})
-    rows = [
-        [name, *(difference(gain(found.get(n, ()), rivals.get(n, ()))) for n in counts)]
-        for name, found in cells.items()
-    ]
-    return table(["policy", *map(str, counts)], rows) if rows and rivals else ""
+    return _against_default(cells, {count: str(count) for count in counts})
+
+
+def steered_gains(records: Sequence[RunRecord]) -> str:
+    """Success of each agent on a policy beside that of the same agent on the default policy."""
+    steered = [record for record in records if _count(record) == STEERED]
+    cells = _cells(steered, lambda record: record.settings.agent)
+    several = {name: found for name, found in cells.items() if len(found) > 1}
+    return _against_default(several, {agent: f"`{agent}`" for agent in _agents(records)})
+
+
+def _against_default(cells: Cells[Column], columns: Mapping[Column, str]) -> str:
+    """Differences to the runs of the default policy in the same column, whose heads are given."""
+    rivals = cells.get(DEFAULT, {})
+    rows = []
+    for name, own in cells.items():
+        if name != DEFAULT:
+            gained = [gain(own.get(c, ()), rivals.get(c, ())) for c in columns]
+            rows.append([name, *map(difference, gained)])
+    return table(["policy", *columns.values()], rows) if rows and rivals else ""
+
+
+def _count(record: RunRecord) -> int:
+    return record.settings.demonstrations.count
 
 
 def properties(base: Sequence[RunRecord]) -> str:
@@ -197,8 +226,8 @@ def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str
         for task in tasks:
             found = [record for record in groups[name] if record.settings.task == task]
             row.append(_interval(success(found)) if found else "-")
-        same = name == DEFAULT
-        row.append("" if same else difference(gain(groups[name], groups.get(DEFAULT, ()))))
+        gained = gain(groups[name], groups.get(DEFAULT, ()))
+        row.append("" if name == DEFAULT else difference(gained))
         rows.append(row)
     head = ["policy", "decode, ms", "its products", *(task.removesuffix("-v1") for task in tasks)]
     return table([*head, f"against {DEFAULT}"], rows) if rows else ""
@@ -206,11 +235,8 @@ def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str
 
 def _trained(base: Sequence[RunRecord]) -> Mapping[str, list[RunRecord]]:
     """The runs whose policies have as many demonstrations as the steered ones, by label."""
-    groups: dict[str, list[RunRecord]] = defaultdict(list)
-    for record in base:
-        if record.settings.demonstrations.count == STEERED:
-            groups[label_of(record)].append(record)
-    return groups
+    cells = _cells(base, _count)
+    return {name: found[STEERED] for name, found in cells.items() if STEERED in found}
 
 
 def steered(records: Sequence[RunRecord]) -> str:
@@ -219,7 +245,7 @@ def steered(records: Sequence[RunRecord]) -> str:
         lambda: defaultdict(list)
     )
     for record in records:
-        if record.settings.demonstrations.count == STEERED:
+        if _count(record) == STEERED:
             cells[label_of(record), record.settings.task][record.settings.agent].append(record)
     agents = _agents(records)
     rows = []
@@ -235,22 +261,6 @@ def steered(records: Sequence[RunRecord]) -> str:
             row.append(_interval(success(runs)) if runs else "-")
         rows.append(row)
     return table(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""
-
-
-def steered_gains(records: Sequence[RunRecord]) -> str:
-    """Success of each agent on a policy beside that of the same agent on the default policy."""
-    cells: dict[str, dict[str, list[RunRecord]]] = defaultdict(lambda: defaultdict(list))
-    for record in records:
-        if record.settings.demonstrations.count == STEERED:
-            cells[label_of(record)][record.settings.agent].append(record)
-    rivals = cells.pop(DEFAULT, {})
-    agents = _agents(records)
-    rows = [
-        [name, *(difference(gain(found.get(a, ()), rivals.get(a, ()))) for a in agents)]
-        for name, found in cells.items()
-        if len(found) > 1
-    ]
-    return table(["policy", *(f"`{a}`" for a in agents)], rows) if rows and rivals else ""
 
 
 def _agents(records: Sequence[RunRecord]) -> list[str]:

@@ -151,6 +151,8 @@ def test_agents_on_a_policy_are_compared_with_the_same_agents_on_the_default():
     records += [run(8, agent="standard", seed=s) for s in range(3)]
     records += [run(5, "plain", seed=s) for s in range(3)]
     records += [run(6, "plain", agent="standard", seed=s) for s in range(3)]
+    # Agents are compared from one number of demonstrations alone.
+    records += [run(10, "plain", agent="standard", seed=s, count=5) for s in range(3)]
     # Without an agent.
     records += [run(1, "canonical", seed=s) for s in range(3)]
     found = rows(page.steered_gains(records))

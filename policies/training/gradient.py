@@ -42,6 +42,15 @@ class GradientPolicy(ChunkPolicy):
         """
 
     @classmethod
+    def pairs(
+        cls, options: Any, episodes: Sequence[Episode], act_layout: Layout
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What is trained on: ``obs [M, obs_dim]`` and the bounded ``chunks [M, Tp, act_dim]``."""
+        obs, chunks = make_chunks(episodes, act_layout, options.horizon, options.hold)
+        # The environment bounds actions block by block: train on what it executes.
+        return obs, clip_blocks(chunks, cls.bounded_layout(act_layout), 1.0)
+
+    @classmethod
     def fit(
         cls,
         options: Any,
@@ -58,10 +67,7 @@ class GradientPolicy(ChunkPolicy):
         """
         check_episodes(episodes, obs_layout, act_layout)
         start = time.perf_counter()
-        obs, chunks = make_chunks(episodes, act_layout, options.horizon, options.hold)
-        # The environment bounds actions block by block: train on what it executes.
-        blocks = cls.bounded_layout(act_layout)
-        chunks = clip_blocks(chunks, blocks, 1.0)
+        obs, chunks = cls.pairs(options, episodes, act_layout)
         generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -70,7 +76,7 @@ class GradientPolicy(ChunkPolicy):
                 obs_layout,
                 act_layout,
                 Normalizer.fit(cls.bounded_layout(obs_layout), obs),
-                Normalizer.fit(blocks, chunks),
+                Normalizer.fit(cls.bounded_layout(act_layout), chunks),
             )
         options = policy.options
         policy.to(device)
