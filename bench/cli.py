@@ -380,6 +380,8 @@ def base(
 ) -> int:
     """Train base policies from few demonstrations and compare their success.
 
+    Each has the settings that it has by default in `symsteer run`.
+
     Args:
         task: Tasks; `symsteer list` names them. Joint policies are trained on all of them together,
             the others on each.
@@ -401,12 +403,11 @@ def base(
     configs = [RunConfig(task=name, embodiment=embodiment, demonstrations=demos) for name in task]
     for config in configs:
         check(config)
-    for name in policies:
-        POLICIES.get(name)
+    options = {name: POLICIES.get(name).Options() for name in policies}
     workers = workers or os.cpu_count() or 1
-    rows = study(configs, out, policies, demonstrations, seeds, episodes, workers)
+    rows = study(configs, out, options, demonstrations, seeds, episodes, workers)
     path = out / "base" / f"study-{'+'.join(task)}-{embodiment}-{mode}.json"
-    write_study(path, configs[0], rows)
+    write_study(path, configs[0], options, rows)
     print(table(rows))
     print(f"wrote {path}")
     return 0

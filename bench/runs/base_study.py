@@ -27,7 +27,7 @@ from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
-from symsteer.policies.contract import ChunkPolicy
+from symsteer.policies.contract import ChunkPolicy, PolicyOptions
 from symsteer.policies.steerability import evenly, jumps
 from symsteer.variant import file_name
 
@@ -48,7 +48,7 @@ class BaseCell:
 def study(
     configs: Sequence[RunConfig],
     out: Path,
-    names: Sequence[str],
+    policies: Mapping[str, PolicyOptions],
     counts: Sequence[int],
     seeds: int,
     episodes: int,
@@ -60,12 +60,11 @@ def study(
     demonstrations; n demonstrations are the first n of the largest number.
 
     Args:
-        configs: embodiment, kind of demonstrations, and options of one policy; they differ in the
-            task alone. The other policies use the same values of the options that they have, too.
-            Policies for several tasks are trained on all of them together, the others on each.
+        configs: embodiment and kind of demonstrations; they differ in the task alone. Policies for
+            several tasks are trained on all of them together, the others on each.
         out: folder that keeps demonstrations in ``out/base`` and what was measured of each policy
             in ``out/base/study``: a study that was stopped goes on there.
-        names: of the policies.
+        policies: names of the policies and their options.
         counts: numbers of demonstrations.
         seeds: number of seeds, from 0.
         episodes: held-out episodes of each policy, with noise from N(0, I).
@@ -80,37 +79,42 @@ def study(
     Raises:
         UserError: if a number is not positive or there is no such policy.
     """
-    if not counts or not names or not configs:
+    if not counts or not policies or not configs:
         raise UserError("a study needs at least one task, number of demonstrations and policy")
     if min(*counts, seeds, episodes, workers) < 1:
         raise UserError("numbers of demonstrations, seeds, episodes and workers must be positive")
-    for name in names:
-        POLICIES.get(name)
     files: dict[int, dict[str, Path]] = {}
     for seed in range(seeds):
         wanted = DemonstrationConfig(configs[0].demonstrations.mode, max(counts), seed)
         mine = [dataclasses.replace(config, demonstrations=wanted) for config in configs]
         files[seed] = {config.task: demonstration_file(config, out) for config in mine}
-    cells = [BaseCell(n, c, s) for c in counts for n in names for s in range(seeds)]
+    cells = [BaseCell(n, c, s) for c in counts for n in policies for s in range(seeds)]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
         jobs = [
-            pool.submit(_play_once, configs[0], cell, files[cell.seed], episodes, out)
+            pool.submit(
+                _play_once, configs[0], cell, policies[cell.name], files[cell.seed], episodes, out
+            )
             for cell in cells
         ]
         parts = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
     return [row for rows in parts for row in rows]
 
 
-def write_study(path: Path, config: RunConfig, rows: Sequence[dict[str, Any]]) -> None:
-    """Write the rows and their configuration as JSON."""
+def write_study(
+    path: Path,
+    config: RunConfig,
+    policies: Mapping[str, PolicyOptions],
+    rows: Sequence[dict[str, Any]],
+) -> None:
+    """Write the rows, the policies' options and the demonstrations as JSON."""
     write_json(
         path,
         {
             "tasks": list(dict.fromkeys(row["task"] for row in rows)),
             "embodiment": config.embodiment,
             "demonstrations": config.demonstrations.mode,
-            "policy": config.to_json()["policy"],
+            "policies": {name: options.to_json() for name, options in policies.items()},
             "rows": list(rows),
         },
     )
@@ -174,32 +178,36 @@ def held_out_episodes(
 
 
 def _play_once(
-    config: RunConfig, cell: BaseCell, demos: Mapping[str, Path], episodes: int, out: Path
+    config: RunConfig,
+    cell: BaseCell,
+    options: PolicyOptions,
+    demos: Mapping[str, Path],
+    episodes: int,
+    out: Path,
 ) -> list[dict[str, Any]]:
     files = {task: path.name for task, path in demos.items()}
-    key = content_key(config.to_json(), dataclasses.asdict(cell), files, episodes)
+    settings = {**config.to_json(), "policy": options.to_json()}
+    key = content_key(settings, dataclasses.asdict(cell), files, episodes)
     name = f"{file_name(cell.name)}-{cell.count}-s{cell.seed}-{key}.json"
     path = out / "base" / "study" / name
     if path.is_file():
         found: list[dict[str, Any]] = json.loads(path.read_text())
         return found
-    rows = _play(config, cell, demos, episodes)
+    rows = _play(config, cell, options, demos, episodes)
     write_json(path, rows)
     return rows
 
 
 def _play(
-    config: RunConfig, cell: BaseCell, demos: Mapping[str, Path], episodes: int
+    config: RunConfig,
+    cell: BaseCell,
+    options: PolicyOptions,
+    demos: Mapping[str, Path],
+    episodes: int,
 ) -> list[dict[str, Any]]:
     torch.set_num_threads(1)
     data = {task: load(path, task, config.embodiment, cell.count) for task, path in demos.items()}
     kind: Any = POLICIES.get(cell.name)
-    common = {
-        field.name: getattr(config.policy, field.name)
-        for field in dataclasses.fields(kind.Options)
-        if hasattr(config.policy, field.name)
-    }
-    options = kind.Options(**common)
     policies: dict[str, ChunkPolicy]
     if len(data) > 1 and hasattr(options, "tasks"):
         together = {task: (d.episodes, d.observation_layout) for task, d in data.items()}
