@@ -127,6 +127,7 @@ def render(
         (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
         (f"Agents against the same ones on {DEFAULT}", steered_gains(records)),
+        ("Success with orbit targets", orbit_gains(base)),
         ("Variance of the gradient with orbit targets", variances(gradient)),
     ]
     return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
@@ -267,6 +268,20 @@ def _agents(records: Sequence[RunRecord]) -> list[str]:
     """Agents in the order of the leaderboard's rows."""
     found = {record.settings.agent for record in records}
     return [a for a in ROW_ORDER if a in found] + sorted(found - {*ROW_ORDER})
+
+
+def orbit_gains(base: Sequence[RunRecord]) -> str:
+    """Success of each policy with orbit targets and without, after equally many steps."""
+    cells = _trained(base)
+    rows = []
+    for found in cells.values():
+        options: Mapping[str, Any] = found[0].config["policy"]  # type: ignore[assignment]
+        if options.get("orbit_targets"):
+            rival = label(str(options["name"]), {**options, "orbit_targets": False})
+            others = cells.get(rival, [])
+            row = [rival, _interval(success(found)), _interval(success(others)) if others else "-"]
+            rows.append([*row, difference(gain(found, others))])
+    return table(["policy", "with", "without", "difference"], rows) if rows else ""
 
 
 def variances(gradient: Sequence[Mapping[str, Any]]) -> str:

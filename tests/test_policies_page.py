@@ -10,6 +10,7 @@ import pytest
 from symsteer import policies_page as page
 from symsteer.bench.pages import BEGIN, END
 from symsteer.leaderboard.records import write_record
+from symsteer.leaderboard.text import difference
 from symsteer.policies import POLICIES
 from tests.leaderboard.record_factory import make_evaluation, make_record
 
@@ -132,6 +133,21 @@ def test_agents_are_compared_on_the_trainings_that_all_have():
     assert cells[4].startswith("0.80 [")
     # Policies that no agent steers have no row.
     assert page.steered([run(2)]) == ""
+
+
+def test_orbit_targets_are_compared_with_the_same_policy_without_them():
+    noisy = {"observation_noise": 1.0}
+    base = [run(s, seed=s, **noisy) for s in (2, 4, 6)]
+    base += [run(s + 1, seed=s, orbit_targets=True, **noisy) for s in (2, 4, 6)]
+    base += [run(9, seed=s) for s in (2, 4, 6)]  # another observation noise
+    base += [run(5, seed=2, name="plain-augmented", orbit_targets=True)]
+    found = rows(page.orbit_gains(base))
+    with_them, without, gained = found["`edp` observation_noise 1.0"]
+    assert with_them.startswith("0.50 [")
+    assert without.startswith("0.40 [")
+    assert gained.startswith("+0.10\xa0[")
+    assert found["`plain-augmented`"][1:] == ["-", difference(None)]
+    assert page.orbit_gains([run(2)]) == ""
 
 
 def test_the_variance_of_the_gradient_is_a_share_of_that_without_orbit_targets():
