@@ -5,6 +5,8 @@ import json
 
 import pytest
 
+from symsteer.bench.cli import base
+from symsteer.bench.runs import base_study
 from symsteer.bench.runs.base_study import study, table, write_study
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
@@ -56,6 +58,19 @@ def test_joint_policies_are_trained_once_for_all_tasks(tmp_path):
     seconds = {(r["name"], r["task"]): r["training_seconds"] for r in rows}
     assert len(seconds) == len(rows) == 4
     assert seconds["edp-joint", "PushCube-v1"] == seconds["edp-joint", "PickCube-v1"]
+
+
+def test_the_command_gives_each_policy_its_own_defaults(tmp_path, monkeypatch):
+    given = {}
+
+    def recorded(configs, out, policies, *numbers):
+        given.update(policies)
+        return [{"name": n, "count": 5, "task": "Push", "success": 0.5} for n in policies]
+
+    monkeypatch.setattr(base_study, "study", recorded)
+    assert base(policies=("edp", "spherical"), demonstrations=(5,), out=tmp_path) == 0
+    assert given == {name: POLICIES.get(name).Options() for name in ("edp", "spherical")}
+    assert given["edp"].width != given["spherical"].width
 
 
 def test_the_table_gives_mean_and_range():
