@@ -1,9 +1,9 @@
 """The lifted network with escnn's layers (https://github.com/QUVA-Lab/escnn).
 
 The same functions as those of ``edp``: our layers and escnn's span the same linear maps, and the
-rest is shared. Training takes longer, because escnn expands its bases in every step; decoding does
-not. It is here for escnn's networks: any of them may encode the observation
-(:meth:`EscnnDiffusionPolicy.make_encoder`).
+rest is shared, as are the first weights. Training takes longer, because escnn expands its bases in
+every step; decoding does not. It is here for escnn's networks: any of them may encode the
+observation (:meth:`EscnnDiffusionPolicy.make_encoder`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ class EscnnLayer(nn.Module):
     escnn orders regular fields as ``[channels, order]``; tensors here are ``[order, channels]``.
 
     Args:
-        ours: the layer whose place it takes; its parameters are not used.
+        ours: the layer whose place it takes; both give the same until one of them is trained. (With
+            escnn's own generalized He initialisation, chunks are predicted worse after equally many
+            steps: ``docs/base-policies.md``.)
     """
 
     def __init__(self, ours: EquivariantLayer):
@@ -49,12 +51,14 @@ class EscnnLayer(nn.Module):
         self.layout, self.ends, self.order = layout, ends, ours.group.order
         vector = layout.field_type(ours.group)
         linear = escnn_modules().Linear(
-            *(regular_fields(vector, count) if count else vector for count in ends)
+            *(regular_fields(vector, count) if count else vector for count in ends),
+            initialize=False,
         )
-        self.weight = nn.Parameter(linear.weights.detach().clone())
-        self.bias = None if linear.bias is None else nn.Parameter(linear.bias.detach().clone())
         # No submodules: bases are no state.
         self.__dict__["_bases"] = linear.basisexpansion, getattr(linear, "bias_expansion", None)
+        self.weight = nn.Parameter(torch.ones_like(linear.weights))
+        self.bias = None if linear.bias is None else nn.Parameter(torch.ones_like(linear.bias))
+        self._start_as(*ours.dense())
 
     @property
     def channels(self) -> int:
@@ -75,6 +79,17 @@ class EscnnLayer(nn.Module):
         flat = x.flatten(-2) if self.ends[0] else x
         out = functional.linear(flat, *self._expanded())
         return out.unflatten(-1, (self.order, self.ends[1])) if self.ends[1] else out
+
+    @torch.enable_grad()
+    def _start_as(self, matrix: torch.Tensor, bias: torch.Tensor) -> None:
+        # The elements of escnn's bases are orthogonal. With all coefficients 1, the product of the
+        # map with one element is that element's squared norm.
+        for parameter, ones, wanted in zip(
+            self.parameters(), self._expanded(), (matrix, bias), strict=False
+        ):
+            (product,) = torch.autograd.grad(ones, parameter, wanted.detach(), retain_graph=True)
+            (squared_norm,) = torch.autograd.grad(ones, parameter, ones.detach())
+            parameter.data = product / squared_norm
 
     def _expanded(self) -> tuple[torch.Tensor, torch.Tensor]:
         basis, bias_basis = self.__dict__["_bases"]

@@ -54,6 +54,14 @@ def test_it_has_the_parameters_and_the_functions_of_edp(world, name):
         assert torch.allclose((basis @ found).squeeze(1), wanted, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["C1", "C8", "D4"])
+def test_it_starts_as_edp_of_the_same_seed(world, name):
+    ours, theirs = (world.untrained(policy, group=name) for policy in ("edp", "escnn"))
+    obs, noise = world.observations(5), torch.randn(5, ours.horizon, 7)
+    assert ours.decode(obs, noise).abs().max() > 0.01
+    assert torch.allclose(theirs.decode(obs, noise), ours.decode(obs, noise), atol=1e-5)
+
+
 def test_fields_are_ordered_as_ours(world):
     """The same coefficients on inputs that are permuted by the group give permuted outputs."""
     group = Group.parse("D4")
