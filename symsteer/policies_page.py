@@ -41,9 +41,6 @@ RECORDS = RESULTS / "policies"
 DECODE = RESULTS / "base-policies" / "decode.json"
 GRADIENT = RESULTS / "base-policies" / "gradient.json"
 
-TRAINING = ("steps", "batch_size")
-"""Options that say how long a policy is trained: not part of its label."""
-
 MEASURES = {"equivariance_error": "{:.1g}", "jump": "{:.2g}", "action_std": "{:.2f}"}
 MEASURES |= {"solvable": "{:.2f}"}
 """Of the base policy, as the record has them, and how they are written."""
@@ -61,7 +58,7 @@ def label(name: str, options: Mapping[str, Any]) -> str:
     own = [
         value if isinstance(value := options[key], str) else f"{key} {value}".removesuffix(" True")
         for key, default in sorted(defaults.items())
-        if key not in TRAINING and options.get(key, default) != default
+        if options.get(key, default) != default
     ]
     return " ".join([f"`{name}`", *own])
 

@@ -47,11 +47,12 @@ def rows(text):
 def test_a_policy_is_named_by_the_options_that_are_not_the_default():
     assert page.label_of(run(1)) == "`edp`"
     assert page.label_of(run(1, group="D4")) == "`edp` D4"
-    flow = run(1, process="flow", prediction="velocity", sampling_steps=4, steps=3000)
+    flow = run(1, process="flow", prediction="velocity", sampling_steps=4)
     assert page.label_of(flow) == "`edp` velocity flow sampling_steps 4"
     noisy = {"observation_noise": 0.1, "orbit_targets": True}
     assert page.label_of(run(1, **noisy)) == "`edp` observation_noise 0.1 orbit_targets"
     assert page.label_of(run(1, name="plain")) == "`plain`"
+    assert page.label_of(run(1, steps=6000)) == "`edp` steps 6000"
 
 
 def test_success_is_over_trainings_and_stands_below_its_number_of_demonstrations():
