@@ -53,12 +53,15 @@ STEERED = 50
 
 
 def label(name: str, options: Mapping[str, Any]) -> str:
-    """The policy's name and those of its options that are not the default."""
+    """The policy's name and those of its options that are not the default.
+
+    The other tasks of a joint policy are left out: it is one policy for all of them.
+    """
     defaults = POLICIES.get(name).Options().to_json()
     own = [
         value if isinstance(value := options[key], str) else f"{key} {value}".removesuffix(" True")
         for key, default in sorted(defaults.items())
-        if options.get(key, default) != default
+        if key != "tasks" and options.get(key, default) != default
     ]
     return " ".join([f"`{name}`", *own])
 

@@ -53,6 +53,7 @@ def test_a_policy_is_named_by_the_options_that_are_not_the_default():
     assert page.label_of(run(1, **noisy)) == "`edp` observation_noise 0.1 orbit_targets"
     assert page.label_of(run(1, name="plain")) == "`plain`"
     assert page.label_of(run(1, steps=6000)) == "`edp` steps 6000"
+    assert page.label_of(run(1, name="edp-joint", tasks=["PushCube-v1"])) == "`edp-joint`"
 
 
 def test_success_is_over_trainings_and_stands_below_its_number_of_demonstrations():
