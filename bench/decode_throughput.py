@@ -1,7 +1,7 @@
 """CPU time in which base policies decode noise, beside that of their matrix products alone.
 
-The policies are untrained, which does not change the cost, and have their default sizes; the
-default policy also has others. All take turns. Action critics decode in every update, so this is a
+The policies are untrained, which does not change the cost, and have their default sizes; some also
+have others. All take turns. Action critics decode in every update, so this is a
 large part of a run's time.
 """
 
@@ -24,15 +24,17 @@ from symsteer.policies.networks.denoiser import parameter_count
 CHUNKS = (64, 192)
 """Chunks that are decoded at once: those of 64 environments, those of a batch of an update."""
 
-DEFAULT = "edp"
-VARIATIONS: Sequence[Mapping[str, Any]] = (
-    {"sampling_steps": 1},
-    {"sampling_steps": 4},
-    {"width": 32},
-    {"channels": 32},
-    {"width": 32, "channels": 32},
+VARIATIONS: Sequence[tuple[str, Mapping[str, Any]]] = (
+    ("edp", {"sampling_steps": 1}),
+    ("edp", {"sampling_steps": 4}),
+    ("edp", {"width": 32}),
+    ("edp", {"channels": 32}),
+    ("edp", {"width": 32, "channels": 32}),
+    ("edp", {"group": "C4"}),
+    ("edp", {"group": "D8"}),
+    ("spherical", {"channels": 64, "width": 64, "depth": 3}),
 )
-"""Options of the default policy that change its cost."""
+"""Policies and options that change their cost; those of the suite `policies`."""
 
 
 def measure(
@@ -60,7 +62,7 @@ def measure(
     rows: list[dict[str, Any]] = []
     contenders: list[Callable[[], Any]] = []
     timed: list[tuple[str, Mapping[str, Any]]] = [(name, {}) for name in policies]
-    timed += [(DEFAULT, options) for options in VARIATIONS if DEFAULT in policies]
+    timed += [(name, options) for name, options in VARIATIONS if name in policies]
     for name, options in timed:
         try:
             policy = _policy(task, name, options)
