@@ -1,8 +1,8 @@
 """CPU time in which base policies decode noise, beside that of their matrix products alone.
 
 The policies are untrained, which does not change the cost, and have their default sizes; some also
-have others. All take turns. Action critics decode in every update, so this is a
-large part of a run's time.
+have others. All take turns. Action critics decode in every update, so this is a large part of a
+run's time.
 """
 
 from __future__ import annotations

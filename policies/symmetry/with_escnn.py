@@ -33,9 +33,8 @@ class EscnnLayer(nn.Module):
     escnn orders regular fields as ``[channels, order]``; tensors here are ``[order, channels]``.
 
     Args:
-        ours: the layer whose place it takes; both give the same until one of them is trained. (With
-            escnn's own generalized He initialisation, chunks are predicted worse after equally many
-            steps: ``docs/base-policies.md``.)
+        ours: the layer whose place it takes; both give the same until one of them is trained.
+            With escnn's own initialisation the policy learns worse (``docs/base-policies.md``).
     """
 
     def __init__(self, ours: EquivariantLayer):
@@ -83,7 +82,7 @@ class EscnnLayer(nn.Module):
     @torch.enable_grad()
     def _start_as(self, matrix: torch.Tensor, bias: torch.Tensor) -> None:
         # The elements of escnn's bases are orthogonal. With all coefficients 1, the product of the
-        # map with one element is that element's squared norm.
+        # map with one element is that element's squared norm. A map to vectors may have no bias.
         for parameter, ones, wanted in zip(
             self.parameters(), self._expanded(), (matrix, bias), strict=False
         ):
