@@ -51,6 +51,17 @@ DEFAULT = "`edp`"
 STEERED = 50
 """Demonstrations of the policies that agents steer."""
 
+LONGER = (
+    ("`edp` steps 6000", "`edp`"),
+    ("`edp` steps 6000", "`plain-augmented`"),
+    ("`plain-augmented` steps 6000", "`plain-augmented`"),
+    ("`plain-augmented` steps 6000", "`edp` steps 6000"),
+    ("`canonical`", "`canonical` match_compute False"),
+    ("`plain`", "`plain` match_compute False"),
+)
+"""Pairs of labels that tell the effect of longer training from that of the policy. By themselves
+plain networks take four gradient steps for each of `steps`; see `match_compute`."""
+
 
 def label(name: str, options: Mapping[str, Any]) -> str:
     """The policy's name and those of its options that are not the default.
@@ -127,6 +138,7 @@ def render(
         (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
         (f"Agents against the same ones on {DEFAULT}", steered_gains(records)),
+        (f"Trained longer ({STEERED} demonstrations)", longer(records)),
         ("Success with orbit targets", orbit_gains(base)),
         ("Variance of the gradient with orbit targets", variances(gradient)),
     ]
@@ -202,9 +214,9 @@ def properties(base: Sequence[RunRecord]) -> str:
     rows = []
     for name, found in _trained(base).items():
         policies = [record.base_policy for record in found]
-        row = [name, str(len(found))]
-        for values in (_known(policies, "parameters"), _known(policies, "training_seconds")):
-            row.append(f"{statistics.median(values):,.0f}" if values else "-")
+        sizes = _known(policies, "parameters")
+        row = [name, str(len(found)), f"{statistics.median(sizes):,.0f}" if sizes else "-"]
+        row.append(_seconds(found))
         for measure, form in MEASURES.items():
             row.append(_range([form.format(value) for value in _known(policies, measure)]))
         rows.append(row)
@@ -232,6 +244,28 @@ def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str
         rows.append(row)
     head = ["policy", "decode, ms", "its products", *(task.removesuffix("-v1") for task in tasks)]
     return table([*head, f"against {DEFAULT}"], rows) if rows else ""
+
+
+def longer(records: Sequence[RunRecord]) -> str:
+    """Success of longer training, alone and steered, minus that of a shorter or another one."""
+    trained = [record for record in records if _count(record) == STEERED]
+    cells = _cells(trained, lambda record: record.settings.agent)
+    agents = _agents(trained)
+    rows = []
+    for name, other in LONGER:
+        if name in cells and other in cells:
+            own, theirs = cells[name], cells[other]
+            row = [name, _seconds(own["base"]), other, _seconds(theirs["base"])]
+            gained = [gain(own.get(agent, ()), theirs.get(agent, ())) for agent in agents]
+            rows.append([*row, *map(difference, gained)])
+    head = ["policy", "training, s", "minus", "training, s", *(f"`{agent}`" for agent in agents)]
+    return table(head, rows) if rows else ""
+
+
+def _seconds(found: Sequence[RunRecord]) -> str:
+    """Median of the trainings' seconds."""
+    seconds = _known([record.base_policy for record in found], "training_seconds")
+    return f"{statistics.median(seconds):,.0f}" if seconds else "-"
 
 
 def _trained(base: Sequence[RunRecord]) -> Mapping[str, list[RunRecord]]:

@@ -152,6 +152,27 @@ def test_orbit_targets_are_compared_with_the_same_policy_without_them():
     assert page.orbit_gains([run(2)]) == ""
 
 
+def test_longer_training_is_told_from_the_policy():
+    base = [run(s, seed=s) for s in (2, 4, 6)]
+    base += [run(s + 2, seed=s, steps=6000) for s in (2, 4, 6)]
+    base += [run(s + 1, "plain-augmented", seed=s) for s in (2, 4, 6)]
+    for record in base:
+        record.base_policy.training_seconds = record.config["policy"]["steps"] / 100
+    steered = [run(9, agent="standard", seed=2), run(6, agent="standard", seed=2, steps=6000)]
+    others = [run(2, seed=2, count=10)]
+    text = page.longer(base + steered + others)
+    lines = [line.strip("| ").split(" | ") for line in text.splitlines()]
+    assert lines[0][-2:] == ["`base`", "`standard`"]
+    assert [line[:4] for line in lines[2:]] == [
+        ["`edp` steps 6000", "60", "`edp`", "15"],
+        ["`edp` steps 6000", "60", "`plain-augmented`", "15"],
+    ]
+    assert [line[4][:5] for line in lines[2:]] == ["+0.20", "+0.10"]
+    assert lines[2][5].startswith("\N{MINUS SIGN}0.30")
+    assert lines[3][5] == difference(None)
+    assert page.longer([run(2)]) == ""
+
+
 def test_the_variance_of_the_gradient_is_a_share_of_that_without_orbit_targets():
     where = {"policy": "edp", "observation_noise": 1.0, "own": 4.0}
     cells = [(0, 1, 4.0), (0, 1500, 3.0), (1, 1, 4.0), (1, 1500, 1.0)]

@@ -38,6 +38,10 @@ class Denoiser(nn.Module, abc.ABC):
         ``time`` has B rows, or one for all.
         """
 
+    def output_layers(self) -> list[nn.Module]:
+        """Layers with which the prediction is 0 if all of their parameters are; may be none."""
+        return []
+
     def expanded(self) -> Self:
         """A copy for inference; subclasses compute here what is the same in every call."""
         return copy.deepcopy(self).requires_grad_(False).eval()

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
+from torch import nn
 
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
@@ -54,6 +55,10 @@ class AveragedDenoiser(Denoiser):
         copies = out.unflatten(0, (self.group.order, len(x)))
         rho = self.group.representation(self.layouts[1], x.dtype, x.device)
         return torch.einsum("gij,gb...j->b...i", rho, copies) / self.group.order
+
+    def output_layers(self) -> list[nn.Module]:
+        """Those of the inner network."""
+        return self.inner.output_layers()
 
     def expanded(self) -> Self:
         """A copy around the inner network's own."""

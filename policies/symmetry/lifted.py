@@ -108,6 +108,10 @@ class LiftedDenoiser(Denoiser):
         slices = self.slice_network(slices, (context + time).flatten(0, 1))
         return self.project(slices.unflatten(0, context.shape[:2]).transpose(1, 2))
 
+    def output_layers(self) -> list[nn.Module]:
+        """The projection to the chunk."""
+        return [self.project]
+
     def expanded(self) -> LiftedDenoiser:
         """A copy for inference whose equivariant layers hold their dense matrices ready."""
         fast = super().expanded()

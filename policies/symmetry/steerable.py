@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
@@ -115,15 +116,68 @@ class IrrepDenoiser(Denoiser):
         features = time_features(t, self.time_in.weight.dtype)
         return self.time_out(functional.silu(self.time_in(features)))
 
-    def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
-        """Predict; see :meth:`Denoiser.forward`."""
+    def features(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        """What a chunk is read from; ``x [B, Tp, Da] -> [B, width, dim]``."""
         films = len(self.time_out.weight)
         features, condition = context.split([context.shape[1] - films, films], dim=-1)
         h = self.chunk_in(x.flatten(1)) + features.unflatten(-1, (-1, self.irreps.dim))
         conditions = (condition + time).chunk(len(self.blocks), dim=-1)
         for block, part in zip(self.blocks, conditions, strict=True):
             h = block(h, part)
-        return self.chunk_out(self.out_norm(h)).view_as(x)
+        return self.out_norm(h)
+
+    def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        """Predict; see :meth:`Denoiser.forward`."""
+        return self.chunk_out(self.features(x, context, time)).view_as(x)
+
+    def output_layers(self) -> list[nn.Module]:
+        """The map to the chunk."""
+        return [self.chunk_out]
+
+
+class SpatialDenoiser(IrrepDenoiser):
+    """A denoiser that commutes with every rotation of space, above a table with a normal n.
+
+    A vector of the chunk is (1 - n n^T) A h1 + n b (h0, n^T h1), with features h of degree 0 and 1:
+    what lies across the normal and what lies along it have weights of their own. With A h1 alone
+    the same weights answered for a gripper's turn about the normal and for its tilt. The errors of
+    the turn are larger, so the small ones of the tilt remained, and added up with every action.
+    """
+
+    vectors: torch.Tensor
+    normal: torch.Tensor
+
+    def __init__(
+        self, irreps: Irreps, obs_layout: Layout, act_layout: Layout, horizon: int, *args: Any
+    ):
+        super().__init__(irreps, obs_layout, act_layout, horizon, *args)
+        vectors = irreps.embedding(act_layout.repeat(horizon))[1]
+        self.along = nn.Linear(2 * self.out_norm.scale.shape[0], len(vectors))
+        normal = obs_layout.spatial_vectors().index(NORMAL)
+        for name, rows in (
+            ("vectors", vectors.flatten(0, 1)),
+            ("normal", irreps.embedding(obs_layout)[1][normal]),
+        ):
+            self.register_buffer(name, rows, persistent=False)
+
+    def encode(self, obs: torch.Tensor) -> torch.Tensor:
+        """As the network without a normal, and the normal; ``[B, width * dim + films + 3]``."""
+        return torch.cat([super().encode(obs), obs @ self.normal.mT], dim=-1)
+
+    def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        """Predict; see :meth:`Denoiser.forward`."""
+        context, normal = context.split([context.shape[1] - 3, 3], dim=-1)
+        h = self.features(x, context, time)
+        out = self.chunk_out(h)
+        across = torch.einsum("bnd,bd->bn", (out @ self.vectors.mT).unflatten(-1, (-1, 3)), normal)
+        heights = torch.einsum("bcd,bd->bc", h[..., self.irreps.slice(1)], normal)
+        along = self.along(torch.cat([h[..., 0], heights], dim=-1)) - across
+        moved = along[..., None] * normal[:, None]
+        return (out + moved.flatten(1) @ self.vectors).view_as(x)
+
+    def output_layers(self) -> list[nn.Module]:
+        """The maps to what lies across and along the normal."""
+        return [self.chunk_out, self.along]
 
 
 @dataclass(frozen=True)
@@ -136,6 +190,8 @@ class SteerableOptions(DenoisingOptions):
     """Irreps of each degree for the chunk."""
     depth: int = 2
     """Blocks for the chunk."""
+    zero_output: bool = True
+    """See the other policies. These hardly learn actions that are always 0 otherwise."""
     symmetry: str = "C8"
     """The group that steering agents may use: a finite group of rotations, C_n."""
 
@@ -197,14 +253,14 @@ class SphericalPolicy(DiffusionPolicy):
         """The network with spatial irreps."""
         if self.options.action_frame:
             raise UserError("an action_frame turns in the plane; the spherical policy has none")
-        layout, kind = self.obs_layout, IrrepDenoiser
+        layout, kind = self.obs_layout, SpatialDenoiser
         if not any(pair == NORMAL for pair in layout.spatial_vectors()):
             layout = Layout([*layout.fields, Field(NORMAL[0], 1), Field(NORMAL[1], 0)])
             kind = LevelDenoiser
         return _denoiser(self, SpatialIrreps(), layout, kind)
 
 
-class LevelDenoiser(IrrepDenoiser):
+class LevelDenoiser(SpatialDenoiser):
     """Adds the vertical to an observation above a level table."""
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
 import torch
+from torch import nn
 
 from symsteer.errors import UserError
 from symsteer.names import unknown
@@ -60,6 +61,8 @@ class DenoisingOptions(GradientOptions):
     """Features of the chunk per group element."""
     depth: int = 3
     """Residual blocks of the MLP."""
+    zero_output: bool = False
+    """Start the network's output layer at 0 instead of with random weights."""
     diffusion_steps: int = 100
     """K: noise levels in training."""
     sampling_steps: int = 2
@@ -138,6 +141,8 @@ class DiffusionPolicy(GradientPolicy):
         self.frame = Frame(options.action_frame, obs_layout, act_layout)
         self.denoiser = self.make_denoiser()
         self.group = self.denoiser.group
+        if options.zero_output:
+            self._zero_output()
         if options.orbit_targets and self.data_group.order == 1:
             raise UserError(
                 f"orbit_targets need a group, and the network of {self.name} has none; leave them "
@@ -145,6 +150,17 @@ class DiffusionPolicy(GradientPolicy):
             )
         self._expanded: tuple[Denoiser, Sequence[torch.Tensor]] | None = None
         self.freeze()
+
+    def _zero_output(self) -> None:
+        layers = self.denoiser.output_layers()
+        if not layers:
+            raise UserError(
+                f"zero_output needs to know the output layer, and the network of {self.name} does "
+                "not tell it; define its output_layers, or leave zero_output out"
+            )
+        for layer in layers:
+            for parameter in layer.parameters():
+                nn.init.zeros_(parameter)
 
     @abc.abstractmethod
     def make_denoiser(self) -> Denoiser:

@@ -50,6 +50,7 @@ class TestEquivariance:
         assert error <= TOLERANCE[dtype]
 
 
+IRREPS = {"channels": 8, "width": 8, "depth": 1, "zero_output": False}
 WAYS = {
     "frame-averaged": {"policy": "frame-averaged", "group": "C8"},
     "frame-averaged, D4": {"policy": "frame-averaged", "group": "D4"},
@@ -59,8 +60,14 @@ WAYS = {
     "escnn": {"policy": "escnn", "group": "C8"},
     "escnn, D4": {"policy": "escnn", "group": "D4"},
     "escnn, U-Net": {"policy": "escnn", "group": "C4", "network": "unet"},
-    "so2": {"policy": "so2", "channels": 8, "width": 8, "depth": 1},
-    "spherical": {"policy": "spherical", "channels": 8, "width": 8, "depth": 1},
+    "so2": {"policy": "so2", "channels": 8, "width": 8, "depth": 1, "zero_output": False},
+    "spherical": {
+        "policy": "spherical",
+        "channels": 8,
+        "width": 8,
+        "depth": 1,
+        "zero_output": False,
+    },
     "C16": {"group": "C16"},
     "D8": {"group": "D8"},
     "relative actions": {"group": "D4", "action_frame": "goal"},

@@ -104,6 +104,23 @@ def test_a_planar_policy_does_not(spherical):
         assert ((moved - turned(own, ACTION, matrix)).abs().max() < 1e-4) == exact
 
 
+def test_a_gripper_that_only_turns_about_the_normal_is_hardly_tilted():
+    """Its turn is random, so that the errors of the turn are large."""
+    generator = torch.Generator().manual_seed(0)
+    data = episodes(24)
+    for obs, actions in data:
+        turn = 2 * torch.rand(8, 1, generator=generator) - 1
+        actions[:, 3:6] = turn * obs[:8, 6:9]
+    options = small_options("spherical", steps=150, **SMALL)
+    policy = POLICIES.get("spherical").fit(options, data, SCENE, ACTION)
+    obs = torch.cat([obs[:8] for obs, _ in data])
+    noise = torch.randn(len(obs), 8, ACTION.dim, generator=generator)
+    turns, normals = policy.decode(obs, noise)[..., 3:6], obs[:, None, 6:9]
+    along = (turns * normals).sum(-1, keepdim=True)
+    tilts = turns - along * normals
+    assert tilts.square().mean().sqrt() < 0.1 * along.square().mean().sqrt()
+
+
 @pytest.mark.long
 def test_both_learn(spherical):
     for name in ("so2", "spherical"):

@@ -9,7 +9,9 @@ from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group, group_average
+from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.symmetry.augmented import Augmentation
+from symsteer.policies.symmetry.lifted import LiftedDenoiser
 from symsteer.policies.training.demonstrations import make_chunks
 
 
@@ -146,6 +148,26 @@ def test_the_policy_keeps_averaged_weights(world):
         return sum((x - y).square().sum() for x, y in pairs).sqrt()
 
     assert 0 < distance(averaged, start) < distance(last, start)
+
+
+@pytest.mark.parametrize("network", ["mlp", "unet"])
+@pytest.mark.parametrize("name", ["edp", "escnn", "frame-averaged", "canonical", "plain-augmented"])
+def test_an_output_from_zero_forgets_the_noise_until_it_is_trained(world, name, network):
+    obs = world.observations(3)
+    noises = [torch.randn(3, 8, world.act_layout.dim) for _ in range(2)]
+    for zero in (True, False):
+        policy = world.untrained(name, network=network, zero_output=zero)
+        own, other = (policy.decode(obs, noise) for noise in noises)
+        assert torch.equal(own, other) == zero
+    trained = world.fit(name, network=network, zero_output=True, steps=5)
+    assert not torch.equal(*(trained.decode(obs, noise) for noise in noises))
+
+
+def test_a_network_of_another_package_must_tell_its_output_layer(world, monkeypatch):
+    monkeypatch.setattr(LiftedDenoiser, "output_layers", Denoiser.output_layers)
+    world.untrained("edp")
+    with pytest.raises(UserError, match="define its output_layers"):
+        world.untrained("edp", zero_output=True)
 
 
 def test_training_leaves_the_global_generator_alone(world):
