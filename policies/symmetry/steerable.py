@@ -152,13 +152,11 @@ class SpatialDenoiser(IrrepDenoiser):
     ):
         super().__init__(irreps, obs_layout, act_layout, horizon, *args)
         vectors = irreps.embedding(act_layout.repeat(horizon))[1]
-        self.along = nn.Linear(2 * self.out_norm.scale.shape[0], len(vectors))
-        normal = obs_layout.spatial_vectors().index(NORMAL)
-        for name, rows in (
-            ("vectors", vectors.flatten(0, 1)),
-            ("normal", irreps.embedding(obs_layout)[1][normal]),
-        ):
-            self.register_buffer(name, rows, persistent=False)
+        self.along = nn.Linear(2 * self.chunk_in.channels, len(vectors))
+        self.register_buffer("vectors", vectors.flatten(0, 1), persistent=False)
+        # Vectors in space are the first ones of the embedding.
+        normal = irreps.embedding(obs_layout)[1][obs_layout.spatial_vectors().index(NORMAL)]
+        self.register_buffer("normal", normal, persistent=False)
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         """As the network without a normal, and the normal; ``[B, width * dim + films + 3]``."""
@@ -191,7 +189,8 @@ class SteerableOptions(DenoisingOptions):
     depth: int = 2
     """Blocks for the chunk."""
     zero_output: bool = True
-    """See the other policies. These hardly learn actions that are always 0 otherwise."""
+    """Start the output layer at 0. With random weights in it, these networks hardly learn actions
+    that are always 0."""
     symmetry: str = "C8"
     """The group that steering agents may use: a finite group of rotations, C_n."""
 
