@@ -48,18 +48,23 @@ MEASURES |= {"solvable": "{:.2f}"}
 DEFAULT = "`edp`"
 """Label of the policy that the others are compared with."""
 
+TILTED = "Tilted"
+"""Tasks whose names begin so are on a tilted table; their tables are their own."""
+
 STEERED = 50
 """Demonstrations of the policies that agents steer."""
 
-LONGER = (
+PAIRS = (
     ("`edp` steps 6000", "`edp`"),
     ("`edp` steps 6000", "`plain-augmented`"),
     ("`plain-augmented` steps 6000", "`plain-augmented`"),
     ("`plain-augmented` steps 6000", "`edp` steps 6000"),
     ("`canonical`", "`canonical` match_compute False"),
     ("`plain`", "`plain` match_compute False"),
+    ("`edp` zero_output", "`edp`"),
+    ("`plain-augmented` zero_output", "`plain-augmented`"),
 )
-"""Pairs of labels that tell the effect of longer training from that of the policy. By themselves
+"""Pairs of labels that tell the effect of the training from that of the policy. By themselves
 plain networks take four gradient steps for each of `steps`; see `match_compute`."""
 
 
@@ -129,18 +134,21 @@ def render(
         gradient: rows of `python -m symsteer.bench.gradient_variance`.
     """
     records = sorted(records, key=_place)
+    tilted = [record for record in records if record.settings.task.startswith(TILTED)]
+    records = [record for record in records if not record.settings.task.startswith(TILTED)]
     base = [record for record in records if record.settings.agent == "base"]
-    tasks = list(dict.fromkeys(record.settings.task for record in base))
-    parts = [(f"{task}: success", demonstrations(base, task)) for task in tasks]
-    parts += [
+    parts = [
+        *successes(base),
         (f"Against {DEFAULT}", gains(base)),
         (f"What they are ({STEERED} demonstrations)", properties(base)),
         (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
         (f"Agents against the same ones on {DEFAULT}", steered_gains(records)),
-        (f"Trained longer ({STEERED} demonstrations)", longer(records)),
+        (f"Trained in another way ({STEERED} demonstrations)", pairs(records)),
         ("Success with orbit targets", orbit_gains(base)),
         ("Variance of the gradient with orbit targets", variances(gradient)),
+        *successes(tilted),
+        (f"Against {DEFAULT}, on a tilted table", gains(tilted)),
     ]
     return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
 
@@ -166,6 +174,12 @@ def _cells(
     for record in records:
         cells.setdefault(label_of(record), {}).setdefault(column(record), []).append(record)
     return cells
+
+
+def successes(base: Sequence[RunRecord]) -> list[tuple[str, str]]:
+    """Title and table of each task."""
+    tasks = dict.fromkeys(record.settings.task for record in base)
+    return [(f"{task}: success", demonstrations(base, task)) for task in tasks]
 
 
 def demonstrations(base: Sequence[RunRecord], task: str) -> str:
@@ -246,13 +260,13 @@ def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str
     return table([*head, f"against {DEFAULT}"], rows) if rows else ""
 
 
-def longer(records: Sequence[RunRecord]) -> str:
-    """Success of longer training, alone and steered, minus that of a shorter or another one."""
+def pairs(records: Sequence[RunRecord]) -> str:
+    """Success of each pair's first policy, alone and steered, minus that of its second one."""
     trained = [record for record in records if _count(record) == STEERED]
     cells = _cells(trained, lambda record: record.settings.agent)
     agents = _agents(trained)
     rows = []
-    for name, other in LONGER:
+    for name, other in PAIRS:
         if name in cells and other in cells:
             own, theirs = cells[name], cells[other]
             row = [name, _seconds(own["base"]), other, _seconds(theirs["base"])]

@@ -160,7 +160,7 @@ def test_longer_training_is_told_from_the_policy():
         record.base_policy.training_seconds = record.config["policy"]["steps"] / 100
     steered = [run(9, agent="standard", seed=2), run(6, agent="standard", seed=2, steps=6000)]
     others = [run(2, seed=2, count=10)]
-    text = page.longer(base + steered + others)
+    text = page.pairs(base + steered + others)
     lines = [line.strip("| ").split(" | ") for line in text.splitlines()]
     assert lines[0][-2:] == ["`base`", "`standard`"]
     assert [line[:4] for line in lines[2:]] == [
@@ -170,7 +170,7 @@ def test_longer_training_is_told_from_the_policy():
     assert [line[4][:5] for line in lines[2:]] == ["+0.20", "+0.10"]
     assert lines[2][5].startswith("\N{MINUS SIGN}0.30")
     assert lines[3][5] == difference(None)
-    assert page.longer([run(2)]) == ""
+    assert page.pairs([run(2)]) == ""
 
 
 def test_the_variance_of_the_gradient_is_a_share_of_that_without_orbit_targets():
@@ -209,6 +209,17 @@ def test_rows_stand_in_the_order_of_the_lists_of_policies_and_agents():
     success = text.partition("### PickCube-v1: success")[2].partition("###")[0]
     assert list(rows(success.strip()))[2:] == ["`edp`", "`edp` width 32", "`plain`"]
     assert "| trainings | `base` | `zero` | `standard` | `equivariant` |" in text
+
+
+def test_tilted_tasks_have_tables_of_their_own():
+    records = [run(3, seed=s) for s in (1, 2)]
+    records += [run(4, n, seed=1, task="TiltedPickCube-v1") for n in ("edp", "plain")]
+    text = page.render(records, [], [])
+    level, _, tilted = text.partition("### TiltedPickCube-v1: success")
+    assert "`plain`" not in level
+    success, _, against = tilted.partition("### Against `edp`, on a tilted table")
+    assert list(rows(success.strip()))[2:] == ["`edp`", "`plain`"]
+    assert rows(against.strip())["`plain`"][0].startswith("0.00\xa0[")
 
 
 @pytest.fixture
