@@ -54,6 +54,9 @@ TILTED = "Tilted"
 STEERED = 50
 """Demonstrations of the policies that agents steer."""
 
+BEFORE = {"zero_output": False}
+"""Options that the first records lack, and what they were."""
+
 PAIRS = (
     ("`edp` steps 6000", "`edp`"),
     ("`edp` steps 6000", "`plain-augmented`"),
@@ -63,6 +66,7 @@ PAIRS = (
     ("`plain`", "`plain` match_compute False"),
     ("`edp` zero_output", "`edp`"),
     ("`plain-augmented` zero_output", "`plain-augmented`"),
+    ("`so2`", "`so2` zero_output False"),
 )
 """Pairs of labels that tell the effect of the training from that of the policy. By themselves
 plain networks take four gradient steps for each of `steps`; see `match_compute`."""
@@ -85,7 +89,7 @@ def label(name: str, options: Mapping[str, Any]) -> str:
 def label_of(record: RunRecord) -> str:
     """The label of a run's base policy."""
     options: Mapping[str, Any] = record.config["policy"]  # type: ignore[assignment]
-    return label(str(options["name"]), options)
+    return label(str(options["name"]), BEFORE | dict(options))
 
 
 def success(records: Sequence[RunRecord]) -> Interval:

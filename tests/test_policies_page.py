@@ -54,6 +54,14 @@ def test_a_policy_is_named_by_the_options_that_are_not_the_default():
     assert page.label_of(run(1, name="plain")) == "`plain`"
     assert page.label_of(run(1, steps=6000)) == "`edp` steps 6000"
     assert page.label_of(run(1, name="edp-joint", tasks=["PushCube-v1"])) == "`edp-joint`"
+    # Records that lack the option are of networks with random first weights.
+    old = run(1, name="so2")
+    assert page.label_of(old) == "`so2`"
+    del old.config["policy"]["zero_output"]
+    assert page.label_of(old) == "`so2` zero_output False"
+    old = run(1)
+    del old.config["policy"]["zero_output"]
+    assert page.label_of(old) == "`edp`"
 
 
 def test_success_is_over_trainings_and_stands_below_its_number_of_demonstrations():
