@@ -20,6 +20,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from scipy.stats import spearmanr
+
 from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
 from symsteer.errors import UserError
 from symsteer.files import write_together
@@ -32,7 +34,7 @@ from symsteer.leaderboard.statistics import (
     combined,
     success_interval,
 )
-from symsteer.leaderboard.text import difference
+from symsteer.leaderboard.text import difference, number
 from symsteer.policies import POLICIES
 
 PAGE = CHECKOUT / "docs" / "base-policies.md"
@@ -65,6 +67,8 @@ PAIRS = (
     ("`canonical`", "`canonical` match_compute False"),
     ("`plain`", "`plain` match_compute False"),
     ("`edp` zero_output", "`edp`"),
+    ("`edp` zero_output", "`plain-augmented`"),
+    ("`edp` zero_output", "`plain-augmented` zero_output"),
     ("`plain-augmented` zero_output", "`plain-augmented`"),
     ("`so2`", "`so2` zero_output False"),
 )
@@ -149,6 +153,7 @@ def render(
         ("What agents make of them", steered(records)),
         (f"Agents against the same ones on {DEFAULT}", steered_gains(records)),
         (f"Trained in another way ({STEERED} demonstrations)", pairs(records)),
+        ("What tells how far agents get", foretold(records)),
         ("Success with orbit targets", orbit_gains(base)),
         ("Variance of the gradient with orbit targets", variances(gradient)),
         *successes(tilted),
@@ -314,6 +319,40 @@ def steered(records: Sequence[RunRecord]) -> str:
             row.append(_interval(success(runs)) if runs else "-")
         rows.append(row)
     return table(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""
+
+
+def _mean_success(run: RunRecord) -> float | None:
+    return statistics.mean(run.final.episodes.success_once) if run.final else None
+
+
+FORETELL: Mapping[str, Callable[[RunRecord], float | None]] = {
+    "its own success": _mean_success,
+    "spread": lambda run: run.base_policy.action_std,
+    "solvable": lambda run: run.base_policy.solvable,
+}
+"""What is known of a policy before it is steered, from its own run."""
+
+
+def foretold(records: Sequence[RunRecord]) -> str:
+    """Rank correlation of what is known of a policy and an agent's success on it, by task."""
+    runs: dict[str, dict[tuple[str, str], RunRecord]] = defaultdict(dict)
+    for run in records:
+        if _count(run) == STEERED:
+            runs[run.settings.agent][run.settings.task, run.base_policy.content_hash] = run
+    base = runs.pop("base", {})
+    rows = []
+    for agent in _agents([run for found in runs.values() for run in found.values()]):
+        for task in sorted({task for task, _ in runs[agent]}):
+            both = [place for place in runs[agent] if place[0] == task and place in base]
+            success = [_mean_success(runs[agent][place]) for place in both]
+            cells = []
+            for known in FORETELL.values():
+                values = [known(base[place]) for place in both]
+                varies = None not in values and min(len(set(values)), len(set(success))) > 1
+                cells.append(number(spearmanr(values, success).statistic) if varies else "-")
+            name = f"`{agent}`, {task.removesuffix('-v1')} ({len(both)})"
+            rows.append([name, *cells])
+    return table(["agent, task (trainings)", *FORETELL], rows) if base and rows else ""
 
 
 def _agents(records: Sequence[RunRecord]) -> list[str]:

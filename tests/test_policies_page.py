@@ -210,6 +210,19 @@ def test_agents_on_a_policy_are_compared_with_the_same_agents_on_the_default():
     assert page.steered_gains(records[6:]) == ""
 
 
+def test_what_is_known_of_a_policy_is_compared_with_how_far_agents_get():
+    base, steered = [run(s, seed=s) for s in range(4)], []
+    for record, spread in zip(base, (0.4, 0.3, 0.2, 0.1), strict=True):
+        record.base_policy.action_std = spread
+        steered.append(run(record.settings.seed + 5, agent="standard", seed=record.settings.seed))
+    # Neither a training without its own run, nor another number of demonstrations.
+    others = [run(0, agent="standard", seed=9), run(9, count=10), run(9, agent="zero", count=10)]
+    found = rows(page.foretold([*base, *steered, *others]))
+    assert list(found)[2:] == ["`standard`, PickCube (4)"]
+    assert found["`standard`, PickCube (4)"] == ["1.00", "\N{MINUS SIGN}1.00", "-"]
+    assert page.foretold(base) == page.foretold(steered) == ""
+
+
 def test_rows_stand_in_the_order_of_the_lists_of_policies_and_agents():
     records = [run(3, agent="equivariant"), run(3, "plain"), run(3, agent="standard"), run(3)]
     records += [run(3, width=32), run(3, "plain", agent="zero")]
