@@ -321,12 +321,8 @@ def steered(records: Sequence[RunRecord]) -> str:
     return table(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""
 
 
-def _mean_success(run: RunRecord) -> float | None:
-    return statistics.mean(run.final.episodes.success_once) if run.final else None
-
-
 FORETELL: Mapping[str, Callable[[RunRecord], float | None]] = {
-    "its own success": _mean_success,
+    "its own success": lambda run: run.final.success_once if run.final else None,
     "spread": lambda run: run.base_policy.action_std,
     "solvable": lambda run: run.base_policy.solvable,
 }
@@ -337,14 +333,14 @@ def foretold(records: Sequence[RunRecord]) -> str:
     """Rank correlation of what is known of a policy and an agent's success on it, by task."""
     runs: dict[str, dict[tuple[str, str], RunRecord]] = defaultdict(dict)
     for run in records:
-        if _count(run) == STEERED:
+        if _count(run) == STEERED and run.final:
             runs[run.settings.agent][run.settings.task, run.base_policy.content_hash] = run
     base = runs.pop("base", {})
     rows = []
     for agent in _agents([run for found in runs.values() for run in found.values()]):
         for task in sorted({task for task, _ in runs[agent]}):
             both = [place for place in runs[agent] if place[0] == task and place in base]
-            success = [_mean_success(runs[agent][place]) for place in both]
+            success = [FORETELL["its own success"](runs[agent][place]) for place in both]
             cells = []
             for known in FORETELL.values():
                 values = [known(base[place]) for place in both]

@@ -167,7 +167,7 @@ def test_longer_training_is_told_from_the_policy():
     for record in base:
         record.base_policy.training_seconds = record.config["policy"]["steps"] / 100
     steered = [run(9, agent="standard", seed=2), run(6, agent="standard", seed=2, steps=6000)]
-    others = [run(2, seed=2, count=10)]
+    others = [run(9, seed=2, count=10)]
     text = page.pairs(base + steered + others)
     lines = [line.strip("| ").split(" | ") for line in text.splitlines()]
     assert lines[0][-2:] == ["`base`", "`standard`"]
