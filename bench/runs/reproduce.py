@@ -14,11 +14,10 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.extensions import extensions_of
 from symsteer.bench.runs.folder import RECORD, is_finished, run_id
 from symsteer.bench.runs.run import check, execute
-from symsteer.bench.runs.stored import read_back
+from symsteer.bench.runs.stored import newer_options, read_back
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.records import (
-    DERIVED,
     FILES,
     PARTS,
     Provenance,
@@ -26,7 +25,6 @@ from symsteer.leaderboard.records import (
     RunRecord,
     dump_reproduction,
     file_hash,
-    flat,
     read_record,
     reproduction_of,
 )
@@ -157,8 +155,7 @@ def conditions(record: RunRecord, config: RunConfig, now: Provenance) -> list[st
         )
     if "cuda" in (config.sim, config.device):
         lines.append("on CUDA sums are not repeatable")
-    known = flat({key: value for key, value in record.config.items() if key not in DERIVED})
-    if newer := sorted(flat(config.to_json()).keys() - known.keys()):
+    if newer := newer_options(config, record.config):
         lines.append(f"options that are newer than the record have defaults: {', '.join(newer)}")
     return lines
 

@@ -22,7 +22,7 @@ from symsteer.bench.runs.trainer import new_agent
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
-from symsteer.leaderboard.records import DERIVED
+from symsteer.leaderboard.records import DERIVED, flat
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path
 
@@ -79,9 +79,16 @@ def stored_config(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
     """Configuration of a run's folder, and the content hashes of the files it started from.
 
     Raises:
-        UserError: if the folder is not a run's, or its configuration is damaged or edited.
+        UserError: if the folder is not a run's, or its configuration is damaged, edited, or of a
+            version with fewer options.
     """
-    config, files = read_back(read_config(folder), folder / CONFIG, folder / RECORD)
+    data = read_config(folder)
+    config, files = read_back(data, folder / CONFIG, folder / RECORD)
+    if newer := newer_options(config, data):
+        raise UserError(
+            f"the run {folder.name} was begun by an older version, without {', '.join(newer)}; "
+            "use that version for it, or start it again with `symsteer run`"
+        )
     if not isinstance(files, dict) or run_id(config, files) != folder.name:
         raise UserError(
             f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or the "
@@ -109,6 +116,11 @@ def read_back(data: Mapping[str, Any], path: Path, record: Path) -> tuple[RunCon
     require_extensions(record)
     own = {key: value for key, value in data.items() if key not in DERIVED}
     return build_config(own, str(path)), data.get("files", {})
+
+
+def newer_options(config: RunConfig, data: Mapping[str, Any]) -> list[str]:
+    """Options that a stored configuration ``data`` lacks; ``config`` has their defaults."""
+    return sorted(flat(config.to_json()).keys() - flat(data).keys())
 
 
 def stored_policy(folder: Path, config: RunConfig) -> ChunkPolicy | None:

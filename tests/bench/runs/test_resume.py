@@ -192,6 +192,14 @@ def test_a_run_of_version_0_1_is_named(begun):
         resume(begun, progress=False)
 
 
+def test_a_run_of_a_version_with_fewer_options_is_named(begun):
+    config = json.loads((begun / "config.json").read_text())
+    del config["policy"]["zero_output"]
+    (begun / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"older version, without policy\.zero_output; use that"):
+        resume(begun, progress=False)
+
+
 def test_what_cannot_be_continued(undisturbed, begun, tmp_path):
     with pytest.raises(UserError, match="finished already"):
         resume(undisturbed, progress=False)
