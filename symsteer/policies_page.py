@@ -50,6 +50,10 @@ MEASURES |= {"solvable": "{:.2f}"}
 DEFAULT = "`edp`"
 """Label of the policy that the others are compared with."""
 
+BEST = "`edp` zero_output"
+"""Label of the policy that the page advises to train: those with several numbers of demonstrations
+are compared with it, too."""
+
 TILTED = "Tilted"
 """Tasks whose names begin so are on a tilted table; their tables are their own."""
 
@@ -66,11 +70,14 @@ PAIRS = (
     ("`plain-augmented` steps 6000", "`edp` steps 6000"),
     ("`canonical`", "`canonical` match_compute False"),
     ("`plain`", "`plain` match_compute False"),
-    ("`edp` zero_output", "`edp`"),
-    ("`edp` zero_output", "`plain-augmented`"),
-    ("`edp` zero_output", "`plain-augmented` zero_output"),
+    (BEST, DEFAULT),
+    (BEST, "`plain-augmented`"),
+    (BEST, "`plain-augmented` zero_output"),
     ("`plain-augmented` zero_output", "`plain-augmented`"),
     ("`so2`", "`so2` zero_output False"),
+    ("`so2`", BEST),
+    ("`spherical`", BEST),
+    ("`spherical` channels 64 depth 3 width 64", BEST),
 )
 """Pairs of labels that tell the effect of the training from that of the policy. By themselves
 plain networks take four gradient steps for each of `steps`; see `match_compute`."""
@@ -148,6 +155,7 @@ def render(
     parts = [
         *successes(base),
         (f"Against {DEFAULT}", gains(base)),
+        (f"Against {BEST}", gains(base, BEST)),
         (f"What they are ({STEERED} demonstrations)", properties(base)),
         (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
@@ -158,6 +166,7 @@ def render(
         ("Variance of the gradient with orbit targets", variances(gradient)),
         *successes(tilted),
         (f"Against {DEFAULT}, on a tilted table", gains(tilted)),
+        (f"Against {BEST}, on a tilted table", gains(tilted, BEST)),
     ]
     return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
 
@@ -202,11 +211,16 @@ def demonstrations(base: Sequence[RunRecord], task: str) -> str:
     return table(["policy", *map(str, counts)], rows)
 
 
-def gains(base: Sequence[RunRecord]) -> str:
-    """Success of each policy beside that of the default one, by number of demonstrations."""
+def gains(base: Sequence[RunRecord], rival: str = DEFAULT) -> str:
+    """Success of each policy minus that of the rival, by number of demonstrations.
+
+    Beside another rival than the default only policies with several numbers are shown.
+    """
     cells = _cells(base, _count)
+    if rival != DEFAULT:
+        cells = {name: found for name, found in cells.items() if len(found) > 1}
     counts = sorted({count for found in cells.values() for count in found})
-    return _against_default(cells, {count: str(count) for count in counts})
+    return _against(rival, cells, {count: str(count) for count in counts})
 
 
 def steered_gains(records: Sequence[RunRecord]) -> str:
@@ -214,15 +228,15 @@ def steered_gains(records: Sequence[RunRecord]) -> str:
     steered = [record for record in records if _count(record) == STEERED]
     cells = _cells(steered, lambda record: record.settings.agent)
     several = {name: found for name, found in cells.items() if len(found) > 1}
-    return _against_default(several, {agent: f"`{agent}`" for agent in _agents(records)})
+    return _against(DEFAULT, several, {agent: f"`{agent}`" for agent in _agents(records)})
 
 
-def _against_default(cells: Cells[Column], columns: Mapping[Column, str]) -> str:
-    """Differences to the runs of the default policy in the same column, whose heads are given."""
-    rivals = cells.get(DEFAULT, {})
+def _against(rival: str, cells: Cells[Column], columns: Mapping[Column, str]) -> str:
+    """Differences to the runs of the rival in the same column, whose heads are given."""
+    rivals = cells.get(rival, {})
     rows = []
     for name, own in cells.items():
-        if name != DEFAULT:
+        if name != rival:
             gained = [gain(own.get(c, ()), rivals.get(c, ())) for c in columns]
             rows.append([name, *map(difference, gained)])
     return table(["policy", *columns.values()], rows) if rows and rivals else ""

@@ -96,6 +96,19 @@ def test_differences_are_paired_by_task_training_and_episode():
     assert page.gains(better) == ""
 
 
+def test_policies_with_several_numbers_of_demonstrations_are_compared_with_the_advised_one():
+    best = [run(5, seed=1, count=n, zero_output=True) for n in (20, 50)]
+    few = run(3, name="plain", seed=1, count=20)
+    many = run(9, name="plain", seed=1, count=50)
+    once = run(9, name="canonical", seed=1, count=50)
+    found = rows(page.gains([*best, few, many, once], page.BEST))
+    assert found["policy"] == ["20", "50"]
+    gained = [page.gain([one], [rival]) for one, rival in zip((few, many), best, strict=True)]
+    assert [one.value for one in gained] == pytest.approx([-0.2, 0.4])
+    assert found["`plain`"] == [difference(one) for one in gained]
+    assert list(found)[2:] == ["`plain`"]
+
+
 def test_properties_are_those_of_the_policies_that_are_steered():
     base = [run(5, seed=s) for s in range(3)] + [run(5, count=5)]
     base[1].base_policy.equivariance_error = 4e-7
