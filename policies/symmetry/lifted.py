@@ -28,7 +28,7 @@ from symsteer.policies.networks.equivariant import (
     RegularLinear,
 )
 from symsteer.policies.networks.points import PointEncoder
-from symsteer.policies.networks.slices import ResidualMLP, TemporalUNet
+from symsteer.policies.networks.slices import FixedResidualMLP, ResidualMLP, TemporalUNet
 from symsteer.policies.networks.times import TIME_FEATURES, time_features
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
 
@@ -124,6 +124,8 @@ class LiftedDenoiser(Denoiser):
             fast.register_module(name, ExpandedLayer(layer, inputs, outputs))
         if self.points is not None:
             fast.points = self.points.expanded()
+        if isinstance(self.slice_network, ResidualMLP):
+            fast.register_module("slice_network", FixedResidualMLP(self.slice_network))
         return fast
 
 

@@ -221,12 +221,14 @@ def test_expanded_layers_equal_the_originals(trained, network, world):
     policy.double()
     try:
         obs = policy.normalized_observation(world.observations(4).double())
-        x = torch.randn(4, policy.horizon, 7, dtype=torch.float64)
+        x = torch.randn(4, policy.horizon, 7, dtype=torch.float64, requires_grad=True)
         fast = policy.denoiser.expanded()
         time = policy.denoiser.encode_time(torch.tensor([7]))
         slow_context = policy.denoiser.encode(obs)
         assert torch.allclose(fast.encode(obs), slow_context, atol=1e-12)
         slow, quick = (net(x, slow_context, time) for net in (policy.denoiser, fast))
+        assert torch.allclose(slow, quick, atol=1e-12)
+        slow, quick = (torch.autograd.grad(out.square().sum(), x)[0] for out in (slow, quick))
         assert torch.allclose(slow, quick, atol=1e-12)
     finally:
         policy.float()
