@@ -83,6 +83,10 @@ PAIRS = (
 plain networks take four gradient steps for each of `steps`; see `match_compute`."""
 
 
+STARTS = ((BEST, DEFAULT), ("`so2`", "`so2` zero_output False"))
+"""The same policies whose output layer starts at 0, and with random weights."""
+
+
 def label(name: str, options: Mapping[str, Any]) -> str:
     """The policy's name and those of its options that are not the default.
 
@@ -156,6 +160,7 @@ def render(
         *successes(base),
         (f"Against {DEFAULT}", gains(base)),
         (f"Against {BEST}", gains(base, BEST)),
+        ("Started at 0, against random first weights", starts(base)),
         (f"What they are ({STEERED} demonstrations)", properties(base)),
         (f"What they cost ({STEERED} demonstrations)", costs(base, decode)),
         ("What agents make of them", steered(records)),
@@ -240,6 +245,18 @@ def _against(rival: str, cells: Cells[Column], columns: Mapping[Column, str]) ->
             gained = [gain(own.get(c, ()), rivals.get(c, ())) for c in columns]
             rows.append([name, *map(difference, gained)])
     return table(["policy", *columns.values()], rows) if rows and rivals else ""
+
+
+def starts(base: Sequence[RunRecord]) -> str:
+    """What the start at 0 gains, by number of demonstrations."""
+    cells = _cells(base, _count)
+    counts = sorted({_count(record) for record in base})
+    rows = [
+        [name, *(difference(gain(cells[name].get(n, ()), cells[rival].get(n, ()))) for n in counts)]
+        for name, rival in STARTS
+        if {name, rival} <= cells.keys()
+    ]
+    return table(["policy", *map(str, counts)], rows) if rows else ""
 
 
 def _count(record: RunRecord) -> int:

@@ -109,6 +109,17 @@ def test_policies_with_several_numbers_of_demonstrations_are_compared_with_the_a
     assert list(found)[2:] == ["`plain`"]
 
 
+def test_the_start_at_0_is_compared_with_random_weights_by_number_of_demonstrations():
+    base = [run(n // 10, seed=1, count=n, zero_output=True) for n in (20, 50, 100)]
+    base += [run(1, seed=1, count=n) for n in (20, 50)]
+    found = rows(page.starts(base))
+    assert found["policy"] == ["20", "50", "100"]
+    gained = [page.gain([own], [other]) for own, other in zip(base[:2], base[3:], strict=True)]
+    assert [one.value for one in gained] == pytest.approx([0.1, 0.4])
+    assert found[page.BEST] == [*map(difference, gained), difference(None)]
+    assert page.starts(base[:3]) == ""
+
+
 def test_properties_are_those_of_the_policies_that_are_steered():
     base = [run(5, seed=s) for s in range(3)] + [run(5, count=5)]
     base[1].base_policy.equivariance_error = 4e-7
