@@ -60,6 +60,9 @@ TILTED = "Tilted"
 STEERED = 50
 """Demonstrations of the policies that agents steer."""
 
+MANY = 100
+"""Demonstrations with which policies are described on tilted tables, where none is steered."""
+
 BEFORE = {"zero_output": False}
 """Options that the first records lack, and what they were."""
 
@@ -81,7 +84,6 @@ PAIRS = (
 )
 """Pairs of labels that tell the effect of the training from that of the policy. By themselves
 plain networks take four gradient steps for each of `steps`; see `match_compute`."""
-
 
 STARTS = ((BEST, DEFAULT), ("`so2`", "`so2` zero_output False"))
 """The same policies whose output layer starts at 0, and with random weights."""
@@ -172,6 +174,7 @@ def render(
         *successes(tilted),
         (f"Against {DEFAULT}, on a tilted table", gains(tilted)),
         (f"Against {BEST}, on a tilted table", gains(tilted, BEST)),
+        (f"What they are, on a tilted table ({MANY} demonstrations)", properties(tilted, MANY)),
     ]
     return "\n\n".join(f"### {title}\n\n{text}" for title, text in parts if text)
 
@@ -263,10 +266,10 @@ def _count(record: RunRecord) -> int:
     return record.settings.demonstrations.count
 
 
-def properties(base: Sequence[RunRecord]) -> str:
+def properties(base: Sequence[RunRecord], count: int = STEERED) -> str:
     """Size, symmetry and steerability of each policy, over tasks and trainings."""
     rows = []
-    for name, found in _trained(base).items():
+    for name, found in _trained(base, count).items():
         policies = [record.base_policy for record in found]
         sizes = _known(policies, "parameters")
         row = [name, str(len(found)), f"{statistics.median(sizes):,.0f}" if sizes else "-"]
@@ -322,10 +325,10 @@ def _seconds(found: Sequence[RunRecord]) -> str:
     return f"{statistics.median(seconds):,.0f}" if seconds else "-"
 
 
-def _trained(base: Sequence[RunRecord]) -> Mapping[str, list[RunRecord]]:
-    """The runs whose policies have as many demonstrations as the steered ones, by label."""
+def _trained(base: Sequence[RunRecord], count: int = STEERED) -> Mapping[str, list[RunRecord]]:
+    """The runs whose policies have so many demonstrations, by label."""
     cells = _cells(base, _count)
-    return {name: found[STEERED] for name, found in cells.items() if STEERED in found}
+    return {name: found[count] for name, found in cells.items() if count in found}
 
 
 def steered(records: Sequence[RunRecord]) -> str:

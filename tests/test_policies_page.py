@@ -259,11 +259,14 @@ def test_rows_stand_in_the_order_of_the_lists_of_policies_and_agents():
 def test_tilted_tasks_have_tables_of_their_own():
     records = [run(3, seed=s) for s in (1, 2)]
     records += [run(4, n, seed=1, task="TiltedPickCube-v1") for n in ("edp", "plain")]
+    records += [run(4, "spherical", seed=1, task="TiltedPickCube-v1", count=page.MANY)]
     text = page.render(records, [], [])
     level, _, tilted = text.partition("### TiltedPickCube-v1: success")
     assert "`plain`" not in level
+    tilted, _, what = tilted.partition("### What they are, on a tilted table")
+    assert list(rows(what.partition("\n\n")[2]))[2:] == ["`spherical`"]
     success, _, against = tilted.partition("### Against `edp`, on a tilted table")
-    assert list(rows(success.strip()))[2:] == ["`edp`", "`plain`"]
+    assert list(rows(success.strip()))[2:] == ["`edp`", "`spherical`", "`plain`"]
     assert rows(against.strip())["`plain`"][0].startswith("0.00\xa0[")
 
 

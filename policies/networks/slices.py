@@ -65,29 +65,29 @@ class FixedResidualMLP(nn.Module):
         self.width = network.width
         blocks = zip(network.norms, network.inner, network.outer, strict=True)
         self.blocks = [[_affine(layer) for layer in block] for block in blocks]
-        self.out_norm = like, _ = _affine(network.out_norm)
-        # Scales of the noise level are relative to 1, shifts to 0.
-        self.rest = torch.cat([torch.ones_like(like), torch.zeros_like(like)])
-        self.rest = self.rest.repeat(len(self.blocks))
+        self.out_norm = _affine(network.out_norm)
+        # A noise level's scales are relative to 1, its shifts to 0.
+        ones = torch.ones_like(network.out_norm.weight)
+        self.neutral = torch.cat([ones, torch.zeros_like(ones)]).repeat(len(self.blocks))
 
     def forward(self, h: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
         width, shape = self.width, h.shape
         seen = context.flatten(0, 1).split(width, dim=-1)
-        level = (time.flatten() + self.rest).split(width)
+        level = (time.flatten() + self.neutral).split(width)
         h = h.reshape(-1, width)
-        for i, (norm, inner, outer) in enumerate(self.blocks):
+        for i, (norm, (inner, inner_bias), (outer, outer_bias)) in enumerate(self.blocks):
             scale, shift = 2 * i, 2 * i + 1
-            u = torch.addmm(inner[1], torch.layer_norm(h, (width,), *norm), inner[0])
+            u = torch.addmm(inner_bias, torch.layer_norm(h, (width,), *norm), inner.t())
             film = torch.addcmul(level[shift], u, level[scale])
             film.add_(seen[shift]).addcmul_(u, seen[scale])
-            h = torch.addmm(outer[1], functional.silu(film, inplace=True), outer[0]).add_(h)
+            h = torch.addmm(outer_bias, functional.silu(film, inplace=True), outer.t()).add_(h)
         h = torch.layer_norm(h, (width,), *self.out_norm)
         return functional.silu(h, inplace=True).view(shape)
 
 
 def _affine(layer: Any) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weight and bias of a layer as its kernel takes them."""
-    return layer.weight.detach().t(), layer.bias.detach()
+    """Weight and bias of a layer, outside of its module."""
+    return layer.weight.detach(), layer.bias.detach()
 
 
 class _TemporalBlock(nn.Module):
