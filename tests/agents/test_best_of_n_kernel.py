@@ -79,8 +79,9 @@ def test_episodes_that_are_left_for_fresh_scenes_are_loose_ends():
 
 def test_the_marginal_likelihood_is_that_of_a_gaussian():
     agent = learned(made(refit=320, points=320), rounds=5)
-    inputs = torch.randn(40, OBS.dim + ACT.dim, dtype=torch.float64)
-    wanted = torch.randn(40, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(4)
+    inputs = torch.randn(40, OBS.dim + ACT.dim, generator=generator, dtype=torch.float64)
+    wanted = torch.randn(40, generator=generator, dtype=torch.float64)
     length, ridge = 0.7, 0.3
     kernel = bk._kernel(inputs / length, agent._orbits(inputs / length))
     covariance = kernel + ridge * torch.eye(40)
@@ -88,7 +89,8 @@ def test_the_marginal_likelihood_is_that_of_a_gaussian():
     density = torch.distributions.MultivariateNormal(torch.zeros(40).double(), best * covariance)
     constant = 0.5 * (1 + math.log(2 * math.pi))
     found = bk._likelihood(kernel, wanted, ridge)
-    assert found == pytest.approx(density.log_prob(wanted).item() / 40 + constant)
+    # The logarithms nearly cancel: a relative tolerance alone is too strict.
+    assert found == pytest.approx(density.log_prob(wanted).item() / 40 + constant, abs=1e-7)
 
 
 def test_only_whole_steps_of_the_last_points_are_used_oldest_first():
