@@ -1,16 +1,16 @@
-"""Main effects of options, where an agent was run in a balanced grid of them."""
+"""Agents that were run in a grid of their options: its settings apart, and main effects."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from symsteer.leaderboard.statistics import Interval, Sample, cell_estimates, combined
-from symsteer.leaderboard.summary import Run, Summary, setting_texts
+from symsteer.leaderboard.summary import Row, Run, Summary, Table, setting_texts
 
 Effect = Literal["success", "magnitude", "diverged"]
 MEASURES: tuple[Effect, ...] = get_args(Effect)
@@ -37,6 +37,21 @@ class MainEffect:
     effect: Interval
     runs: int
     policies: int
+
+
+def by_setting(table: Table) -> list[Table]:
+    """A part of the table for each setting of the options that vary within any of its agents."""
+    options = {id(row): _options(row.runs[0]) for row in table.rows if row.runs}
+    varied = set()
+    for agent in {row.agent for row in table.rows}:
+        own = [options[id(row)] for row in table.rows if row.agent == agent and row.runs]
+        names = {name for texts in own for name in texts}
+        varied |= {name for name in names if len({texts.get(name) for texts in own}) > 1}
+    parts: dict[tuple[str | None, ...], list[Row]] = defaultdict(list)
+    for row in table.rows:
+        if row.runs:
+            parts[tuple(options[id(row)].get(name) for name in sorted(varied))].append(row)
+    return [replace(table, rows=rows) for rows in parts.values()]
 
 
 def main_effects(summary: Summary) -> list[MainEffect]:

@@ -299,6 +299,10 @@ class Row:
     def finished(self) -> list[Run]:
         return [run for run in self.runs if run.finished]
 
+    def standing(self) -> tuple[bool, int]:
+        """How well it stands for its agent: with the usual settings, with more finished runs."""
+        return self.usual, len(self.finished)
+
     @property
     def is_reference(self) -> bool:
         """Whether it is compared with and never ranked."""
@@ -363,10 +367,12 @@ class Table:
     def row_of(self, agent: str) -> Row | None:
         """The agent's row with its usual settings, else that with the most finished runs.
 
-        None if the agent finished none.
+        None if the agent finished none, or if no row has more of them than all others.
         """
         rows = [row for row in self.rows if row.agent == agent and row.finished]
-        return max(rows, key=lambda row: (row.usual, len(row.finished)), default=None)
+        rows.sort(key=Row.standing, reverse=True)
+        tie = len(rows) > 1 and rows[0].standing() == rows[1].standing()
+        return None if tie or not rows else rows[0]
 
     @property
     def runs(self) -> list[Run]:
