@@ -17,7 +17,7 @@ from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
 from symsteer.leaderboard.soundness import MAX_BIAS, MAX_FALL, MIN_CORRELATION, soundness
 from symsteer.leaderboard.statistics import Spread
 from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary, Table
-from symsteer.leaderboard.tables import Links, cell_name, section, status
+from symsteer.leaderboard.tables import Links, cell_name, heading, section, status
 from symsteer.leaderboard.text import (
     MARKS,
     NOTHING,
@@ -139,7 +139,12 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
         places.setdefault((table.key.task, table.key.embodiment), []).append(table)
     for place, tables in places.items():
         drawn = [image(*figure) for figure in figures.get(place, {}).values()]
-        blocks = [block for table in tables for block in section(table, links)]
+        keys = [table.key for table in tables]
+        blocks = [
+            block
+            for table in tables
+            for block in (f"### {heading(table.key, keys)}", *section(table, links))
+        ]
         simple = all(re.fullmatch(r"[A-Za-z0-9][\w.-]{,60}", word, re.ASCII) for word in place)
         # A name that a record may have, and no task, is shown as code below the title.
         title = ", ".join(place) if simple else "Other cells"
@@ -177,7 +182,8 @@ def _effects_table(found: Sequence[MainEffect]) -> str:
 
 def seed_notice(summary: Summary) -> str:
     """A quotation in markdown that says who is not ranked; empty where all are."""
-    ranked = [row for table in summary.tables for row in table.rows if row.role == "learner"]
+    rows = [row for table in summary.tables for row in table.rows if row.runs]
+    ranked = [row for row in rows if row.role == "learner"]
     few = [row for row in ranked if len(row.finished) < MIN_SEEDS]
     if not few:
         return ""
@@ -209,7 +215,7 @@ def at_a_glance(table: Table, agent: str) -> list[Row]:
 
 def _glance(row: Row) -> str:
     if row.success is None:
-        return status(row)
+        return status(row) if row.runs else NOTHING
     mark = MARKS[row.difference.sign] if row.difference else ""
     dagger = " \u2020" if any(row.diverged) else ""
     return f"{number(row.success.value)}{mark}{dagger}".replace(" ", SPACE)

@@ -48,12 +48,22 @@ def cell_name(table: Table, summary: Summary) -> str:
     return name
 
 
-def section(table: Table, links: Links) -> list[str]:
-    """Heading, both tables and notes of one table, as blocks of markdown."""
-    key = table.key
+def heading(key: Key, others: Sequence[Key]) -> str:
+    """What breaks the symmetry, and how the table differs from others of its place and break."""
     broken = broken_by(key)
-    heading = f"Broken by {broken}" if broken else "Unbroken symmetry"
-    parts = [f"### {heading}", _base_line(table)]
+    words = [f"Broken by {broken}" if broken else "Unbroken symmetry"]
+    same = [other for other in others if (other.place, other.variant) == (key.place, key.variant)]
+    if len({other.demonstrations for other in same}) > 1:
+        words.append(f"{key.demonstrations} demonstrations")
+    if len({other.env_steps for other in same}) > 1:
+        words.append(f"{count(key.env_steps)} steps")
+    return ", ".join(words)
+
+
+def section(table: Table, links: Links) -> list[str]:
+    """Both tables and notes of one table, as blocks of markdown."""
+    key = table.key
+    parts = [_base_line(table)]
     header = [
         "Agent",
         "Success (final window)",
@@ -64,13 +74,14 @@ def section(table: Table, links: Links) -> list[str]:
         "Seeds \u00d7 episodes",
     ]
     # Where all runs have ended as they should, their status is no news.
-    shows_status = any(status(row) != f"{len(row.runs)}{SPACE}finished" for row in table.rows)
+    there = [row for row in table.rows if row.runs]
+    shows_status = any(status(row) != f"{len(row.runs)}{SPACE}finished" for row in there)
     if shows_status:
         header.append("Status")
     if table.is_ranked:
         header.insert(0, "Rank")
     rows = []
-    for row in sorted(table.rows, key=_place):
+    for row in sorted(there, key=_place):
         cells = [
             code(row.label),
             stacked(row.success),
@@ -83,6 +94,8 @@ def section(table: Table, links: Links) -> list[str]:
         ]
         rows.append([_rank(row, table), *cells] if table.is_ranked else cells)
     parts.append(grid(header, rows, left=2 if table.is_ranked else 1))
+    if absent := [code(row.agent) for row in table.rows if not row.runs]:
+        parts.append(f"Not run here: {', '.join(absent)}.")
     parts += [*_against_best(table), *_plateau(table), *_diagnostics(table)]
     if notes := _notes(table):
         parts.append("\n".join(f"- {note}" for note in notes))

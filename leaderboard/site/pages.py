@@ -229,8 +229,6 @@ def cell(board: Board, table: Table, before: Table | None, after: Table | None) 
     """One task, embodiment and variant: curves, Q, equivariance, all tables."""
     key = table.key
     links = {run.path: f"../{board.run(run)}" for run in table.runs}
-    # Without its heading: the page has its own.
-    blocks = section(table, links)[1:]
     defect = defect_of(key, board.audit)
     picture = board.docs.task_picture(key.task) if board.docs.built else None
     return {
@@ -240,7 +238,7 @@ def cell(board: Board, table: Table, before: Table | None, after: Table | None) 
         "dials": [(name, f"../{board.variant(name)}") for name in dials(key.variant)],
         "defect": f"{_defect(defect.interval)}, {defect.part}" if defect else "not audited",
         "budget": count(key.env_steps),
-        "tables": markup.html(blocks, _same),
+        "tables": markup.html(section(table, links), _same),
         "success": charts.success_chart(table),
         "q": charts.q_chart(table),
         "equivariance": charts.equivariance_chart(table),

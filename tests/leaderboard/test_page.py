@@ -130,6 +130,36 @@ def test_the_main_table_ranks_with_ties_and_never_references(board: Path) -> Non
     assert shown["`equivariant`"][7].startswith("5 \u00d7 100<br>")
 
 
+def test_headings_tell_apart_budgets_and_demonstrations_of_one_break() -> None:
+    few = {"mode": "diverse", "count": 5, "seed": 0}
+    rates = {"base": 0.3, "standard": 0.5}
+    records = make_cell(rates) + make_cell(rates, demonstrations=few)
+    records += make_cell(rates, variant="wind:1") + make_cell(
+        rates, variant="wind:1", env_steps=100_000
+    )
+    headings = re.findall(r"^### (.*)$", page_of(records).replace("\u00a0", " "), re.MULTILINE)
+    assert headings[-4:] == [
+        "Unbroken symmetry, 5 demonstrations",
+        "Unbroken symmetry, 50 demonstrations",
+        "Broken by `wind:1`, 50 k steps",
+        "Broken by `wind:1`, 100 k steps",
+    ]
+
+
+def test_agents_that_a_cell_does_not_have_are_named_below_its_table() -> None:
+    records = make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.5})
+    records += make_cell({"base": 0.3, "standard": 0.5}, variant="wind:1")
+    text = page_of(records)
+    assert "Not ranked" not in text
+    assert text.count("Not run here: `equivariant`.") == 1
+    _, _, *rows = table_after(text, "### Broken by")
+    assert [row[0] for row in rows] == ["`base`", "`standard`"]
+    (few,) = make_cell({"equivariant": 0.5}, seeds=1, variant="wind:1")
+    text = page_of([*records, few])
+    assert "Not every agent here has the 5 finished seeds" in text
+    assert "1\u00a0finished, 4\u00a0missing" in text
+
+
 def test_learners_are_held_against_the_best_reference(board: Path) -> None:
     text = text_of(board)
     assert "Best reference: `golden-ticket`, 0.45. Against it: `equivariant` +0.35 [" in text
