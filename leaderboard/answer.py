@@ -6,7 +6,6 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 from symsteer.leaderboard.defects import MEASURES, advantage, dial_of, parts_of
-from symsteer.leaderboard.factors import by_setting
 from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
 from symsteer.leaderboard.statistics import Interval, cell_estimates, combined
 from symsteer.leaderboard.summary import MIN_SEEDS, SYMMETRIC_EMBODIMENT, Key, Summary, Table
@@ -45,13 +44,7 @@ def gains(summary: Summary) -> list[Gain]:
     for kind, tables in kinds(summary).items():
         for agent in AGENTS:
             for measure in MEASURES:
-                cells = [
-                    pairs
-                    for table in tables
-                    # Where no setting is the usual one, all count.
-                    for part in ([table] if table.row_of(STANDARD) else by_setting(table))
-                    if (pairs := advantage(part, agent, STANDARD, measure))
-                ]
+                cells = [pairs for t in tables if (pairs := advantage(t, agent, STANDARD, measure))]
                 enough = [pairs for pairs in cells if len(pairs) >= MIN_SEEDS]
                 if used := enough or cells:
                     drawn = combined(cell_estimates([list(pairs.values()) for pairs in used]))

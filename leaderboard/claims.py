@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from symsteer.leaderboard.defects import Audit, Point, advantage, defect_of, fit, parts_of
-from symsteer.leaderboard.factors import by_setting
 from symsteer.leaderboard.paper import ROW_ORDER
 from symsteer.leaderboard.statistics import (
     CONFIDENCE,
@@ -135,8 +134,6 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> Outcome:
         if cells is None:
             continue
         tables, reason = selected(cells, summary.tables, audit)
-        if claim.settings == "each":
-            tables = [part for table in tables for part in by_setting(table)]
         used = [(table, pairs) for table in tables if (pairs := paired(table, claim))]
         reason = reason or ("" if used else _without_pairs(tables, claim, cells))
         if reason:
@@ -240,11 +237,8 @@ def _without_pairs(tables: Sequence[Table], claim: Claim, cells: Cells) -> str:
     """Why no runs of the two agents can be compared."""
     place = "" if cells == Cells() else f" in {where(cells)}"
     for agent in claim.agents:
-        rows = [row for table in tables for row in table.rows if row.agent == agent]
-        if not any(row.runs for row in rows):
+        if not any(row.agent == agent and row.runs for table in tables for row in table.rows):
             return f"no runs of {code(agent)}" + place
-        if any(row.finished for row in rows) and not any(t.row_of(agent) for t in tables):
-            return f"no settings of {code(agent)} are the usual ones{place}"
     if claim.measure == "bias":
         return "not measured over all decisions"
     return f"no runs of both agents with the same seed on the same base policy{place}"
@@ -264,7 +258,7 @@ def paired(table: Table, claim: Claim) -> dict[Pair, Sample]:
 
 def _values(table: Table, agent: str, measure: str) -> dict[Pair, float]:
     """A number for each run of an agent that has it; of several recipes, of the usual one, or of
-    that with most runs; none if several have as many."""
+    that with most runs."""
 
     def of(run: Run) -> float | None:
         if measure == "diverged":
@@ -283,9 +277,7 @@ def _values(table: Table, agent: str, measure: str) -> dict[Pair, float]:
         for row in rows
         if (values := {r.pair: float(v) for r in row.runs if (v := of(r)) is not None})
     ]
-    found.sort(key=lambda each: each[:2], reverse=True)
-    tie = len(found) > 1 and found[0][:2] == found[1][:2]
-    return {} if tie or not found else found[0][2]
+    return max(found, key=lambda each: each[:2], default=(False, 0, {}))[2]
 
 
 def _shares(cells: Used, claim: Claim, drawn: Estimate) -> tuple[Effect | None, str]:

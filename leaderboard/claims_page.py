@@ -101,8 +101,6 @@ def _verdict(outcome: Outcome) -> str:
 def _test(claim: Claim) -> str:
     first, second = map(code, claim.agents)
     text = f"{MEASURE_WORDS[claim.measure]}, {first} minus {second}, {where(claim.cells)}"
-    if claim.settings == "each":
-        text += ", each setting"
     if claim.minus is not None:
         text += f" minus the same in {where(claim.minus)}"
     return f"slope of {text}" if claim.effect == "slope" else text

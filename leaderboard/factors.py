@@ -1,8 +1,8 @@
-"""Agents that were run in a grid of their options: its settings apart, and main effects."""
+"""Main effects of options, where an agent was run in a balanced grid of them."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -10,12 +10,10 @@ from typing import Literal, get_args
 import numpy as np
 
 from symsteer.leaderboard.statistics import Interval, Sample, cell_estimates, combined
-from symsteer.leaderboard.summary import Row, Run, Summary, Table, setting_texts
+from symsteer.leaderboard.summary import Key, Run, Summary, agent_options, is_balanced
 
 Effect = Literal["success", "magnitude", "diverged"]
 MEASURES: tuple[Effect, ...] = get_args(Effect)
-
-PREFIX = "agent_options."
 
 
 @dataclass(frozen=True)
@@ -39,21 +37,6 @@ class MainEffect:
     policies: int
 
 
-def by_setting(table: Table) -> list[Table]:
-    """A part of the table for each setting of the options that vary within any of its agents."""
-    options = {id(row): _options(row.runs[0]) for row in table.rows if row.runs}
-    varied = set()
-    for agent in {row.agent for row in table.rows}:
-        own = [options[id(row)] for row in table.rows if row.agent == agent and row.runs]
-        names = {name for texts in own for name in texts}
-        varied |= {name for name in names if len({texts.get(name) for texts in own}) > 1}
-    parts: dict[tuple[str | None, ...], list[Row]] = defaultdict(list)
-    for row in table.rows:
-        if row.runs:
-            parts[tuple(options[id(row)].get(name) for name in sorted(varied))].append(row)
-    return [replace(table, rows=rows) for rows in parts.values()]
-
-
 def main_effects(summary: Summary) -> list[MainEffect]:
     """By agent, option and measure; only of base policies for which the grid is balanced.
 
@@ -62,11 +45,12 @@ def main_effects(summary: Summary) -> list[MainEffect]:
     """
     found = []
     for agent in summary.agents:
-        cells = [
-            runs
-            for table in summary.tables
-            if (runs := [r for row in table.rows if row.agent == agent for r in row.runs])
-        ]
+        # The settings of a grid are tables of their own; here they belong together.
+        worlds: dict[Key, list[Run]] = defaultdict(list)
+        for table in summary.tables:
+            runs = [run for row in table.rows if row.agent == agent for run in row.runs]
+            worlds[replace(table.key, settings="")] += runs
+        cells = [runs for runs in worlds.values() if runs]
         options = _varied([run for runs in cells for run in runs])
         if len(options) < 2:
             continue
@@ -82,7 +66,7 @@ def _varied(runs: Sequence[Run]) -> dict[str, tuple[str, str]]:
     """Options of the agent with two values, in order."""
     values: dict[str, set[str]] = {}
     for run in runs:
-        for name, text in _options(run).items():
+        for name, text in agent_options(run.record.config).items():
             values.setdefault(name, set()).add(text)
     return {name: _ordered(texts) for name, texts in values.items() if len(texts) == 2}
 
@@ -98,11 +82,6 @@ def _ordered(texts: set[str]) -> tuple[str, str]:
     return first, second
 
 
-def _options(run: Run) -> dict[str, str]:
-    texts = setting_texts(run.record.config)
-    return {k.removeprefix(PREFIX): text for k, text in texts.items() if k.startswith(PREFIX)}
-
-
 def _effect(
     cells: Sequence[Sequence[Run]],
     options: dict[str, tuple[str, str]],
@@ -115,11 +94,11 @@ def _effect(
         own = []
         for policy in dict.fromkeys(run.policy for run in runs):
             measured = [
-                (_options(run), value)
+                (agent_options(run.record.config), value)
                 for run in runs
                 if run.policy == policy and (value := _of(run, measure)) is not None
             ]
-            if not _is_balanced([settings for settings, _ in measured], options):
+            if not is_balanced([settings for settings, _ in measured], options):
                 continue
             low, high = (
                 np.mean([v for settings, v in measured if settings.get(option) == level])
@@ -142,13 +121,3 @@ def _of(run: Run, measure: Effect) -> float | None:
     if measure == "diverged":
         return None if run.diverged is None else float(run.diverged)
     return run.record.divergence.magnitude if run.record.divergence else None
-
-
-def _is_balanced(settings: Sequence[dict[str, str]], options: dict[str, tuple[str, str]]) -> bool:
-    names = list(options)
-    for index, first in enumerate(names):
-        for second in names[index + 1 :]:
-            pairs = Counter((s.get(first), s.get(second)) for s in settings)
-            if len(pairs) != 4 or len(set(pairs.values())) != 1:
-                return False
-    return bool(settings)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,8 @@ PARTS = {
 FIT = "#444444"
 
 COLUMNS = 3
+TITLE_WIDTH = 36
+"""Characters of a panel's title."""
 WIDEST = 13.3
 """Characters of a line of the legend, per inch."""
 HANDLE = 7
@@ -508,7 +511,9 @@ def _title(table: Table, tables: Sequence[Table]) -> str:
         parts.append(f"{key.base} {key.group}".strip())
     if len({(other.mode, other.demonstrations) for other in keys}) > 1:
         parts.append(f"{key.demonstrations} {key.mode} demonstrations")
-    return plain(", ".join(parts), 60)
+    if len({other.env_steps for other in keys}) > 1:
+        parts.append(f"{key.env_steps:,} steps")
+    return "\n".join([plain(", ".join(parts), 60), *wrap(plain(key.settings, 90), TITLE_WIDTH)])
 
 
 def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int = 7) -> None:

@@ -64,8 +64,6 @@ class Claim(_Table):
     measure: Measure
     agents: tuple[str, str]
     """The effect is the first one's measure minus the second one's."""
-    settings: Literal["usual", "each"] = "usual"
-    """Of agents that were run with several: `each` makes a cell of each that both have."""
     effect: Literal["difference", "slope"] = "difference"
     """`slope`: change of the difference with the defect, per 0.1, within each base policy."""
     cells: Cells = Cells()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
@@ -71,6 +71,9 @@ CELL = frozenset({"task", "embodiment", "variant", "evaluation_variant", "env_st
 
 MACHINE = frozenset({"device", "threads", "torch_threads", "workers", "progress", "out"})
 """Configuration keys, at any depth, that may differ between runs of one row, as seeds may."""
+
+OPTIONS = "agent_options."
+"""What the configuration keys of an agent's options begin with."""
 
 
 Pair = tuple[str, int]
@@ -238,6 +241,8 @@ class Key:
     mode: str
     demonstrations: int
     env_steps: int
+    settings: str = ""
+    """Where learners share a grid of options (`grid_of`), their values: ``tau 0.05, utd 4.0``."""
 
     @property
     def variant(self) -> str:
@@ -258,8 +263,10 @@ class Key:
         return arm if self.variant == "none" else (*arm, self.variant)
 
     @classmethod
-    def of(cls, record: RunRecord) -> Key:
+    def of(cls, record: RunRecord, grid: Sequence[str] = ()) -> Key:
+        """The key of a run's table, where `grid` are the options of a grid."""
         settings, policy = record.settings, record.base_policy
+        options = agent_options(record.config)
         return cls(
             settings.task,
             settings.embodiment,
@@ -269,6 +276,7 @@ class Key:
             settings.demonstrations.mode,
             settings.demonstrations.count,
             settings.env_steps,
+            ", ".join(f"{name} {options[name]}" for name in grid if name in options),
         )
 
 
@@ -298,10 +306,6 @@ class Row:
     @property
     def finished(self) -> list[Run]:
         return [run for run in self.runs if run.finished]
-
-    def standing(self) -> tuple[bool, int]:
-        """How well it stands for its agent: with the usual settings, with more finished runs."""
-        return self.usual, len(self.finished)
 
     @property
     def is_reference(self) -> bool:
@@ -367,12 +371,10 @@ class Table:
     def row_of(self, agent: str) -> Row | None:
         """The agent's row with its usual settings, else that with the most finished runs.
 
-        None if the agent finished none, or if no row has more of them than all others.
+        None if the agent finished none.
         """
         rows = [row for row in self.rows if row.agent == agent and row.finished]
-        rows.sort(key=Row.standing, reverse=True)
-        tie = len(rows) > 1 and rows[0].standing() == rows[1].standing()
-        return None if tie or not rows else rows[0]
+        return max(rows, key=lambda row: (row.usual, len(row.finished)), default=None)
 
     @property
     def runs(self) -> list[Run]:
@@ -515,14 +517,52 @@ def summarize(runs: Sequence[Run]) -> Summary:
 def grouped(runs: Sequence[Run]) -> tuple[list[Table], list[Run]]:
     """Tables whose rows have runs and names but no numbers yet, and the runs that are set aside."""
     chosen, set_aside = _one_per_cell(runs)
+    grid = grid_of(chosen)
     tables: dict[Key, dict[tuple[str, str], list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in chosen:
-        tables[Key.of(run.record)][run.agent, recipe_of(run.record.config)].append(run)
+        tables[Key.of(run.record, grid)][run.agent, recipe_of(run.record.config)].append(run)
     # An agent has one role: that of its newest run.
     by_age = sorted(chosen, key=lambda run: (run.record.started, run.record.run_id))
     roles = {run.agent: run.record.role for run in by_age}
     usual = _usual_settings(chosen)
     return [_table(key, rows, roles, usual) for key, rows in sorted(tables.items())], set_aside
+
+
+def grid_of(runs: Iterable[Run]) -> tuple[str, ...]:
+    """The options of a balanced grid, if two or more learners were all run in the same one.
+
+    At least two options must vary. Balanced: every pair of values of two of them occurs in equally
+    many of the grid's settings, as in full grids and in fractions of a resolution of III or more.
+    """
+    options: dict[str, list[dict[str, str]]] = defaultdict(list)
+    for run in runs:
+        if not run.is_reference:
+            options[run.agent].append(agent_options(run.record.config))
+    grids = set()
+    for own in options.values():
+        names = sorted({name for texts in own for name in texts})
+        varied = [name for name in names if len({texts.get(name) for texts in own}) > 1]
+        settings = {tuple(texts.get(name, "unset") for name in varied) for texts in own}
+        grids.add((tuple(varied), frozenset(settings)))
+    if len(options) < 2 or len(grids) != 1:
+        return ()
+    ((shared, found),) = grids
+    points = [dict(zip(shared, values, strict=True)) for values in found]
+    levels = {name: {point[name] for point in points} for name in shared}
+    return shared if len(shared) > 1 and is_balanced(points, levels) else ()
+
+
+def is_balanced(
+    settings: Sequence[Mapping[str, str]], options: Mapping[str, Collection[str]]
+) -> bool:
+    """Whether every pair of values of two options occurs, and all equally often."""
+    for first, second in combinations(options, 2):
+        pairs = Counter((each.get(first), each.get(second)) for each in settings)
+        if len(pairs) != len(options[first]) * len(options[second]):
+            return False
+        if len(set(pairs.values())) != 1:
+            return False
+    return bool(settings)
 
 
 def _usual_settings(runs: Iterable[Run]) -> dict[str, dict[str, str]]:
@@ -634,10 +674,16 @@ def _label(twins: Sequence[Row], common: Mapping[str, str] | None) -> None:
 def _settings(config: Mapping[str, Any]) -> dict[str, str]:
     """The settings that define a row as texts; those of the agent without a prefix."""
     return {
-        key.removeprefix("agent_options."): value
+        key.removeprefix(OPTIONS): value
         for key, value in setting_texts(config).items()
         if not any(part in CELL or _is_seed(part) for part in key.split("."))
     }
+
+
+def agent_options(config: Mapping[str, Any]) -> dict[str, str]:
+    """The options of the agent as texts."""
+    texts = setting_texts(config)
+    return {k.removeprefix(OPTIONS): text for k, text in texts.items() if k.startswith(OPTIONS)}
 
 
 def setting_texts(config: Mapping[str, Any]) -> dict[str, str]:

@@ -45,6 +45,8 @@ def cell_name(table: Table, summary: Summary) -> str:
         name += f" {code(f'{key.demonstrations} {key.mode}')}"
     if len({other.env_steps for other in keys}) > 1:
         name += f" {count(key.env_steps)}"
+    if key.settings:
+        name += f" {code(key.settings)}"
     return name
 
 
@@ -57,6 +59,8 @@ def heading(key: Key, others: Sequence[Key]) -> str:
         words.append(f"{key.demonstrations} demonstrations")
     if len({other.env_steps for other in same}) > 1:
         words.append(f"{count(key.env_steps)} steps")
+    if key.settings:
+        words.append(code(key.settings))
     return ", ".join(words)
 
 
@@ -326,8 +330,10 @@ REPRODUCTION_COLUMNS: dict[str, Verdict] = {
 def render_csv(summary: Summary) -> str:
     """One line a row of the tables, full precision (6 significant digits), empty where unknown."""
     rows = [_csv_row(table, row) for table in summary.tables for row in table.rows]
-    if not summary.has_reproductions:
-        rows = [{k: v for k, v in row.items() if k not in REPRODUCTION_COLUMNS} for row in rows]
+    left_out = set() if summary.has_reproductions else set(REPRODUCTION_COLUMNS)
+    if not any(table.key.settings for table in summary.tables):
+        left_out.add("settings")
+    rows = [{k: v for k, v in row.items() if k not in left_out} for row in rows]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(rows[0])
@@ -349,6 +355,7 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
         "demonstration_mode": key.mode,
         "demonstrations": key.demonstrations,
         "env_steps": key.env_steps,
+        "settings": key.settings,
         "agent": row.agent,
         "recipe": row.recipe[:12],
         "rank": row.rank,

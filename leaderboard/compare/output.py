@@ -109,6 +109,7 @@ def cell_names(cells: Sequence[Cell]) -> list[tuple[str, str]]:
             parts.append(f"{key.demonstrations} {key.mode} demonstrations")
         if len({other.env_steps for other in keys}) > 1:
             parts.append(f"{key.env_steps:,} steps")
+        parts.append(key.settings)
         names.append((f"{key.task} {key.embodiment}", " ".join(part for part in parts if part)))
     return names
 

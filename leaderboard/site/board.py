@@ -108,7 +108,8 @@ class Board:
         """Address of a cell's page."""
         words = (key.task, key.embodiment, key.variant, key.base, key.group, key.mode)
         numbers = (str(key.demonstrations), str(key.env_steps))
-        return f"cells/{slug(*words, *numbers, digits=DIGITS)}.html"
+        grid = (key.settings,) if key.settings else ()
+        return f"cells/{slug(*words, *numbers, *grid, digits=DIGITS)}.html"
 
     def agent(self, name: str) -> str:
         """Address of an agent's page."""

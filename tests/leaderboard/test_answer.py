@@ -59,18 +59,6 @@ def test_gains_are_means_over_cells_with_enough_runs() -> None:
     assert gains(summary_of(make_cell({"standard": 0.5}, 5))) == []
 
 
-def test_gains_of_a_grid_are_means_over_its_settings() -> None:
-    records = [
-        record
-        for tau, rate in ((0.005, 0.6), (0.05, 0.9))
-        for record in make_cell(RATES | {"equivariant": rate}, agent_options={"tau": tau})
-    ]
-    found = {(g.agent, g.measure): g for g in gains(summary_of(records))}
-    strict = found["equivariant", "success"]
-    assert strict.effect.value == pytest.approx(0.25)
-    assert (strict.cells, strict.pairs) == (2, 10)
-
-
 def test_every_record_has_a_line() -> None:
     records = make_cell(RATES, 2, variant="wind:1") + make_cell({"=HYPERLINK(1)": 0.5}, 1)
     summary = summary_of(records)

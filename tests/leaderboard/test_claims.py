@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -125,7 +126,6 @@ def test_of_several_settings_the_usual_ones_stand_for_an_agent() -> None:
     assert stands(row(False, True, 3), row(True, False, 2)) == {("p", 0): 0.0, ("p", 1): 0.0}
     assert stands(row(False, True, 2), row(False, False, 1)) == {("p", 0): 1.0, ("p", 1): 1.0}
     assert stands(row(True, True, 2, "other")) == {}
-    assert stands(row(False, True, 2), row(False, False, 2)) == {}
 
 
 def test_each_setting_of_a_grid_is_a_cell() -> None:
@@ -133,33 +133,32 @@ def test_each_setting_of_a_grid_is_a_cell() -> None:
         return [
             record
             for tau, cell in rates.items()
-            for record in make_cell(cell, agent_options={"tau": tau})
+            for utd in (1.0, 4.0)
+            for record in make_cell(cell, agent_options={"tau": tau, "utd": utd})
         ]
 
     rates = {
         0.005: {"standard": 0.5, "equivariant": 0.7},
         0.05: {"standard": 0.5, "equivariant": 0.9},
     }
-    usual, each = claim_of(), claim_of(settings="each")
-    found = outcomes(grid(rates), usual, each)
-    assert found[0].reason == "no settings of `equivariant` are the usual ones"
-    assert (found[1].cells, found[1].pairs, found[1].verdict) == (2, 10, "supported")
-    assert value(found[1]) == pytest.approx(0.3)
-    # A setting that one of them lacks is no pair.
-    del rates[0.05]["standard"]
-    (found_one,) = outcomes(grid(rates), each)
-    assert (found_one.cells, value(found_one)) == (1, pytest.approx(0.2))
+    (found,) = outcomes(grid(rates), claim_of())
+    assert (found.cells, found.pairs, found.verdict) == (4, 20, "supported")
+    assert value(found) == pytest.approx(0.3)
 
 
 def test_divergence_counts_runs_over_the_settings_of_a_grid() -> None:
     records = [
         record
-        for tau, seeds in ((0.005, []), (0.05, range(5)))
-        for agent, own in (("standard", seeds), ("equivariant", []))
-        for record in diverging(agent, own, agent_options={"tau": tau})
+        for tau, utd in product((0.005, 0.05), (1.0, 4.0))
+        for agent in DIVERGED.agents
+        for record in diverging(
+            agent,
+            range(5) if agent == "standard" and tau > 0.01 else [],
+            agent_options={"tau": tau, "utd": utd},
+        )
     ]
-    (found,) = outcomes(records, claim_of("diverged", **AGAINST, settings="each"))
-    assert (found.counts, value(found)) == ("5/10 against 0/10 diverged", 0.5)
+    (found,) = outcomes(records, DIVERGED)
+    assert (found.counts, value(found)) == ("10/20 against 0/20 diverged", 0.5)
 
 
 def test_verdicts_are_corrected_within_a_family() -> None:
@@ -263,8 +262,7 @@ def diverging(
     return records
 
 
-AGAINST: dict[str, Any] = {"agents": ["standard", "equivariant"]}
-DIVERGED = claim_of("diverged", **AGAINST)
+DIVERGED = claim_of("diverged", agents=["standard", "equivariant"])
 
 
 def test_divergence_counts_runs() -> None:

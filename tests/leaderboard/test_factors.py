@@ -1,6 +1,7 @@
 """Main effects of options: a fractional design, what is unbalanced, what does not vary."""
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,13 @@ from tests.leaderboard.record_factory import make_cell
 
 def effects(records: list[RunRecord]) -> dict[tuple[str, str], MainEffect]:
     summary = summarize([Run(Path(f"{i}.json"), record) for i, record in enumerate(records)])
-    return {(one.option, one.measure): one for one in main_effects(summary)}
+    found = main_effects(summary)
+    return {(one.option, one.measure): one for one in found if one.agent == "standard"}
 
 
-def design(seeds: int = 5, skip: int | None = None) -> list[RunRecord]:
+def design(
+    seeds: int = 5, skip: int | None = None, agents: Sequence[str] = ("standard",)
+) -> list[RunRecord]:
     """Half of the grid of four options: success 0.5, +0.2 with LayerNorm, -0.1 with 4 updates."""
     records = []
     for index, (utd, norm, tau) in enumerate(itertools.product((0, 1), repeat=3)):
@@ -31,12 +35,15 @@ def design(seeds: int = 5, skip: int | None = None) -> list[RunRecord]:
         }
         rate = 0.5 + 0.2 * norm - 0.1 * utd
         for variant in ("none", "wind:1"):
-            records += make_cell({"standard": rate}, seeds, variant=variant, agent_options=options)
+            cell = dict.fromkeys(agents, rate)
+            records += make_cell(cell, seeds, variant=variant, agent_options=options)
     return records
 
 
-def test_a_fraction_of_the_grid_gives_the_main_effects() -> None:
-    found = effects(design())
+@pytest.mark.parametrize("agents", [("standard",), ("standard", "equivariant")])
+def test_a_fraction_of_the_grid_gives_the_main_effects(agents: Sequence[str]) -> None:
+    """Whether its settings are rows of one table, or tables that two learners share."""
+    found = effects(design(agents=agents))
     assert {option for option, _ in found} == {"utd", "layer_norm", "tau", "soft_backup"}
     norm = found["layer_norm", "success"]
     assert norm.effect.value == pytest.approx(0.2)
@@ -52,6 +59,11 @@ def test_a_fraction_of_the_grid_gives_the_main_effects() -> None:
 def test_what_is_not_balanced_is_no_design() -> None:
     assert not effects(design(skip=3))
     assert not effects(make_cell({"standard": 0.5}, agent_options={"tau": 0.1}))
+    # One option at a time: each policy has all values of one option only.
+    records = []
+    for options in ({"tau": 0.1, "utd": 1.0}, {"tau": 0.2, "utd": 1.0}, {"tau": 0.1, "utd": 4.0}):
+        records += make_cell({"standard": 0.5}, agent_options=options)
+    assert not effects(records)
     two = [0.1, 0.2]
     assert not effects(
         [r for tau in two for r in make_cell({"standard": 0.5}, agent_options={"tau": tau})]

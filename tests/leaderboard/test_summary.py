@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import random
 import re
+from collections.abc import Sequence
 from datetime import timedelta
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,13 @@ from symsteer.leaderboard.summary import (
     success_pairs,
     summarize,
 )
-from tests.leaderboard.record_factory import START, make_curve, make_evaluation, make_record
+from tests.leaderboard.record_factory import (
+    START,
+    make_cell,
+    make_curve,
+    make_evaluation,
+    make_record,
+)
 
 
 def run(record: RunRecord, name: str = "") -> Run:
@@ -438,3 +446,37 @@ def test_nothing_to_read_is_one_sentence(tmp_path: Path) -> None:
         load_runs([tmp_path / "nowhere"])
     with pytest.raises(UserError, match="holds no record"):
         load_runs([tmp_path])
+
+
+def test_each_setting_of_a_grid_that_learners_share_is_a_table() -> None:
+    both = ["standard", "equivariant"]
+
+    def grid(*settings: tuple[float, float], agents: Sequence[str] = both) -> list[Any]:
+        records = [
+            record
+            for tau, utd in settings
+            for record in make_cell(
+                dict.fromkeys(agents, 0.5), 1, agent_options={"tau": tau, "utd": utd, "width": 8}
+            )
+        ]
+        found = summarize([run(r) for r in [*records, *make_cell({"base": 0.3}, 1)]])
+        return [(t.key.settings, [r.label for r in t.rows if r.runs]) for t in found.tables]
+
+    full = list(product((0.005, 0.05), (1.0, 4.0)))
+    assert grid(*full) == [
+        ("", ["base"]),
+        ("tau 0.005, utd 1.0", both),
+        ("tau 0.005, utd 4.0", both),
+        ("tau 0.05, utd 1.0", both),
+        ("tau 0.05, utd 4.0", both),
+    ]
+    # One learner, one option at a time, one option alone: rows of one table.
+    assert len(grid(*full, agents=["standard"])) == 1
+    assert len(grid(*full[:3])) == 1
+    assert len(grid(*full[:2])) == 1
+    # Learners that do not share it.
+    records = make_cell({"standard": 0.5}, 1, agent_options={"tau": 0.1, "utd": 1.0})
+    for tau, utd in full:
+        options = {"tau": tau, "utd": utd}
+        records += make_cell({"equivariant": 0.5}, 1, agent_options=options)
+    assert len(summarize([run(r) for r in records]).tables) == 1
