@@ -29,6 +29,8 @@ from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import BASE, STANDARD
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import MIN_SEEDS, Row, Summary, Table
+from symsteer.leaderboard.tables import beside_variant
+from symsteer.leaderboard.text import SPACE
 
 Style = tuple[str, str, Any]
 """Color, marker and line style of an agent."""
@@ -509,11 +511,15 @@ def _title(table: Table, tables: Sequence[Table]) -> str:
     parts = list(key.broken_by) or ["unbroken"]
     if len({other.base + other.group for other in keys}) > 1:
         parts.append(f"{key.base} {key.group}".strip())
-    if len({(other.mode, other.demonstrations) for other in keys}) > 1:
-        parts.append(f"{key.demonstrations} {key.mode} demonstrations")
-    if len({other.env_steps for other in keys}) > 1:
-        parts.append(f"{key.env_steps:,} steps")
-    return "\n".join([plain(", ".join(parts), 60), *wrap(plain(key.settings, 90), TITLE_WIDTH)])
+    if len({other.mode for other in keys}) > 1:
+        parts.append(f"{key.mode} demonstrations")
+    parts += beside_variant(key, keys)
+    lines = []
+    for words in (parts, key.settings.split(", ")):
+        # Lines break between the parts, not within them.
+        text = ", ".join(word.replace(" ", SPACE) for word in words)
+        lines += wrap(text, TITLE_WIDTH, max_lines=3, placeholder="...")
+    return "\n".join(plain(line) for line in lines)
 
 
 def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int = 7) -> None:
@@ -548,5 +554,6 @@ def _thousands(value: float, _position: int | None = None) -> str:
 
 def plain(text: str, limit: int = 40) -> str:
     """Text for a figure: printable ASCII, no `$` (matplotlib would read it as mathematics)."""
+    text = text.replace(SPACE, " ")
     clean = "".join(c if c.isascii() and c.isprintable() and c != "$" else "?" for c in text)
     return clean if len(clean) <= limit else clean[: limit - 3] + "..."

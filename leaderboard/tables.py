@@ -50,15 +50,22 @@ def cell_name(table: Table, summary: Summary) -> str:
     return name
 
 
+def beside_variant(key: Key, others: Sequence[Key]) -> list[str]:
+    """Demonstrations and steps, where other tables of the same place and variant differ in them."""
+    same = [other for other in others if (other.place, other.variant) == (key.place, key.variant)]
+    words = []
+    if len({other.demonstrations for other in same}) > 1:
+        words.append(f"{key.demonstrations} demonstrations")
+    if len({other.env_steps for other in same if other.demonstrations == key.demonstrations}) > 1:
+        words.append(f"{count(key.env_steps)} steps")
+    return words
+
+
 def heading(key: Key, others: Sequence[Key]) -> str:
     """What breaks the symmetry, and how the table differs from others of its place and break."""
     broken = broken_by(key)
     words = [f"Broken by {broken}" if broken else "Unbroken symmetry"]
-    same = [other for other in others if (other.place, other.variant) == (key.place, key.variant)]
-    if len({other.demonstrations for other in same}) > 1:
-        words.append(f"{key.demonstrations} demonstrations")
-    if len({other.env_steps for other in same}) > 1:
-        words.append(f"{count(key.env_steps)} steps")
+    words += beside_variant(key, others)
     if key.settings:
         words.append(code(key.settings))
     return ", ".join(words)

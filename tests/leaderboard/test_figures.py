@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import pytest
+from matplotlib import style as mpl_style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import FillBetweenPolyCollection
 
 from symsteer.agents import AGENTS
-from symsteer.leaderboard.figures import MANY, STYLES, learning_curves
+from symsteer.leaderboard.figures import MANY, SHEETS, STYLES, learning_curves
 from symsteer.leaderboard.site.charts import look
 from symsteer.leaderboard.summary import Run, Table, summarize
-from tests.leaderboard.record_factory import make_evaluation, make_record
+from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 
 LEARNERS = [name for name in AGENTS.names() if AGENTS.get(name).role != "reference"]
 
@@ -44,3 +46,34 @@ def test_the_legend_fits_and_bands_are_left_out_of_crowded_panels(number: int) -
     assert box.x1 <= figure.bbox.x1
     bands = [c for c in figure.axes[0].collections if isinstance(c, FillBetweenPolyCollection)]
     assert len(bands) == (number if number < MANY else 0)
+
+
+def test_titles_of_panels_say_how_they_differ_and_fit_beside_each_other() -> None:
+    few = {"mode": "diverse", "count": 5, "seed": 0}
+    rates = {"standard": 0.5, "equivariant": 0.5}
+    records = make_cell(rates, 1, demonstrations=few) + make_cell(rates, 1)
+    records += make_cell(rates, 1, env_steps=500_000)
+    for tau, utd, norm in itertools.product((0.005, 0.05), (1.0, 4.0), (False, True)):
+        options = {"tau": tau, "utd": utd, "layer_norm": norm, "target_entropy": 0.5}
+        records += make_cell(rates, 1, variant="wind:1", agent_options=options)
+    runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(records)]
+    for variant, titles in (
+        (
+            "none",
+            [
+                "unbroken, 5 demonstrations",
+                "unbroken, 50 demonstrations,\n50 k steps",
+                "unbroken, 50 demonstrations,\n500 k steps",
+            ],
+        ),
+        ("wind:1", ["wind:1\nlayer_norm false, tau 0.005, utd 1.0"]),
+    ):
+        own = [run for run in runs if run.record.settings.variant == variant]
+        with mpl_style.context(SHEETS):
+            figure = learning_curves(summarize(own).tables)
+            canvas = FigureCanvasAgg(figure)
+            canvas.draw()
+        shown = [ax.title for ax in figure.axes if ax.get_visible()]
+        assert [title.get_text() for title in shown][: len(titles)] == titles
+        boxes = [title.get_window_extent(canvas.get_renderer()) for title in shown[:3]]
+        assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
