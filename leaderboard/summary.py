@@ -514,10 +514,17 @@ def summarize(runs: Sequence[Run]) -> Summary:
     return Summary(tables, set_aside)
 
 
-def grouped(runs: Sequence[Run]) -> tuple[list[Table], list[Run]]:
-    """Tables whose rows have runs and names but no numbers yet, and the runs that are set aside."""
+def grouped(
+    runs: Sequence[Run], grid: Sequence[str] | None = None
+) -> tuple[list[Table], list[Run]]:
+    """Tables whose rows have runs and names but no numbers yet, and the runs that are set aside.
+
+    Args:
+        runs: the runs.
+        grid: the options of a grid; None finds them in the runs.
+    """
     chosen, set_aside = _one_per_cell(runs)
-    grid = grid_of(chosen)
+    grid = grid_of(chosen) if grid is None else grid
     tables: dict[Key, dict[tuple[str, str], list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in chosen:
         tables[Key.of(run.record, grid)][run.agent, recipe_of(run.record.config)].append(run)

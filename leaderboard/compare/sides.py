@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.summary import Key, Row, Run, grouped, load_runs
+from symsteer.leaderboard.summary import Key, Row, Run, grid_of, grouped, load_runs
 from symsteer.names import unknown
 
 Kind = Literal["folder", "file", "agent", "commit"]
@@ -88,7 +88,8 @@ def _side(name: str, place: Path, load: Callable[[], list[Run]]) -> Side:
     pool = load()
     agents = sorted({run.agent for run in pool})
     if name in agents:
-        return _built(name, "agent", place, [run for run in pool if run.agent == name])
+        own = [run for run in pool if run.agent == name]
+        return _built(name, "agent", place, own, grid_of(pool))
     codes = sorted({code_of(run) for run in pool} - {""})
     prefix = name.lower()
     begun = [code for code in codes if COMMIT.fullmatch(prefix) and code.startswith(prefix)]
@@ -109,8 +110,11 @@ def code_of(run: Run) -> str:
     return provenance.commit or provenance.sha256 or ""
 
 
-def _built(name: str, kind: Kind, place: Path, runs: Sequence[Run]) -> Side:
-    tables, older = grouped(runs)
+def _built(
+    name: str, kind: Kind, place: Path, runs: Sequence[Run], grid: Sequence[str] | None = None
+) -> Side:
+    """A side; of an agent's runs alone no `grid` can be seen."""
+    tables, older = grouped(runs, grid)
     leftovers = [Leftover(run, "a newer record of the same run") for run in older]
     rows = []
     for table in tables:

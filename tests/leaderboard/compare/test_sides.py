@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -125,6 +126,16 @@ def test_an_agent_stands_for_its_usual_settings(place):
     assert [run.record.config["learning_rate"] for run in a.runs] == [3e-4] * 2
     (left,) = a.leftovers
     assert left.reason == "other settings: standard (learning_rate 0.1)"
+
+
+def test_all_settings_of_a_grid_stand_for_an_agent(tmp_path: Path):
+    for tau, utd in product((0.005, 0.05), (1.0, 4.0)):
+        for agent in ("standard", "equivariant"):
+            runs = runs_of(*GOOD, agent=agent, agent_options={"tau": tau, "utd": utd})
+            save(tmp_path / f"{agent}-{tau}-{utd}", runs)
+    a, b = read_sides("standard", "equivariant", tmp_path)
+    assert [key.settings for key, _ in a.rows] == [key.settings for key, _ in b.rows]
+    assert (len(a.rows), len(a.runs), a.leftovers) == (4, 8, ())
 
 
 @pytest.mark.parametrize("text", ["{}", "[1]", "{", '{"schema_version": 5, "run_id": "x"}', "\0"])
