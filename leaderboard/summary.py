@@ -266,7 +266,7 @@ class Key:
     def of(cls, record: RunRecord, grid: Sequence[str] = ()) -> Key:
         """The key of a run's table, where `grid` are the options of a grid."""
         settings, policy = record.settings, record.base_policy
-        options = agent_options(record.config)
+        options = agent_options(record.config) if grid else {}
         return cls(
             settings.task,
             settings.embodiment,

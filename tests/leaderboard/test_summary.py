@@ -31,6 +31,7 @@ from symsteer.leaderboard.summary import (
     success_pairs,
     summarize,
 )
+from symsteer.leaderboard.tables import render_csv
 from tests.leaderboard.record_factory import (
     START,
     make_cell,
@@ -460,6 +461,8 @@ def test_each_setting_of_a_grid_that_learners_share_is_a_table() -> None:
             )
         ]
         found = summarize([run(r) for r in [*records, *make_cell({"base": 0.3}, 1)]])
+        columns = render_csv(found).splitlines()[0].split(",")
+        assert ("settings" in columns) == (len(found.tables) > 1)
         return [(t.key.settings, [r.label for r in t.rows if r.runs]) for t in found.tables]
 
     full = list(product((0.005, 0.05), (1.0, 4.0)))
