@@ -216,7 +216,7 @@ class _Known:
     """The records that one record is compared with: the committed ones and those before it."""
 
     def __init__(self) -> None:
-        self._runs: dict[tuple[RowKey, str], tuple[Path, RunRecord]] = {}
+        self._runs: dict[tuple[RowKey, str, str], tuple[Path, RunRecord]] = {}
         self._outcomes: dict[str, Path] = {}
         self._seeds: dict[RowKey, set[int]] = defaultdict(set)
         self._committed: dict[Key, set[str]] = defaultdict(set)
@@ -226,7 +226,7 @@ class _Known:
 
     def add(self, file: Path, record: RunRecord, committed: bool = False) -> None:
         row = _row(record)
-        self._runs.setdefault((row, seeds_of(record.config)), (file, record))
+        self._runs.setdefault(_identity(record), (file, record))
         if outcome := _outcome(record):
             self._outcomes.setdefault(outcome, file)
         if committed:
@@ -240,14 +240,14 @@ class _Known:
             self._agents[row[0], policy].add(record.settings.agent)
 
     def duplicates(self, record: RunRecord) -> Iterator[str]:
-        twin = self._runs.get((_row(record), seeds_of(record.config)))
+        twin = self._runs.get(_identity(record))
         outcome = _outcome(record)
         if twin and twin[1] == record:
             yield f"it is a copy of {twin[0]}: remove one of the two"
         elif twin:
             yield (
-                f"{twin[0]} holds the same configuration and seeds already: remove one of the two "
-                "(to replace a committed record, say why in the pull request)"
+                f"{twin[0]} holds the same configuration, seeds and base policy already: remove "
+                "one of the two (to replace a committed record, say why in the pull request)"
             )
         elif outcome in self._outcomes:
             yield (
@@ -284,6 +284,11 @@ class _Known:
                 f"its commit {commit[:12]} is not in this clone: push it with the pull request, so "
                 "that others can run the same code"
             )
+
+
+def _identity(record: RunRecord) -> tuple[RowKey, str, str]:
+    """What two runs may not share. A base policy trained elsewhere is another one."""
+    return _row(record), seeds_of(record.config), record.base_policy.content_hash
 
 
 def _row(record: RunRecord) -> RowKey:

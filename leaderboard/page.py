@@ -364,8 +364,8 @@ def _provenance(summary: Summary, audit: str, links: Links) -> list[str]:
     if summary.set_aside:
         aside = ", ".join(_link(run, links) for run in summary.set_aside)
         parts.append(
-            "Set aside, because a finished or newer record of the same configuration and seed "
-            f"exists: {aside}."
+            "Set aside, because a finished or newer record of the same configuration, seed and "
+            f"base policy exists: {aside}."
         )
     return parts
 

@@ -399,7 +399,7 @@ class Summary:
 
     tables: list[Table]
     set_aside: list[Run]
-    """Older or unfinished records of a configuration and seed that has a better record."""
+    """Older or unfinished records of a configuration, seed and base policy with a better one."""
 
     @property
     def runs(self) -> list[Run]:
@@ -586,12 +586,16 @@ def _usual_settings(runs: Iterable[Run]) -> dict[str, dict[str, str]]:
 
 
 def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
-    """Keep the newest finished record of each configuration and seed; set the others aside."""
-    cells: dict[tuple[Key, str, str, str], list[Run]] = defaultdict(list)
+    """Keep the newest finished record of each configuration, seed and base policy.
+
+    The others are set aside. A base policy that is trained again with its seed on another kind of
+    processor differs, and runs are compared only on the same one: so both count.
+    """
+    cells: dict[tuple[Key, str, str, str, str], list[Run]] = defaultdict(list)
     for run in runs:
         record = run.record
-        recipe = recipe_of(record.config)
-        cells[Key.of(record), run.agent, recipe, seeds_of(record.config)].append(run)
+        recipe, seeds = recipe_of(record.config), seeds_of(record.config)
+        cells[Key.of(record), run.agent, recipe, seeds, run.policy].append(run)
     chosen, set_aside = [], []
     for cell in sorted(cells):
         candidates = sorted(

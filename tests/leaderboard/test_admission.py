@@ -270,8 +270,8 @@ def test_duplicates(tmp_path: Path) -> None:
     assert [verdict.problems for verdict in verdicts] == [
         [f"it is a copy of {old[1]}: remove one of the two"],
         [
-            f"{old[2]} holds the same configuration and seeds already: remove one of the two "
-            "(to replace a committed record, say why in the pull request)"
+            f"{old[2]} holds the same configuration, seeds and base policy already: remove one of "
+            "the two (to replace a committed record, say why in the pull request)"
         ],
         [
             f"its evaluations equal those of {old[3]} to the last digit: a copy, or a setting that "
@@ -318,6 +318,8 @@ def test_another_base_policy_is_said(tmp_path: Path) -> None:
     assert "submit base, zero on it" in note
     verdicts = judge(learner, on_another_policy("base", 0), committed=committed)
     assert "submit zero on it" in verdicts[0].notes[1]
+    # The committed run of base with this seed is on another policy, so it is no twin.
+    assert all("same configuration" not in problem for problem in verdicts[1].problems)
     # In a separate table there are no runs to compare with.
     elsewhere = store(admissible(task="PushCube-v1", seed=3), new, "elsewhere.json")
     assert not any("base policy" in n for n in judge(elsewhere, committed=committed)[0].notes)

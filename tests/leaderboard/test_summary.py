@@ -426,6 +426,14 @@ def test_a_second_attempt_replaces_the_first_in_plain_sight() -> None:
         assert len(summary.set_aside) == 3
 
 
+def test_a_base_policy_that_was_trained_elsewhere_replaces_none() -> None:
+    here, elsewhere = make_record(), make_record()
+    elsewhere.base_policy.content_hash = "ab" * 32
+    summary = summarize([run(here, "here.json"), run(elsewhere, "elsewhere.json")])
+    assert len(row(summary, "standard").runs) == 2
+    assert summary.set_aside == []
+
+
 def test_folders_are_searched_for_records(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     write_record(make_record(), runs / "a" / "record.json")
