@@ -76,14 +76,15 @@ def reproduce(
     out: Path | None = None,
     demos: Path | None = None,
     base_policy: Path | None = None,
+    base_from: Path | None = None,
     into: Path | None = None,
     workers: int = 1,
     quiet: bool = False,
 ) -> int:
     """Make a run again from its record, and say what agrees (docs/runner.md).
 
-    Demonstrations and base policy are made anew, too. Exit code 0 if every episode and number
-    agrees exactly, 1 if not.
+    Demonstrations and base policy are made anew, too, but for --base-from. Exit code 0 if every
+    episode and number agrees exactly, 1 if not.
 
     Args:
         record: A record.json, or the folder of a run.
@@ -91,6 +92,8 @@ def reproduce(
             kept. The same command continues a reproduction that was stopped there.
         demos: The trajectory file that the run began from, if it did.
         base_policy: The saved base policy that the run began from, if it did.
+        base_from: Folder of runs whose demonstrations and base policy (in its folder base) are
+            taken, because a policy that is trained on another kind of processor differs.
         into: Folder that gets a copy of reproduction.json, named after the record's hash.
         workers: Processes that share the simulation.
         quiet: No progress bars.
@@ -100,7 +103,7 @@ def reproduce(
     def report(line: str) -> None:
         print(printable(line), file=sys.stderr, flush=True)
 
-    done = reproduce(record, out, demos, base_policy, into, not quiet, workers, report)
+    done = reproduce(record, out, demos, base_policy, into, not quiet, workers, base_from, report)
     print(printable(text(done)))
     return 0 if done.reproduction.verdict == "exact" else 1
 

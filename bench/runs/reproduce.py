@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from symsteer.bench.runs.base_policy import origin
+from symsteer.bench.runs.base_policy import demonstration_path, find_base, origin
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.extensions import extensions_of
 from symsteer.bench.runs.folder import RECORD, is_finished, run_id
@@ -28,6 +29,7 @@ from symsteer.leaderboard.records import (
     read_record,
     reproduction_of,
 )
+from symsteer.policies.files import load_policy
 
 RESULT = "reproduction.json"
 
@@ -39,6 +41,8 @@ SENTENCES = {
     "record's.",
 }
 """The verdicts in words."""
+
+TAKEN = "demonstrations and base policy are those of other runs, not made anew"
 
 DIGITS = 12
 """Of a record's hash, in the name of the folder of its reproduction."""
@@ -69,12 +73,14 @@ def reproduce(
     into: Path | None = None,
     progress: bool = True,
     workers: int = 1,
+    base_from: Path | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Reproduced:
     """Run the configuration of a record again, and compare.
 
     Nothing of the first run is used but its record: demonstrations and base policy are made anew,
-    unless the run began from files. The same call continues a reproduction that was stopped.
+    unless the run began from files or they are taken from other runs. The same call continues a
+    reproduction that was stopped.
 
     Args:
         path: of a record, or of a run's folder.
@@ -83,11 +89,12 @@ def reproduce(
         into: a folder that gets a copy of the comparison, named after the record's hash.
         progress: whether to show progress bars.
         workers: processes that share the environments.
+        base_from: a folder of runs whose demonstrations and base policy are taken.
         report: receives lines on where the new run is, and why it may differ.
 
     Raises:
         UserError: if the record is not that of a finished run, this version of SymSteer cannot
-            repeat it, or the files are not those that the run began from.
+            repeat it, or the files or the base policy are not those that the run began from.
     """
     path = path / RECORD if path.is_dir() else path
     if not path.is_file():
@@ -105,14 +112,17 @@ def reproduce(
     report(f"repeating {record.run_id} in {place}")
     report(f"the recorded run took {record.wall_clock.total / 60:.1f} minutes")
     here = Provenance.collect(config.device, torch.get_num_threads(), extensions_of(config))
-    for line in conditions(record, config, here):
+    taken = [] if base_from is None else [TAKEN]
+    if base_from is not None:
+        _take_base(record, config, files, base_from, place)
+    for line in [*taken, *conditions(record, config, here)]:
         report(f"note: {line}")
     if is_finished(folder):
         report("the run is there and finished: it is compared without making it again")
     else:
         execute(config, place, demonstrations, policy, progress, workers)
     made = read_record(folder / RECORD).provenance
-    found = reproduction_of(path, folder / RECORD, conditions(record, config, made))
+    found = reproduction_of(path, folder / RECORD, taken + conditions(record, config, made))
     targets = [place / RESULT] + ([into / f"{found.record.sha256}.json"] if into else [])
     write_together(dict.fromkeys(targets, dump_reproduction(found)))
     return Reproduced(record, folder, tuple(targets), found)
@@ -231,6 +241,36 @@ def _check_files(
                 f"the {kind} file has the hash {given[kind][:DIGITS]}, but {record.run_id} began "
                 f"from one with {recorded[kind][:DIGITS]}; give that one with {option}"
             )
+
+
+def _take_base(
+    record: RunRecord, config: RunConfig, files: Mapping[str, str], runs: Path, place: Path
+) -> None:
+    """Put the recorded run's demonstrations and base policy where the new run looks for them."""
+    if files:
+        raise UserError(
+            f"{record.run_id} began from files, which have to be given; leave --base-from out"
+        )
+    folder = find_base(config, runs)
+    if folder is None:
+        raise UserError(
+            f"{runs / 'base'} does not have both demonstrations and base policy of "
+            f"{record.run_id}; name a folder of runs that has, or leave --base-from out to make "
+            "them anew"
+        )
+    found, wanted = load_policy(folder).content_hash(), record.base_policy.content_hash
+    if found != wanted:
+        raise UserError(
+            f"the base policy in {folder} is {found[:DIGITS]}, and {record.run_id} steered "
+            f"{wanted[:DIGITS]}; name a folder of runs that has that one, or leave --base-from out "
+            "to train it anew"
+        )
+    target = place / "base"
+    shutil.copytree(folder, target / folder.name, dirs_exist_ok=True)
+    for task in config.policy_tasks:
+        file = demonstration_path(replace(config, task=task), runs)
+        for source in (file, file.with_suffix(".json")):
+            shutil.copyfile(source, target / source.name)
 
 
 def _place(path: Path, out: Path | None) -> Path:

@@ -144,12 +144,48 @@ def test_files_that_the_run_began_from_are_checked(finished, tmp_path, monkeypat
     code, shown = call(monkeypatch, capsys, run, "--base-policy", other)
     assert code == 2
     assert "has the hash" in shown.err
+    code, shown = call(monkeypatch, capsys, run, "--base-policy", policy, "--base-from", tmp_path)
+    assert code == 2
+    assert "leave --base-from out" in shown.err
     code, shown = call(monkeypatch, capsys, folder, "--demos", policy)
     assert code == 2
     assert "began from no demonstrations file; leave --demos out" in shown.err
     out = tmp_path / "out"
     code, shown = call(monkeypatch, capsys, run, "--base-policy", policy, "--out", out)
     assert code == 0
+
+
+def test_the_base_policy_of_other_runs_is_taken(finished, tmp_path, monkeypatch, capsys):
+    folder = finished[1]
+    runs = folder.parent
+    arguments = (folder, "--out", tmp_path / "out", "--base-from")
+    code, shown = call(monkeypatch, capsys, *arguments, tmp_path / "nowhere")
+    assert code == 2
+    assert "does not have both demonstrations and base policy" in shown.err
+    assert not (tmp_path / "out").exists()
+    code, shown = call(monkeypatch, capsys, *arguments, runs)
+    assert code == 0
+    assert "are those of other runs, not made anew" in shown.out
+    (place,) = (tmp_path / "out").iterdir()
+    taken = sorted(path.name for path in (place / "base").iterdir())
+    assert set(taken) <= {path.name for path in (runs / "base").iterdir()}
+    # Training again would give the same policy, but not the same time in its file.
+    (policy,) = (place / "base").glob("*/policy.safetensors")
+    assert policy.read_bytes() == (runs / "base" / policy.relative_to(place / "base")).read_bytes()
+
+
+def test_a_base_policy_that_the_run_did_not_steer_is_refused(
+    finished, tmp_path, monkeypatch, capsys
+):
+    record = json.loads((finished[1] / "record.json").read_text())
+    record["base_policy"]["content_hash"] = "ab" * 32
+    path = tmp_path / "record.json"
+    path.write_text(json.dumps(record))
+    arguments = (path, "--out", tmp_path / "out", "--base-from", finished[1].parent)
+    code, shown = call(monkeypatch, capsys, *arguments)
+    assert code == 2
+    assert "steered abababababab" in shown.err
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_cannot_be_repeated_is_one_sentence(repeated, tmp_path, monkeypatch, capsys):
