@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -142,6 +143,45 @@ def find_base(config: RunConfig, out: Path) -> Path | None:
             return None
     folder = _policy_folder(config, out, demos)
     return folder if policy_path(folder).is_file() else None
+
+
+def take_base(config: RunConfig, content_hash: str, runs: Path, out: Path) -> None:
+    """Copy a trained base policy and its demonstrations from ``runs/base`` to ``out/base``.
+
+    The policy is found by its content: a version of SymSteer with further options gives another
+    name to its folder.
+
+    Args:
+        config: the run that is to steer it.
+        content_hash: of the policy.
+        runs, out: folders of runs.
+
+    Raises:
+        UserError: if the policy or the demonstrations are not there.
+    """
+    demos = {}
+    for name in config.policy_tasks:
+        one = dataclasses.replace(config, task=name)
+        demos[name] = demonstration_path(one, runs)
+    folders = (runs / "base").glob(f"{config.task}-{config.embodiment}-*")
+    same = [
+        folder
+        for folder in sorted(folders)
+        if policy_path(folder).is_file() and load_policy(folder).content_hash() == content_hash
+    ]
+    if not same or not all(path.is_file() for path in demos.values()):
+        raise UserError(
+            f"{runs / 'base'} does not have the base policy {content_hash[:12]} and its "
+            "demonstrations; name a folder of runs that has, or leave --base-from out to make them "
+            "anew"
+        )
+    (out / "base").mkdir(parents=True, exist_ok=True)
+    for path in demos.values():
+        for source in (path, path.with_suffix(".json")):
+            shutil.copyfile(source, out / "base" / source.name)
+    count = config.demonstrations.count
+    loaded = {name: load(path, name, config.embodiment, count) for name, path in demos.items()}
+    shutil.copytree(same[0], _policy_folder(config, out, loaded), dirs_exist_ok=True)
 
 
 def demonstration_path(config: RunConfig, out: Path) -> Path:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from symsteer.bench.runs.base_policy import demonstration_path, find_base, origin
+from symsteer.bench.runs.base_policy import origin, take_base
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.extensions import extensions_of
 from symsteer.bench.runs.folder import RECORD, is_finished, run_id
@@ -29,7 +28,6 @@ from symsteer.leaderboard.records import (
     read_record,
     reproduction_of,
 )
-from symsteer.policies.files import load_policy
 
 RESULT = "reproduction.json"
 
@@ -112,9 +110,14 @@ def reproduce(
     report(f"repeating {record.run_id} in {place}")
     report(f"the recorded run took {record.wall_clock.total / 60:.1f} minutes")
     here = Provenance.collect(config.device, torch.get_num_threads(), extensions_of(config))
-    taken = [] if base_from is None else [TAKEN]
+    taken = []
     if base_from is not None:
-        _take_base(record, config, files, base_from, place)
+        if files:
+            raise UserError(
+                f"{record.run_id} began from files, which have to be given; leave --base-from out"
+            )
+        take_base(config, record.base_policy.content_hash, base_from, place)
+        taken = [TAKEN]
     for line in [*taken, *conditions(record, config, here)]:
         report(f"note: {line}")
     if is_finished(folder):
@@ -241,36 +244,6 @@ def _check_files(
                 f"the {kind} file has the hash {given[kind][:DIGITS]}, but {record.run_id} began "
                 f"from one with {recorded[kind][:DIGITS]}; give that one with {option}"
             )
-
-
-def _take_base(
-    record: RunRecord, config: RunConfig, files: Mapping[str, str], runs: Path, place: Path
-) -> None:
-    """Put the recorded run's demonstrations and base policy where the new run looks for them."""
-    if files:
-        raise UserError(
-            f"{record.run_id} began from files, which have to be given; leave --base-from out"
-        )
-    folder = find_base(config, runs)
-    if folder is None:
-        raise UserError(
-            f"{runs / 'base'} does not have both demonstrations and base policy of "
-            f"{record.run_id}; name a folder of runs that has, or leave --base-from out to make "
-            "them anew"
-        )
-    found, wanted = load_policy(folder).content_hash(), record.base_policy.content_hash
-    if found != wanted:
-        raise UserError(
-            f"the base policy in {folder} is {found[:DIGITS]}, and {record.run_id} steered "
-            f"{wanted[:DIGITS]}; name a folder of runs that has that one, or leave --base-from out "
-            "to train it anew"
-        )
-    target = place / "base"
-    shutil.copytree(folder, target / folder.name, dirs_exist_ok=True)
-    for task in config.policy_tasks:
-        file = demonstration_path(replace(config, task=task), runs)
-        for source in (file, file.with_suffix(".json")):
-            shutil.copyfile(source, target / source.name)
 
 
 def _place(path: Path, out: Path | None) -> Path:
