@@ -73,8 +73,8 @@ demonstrations, the budget and the held-out episodes.
 
 MADE_AGAIN = """\
 Some runs were made again from their records (`symsteer reproduce`); **Status** counts them.
-*Reproduced exactly*: every episode and every measured number agrees. *Reproduced within its
-interval*: the final success lies within Wilson's 95 % interval of the record's.
+*Reproduced exactly*: every episode and every measured number agrees. *Reproduced alike*: the 95 %
+interval of the difference in final success includes 0.
 """
 """Shown only where it is so."""
 

@@ -328,7 +328,7 @@ CSV_DIAGNOSTICS = (
 
 REPRODUCTION_COLUMNS: dict[str, Verdict] = {
     "reproduced_exactly": "exact",
-    "reproduced_within_interval": "within the interval",
+    "reproduced_alike": "alike",
     "not_reproduced": "different",
 }
 """Columns of leaderboards in which a run was made again: the number of such runs."""

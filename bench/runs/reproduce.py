@@ -33,10 +33,10 @@ RESULT = "reproduction.json"
 
 SENTENCES = {
     "exact": "Everything agrees exactly.",
-    "within the interval": "It does not agree exactly; its final success lies within the 95 % "
-    "interval of the record's.",
-    "different": "It does not agree: its final success lies outside of the 95 % interval of the "
-    "record's.",
+    "alike": "It does not agree exactly; the final success does not differ clearly (the interval "
+    "of the difference includes 0).",
+    "different": "It does not agree: the final success differs (the interval of the difference "
+    "excludes 0).",
 }
 """The verdicts in words."""
 
@@ -193,8 +193,8 @@ def text(done: Reproduced) -> str:
     lines += [
         "",
         f"agree exactly  {', '.join(alike) or 'nothing'}",
-        f"final success  {success.recorded:.3f} [{success.low:.3f}, {success.high:.3f}] in the "
-        f"record, {success.repeated:.3f} here ({success.repeated - success.recorded:+.3f})",
+        f"final success  {success.recorded:.3f} in the record, {success.repeated:.3f} here "
+        f"({success.repeated - success.recorded:+.3f} [{success.low:+.3f}, {success.high:+.3f}])",
         f"area           {area.recorded:.3f} in the record, {area.repeated:.3f} here "
         f"({area.repeated - area.recorded:+.3f})",
         "",

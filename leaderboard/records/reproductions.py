@@ -1,8 +1,7 @@
 """Runs that were made again from their records: what agrees, and the files that say so.
 
 A reproduction belongs to the bytes of one record file. On one kind of machine, with the same code
-and packages, a run on the CPU repeats to the last digit; elsewhere it may agree within the interval
-of its final success.
+and packages, a run on the CPU repeats to the last digit; elsewhere its final success may be alike.
 """
 
 from __future__ import annotations
@@ -35,12 +34,12 @@ from symsteer.leaderboard.records.values import (
     first_problem,
 )
 
-Verdict = Literal["exact", "within the interval", "different"]
+Verdict = Literal["exact", "alike", "different"]
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 
 REPRODUCED: dict[Verdict, str] = {
     "exact": "reproduced exactly",
-    "within the interval": "reproduced within its interval",
+    "alike": "reproduced alike",
     "different": "NOT reproduced",
 }
 """How pages say it of a run."""
@@ -89,12 +88,15 @@ class Difference(Block):
 
 
 class Success(Block):
-    """Share of the final episodes with success, and Wilson's 95 % interval of the record's."""
+    """Share of the final episodes with success, and the 95 % interval of `repeated - recorded`.
+
+    Both are samples: it combines their two Wilson intervals (Newcombe 1998, method 10).
+    """
 
     recorded: Share
-    low: Share
-    high: Share
     repeated: Share
+    low: Finite
+    high: Finite
 
 
 class Area(Block):
@@ -145,7 +147,12 @@ def compare_records(record: RunRecord, again: RunRecord) -> tuple[list[Differenc
     ]
     mine, theirs = (_final(one).success_once for one in (record, again))
     trials = len(_final(record).episodes.seed)
-    sure = binomtest(round(mine * trials), trials).proportion_ci(method="wilson")
+    was, now = (
+        binomtest(round(share * trials), trials).proportion_ci(method="wilson")
+        for share in (mine, theirs)
+    )
+    low = theirs - mine - math.hypot(theirs - now.low, was.high - mine)
+    high = theirs - mine + math.hypot(now.high - theirs, mine - was.low)
     areas = [
         area_under_curve(
             [e.env_steps for e in one.evaluations],
@@ -154,7 +161,7 @@ def compare_records(record: RunRecord, again: RunRecord) -> tuple[list[Differenc
         )
         for one in (record, again)
     ]
-    success = Success(recorded=mine, low=sure.low, high=sure.high, repeated=theirs)
+    success = Success(recorded=mine, repeated=theirs, low=low, high=high)
     found = [difference for difference in differences if difference.differ]
     return found, success, Area(recorded=areas[0], repeated=areas[1])
 
@@ -220,8 +227,7 @@ def read_reproductions(folder: Path) -> dict[str, Reproduction]:
 def _verdict(differences: Sequence[Difference], success: Success) -> Verdict:
     if not differences:
         return "exact"
-    inside = success.low <= success.repeated <= success.high
-    return "within the interval" if inside else "different"
+    return "alike" if success.low <= 0 <= success.high else "different"
 
 
 def _final(record: RunRecord) -> Evaluation:

@@ -22,6 +22,7 @@ from symsteer.leaderboard.records import (
 )
 from symsteer.leaderboard.report import generate
 from symsteer.leaderboard.site.build import generate as generate_site
+from symsteer.leaderboard.statistics import ShareDifference
 from symsteer.leaderboard.summary import load_runs, summarize
 from symsteer.leaderboard.tables import status
 from tests.leaderboard.command_line import main
@@ -50,9 +51,24 @@ def test_equal_runs_agree_whatever_the_clock_and_the_machine() -> None:
     differences, success, area = compare_records(record, again)
     assert differences == []
     assert (success.recorded, success.repeated) == (0.5, 0.5)
-    assert success.low == pytest.approx(0.150, abs=1e-3)
-    assert success.high == pytest.approx(0.850, abs=1e-3)
+    assert success.low == pytest.approx(-0.495, abs=1e-3)
+    assert success.high == pytest.approx(0.495, abs=1e-3)
     assert area.recorded == area.repeated == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("count", "verdict"), [(0, "alike"), (7, "alike"), (20, "different")])
+def test_both_runs_are_samples(count: int, verdict: str, tmp_path: Path) -> None:
+    """.80 and .87 in 100 episodes are no clear difference; .87 is outside of .80's own interval."""
+    paths = []
+    for name, successes in (("record", 80), ("again", 80 + count)):
+        final = make_evaluation([1] * successes + [0] * (100 - successes), q_mean=-len(name))
+        paths.append(tmp_path / f"{name}.json")
+        write_record(make_record([final]), paths[-1])
+    found = reproduction_of(*paths, [])
+    assert found.verdict == verdict
+    wanted = ShareDifference((80 + count, 100), (80, 100)).interval()
+    assert found.success.low == pytest.approx(wanted.low)
+    assert found.success.high == pytest.approx(wanted.high)
 
 
 def flip(record: RunRecord) -> None:
@@ -164,8 +180,8 @@ def results(tmp_path: Path) -> Path:
 
 
 def test_the_verdicts_and_the_round_trip_of_a_file(results: Path) -> None:
-    found = sorted(read_reproductions(results / "marks").values(), key=lambda r: r.verdict)
-    assert [one.verdict for one in found] == ["exact", "within the interval"]
+    found = sorted(read_reproductions(results / "marks").values(), key=lambda r: len(r.differences))
+    assert [one.verdict for one in found] == ["exact", "alike"]
     assert found[1].conditions == ["a note"]
     (difference,) = found[1].differences
     assert (difference.part, difference.largest) == ("diagnostics", 4.0)
@@ -179,15 +195,15 @@ def test_rows_and_runs_are_marked(results: Path) -> None:
     page = written["LEADERBOARD.md"].read_text()
     row = next(line for line in page.splitlines() if "0.80" in line and "`equivariant`" in line)
     (cell,) = [c for c in page.replace("\u00a0", " ").split(" | ") if "1 reproduced exactly" in c]
-    assert "5 finished, 1 reproduced exactly, 1 reproduced within its interval" in cell
+    assert "5 finished, 1 reproduced exactly, 1 reproduced alike" in cell
     assert row
     assert "made again from their records" in page
     listed = csv.DictReader(io.StringIO(written["records.csv"].read_text()))
     verdicts = [record["reproduced"] for record in listed if record["reproduced"]]
-    assert sorted(verdicts) == ["exact", "within the interval"]
+    assert sorted(verdicts) == ["alike", "exact"]
     rows = list(csv.DictReader(io.StringIO(written["leaderboard.csv"].read_text())))
     counted = {
-        r["agent"]: (r["reproduced_exactly"], r["reproduced_within_interval"], r["not_reproduced"])
+        r["agent"]: (r["reproduced_exactly"], r["reproduced_alike"], r["not_reproduced"])
         for r in rows
     }
     assert counted["equivariant"] == ("1", "1", "0")
@@ -239,8 +255,8 @@ def test_a_bad_reproduction_is_one_sentence(results: Path) -> None:
         "",
         text[:-9],
         "3",
-        text.replace('"verdict": "exact"', '"verdict": "within the interval"').replace(
-            '"verdict": "within the interval",\n "record"', '"verdict": "different",\n "record"', 1
+        text.replace('"verdict": "exact"', '"verdict": "alike"').replace(
+            '"verdict": "alike",\n "record"', '"verdict": "different",\n "record"', 1
         ),
         text.replace('"schema_version": 1', '"schema_version": 2'),
         # A copy of the record is no second run.
