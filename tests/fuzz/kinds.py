@@ -426,7 +426,7 @@ def demonstrations(workshop: Workshop, number: int, folder: Path) -> Ending:
     with stopped_at((base_policy, "_train")):
         ending = end_of(["run", "--quiet", "--demos", path, *arguments], ["mutant"])
     if ending.kind == "accepted":
-        demos = ending.found[1]
+        (demos,) = ending.found[1].values()
         layout = task_class(workshop.config.task).observation_layout
         for obs, actions in demos.episodes:
             _require(bool(obs.isfinite().all() and actions.isfinite().all()), "NaN was accepted")
