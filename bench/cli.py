@@ -83,8 +83,8 @@ def reproduce(
 ) -> int:
     """Make a run again from its record, and say what agrees (docs/runner.md).
 
-    Demonstrations and base policy are made anew, too, but for --base-from. Exit code 0 if every
-    episode and number agrees exactly, 1 if not.
+    Demonstrations and base policy are made anew, too, unless --base-from is given. Exit code 0 if
+    every episode and number agrees exactly, 1 if not.
 
     Args:
         record: A record.json, or the folder of a run.

@@ -105,7 +105,7 @@ def reproduce(
         )
     config, files = _configuration(path, record)
     _check_files(record, files, demonstrations, policy)
-    place = _place(path, out)
+    place = _place(path, out, base_from is not None)
     folder = place / run_id(config, files)
     report(f"repeating {record.run_id} in {place}")
     report(f"the recorded run took {record.wall_clock.total / 60:.1f} minutes")
@@ -246,11 +246,14 @@ def _check_files(
             )
 
 
-def _place(path: Path, out: Path | None) -> Path:
-    """The folder of the reproduction of the record at a path."""
+def _place(path: Path, out: Path | None, taken: bool) -> Path:
+    """The folder of the reproduction of the record at a path.
+
+    One with a base policy that was `taken` has its own: it does not continue one that trains it.
+    """
     if out is None:
         return Path(tempfile.mkdtemp(prefix="symsteer-reproduction-"))
-    return out / f"reproduction-{file_hash(path)[:DIGITS]}"
+    return out / f"reproduction-{file_hash(path)[:DIGITS]}{'-taken' if taken else ''}"
 
 
 def _code(provenance: Provenance) -> str:

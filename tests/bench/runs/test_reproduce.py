@@ -172,6 +172,7 @@ def test_the_base_policy_of_other_runs_is_taken(finished, tmp_path, monkeypatch,
     assert code == 0
     assert "are those of other runs, not made anew" in shown.out
     (place,) = (tmp_path / "out").iterdir()
+    assert place.name.endswith("-taken")
     # Training again would give the same policy, but not the same time in its file.
     (copy,) = (place / "base").glob("*/policy.safetensors")
     assert copy.read_bytes() == policy.read_bytes()
