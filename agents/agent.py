@@ -22,6 +22,7 @@ from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 import torch
 
 from symsteer.agents.episodes import Played
+from symsteer.agents.generators import continue_stream
 from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
@@ -255,7 +256,7 @@ class Agent:
                     f"this checkpoint has {key} {saved.get(key)!r}, the agent has {value!r}; "
                     "load it with the run's own configuration"
                 )
-        self.generator.set_state(state["generator"].cpu())
+        continue_stream(self.generator, state["generator"])
 
     def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
         """``count`` actions ``[count, rows, Da]`` of the base policy: noise from N(0, I)."""

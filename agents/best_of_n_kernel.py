@@ -34,6 +34,7 @@ from symsteer.agents.diagnostics import (
     value_errors,
 )
 from symsteer.agents.episodes import Played
+from symsteer.agents.generators import continue_stream
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import ReplayBuffer, Transition
 from symsteer.errors import UserError
@@ -303,7 +304,7 @@ class KernelBestOfNAgent(Agent):
         self.fitted = {
             name: state["fitted"][name].to(tensor) for name, tensor in self.fitted.items()
         }
-        self.fit_generator.set_state(state["fit_generator"].cpu())
+        continue_stream(self.fit_generator, state["fit_generator"])
         self.decisions, self.fits = int(state["decisions"]), int(state["fits"])
 
 

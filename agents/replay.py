@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from symsteer.agents.generators import continue_stream
 from symsteer.errors import UserError
 
 FOLLOWED = ("reward", "next_obs", "terminal", "truncated")
@@ -191,7 +192,7 @@ class ReplayBuffer:
             kept[:size] = rows[name].to(kept)
         self.size, self.position = size, int(state["position"])
         self.stride = int(state["stride"])
-        self.generator.set_state(state["generator"].cpu())
+        continue_stream(self.generator, state["generator"])
 
     def _rows(self, name: str, count: int) -> torch.Tensor:
         return torch.zeros(count, *self.shapes[name], dtype=self.dtype, device=self.device)

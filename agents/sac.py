@@ -50,6 +50,7 @@ from symsteer.agents.agent import Agent, AgentContext, Budget, MakeEnv, Role
 from symsteer.agents.diagnostics import critic_diagnostics
 from symsteer.agents.distributions import LOG_SCALE_MAX, LOG_SCALE_MIN, SquashedGaussian
 from symsteer.agents.episodes import Played
+from symsteer.agents.generators import continue_stream
 from symsteer.agents.networks import Ensemble, Weights, count, detached
 from symsteer.agents.optimization import Multiplier, adam, descend
 from symsteer.agents.options import NoiseSource, SacOptions
@@ -563,7 +564,7 @@ class SacAgent(Agent):
             flat = _flat(self.target)
             torch._foreach_copy_(flat, [t.to(flat[0]) for t in state["target"]])
         for name, generator in self._generators.items():
-            generator.set_state(state["generators"][name].cpu())
+            continue_stream(generator, state["generators"][name])
         for name in COUNTERS:
             setattr(self, name, type(getattr(self, name))(state[name]))
 

@@ -30,7 +30,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(folder: Path) -> dict[str, Any] | None:
-    """The last checkpoint of a run (``weights_only``), or None before the first one.
+    """The last checkpoint of a run on the CPU (``weights_only``), or None before the first one.
 
     Raises:
         UserError: if the file is damaged or of another run.
@@ -50,7 +50,8 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
             f"checksum; {cure}"
         )
     try:
-        file = torch.load(io.BytesIO(archive), weights_only=True)
+        # Also where the run's GPU is missing.
+        file = torch.load(io.BytesIO(archive), map_location="cpu", weights_only=True)
     # Pickles of other programs fail in many ways.
     except Exception as error:
         raise UserError(f"{path} cannot be read as a checkpoint; {cure}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from symsteer.bench.runs.base_policy import origin, take_base
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.extensions import extensions_of
 from symsteer.bench.runs.folder import RECORD, is_finished, run_id
-from symsteer.bench.runs.run import check, execute
+from symsteer.bench.runs.run import check, check_device, execute
 from symsteer.bench.runs.stored import newer_options, read_back
 from symsteer.errors import UserError
 from symsteer.files import write_together
@@ -214,12 +215,13 @@ def _configuration(path: Path, record: RunRecord) -> tuple[RunConfig, dict[str, 
         config, files = read_back(record.config, path, path)
         if not isinstance(files, dict) or not files.keys() <= FILES.keys():
             raise UserError("it began from files of a kind that this version does not know")
-        check(config)
+        check(dataclasses.replace(config, sim="cpu", device="cpu"))
     except UserError as error:
         raise UserError(
             f"this version of SymSteer cannot repeat {path} ({error}); the record is of "
             f"{_code(record.provenance)}: use that"
         ) from error
+    check_device(config, f"the run of {path}")
     return config, files
 
 

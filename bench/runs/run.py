@@ -74,12 +74,31 @@ def check(config: RunConfig) -> None:
             "it out, or use none, the unbroken task"
         )
     AGENTS.get(config.agent).check(config.agent_options, budget_of(config))
-    for option, device in (("--device", config.device), ("--sim", config.sim)):
-        if device == "cuda" and not torch.cuda.is_available():
-            raise UserError(
-                f"{option} cuda was asked for, but torch finds no CUDA device here; "
-                f"use {option} cpu (`symsteer doctor` says what is missing)"
-            )
+    if option := _option_of_missing_device(config):
+        raise UserError(
+            f"{option} cuda was asked for, but torch finds no CUDA device here; "
+            f"use {option} cpu (`symsteer doctor` says what is missing)"
+        )
+
+
+def check_device(config: RunConfig, name: str) -> None:
+    """Check that this machine has the devices of a run that was begun already.
+
+    Raises:
+        UserError: if it has not; it calls the run ``name``.
+    """
+    if option := _option_of_missing_device(config):
+        raise UserError(
+            f"{name} was begun with {option} cuda, but torch finds no CUDA device here; go on with "
+            "it on a machine that has one (`symsteer doctor` says what is missing)"
+        )
+
+
+def _option_of_missing_device(config: RunConfig) -> str | None:
+    if torch.cuda.is_available():
+        return None
+    options = (("--device", config.device), ("--sim", config.sim))
+    return next((option for option, device in options if device == "cuda"), None)
 
 
 def execute(
@@ -176,10 +195,11 @@ def resume(
 
     Raises:
         UserError: if the folder is not a run's, the run is finished, its checkpoint is damaged, or
-            another process is working on it.
+            another process is working on it, or this machine lacks its device.
     """
     folder = named(folder)
     config, files = stored_config(folder)
+    check_device(config, f"the run {folder.name}")
     _check_all(config, workers)
 
     def check_own() -> None:
@@ -213,7 +233,7 @@ class EvaluationResult:
         variant: of these episodes.
         evaluation: as in a record.
         recorded: whether the final evaluation in the record is equal; None if it has another
-            variant or number of episodes.
+            variant or number of episodes, or if the run was made on a GPU.
     """
 
     run_id: str
@@ -268,7 +288,11 @@ def evaluate(
         episodes=Episodes.model_validate(columns),
         diagnostics=dict(diagnostics),
     )
-    final = read_record(folder / RECORD).final if is_finished(folder) else None
+    final = None
+    if is_finished(folder):
+        record = read_record(folder / RECORD)
+        repeatable = "cuda" not in (record.config["sim"], record.config["device"])
+        final = record.final if repeatable else None
     comparable = final and variants == own and len(final.episodes.seed) == count
     return EvaluationResult(
         run_id=folder.name,

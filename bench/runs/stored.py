@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as deserialize
 from safetensors.torch import save as serialize
@@ -33,7 +34,7 @@ class Restored:
 
     Attributes:
         folder: of the run.
-        config: of the run.
+        config: of the run; with the device on which it was restored.
         policy: the frozen base policy.
         agent: with the weights of the checkpoint.
         state: the whole checkpoint.
@@ -49,11 +50,15 @@ class Restored:
 def restored(folder: Path) -> Restored:
     """Read a run's last checkpoint.
 
+    A run that was trained on a GPU comes back on the CPU where there is none.
+
     Raises:
         UserError: if the folder is not a run's, it has no checkpoint yet, or a file is damaged.
     """
     folder = named(folder)
     config, _ = stored_config(folder)
+    if not torch.cuda.is_available():
+        config = replace(config, device="cpu")
     state = load_checkpoint(folder)
     if state is None:
         raise UserError(

@@ -89,7 +89,7 @@ def load(path: str | Path, device: str = "cpu") -> Trained:
 
     Args:
         path: folder of a run, or a policy file (``policy.safetensors``).
-        device: for a policy file; a run comes back on its own device.
+        device: for a policy file; a run comes back on its own device, or on the CPU without a GPU.
 
     Raises:
         UserError: if the path is neither of them, or a file is damaged.

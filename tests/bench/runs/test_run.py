@@ -234,15 +234,6 @@ def test_an_unwritable_folder_is_refused(tmp_path):
         execute(tiny_config(), tmp_path / "file", progress=False)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-def test_learner_on_cuda_with_physics_on_the_cpu(tmp_path):
-    record = read_record(
-        execute(tiny_config(device="cuda"), tmp_path, progress=False) / "record.json"
-    )
-    assert record.status == "finished"
-
-
 def test_the_settings_of_a_given_base_policy_are_recorded(finished, tmp_path):
     """The run has the settings and demonstrations of the file, not the defaults."""
     config, folder = finished

@@ -1,12 +1,20 @@
 """Using what was trained: a run as an object that acts, and its videos."""
 
+import dataclasses
+import json
+import shutil
+
 import pytest
 import torch
 
 import symsteer
+from symsteer.bench.runs.checkpoint import load_checkpoint, save_checkpoint
+from symsteer.bench.runs.folder import is_finished, run_id
+from symsteer.bench.runs.reproduce import reproduce
+from symsteer.bench.runs.run import evaluate, resume
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import read_record
+from symsteer.leaderboard.records import config_hash, read_record
 
 
 def success(run, count, **options):
@@ -47,6 +55,49 @@ def test_a_loaded_run_acts_in_another_variant(finished):
     env = run.make_env(num_envs=2)
     assert env.variants == ()
     env.close()
+
+
+@pytest.fixture
+def of_a_gpu(finished, tmp_path):
+    """What a finished run on a GPU leaves behind: tensors of CUDA, and streams of its kind."""
+    config, folder = finished
+    config = dataclasses.replace(config, device="cuda")
+    copy = tmp_path / run_id(config, {})
+    shutil.copytree(folder, copy)
+    for name in ("config.json", "record.json"):
+        data = json.loads((copy / name).read_text())
+        data.get("config", data)["device"] = "cuda"
+        if name == "record.json":
+            data |= {"run_id": copy.name, "config_hash": config_hash(data["config"])}
+        (copy / name).write_text(json.dumps(data))
+    with pytest.MonkeyPatch.context() as patch:
+        state = load_checkpoint(folder)
+        agent = state["agent"]
+        agent["generator"] = torch.zeros(16, dtype=torch.uint8)
+        agent["generators"] = dict.fromkeys(agent["generators"], agent["generator"])
+        patch.setattr(torch.serialization, "location_tag", lambda storage: "cuda:0")
+        save_checkpoint(copy, state)
+    assert is_finished(copy)
+    return copy
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_a_run_of_a_gpu_is_used_without_one(finished, of_a_gpu):
+    """It acts and is evaluated as on the CPU. It does not go on here, and nothing is lost."""
+    found, same = (symsteer.load(folder) for folder in (of_a_gpu, finished[1]))
+    obs = torch.randn(3, found.policy.obs_layout.dim)
+    assert torch.equal(found.act(obs), same.act(obs))
+    here, there = evaluate(of_a_gpu), evaluate(finished[1])
+    assert here.evaluation.episodes == there.evaluation.episodes
+    # Numbers of a GPU are not those of a processor, so it does not say whether they are equal.
+    assert (here.recorded, there.recorded) == (None, True)
+    before = {path: path.read_bytes() for path in of_a_gpu.iterdir() if path.is_file()}
+    message = "was begun with --device cuda, but torch finds no CUDA device here"
+    with pytest.raises(UserError, match=message):
+        resume(of_a_gpu, progress=False)
+    with pytest.raises(UserError, match=message):
+        reproduce(of_a_gpu)
+    assert before == {path: path.read_bytes() for path in of_a_gpu.iterdir() if path.is_file()}
 
 
 def test_a_policy_file_plays_with_random_noise(finished):

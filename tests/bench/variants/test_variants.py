@@ -6,6 +6,7 @@ import gymnasium as gym
 import pytest
 import torch
 
+from symsteer.bench.sim.environment import check_cuda
 from symsteer.bench.tasks import EMBODIMENTS, make
 from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.variants import VARIANTS, build, evaluation_variants, highest_cost, parse, read
@@ -295,9 +296,12 @@ def test_every_task_takes_every_variant(task, embodiment):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 @pytest.mark.parametrize("name", NAMES)
 def test_every_variant_runs_on_cuda(name):
+    try:
+        check_cuda()
+    except UserError as error:
+        pytest.skip(str(error))
     check_runs(make("PickCube-v1", num_envs=2, sim="cuda", variant=name, strength=MIXED))
 
 
