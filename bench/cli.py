@@ -696,6 +696,7 @@ def throughput(
     decode: bool = False,
     run: bool = False,
     runs: Path = Path("runs"),
+    device: Literal["cpu", "cuda"] = "cpu",
     json: bool = False,
 ) -> int:
     """Compare the speed of simulation with stock ManiSkill and with PhysX alone, in minutes.
@@ -712,6 +713,8 @@ def throughput(
         run: Only measure the CPU time of whole runs with the default settings, alone and in teams
             of five, two agents; about an hour for each repeat.
         runs: Folder that keeps the base policy of these runs.
+        device: With cuda, --learner and --decode measure wall-clock time on the processor and on
+            the GPU, in turns.
         json: Print only JSON.
     """
     from symsteer.bench import throughput as speed
@@ -719,16 +722,27 @@ def throughput(
     def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
+    if device == "cuda":
+        import torch
+
+        if not learner and not decode:
+            raise UserError("--device cuda is for --learner and --decode; name one of them")
+        if not torch.cuda.is_available():
+            raise UserError(
+                "--device cuda was asked for, but torch finds no CUDA device here; leave it out "
+                "(`symsteer doctor` says what is missing)"
+            )
+    devices = ("cpu",) if device == "cpu" else ("cpu", "cuda")
     if learner:
         from symsteer.bench import learner_throughput
 
-        rows = learner_throughput.measure(task, updates=20, repeats=repeats, report=report)
+        rows = learner_throughput.measure(task, 20, repeats, report, devices=devices)
         print(speed.dump({"rows": rows}) if json else learner_throughput.table(rows))
         return 0
     if decode:
         from symsteer.bench import decode_throughput
 
-        rows = decode_throughput.measure(task, calls=10, repeats=repeats, report=report)
+        rows = decode_throughput.measure(task, 10, repeats, report, devices=devices)
         print(speed.dump({"rows": rows}) if json else decode_throughput.table(rows))
         return 0
     if run:

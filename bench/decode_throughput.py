@@ -1,4 +1,4 @@
-"""CPU time in which base policies decode noise, beside that of their matrix products alone.
+"""Time in which base policies decode noise, beside that of their matrix products alone.
 
 The policies are untrained, which does not change the cost, and have their default sizes; some also
 have others. All take turns. Action critics decode in every update, so this is a large part of a
@@ -8,6 +8,7 @@ run's time.
 from __future__ import annotations
 
 import functools
+import itertools
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import torch
 
 from symsteer.bench.tasks import task_class
-from symsteer.bench.timing import in_turns, products_of
+from symsteer.bench.timing import clock_of, in_turns, name_of, products_of
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
@@ -43,6 +44,7 @@ def measure(
     repeats: int,
     report: Callable[[str], None],
     policies: Sequence[str] = tuple(POLICIES.builtin),
+    devices: Sequence[str] = ("cpu",),
 ) -> list[dict[str, Any]]:
     """Time the decoders of policies.
 
@@ -52,20 +54,21 @@ def measure(
         repeats: measurements of each contender.
         report: receives a line for each round, and for each policy that cannot be built here.
         policies: names.
+        devices: ``cpu``, ``cuda``.
 
     Returns:
-        A row for each policy and number of ``chunks``: ``policy``, ``options`` (those that are not
-        the default), ``parameters``, ``sampling_steps`` (None for policies without them),
-        milliseconds of one call ``median``, ``min``, ``max``, and ``products``, the median of the
-        matrix products alone.
+        A row for each device, policy and number of ``chunks``: ``device``, ``policy``, ``options``
+        (those that are not the default), ``parameters``, ``sampling_steps`` (None for policies
+        without them), milliseconds of one call ``median``, ``min``, ``max``, and ``products``, the
+        median of the matrix products alone. They are of CPU time, with a GPU of wall-clock time.
     """
     rows: list[dict[str, Any]] = []
     contenders: list[Callable[[], Any]] = []
     timed: list[tuple[str, Mapping[str, Any]]] = [(name, {}) for name in policies]
     timed += [(name, options) for name, options in VARIATIONS if name in policies]
-    for name, options in timed:
+    for device, (name, options) in itertools.product(devices, timed):
         try:
-            policy = _policy(task, name, options)
+            policy = _policy(task, name, options).to(device)
         except UserError as error:
             report(f"without {name}: {error}")
             continue
@@ -73,6 +76,7 @@ def measure(
             decode = functools.partial(policy.decode, *_inputs(policy, chunks))
             rows.append(
                 {
+                    "device": device,
                     "policy": name,
                     "options": dict(options),
                     "parameters": parameter_count(policy),
@@ -81,7 +85,7 @@ def measure(
                 }
             )
             contenders += [decode, products_of(decode)]
-    times = in_turns(contenders, calls, repeats, report)
+    times = in_turns(contenders, calls, repeats, report, clock_of(devices))
     for row, found, products in zip(rows, times[::2], times[1::2], strict=True):
         row |= {"median": statistics.median(found), "min": min(found), "max": max(found)}
         row |= {"products": statistics.median(products)}
@@ -91,12 +95,13 @@ def measure(
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Text table of :func:`measure`; ratios to the first policy with as many chunks."""
     units = {row["chunks"]: row["median"] for row in reversed(rows)}
+    clock = name_of(clock_of([row["device"] for row in rows]))
     lines = [
-        "CPU time of one call of decode, one thread; median of the measurements (smallest to "
+        f"{clock} of one call of decode, one thread; median of the measurements (smallest to "
         "largest), and of its matrix products alone",
         "",
-        f"{'policy':30s} {'parameters':>10s} {'steps':>5s} {'chunks':>6s} {'ms':>7s} {'':18s} "
-        f"{'ratio':>5s} {'products':>8s} {'share':>5s}",
+        f"{'device':6s} {'policy':30s} {'parameters':>10s} {'steps':>5s} {'chunks':>6s} "
+        f"{'ms':>7s} {'':18s} {'ratio':>5s} {'products':>8s} {'share':>5s}",
     ]
     for row in rows:
         spread = f"({row['min']:.1f} to {row['max']:.1f})"
@@ -104,9 +109,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             [row["policy"], *(f"{key} {value}" for key, value in row["options"].items())]
         )
         lines.append(
-            f"{name:30s} {row['parameters']:10,d} {row['sampling_steps'] or '':>5} "
-            f"{row['chunks']:6d} {row['median']:7.2f} {spread:18s} "
-            f"{row['median'] / units[row['chunks']]:5.2f} {row['products']:8.2f} "
+            f"{row['device']:6s} {name:30s} {row['parameters']:10,d} "
+            f"{row['sampling_steps'] or '':>5} {row['chunks']:6d} {row['median']:7.2f} "
+            f"{spread:18s} {row['median'] / units[row['chunks']]:5.2f} {row['products']:8.2f} "
             f"{row['products'] / row['median']:5.0%}"
         )
     return "\n".join(lines)
@@ -125,4 +130,4 @@ def _inputs(policy: ChunkPolicy, chunks: int) -> tuple[torch.Tensor, torch.Tenso
     generator = torch.Generator().manual_seed(0)
     obs = 0.1 * torch.randn(chunks, policy.obs_layout.dim, generator=generator)
     noise = torch.randn(chunks, policy.horizon, policy.act_layout.dim, generator=generator)
-    return obs, noise
+    return obs.to(policy.device), noise.to(policy.device)

@@ -1,4 +1,4 @@
-"""CPU time of an update of each learner, side by side with what bounds it.
+"""Time of an update of each learner, side by side with what bounds it.
 
 The base policy has the default size and is untrained, transitions are random: neither changes the
 cost. The agent `best-of-n-kernel` has fits in place of updates: its time is that of a fit, divided
@@ -24,14 +24,14 @@ from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
 from symsteer.bench.tasks import task_class
-from symsteer.bench.timing import in_turns, products_of
+from symsteer.bench.timing import clock_of, in_turns, name_of, products_of
 from symsteer.policies import POLICIES
 
 DECISIONS = 512
 """Random decisions in the replay."""
 
-TEAM = 5
-"""Members of a team."""
+TEAMS = {"cpu": (5,), "cuda": (5, 20)}
+"""Members of the teams on each device."""
 
 
 @dataclass
@@ -39,6 +39,7 @@ class Contender:
     """What is timed.
 
     Attributes:
+        device: of its tensors.
         what: the update, its matrix products alone, or a fit.
         critic: of a learner.
         members: learners that are updated at once.
@@ -47,6 +48,7 @@ class Contender:
         updates: that ``run`` stands for.
     """
 
+    device: str
     agent: str
     what: str
     critic: str
@@ -63,6 +65,7 @@ def measure(
     repeats: int,
     report: Callable[[str], None],
     agents: Sequence[str] = tuple(AGENTS.builtin),
+    devices: Sequence[str] = ("cpu",),
 ) -> list[dict[str, Any]]:
     """Time the updates of learners.
 
@@ -72,18 +75,21 @@ def measure(
         repeats: measurements of each contender.
         report: receives a line for each round.
         agents: names; those that are no learners are left out.
+        devices: ``cpu``, ``cuda``.
 
     Returns:
-        One row each: the fields of :class:`Contender` but ``run``, and CPU milliseconds of one
-        update of one member: ``median``, ``min``, ``max``.
+        One row each: the fields of :class:`Contender` but ``run``, and milliseconds of one update
+        of one member: ``median``, ``min``, ``max``. They are of CPU time, with a GPU of wall-clock
+        time.
     """
-    contenders = _contenders(task, agents)
+    contenders = [
+        contender for device in devices for contender in _contenders(task, agents, device)
+    ]
+    runs = [contender.run for contender in contenders]
     times = [
         [spent / contender.updates for spent in found]
         for contender, found in zip(
-            contenders,
-            in_turns([contender.run for contender in contenders], updates, repeats, report),
-            strict=True,
+            contenders, in_turns(runs, updates, repeats, report, clock_of(devices)), strict=True
         )
     ]
     return [
@@ -96,83 +102,90 @@ def measure(
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Text table of :func:`measure`; ratios to `standard` with critics of the noise."""
+    """Text table of :func:`measure`; ratios to `standard` with critics of the noise.
+
+    They are to the one on the first device.
+    """
+    devices = {row["device"] for row in rows}
     unit = next(
         row["median"]
         for row in rows
         if (row["agent"], row["what"], row["critic"]) == ("standard", "update", "noise")
     )
     lines = [
-        "CPU time of one update of one learner, one thread; median of the measurements (smallest "
-        "to largest)",
+        f"{name_of(clock_of([*devices]))} of one update of one learner, one thread; "
+        "median of the measurements (smallest to largest)",
         "",
-        f"{'agent':18s} {'what':16s} {'critic':9s} {'parameters':>10s} {'batch':>6s} {'ms':>7s} "
-        f"{'':18s} ratio",
+        f"{'device':6s} {'agent':18s} {'what':16s} {'critic':9s} {'parameters':>10s} {'batch':>6s} "
+        f"{'ms':>7s} {'':18s} ratio",
     ]
     for row in rows:
         spread = f"({row['min']:.1f} to {row['max']:.1f})"
         parameters = f"{row['parameters']:,d}" if row["parameters"] else ""
         what = row["what"] if row["members"] == 1 else f"in a team of {row['members']}"
         lines.append(
-            f"{row['agent']:18s} {what:16s} {row['critic']:9s} {parameters:>10s} "
-            f"{row['batch_size'] or '':>6} {row['median']:7.2f} {spread:18s} "
+            f"{row['device']:6s} {row['agent']:18s} {what:16s} {row['critic']:9s} "
+            f"{parameters:>10s} {row['batch_size'] or '':>6} {row['median']:7.2f} {spread:18s} "
             f"{row['median'] / unit:5.2f}"
         )
     return "\n".join(lines)
 
 
-def _contenders(task: str, agents: Sequence[str]) -> list[Contender]:
+def _contenders(task: str, agents: Sequence[str], device: str) -> list[Contender]:
     found = []
     for name in agents:
         agent_class = AGENTS.get(name)
         if agent_class is KernelBestOfNAgent:
-            found.append(_kernel(task, name))
+            found.append(_kernel(task, name, device))
         if not issubclass(agent_class, SacAgent):
             continue
         for critic in critics_of(agent_class.Options):
-            alone, *team = (_learner(task, name, critic, seed) for seed in range(1 + TEAM))
+            alone = _learner(task, name, critic, 0, device)
             sizes = (alone.parameter_counts()["total"], alone.options.batch_size)
             update = functools.partial(_update, alone)
-            found.append(Contender(name, "update", critic, 1, *sizes, update))
+            found.append(Contender(device, name, "update", critic, 1, *sizes, update))
             if name == "standard":
                 products = products_of(update)
-                found.append(Contender(name, "products alone", critic, 1, *sizes, products))
-            if can_join(agent_class):
-                run = functools.partial(_update_team, Team(team))
-                found.append(Contender(name, "update", critic, TEAM, *sizes, run, TEAM))
-    context = _context(task, 0)
+                found.append(Contender(device, name, "products alone", critic, 1, *sizes, products))
+            for count in TEAMS[device] if can_join(agent_class) else ():
+                seeds = range(1, 1 + count)
+                team = Team([_learner(task, name, critic, seed, device) for seed in seeds])
+                run = functools.partial(_update_team, team)
+                found.append(Contender(device, name, "update", critic, count, *sizes, run, count))
+    context = _context(task, 0, device)
     if importlib.util.find_spec("stable_baselines3"):
         size = _standard_options().batch_size
-        found.append(Contender("stable-baselines3", "update", "noise", 1, 0, size, _sb3(context)))
+        train = _sb3(context)
+        found.append(Contender(device, "stable-baselines3", "update", "noise", 1, 0, size, train))
     return found
 
 
-def _context(task: str, seed: int) -> AgentContext:
+def _context(task: str, seed: int, device: str) -> AgentContext:
     kind, policy = task_class(task), POLICIES.get("edp")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         base = policy(policy.Options(), kind.observation_layout, kind.action_layout)
-    return AgentContext.of(base, seed=seed)
+    return AgentContext.of(base.to(device), device, seed)
 
 
-def _agent(task: str, name: str, seed: int, **options: Any) -> Agent:
+def _agent(task: str, name: str, seed: int, device: str, **options: Any) -> Agent:
     agent_class = AGENTS.get(name)
-    return agent_class(_context(task, seed), agent_class.Options(**options))
+    return agent_class(_context(task, seed, device), agent_class.Options(**options))
 
 
-def _learner(task: str, name: str, critic: str, seed: int) -> SacAgent:
-    agent = _agent(task, name, seed, critic=critic)
+def _learner(task: str, name: str, critic: str, seed: int, device: str) -> SacAgent:
+    agent = _agent(task, name, seed, device, critic=critic)
     assert isinstance(agent, SacAgent)
     agent.observe(_decisions(agent.context, agent.rows, DECISIONS))
     return agent
 
 
-def _kernel(task: str, name: str) -> Contender:
-    agent = _agent(task, name, 0)
+def _kernel(task: str, name: str, device: str) -> Contender:
+    agent = _agent(task, name, 0, device)
     assert isinstance(agent, KernelBestOfNAgent)
     agent.observe(_decisions(agent.context, agent.rows, agent.options.points))
     updates = agent.options.refit * _standard_options().utd
-    return Contender(name, "fit, per update", "", 1, 0, 0, agent.fit, updates)
+    return Contender(device, name, "fit, per update", "", 1, 0, 0, agent.fit, updates)
 
 
 def _standard_options() -> SacOptions:
@@ -183,7 +196,7 @@ def _decisions(context: AgentContext, rows: int, count: int) -> Transition:
     generator = torch.Generator().manual_seed(0)
 
     def draw(*shape: int) -> torch.Tensor:
-        return torch.randn(count, *shape, generator=generator)
+        return torch.randn(count, *shape, generator=generator).to(context.device)
 
     obs_dim, act_dim = context.obs_layout.dim, context.act_layout.dim
     return Transition(
@@ -192,8 +205,8 @@ def _decisions(context: AgentContext, rows: int, count: int) -> Transition:
         actions=draw(context.execute, act_dim).tanh(),
         reward=draw(),
         next_obs=0.1 * draw(obs_dim),
-        terminal=torch.zeros(count),
-        truncated=torch.zeros(count),
+        terminal=torch.zeros(count, device=context.device),
+        truncated=torch.zeros(count, device=context.device),
     )
 
 
@@ -235,7 +248,7 @@ def _sb3(context: AgentContext) -> Callable[[], None]:
             "net_arch": [options.width] * options.depth,
             "n_critics": options.critics,
         },
-        device="cpu",
+        device=context.device,
     )
     model.set_logger(Logger(folder=None, output_formats=[]))
     assert model.replay_buffer is not None

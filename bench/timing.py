@@ -1,4 +1,4 @@
-"""CPU time of computations that take turns, and of their matrix products alone."""
+"""Time of computations that take turns, and of their matrix products alone."""
 
 from __future__ import annotations
 
@@ -16,13 +16,33 @@ PRODUCTS = ("mm", "addmm", "bmm", "baddbmm", "convolution")
 """Operations that multiply matrices."""
 
 
+def clock_of(devices: Sequence[str]) -> Callable[[], float]:
+    """What times computations on these devices, in seconds.
+
+    CPU time is disturbed less by other programs. A GPU does its work beside the processor, so it
+    has wall-clock time, and the processor that it is compared with, too.
+    """
+    return time.process_time if set(devices) == {"cpu"} else _wall_clock
+
+
+def name_of(clock: Callable[[], float]) -> str:
+    """What a clock shows, as the beginning of a sentence."""
+    return "CPU time" if clock is time.process_time else "Wall-clock time"
+
+
+def _wall_clock() -> float:
+    torch.cuda.synchronize()
+    return time.perf_counter()
+
+
 def in_turns(
     contenders: Sequence[Callable[[], Any]],
     calls: int,
     repeats: int,
     report: Callable[[str], None],
+    clock: Callable[[], float] = time.process_time,
 ) -> list[list[float]]:
-    """CPU milliseconds of one call, ``repeats`` measurements of each contender.
+    """Milliseconds of one call, ``repeats`` measurements of each contender.
 
     They take turns, so that a change in the machine's speed reaches all of them.
 
@@ -31,6 +51,7 @@ def in_turns(
         calls: in one measurement.
         repeats: measurements of each contender.
         report: receives a line for each round.
+        clock: see :func:`clock_of`.
     """
     for run in contenders:
         for _ in range(WARM_UP):
@@ -38,10 +59,10 @@ def in_turns(
     times: list[list[float]] = [[] for _ in contenders]
     for turn in range(repeats):
         for found, run in zip(times, contenders, strict=True):
-            begin = time.process_time()
+            begin = clock()
             for _ in range(calls):
                 run()
-            found.append(1e3 * (time.process_time() - begin) / calls)
+            found.append(1e3 * (clock() - begin) / calls)
         report(f"round {turn + 1} of {repeats}")
     return times
 

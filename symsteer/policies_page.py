@@ -284,6 +284,7 @@ def properties(base: Sequence[RunRecord], count: int = STEERED) -> str:
 
 def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str:
     """Success of each policy on each task beside the time in which it decodes, cheapest first."""
+    decode = [row for row in decode if row.get("device", "cpu") == "cpu"]
     largest = max((row["chunks"] for row in decode), default=0)
     times = {label(r["policy"], r["options"]): r for r in decode if r["chunks"] == largest}
     tasks = list(dict.fromkeys(record.settings.task for record in base))

@@ -19,6 +19,7 @@ DECODE = [
     {"policy": "edp", "options": {}, "chunks": 192, "median": 8.0, "products": 6.0},
     {"policy": "edp", "options": {"width": 32}, "chunks": 192, "median": 4.0, "products": 2.0},
     {"policy": "plain", "options": {}, "chunks": 192, "median": 1.0, "products": 0.5},
+    {"device": "cuda", "policy": "plain", "options": {}, "chunks": 192, "median": 9, "products": 1},
 ]
 
 

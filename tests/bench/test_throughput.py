@@ -190,7 +190,7 @@ def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
     }
     text = learner_throughput.table(rows)
     (line,) = (
-        row for row in text.splitlines() if row.split()[:3] == ["standard", "update", "noise"]
+        row for row in text.splitlines() if row.split()[1:4] == ["standard", "update", "noise"]
     )
     assert line.endswith("1.00")
 
@@ -207,10 +207,10 @@ def test_decoders_are_timed_beside_their_products():
         assert 0 < row["products"] < row["median"]
         assert 0 < row["min"] <= row["median"] <= row["max"]
         assert row["sampling_steps"] == row["options"].get("sampling_steps", 2)
-    assert "\nedp width 32 channels 32 " in decode_throughput.table(rows)
+    assert "\ncpu    edp width 32 channels 32 " in decode_throughput.table(rows)
     *_, first, second = decode_throughput.table(rows[:2]).splitlines()
-    assert first.split()[:4] == ["edp", f"{rows[0]['parameters']:,}", "2", "64"]
-    assert second.split()[0] == "edp"
+    assert first.split()[:5] == ["cpu", "edp", f"{rows[0]['parameters']:,}", "2", "64"]
+    assert second.split()[1] == "edp"
     assert " 1.00 " in first
     assert " 1.00 " in second
 
