@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from symsteer.leaderboard.records.curves import area_under_curve
+from symsteer.leaderboard.records.shares import CONFIDENCE, newcombe, normal_quantile, wilson
 
-CONFIDENCE = 0.95
 RESAMPLES = 5000
 _EPISODES, _UNITS = 1, 2
 """Separate the streams of weights from each other and from generators with small seeds."""
@@ -179,18 +179,6 @@ def mean(values: Sequence[float] | Array, weights: Array | None = None) -> Array
     return np.asarray(np.average(np.asarray(values, dtype=np.float64), axis=-1, weights=weights))
 
 
-def wilson(successes: float, trials: float, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Wilson's interval of a success probability; the numbers need not be whole."""
-    z, share = _normal(confidence), successes / trials
-    centre = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
-    half = z * np.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2)) / (1 + z**2 / trials)
-    # At the ends the formula gives 0 and 1, up to rounding.
-    return (
-        0.0 if share == 0 else float(centre - half),
-        1.0 if share == 1 else float(centre + half),
-    )
-
-
 def percentile(value: float, draws: Array, confidence: float = CONFIDENCE) -> Interval:
     """`value` with the percentile interval of its bootstrap draws."""
     tail = (1 - confidence) / 2
@@ -198,15 +186,11 @@ def percentile(value: float, draws: Array, confidence: float = CONFIDENCE) -> In
     return Interval(float(value), float(low), float(high))
 
 
-def _normal(confidence: float) -> float:
-    return float(special.ndtri((1 + confidence) / 2))
-
-
 def tails(confidence: float, freedom: int) -> float:
     """By how much Student's tails are longer than those of a normal distribution; 1.42 for five."""
     if freedom == 0:
         return 1.0
-    return float(special.stdtrit(freedom, (1 + confidence) / 2)) / _normal(confidence)
+    return float(special.stdtrit(freedom, (1 + confidence) / 2)) / normal_quantile(confidence)
 
 
 class Effect(Protocol):
@@ -246,10 +230,8 @@ class Estimate:
 class ShareDifference:
     """Difference of two shares, each (successes, trials), with Newcombe's hybrid interval.
 
-    It combines the two Wilson intervals (Newcombe 1998, method 10); unlike a bootstrap it has a
-    width when nobody or everybody succeeds. Where successes come in clusters, give the number of
-    clusters as trials and the sum of the clusters' shares as successes: a share of a cluster varies
-    at most as much as a single success.
+    Where successes come in clusters, give the number of clusters as trials and the sum of the
+    clusters' shares as successes: a share of a cluster varies at most as much as a single success.
     """
 
     first: tuple[float, float]
@@ -260,12 +242,7 @@ class ShareDifference:
         return self.first[0] / self.first[1] - self.second[0] / self.second[1]
 
     def interval(self, confidence: float = CONFIDENCE) -> Interval:
-        p, q = self.first[0] / self.first[1], self.second[0] / self.second[1]
-        p_low, p_high = wilson(*self.first, confidence)
-        q_low, q_high = wilson(*self.second, confidence)
-        low = self.value - float(np.hypot(p - p_low, q_high - q))
-        high = self.value + float(np.hypot(p_high - p, q - q_low))
-        return Interval(self.value, low, high)
+        return Interval(self.value, *newcombe(self.first, self.second, confidence))
 
 
 def p_difference(effect: Effect) -> float:

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
 from pydantic import ValidationError, model_validator
-from scipy.stats import binomtest
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.records.curves import area_under_curve
 from symsteer.leaderboard.records.files import read_record
 from symsteer.leaderboard.records.provenance import Provenance
 from symsteer.leaderboard.records.schema import Evaluation, RunRecord
+from symsteer.leaderboard.records.shares import newcombe
 from symsteer.leaderboard.records.values import (
     Block,
     Count,
@@ -147,12 +147,7 @@ def compare_records(record: RunRecord, again: RunRecord) -> tuple[list[Differenc
     ]
     mine, theirs = (_final(one).success_once for one in (record, again))
     trials = len(_final(record).episodes.seed)
-    was, now = (
-        binomtest(round(share * trials), trials).proportion_ci(method="wilson")
-        for share in (mine, theirs)
-    )
-    low = theirs - mine - math.hypot(theirs - now.low, was.high - mine)
-    high = theirs - mine + math.hypot(now.high - theirs, mine - was.low)
+    low, high = newcombe((theirs * trials, trials), (mine * trials, trials))
     areas = [
         area_under_curve(
             [e.env_steps for e in one.evaluations],

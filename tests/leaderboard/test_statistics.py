@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from symsteer.leaderboard.records.curves import area_under_curve
+from symsteer.leaderboard.records.shares import wilson
 from symsteer.leaderboard.statistics import (
     Array,
     Effect,
@@ -36,7 +37,6 @@ from symsteer.leaderboard.statistics import (
     stratified_bootstrap,
     success_interval,
     tails,
-    wilson,
 )
 
 
