@@ -263,10 +263,12 @@ def evaluate(
         workers: processes that share the environments.
 
     Raises:
-        UserError: if the folder is not a run's, or it has no checkpoint yet.
+        UserError: if the folder is not a run's, it has no checkpoint yet, or it was simulated on a
+            GPU and this machine has none.
     """
     run = restored(folder)
     config, folder = run.config, run.folder
+    check_device(config, f"the run {folder.name}")
     _check_all(config, workers)
     share = 1.0 if run.state["final"] else run.state["env_steps"] / config.env_steps
     own = evaluation_variants(config.variants, share)
