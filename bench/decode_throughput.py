@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from symsteer.bench.tasks import task_class
-from symsteer.bench.timing import clock_of, in_turns, name_of, products_of
+from symsteer.bench.timing import clock_of, in_turns, products_of, time_on
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
@@ -95,10 +95,9 @@ def measure(
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Text table of :func:`measure`; ratios to the first policy with as many chunks."""
     units = {row["chunks"]: row["median"] for row in reversed(rows)}
-    clock = name_of(clock_of([row["device"] for row in rows]))
     lines = [
-        f"{clock} of one call of decode, one thread; median of the measurements (smallest to "
-        "largest), and of its matrix products alone",
+        f"{time_on([row['device'] for row in rows])} of one call of decode, one thread; "
+        "median of the measurements (smallest to largest), and of its matrix products alone",
         "",
         f"{'device':6s} {'policy':30s} {'parameters':>10s} {'steps':>5s} {'chunks':>6s} "
         f"{'ms':>7s} {'':18s} {'ratio':>5s} {'products':>8s} {'share':>5s}",

@@ -24,7 +24,7 @@ from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
 from symsteer.bench.tasks import task_class
-from symsteer.bench.timing import clock_of, in_turns, name_of, products_of
+from symsteer.bench.timing import clock_of, in_turns, products_of, time_on
 from symsteer.policies import POLICIES
 
 DECISIONS = 512
@@ -113,7 +113,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         if (row["agent"], row["what"], row["critic"]) == ("standard", "update", "noise")
     )
     lines = [
-        f"{name_of(clock_of([*devices]))} of one update of one learner, one thread; "
+        f"{time_on([*devices])} of one update of one learner, one thread; "
         "median of the measurements (smallest to largest)",
         "",
         f"{'device':6s} {'agent':18s} {'what':16s} {'critic':9s} {'parameters':>10s} {'batch':>6s} "

@@ -25,9 +25,9 @@ def clock_of(devices: Sequence[str]) -> Callable[[], float]:
     return time.process_time if set(devices) == {"cpu"} else _wall_clock
 
 
-def name_of(clock: Callable[[], float]) -> str:
-    """What a clock shows, as the beginning of a sentence."""
-    return "CPU time" if clock is time.process_time else "Wall-clock time"
+def time_on(devices: Sequence[str]) -> str:
+    """The time that :func:`clock_of` shows, as the beginning of a sentence."""
+    return "CPU time" if set(devices) == {"cpu"} else "Wall-clock time"
 
 
 def _wall_clock() -> float:

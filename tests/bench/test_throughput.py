@@ -19,7 +19,7 @@ from symsteer.bench import (
     throughput,
 )
 from symsteer.bench.throughput import Replay, Row, Turn, _Stopwatch
-from symsteer.bench.timing import products_of
+from symsteer.bench.timing import clock_of, products_of, time_on
 from symsteer.errors import UserError
 from tests.bench.tiny_run import tiny_config
 
@@ -193,6 +193,13 @@ def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
         row for row in text.splitlines() if row.split()[1:4] == ["standard", "update", "noise"]
     )
     assert line.endswith("1.00")
+
+
+def test_a_gpu_is_timed_by_the_wall_clock():
+    """CPU time would not count what the GPU does, and the two devices share one table."""
+    assert (clock_of(["cpu"]), time_on(["cpu"])) == (time.process_time, "CPU time")
+    assert clock_of(["cpu", "cuda"]) is not time.process_time
+    assert time_on(["cpu", "cuda"]) == "Wall-clock time"
 
 
 def test_decoders_are_timed_beside_their_products():

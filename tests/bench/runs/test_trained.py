@@ -57,16 +57,15 @@ def test_a_loaded_run_acts_in_another_variant(finished):
     env.close()
 
 
-@pytest.fixture
-def of_a_gpu(finished, tmp_path):
+def made_on_a_gpu(finished, tmp_path, option):
     """What a finished run on a GPU leaves behind: tensors of CUDA, and streams of its kind."""
     config, folder = finished
-    config = dataclasses.replace(config, device="cuda")
+    config = dataclasses.replace(config, **{option: "cuda"})
     copy = tmp_path / run_id(config, {})
     shutil.copytree(folder, copy)
     for name in ("config.json", "record.json"):
         data = json.loads((copy / name).read_text())
-        data.get("config", data)["device"] = "cuda"
+        data.get("config", data)[option] = "cuda"
         if name == "record.json":
             data |= {"run_id": copy.name, "config_hash": config_hash(data["config"])}
         (copy / name).write_text(json.dumps(data))
@@ -82,8 +81,9 @@ def of_a_gpu(finished, tmp_path):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-def test_a_run_of_a_gpu_is_used_without_one(finished, of_a_gpu):
+def test_a_run_of_a_gpu_is_used_without_one(finished, tmp_path):
     """It acts and is evaluated as on the CPU. It does not go on here, and nothing is lost."""
+    of_a_gpu = made_on_a_gpu(finished, tmp_path, "device")
     found, same = (symsteer.load(folder) for folder in (of_a_gpu, finished[1]))
     obs = torch.randn(3, found.policy.obs_layout.dim)
     assert torch.equal(found.act(obs), same.act(obs))
@@ -98,6 +98,10 @@ def test_a_run_of_a_gpu_is_used_without_one(finished, of_a_gpu):
     with pytest.raises(UserError, match=message):
         reproduce(of_a_gpu)
     assert before == {path: path.read_bytes() for path in of_a_gpu.iterdir() if path.is_file()}
+    simulated = made_on_a_gpu(finished, tmp_path, "sim")
+    assert symsteer.load(simulated).act(obs).isfinite().all()
+    with pytest.raises(UserError, match="was begun with --sim cuda"):
+        evaluate(simulated)
 
 
 def test_a_policy_file_plays_with_random_noise(finished):
