@@ -21,7 +21,7 @@ RECORDS = RESULTS / "records"
 REPRODUCTIONS = RESULTS / "reproductions"
 """What `symsteer reproduce --into` wrote about committed records."""
 
-STUDY = "first"
+STUDY = "answer"
 """The study that the committed records belong to."""
 
 RECORD = "record.json"
@@ -30,8 +30,10 @@ RECORD = "record.json"
 _BEGINNING = re.compile(rb'\s*\{\s*"schema_version"\s*:\s*\d+\s*,\s*"run_id"')
 
 
-def chosen_records(records: Sequence[Path], verb: str) -> Sequence[Path]:
-    """The records that a verb was given; else the committed ones.
+def chosen_records(
+    records: Sequence[Path], verb: str, argument: str = "RUNS"
+) -> Sequence[Path]:
+    """The records that a verb was given, in ``argument``; else the committed ones.
 
     Raises:
         UserError: none were given, and there are no committed ones.
@@ -39,19 +41,9 @@ def chosen_records(records: Sequence[Path], verb: str) -> Sequence[Path]:
     if not records and not RECORDS.is_dir():
         raise UserError(
             "the committed records exist only in a checkout of the repository; name run folders: "
-            f"symsteer {verb} RUNS"
+            f"symsteer {verb} {argument}"
         )
     return records or (RECORDS,)
-
-
-def committed_records() -> list[Path]:
-    """The folders of `RESULTS` that hold records."""
-    folders = sorted(path for path in RESULTS.glob("*") if path.is_dir())
-    return [
-        folder
-        for folder in folders
-        if (first := min(folder.rglob("*.json"), default=None)) and _begins_like_a_record(first)
-    ]
 
 
 def reproductions_for(records: Iterable[Path], folder: Path | None) -> Path | None:

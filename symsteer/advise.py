@@ -46,7 +46,7 @@ def advise(
         group: Group of the base policy.
         audit: What `symsteer audit --out` wrote, the folder or its audit.json or summary.json.
         detection: What `symsteer detect --out` wrote, the folder or its detect.json.
-        records: Folders of runs or records, each a study of its own; default: the committed ones.
+        records: Folders of runs or records, each a study of its own; default: the committed records.
         states: States of the expert and of the base policy, each, of an audit that is measured.
         runs: Folder of the runs; base policies of an audit that is measured are kept in RUNS/base.
         json: Write everything into this file, too.
@@ -55,15 +55,10 @@ def advise(
         raise UserError("name one world: with --task and --variant, with --audit or --detection")
     from symsteer.leaderboard.advice import advise, leave_tasks_out
     from symsteer.leaderboard.defects import read_audit
-    from symsteer.leaderboard.paths import committed_records
+    from symsteer.leaderboard.paths import chosen_records
     from symsteer.leaderboard.summary import load_runs, summarize
 
-    folders = records or committed_records()
-    if not folders:
-        raise UserError(
-            "the committed records exist only in a checkout of the repository; name folders of "
-            "runs with --records"
-        )
+    folders = chosen_records(records, "advise", "--records RUNS")
     # Mistakes first: to read the records takes seconds, to measure a world minutes.
     settings = None
     if audit is not None:
@@ -83,7 +78,8 @@ def advise(
     blocks = [_text(found, source) for found, (_, source) in zip(advices, worlds, strict=True)]
     blocks += [_test_text(test) for test in tests]
     blocks += [DETECTION] if detection is not None else []
-    print(printable("\n\n".join([f"From {number} runs of {len(folders)} studies.", *blocks])))
+    studies = f"{len(folders)} studies" if len(folders) > 1 else "one study"
+    print(printable("\n\n".join([f"From {number} runs of {studies}.", *blocks])))
     if json is not None:
         from symsteer.files import write_atomically
 

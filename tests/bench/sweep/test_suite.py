@@ -8,6 +8,7 @@ import pytest
 
 from symsteer.agents import AGENTS
 from symsteer.agents.presets import preset_options
+from symsteer.bench.runs.base_policy import find_base
 from symsteer.bench.runs.config import build_config
 from symsteer.bench.sweep.command import preview
 from symsteer.bench.sweep.grid import read_suite, suite_names
@@ -16,9 +17,12 @@ from symsteer.bench.sweep.schedule import tasks_of
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
-from symsteer.leaderboard.paths import RECORDS
+from symsteer.leaderboard.paths import RECORDS, RESULTS
+from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.study import read_study
+from symsteer.leaderboard.summary import Key
 from symsteer.policies import POLICIES
+from symsteer.policies.files import load_policy
 
 
 def write(tmp_path, text: str) -> str:
@@ -74,10 +78,10 @@ def test_every_suite_that_ships_can_be_read_and_its_policies_made(name):
         POLICIES.get(policy_name)(options, task.observation_layout, task.action_layout)
 
 
-def test_the_suite_first_describes_the_committed_records():
+def test_the_suite_first_describes_its_records():
     """Its records are of one base policy, unlike those of suites that name no policy seed."""
     recorded = {}
-    for path in RECORDS.glob("first/*.json"):
+    for path in RESULTS.glob("first/*.json"):
         config = json.loads(path.read_text())["config"]
         recorded[tuple(config[key] for key in BASIC)] = config
     for run in load_suite("first").runs:
@@ -130,6 +134,27 @@ def test_the_zoo_is_compared_in_cells_of_the_suite_second():
     assert {cell(run) for run in zoo} <= {run for run in second if run.agent == "standard"}
     claimed = {agent for claim in read_study("zoo").claims for agent in claim.agents}
     assert {run.agent for run in zoo} == claimed - {"standard", "equivariant", "residual-pathway"}
+
+
+def test_a_submission_steers_the_base_policies_of_the_committed_runs():
+    """A new option of policies gives the folders of base policies other names: rename them then."""
+    steered = {}
+    for path in RECORDS.glob("second/*-standard-*.json"):
+        record = read_record(path)
+        steered[Key.of(record), record.settings.seed] = record.base_policy.content_hash
+    second = load_suite("second").runs
+    for run in load_suite("submission").runs:
+        assert run in second
+        folder = find_base(run, RESULTS)
+        assert folder is not None, (run.task, run.seed)
+        (key,) = (
+            key
+            for key, seed in steered
+            if seed == run.seed
+            and (key.task, key.variant, key.embodiment) == (run.task, run.variant, run.embodiment)
+            and (key.env_steps, key.demonstrations) == (run.env_steps, run.demonstrations.count)
+        )
+        assert load_policy(folder).content_hash() == steered[key, run.seed]
 
 
 def test_agents_and_variants_of_a_seed_share_its_base_policy(tmp_path):
