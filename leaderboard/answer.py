@@ -6,14 +6,11 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 from symsteer.leaderboard.defects import MEASURES, advantage, dial_of, parts_of
-from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.paper import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.statistics import Interval, cell_estimates, combined
 from symsteer.leaderboard.summary import MIN_SEEDS, SYMMETRIC_EMBODIMENT, Key, Summary, Table
 from symsteer.leaderboard.text import code, count
 from symsteer.variant import UNBROKEN
-
-AGENTS = ("augmented", *WITH_SYMMETRY)
-"""Those that use the symmetry: the fair rival, which has it from data, and those of the map."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +39,7 @@ def gains(summary: Summary) -> list[Gain]:
     """By kind (unbroken worlds first), agent and measure; what has no paired runs is left out."""
     found = []
     for kind, tables in kinds(summary).items():
-        for agent in AGENTS:
+        for agent in USING_SYMMETRY:
             for measure in MEASURES:
                 cells = [pairs for t in tables if (pairs := advantage(t, agent, STANDARD, measure))]
                 enough = [pairs for pairs in cells if len(pairs) >= MIN_SEEDS]

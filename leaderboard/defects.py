@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.paper import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.paper import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.records import canonical_json
 from symsteer.leaderboard.statistics import (
     RESAMPLES,
@@ -370,11 +370,11 @@ class DefectMap:
         return sorted({e for (e, _, _), panel in self.panels.items() if panel.points})
 
     def agents(self, embodiment: str) -> list[str]:
-        """Those of `WITH_SYMMETRY` that have points."""
+        """Those of `USING_SYMMETRY` that have points."""
         with_points = {
             a for (e, a, _), panel in self.panels.items() if e == embodiment and panel.points
         }
-        return [agent for agent in WITH_SYMMETRY if agent in with_points]
+        return [agent for agent in USING_SYMMETRY if agent in with_points]
 
     def panel(self, embodiment: str, agent: str, measure: str) -> Panel:
         """A panel, without points if there are none."""
@@ -383,10 +383,10 @@ class DefectMap:
 
 
 def defect_map(summary: Summary, audit: Audit) -> DefectMap:
-    """Advantage of `WITH_SYMMETRY` over `STANDARD` in audited tables, with slopes."""
+    """Advantage of `USING_SYMMETRY` over `STANDARD` in audited tables, with slopes."""
     panels = {}
     for embodiment in sorted({table.key.embodiment for table in summary.tables}):
-        for agent in WITH_SYMMETRY:
+        for agent in USING_SYMMETRY:
             for measure in MEASURES:
                 points = points_of(summary, audit, embodiment, agent, measure)
                 fits = {

@@ -303,8 +303,8 @@ def advantage_map(found: DefectMap, embodiment: str) -> Figure:
     intervals, hollow points have few runs. A line per task has the slope within base policies and
     goes through the task's mean; the fan around it has the slopes of the 95 % interval.
     """
-    figure = Figure(figsize=(9.0, 6.9), layout="constrained")
     agents = found.agents(embodiment)
+    figure = Figure(figsize=(9.0, 1.4 + 2.75 * len(agents)), layout="constrained")
     shape = len(agents), len(MEASURES)
     grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
     panels = [[found.panel(embodiment, a, m) for m in MEASURES] for a in agents]

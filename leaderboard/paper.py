@@ -14,8 +14,12 @@ WITHOUT_SYMMETRY = (STANDARD, "standard-matched", "augmented")
 equivariant agent, and the fair one, which learns from rotated data."""
 
 WITH_SYMMETRY = ("equivariant", "residual-pathway", "approximate")
-"""The agents of the map, which shows their advantage over `STANDARD`. The last one is that of the
-first leaderboard, which `residual-pathway` has replaced."""
+"""Strict and approximate. The last one is that of the first leaderboard, which `residual-pathway` has
+replaced."""
+
+USING_SYMMETRY = ("augmented", *WITH_SYMMETRY)
+"""The agents whose advantage over `STANDARD` is shown by kind of break and on the map: the fair
+rival has the symmetry from data, the others have it in their networks."""
 
 ROW_ORDER = (BASE, "zero", "golden-ticket", *WITHOUT_SYMMETRY, *WITH_SYMMETRY, "wrong-group")
 """Other agents follow in alphabetical order; references come before learners, then controls. The

@@ -203,6 +203,15 @@ def test_the_map_pairs_and_places_every_audited_cell() -> None:
     assert [key.variant for key in found.unaudited] == ["obstacle:1"]
 
 
+def test_the_map_has_the_fair_rival() -> None:
+    rates = {"standard": 0.5, "augmented": 0.7, "equivariant": 0.9}
+    records = [*make_cell(rates), *make_cell(rates, variant="wind:1")]
+    found = defect_map(summary_of(records), audit_of({"none": 0.0, "wind:1": 0.3}))
+    assert found.agents("floating") == ["augmented", "equivariant"]
+    points = found.panel("floating", "augmented", "success").points
+    assert [point.advantage.value for point in points] == pytest.approx([0.2, 0.2])
+
+
 def test_the_area_is_measured_along_the_whole_curve() -> None:
     records = make_cell({"standard": (0.0, 0.5, 0.5), "equivariant": (0.0, 1.0, 0.5)})
     found = defect_map(summary_of(records), audit_of({"none": 0.0}))

@@ -85,6 +85,7 @@ def test_a_dead_link_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     linked = ("examples", "leaderboard/site", "leaderboard/LEADERBOARD.md", "CITATION.cff")
     linked += ("leaderboard/learners/LEADERBOARD.md", "leaderboard/results/audit")
     linked += ("leaderboard/zoo/LEADERBOARD.md", "leaderboard/results/base-policies")
+    linked += ("leaderboard/first/LEADERBOARD.md",)
     for name in ("docs", "README.md", "CHANGELOG.md", "mkdocs.yml", *linked):
         source = ROOT / name
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
