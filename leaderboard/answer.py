@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass
 
-from symsteer.leaderboard.defects import MEASURES, advantage, dial_of, parts_of
+from symsteer.leaderboard.defects import (
+    MEASURES,
+    Audit,
+    advantage,
+    defect_of,
+    dial_of,
+    parts_of,
+)
 from symsteer.leaderboard.paper import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.statistics import Interval, cell_estimates, combined
 from symsteer.leaderboard.summary import MIN_SEEDS, SYMMETRIC_EMBODIMENT, Key, Summary, Table
@@ -24,6 +31,7 @@ class Gain:
             all have fewer.
         pairs: paired runs in all of them.
         enough: whether the cells have the pairs that a verdict needs.
+        defects: smallest and largest audited defect of the kind's cells; None if one has none.
     """
 
     kind: str
@@ -33,12 +41,15 @@ class Gain:
     cells: int
     pairs: int
     enough: bool
+    defects: tuple[float, float] | None
 
 
-def gains(summary: Summary) -> list[Gain]:
+def gains(summary: Summary, audit: Audit) -> list[Gain]:
     """By kind (unbroken worlds first), agent and measure; what has no paired runs is left out."""
     found = []
     for kind, tables in kinds(summary).items():
+        audited = [defect.value for t in tables if (defect := defect_of(t.key, audit))]
+        defects = (min(audited), max(audited)) if len(audited) == len(tables) else None
         for agent in USING_SYMMETRY:
             for measure in MEASURES:
                 cells = [pairs for t in tables if (pairs := advantage(t, agent, STANDARD, measure))]
@@ -46,7 +57,7 @@ def gains(summary: Summary) -> list[Gain]:
                 if used := enough or cells:
                     drawn = combined(cell_estimates([list(pairs.values()) for pairs in used]))
                     sizes = len(used), sum(map(len, used)), bool(enough)
-                    found.append(Gain(kind, agent, measure, drawn.interval(), *sizes))
+                    found.append(Gain(kind, agent, measure, drawn.interval(), *sizes, defects))
     return found
 
 

@@ -4,26 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from symsteer.leaderboard.answer import Gain, gains
+from symsteer.leaderboard.answer import Gain
 from symsteer.leaderboard.claims_page import standing, statements
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import STANDARD
-from symsteer.leaderboard.summary import MIN_SEEDS, Summary
-from symsteer.leaderboard.text import NOTHING, code, difference, grid, image, interval
+from symsteer.leaderboard.summary import MIN_SEEDS
+from symsteer.leaderboard.text import (
+    NOTHING,
+    SPACE,
+    code,
+    difference,
+    grid,
+    image,
+    interval,
+    number,
+)
 
 ANSWER = f"""\
 Advantage over `{STANDARD}` by what breaks the symmetry: mean over cells of the difference in
 success (final window) and in the area under its curve, paired by base policy and episode, with 95 %
 intervals. \u25b2 and \u25bc: the interval excludes 0, in cells with {MIN_SEEDS} pairs of runs.
+*Defect*: how differently the world answers to turned copies of a decision, the smallest and the
+largest of these cells.
 """
 
 
-def answer_section(
-    summary: Summary, findings: Findings, figures: Mapping[str, tuple[str, str]]
-) -> list[str]:
+def answer_section(findings: Findings, figures: Mapping[str, tuple[str, str]]) -> list[str]:
     """The picture, the gains by kind of break, and what became of the claims."""
     parts = []
-    if gained := gains_section(summary):
+    if gained := gains_section(findings):
         explained, table = gained
         drawn = [image(*figures["answer"])] if "answer" in figures else []
         parts += ["## What symmetry gains", explained, *drawn, table]
@@ -31,9 +40,9 @@ def answer_section(
     return [*parts, *(["## Verdicts", verdicts] if verdicts else [])]
 
 
-def gains_section(summary: Summary) -> list[str]:
+def gains_section(findings: Findings) -> list[str]:
     """What the numbers are, and their table; empty if no runs can be paired."""
-    found = gains(summary)
+    found = findings.gains
     return [ANSWER.strip(), _gains_table(found)] if found else []
 
 
@@ -41,16 +50,28 @@ def _gains_table(found: Sequence[Gain]) -> str:
     agents = list(dict.fromkeys(gain.agent for gain in found))
     texts: dict[str, dict[str, list[str]]] = {}
     cells: dict[str, int] = {}
+    defects = {gain.kind: gain.defects for gain in found}
     for gain in found:
         text = difference(gain.effect) if gain.enough else interval(gain.effect, sign=True)
         texts.setdefault(gain.kind, {}).setdefault(gain.agent, []).append(text)
         cells[gain.kind] = max(gain.cells, cells.get(gain.kind, 0))
     rows = [
-        [kind, str(cells[kind]), *("<br>".join(own.get(agent, [NOTHING])) for agent in agents)]
+        [
+            kind,
+            _defects(defects[kind]),
+            str(cells[kind]),
+            *("<br>".join(own.get(agent, [NOTHING])) for agent in agents),
+        ]
         for kind, own in texts.items()
     ]
     header = [f"{code(agent)}: AUC,<br>success" for agent in agents]
-    return grid(["World", "Cells", *header], rows, left=1)
+    return grid(["World", "Defect", "Cells", *header], rows, left=1)
+
+
+def _defects(found: tuple[float, float] | None) -> str:
+    if found is None:
+        return NOTHING
+    return " to ".join(dict.fromkeys(number(defect) for defect in found)).replace(" ", SPACE)
 
 
 def _verdicts(findings: Findings) -> str:

@@ -21,7 +21,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from symsteer.leaderboard.answer import Gain, gains
+from symsteer.leaderboard.answer import Gain
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
 from symsteer.leaderboard.curves import mean_series, series, success_curve
 from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel
@@ -121,9 +121,9 @@ def render_figures(summary: Summary, findings: Findings) -> list[Drawing]:
         if table.runs:
             places.setdefault((table.key.task, table.key.embodiment), []).append(table)
     with mpl_style.context(SHEETS):
-        if found := gains(summary):
+        if findings.gains:
             text = "Advantage of symmetry over the standard agent, by kind of break"
-            drawings.append(Drawing("answer", (), text, answer_chart(found)))
+            drawings.append(Drawing("answer", (), text, answer_chart(findings.gains)))
         for embodiment in findings.map.embodiments:
             text = "Advantage of symmetry against the audited defect"
             figure = advantage_map(findings.map, embodiment)
@@ -374,10 +374,14 @@ def _draw_fit(ax: Axes, fit: Fit) -> None:
 
 
 def answer_chart(found: Sequence[Gain]) -> Figure:
-    """Advantage over the standard agent by kind of break, with 95 % intervals; hollow: few runs."""
-    kinds = list(dict.fromkeys(gain.kind for gain in found))
+    """Advantage over the standard agent by kind of break, with 95 % intervals; hollow: few runs.
+
+    Beside each kind stand the smallest and the largest audited defect of its cells.
+    """
+    defects = {gain.kind: gain.defects for gain in found}
+    kinds = list(defects)
     agents = list(dict.fromkeys(gain.agent for gain in found))
-    figure = Figure(figsize=(9.0, 1.2 + 0.36 * len(kinds)), layout="constrained")
+    figure = Figure(figsize=(9.0, 1.2 + 0.44 * len(kinds)), layout="constrained")
     names = {"auc": "area under the curve", "success": "final success"}
     axes = figure.subplots(1, len(MEASURES), sharey=True)
     for ax, measure in zip(axes, MEASURES, strict=True):
@@ -399,7 +403,8 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
             )
         ax.set_title(f"advantage over {STANDARD}: {names[measure]}")
         ax.grid(axis="y", visible=False)
-    axes[0].set_yticks(range(len(kinds)), [plain(kind.replace("`", ""), 44) for kind in kinds])
+    labels = [_with_defects(kind, ends) for kind, ends in defects.items()]
+    axes[0].set_yticks(range(len(kinds)), labels)
     axes[0].set_ylim(len(kinds) - 0.5, -0.5)
     handles: dict[str, Line2D | Patch] = {}
     for agent in agents:
@@ -407,6 +412,14 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
         handles[plain(agent, 26)] = Line2D([], [], color=color, marker=marker, linestyle=line)
     _legend(figure, handles)
     return figure
+
+
+def _with_defects(kind: str, ends: tuple[float, float] | None) -> str:
+    """A kind of break without its marks of code, and the audited defects of its cells below it."""
+    text = plain(kind.replace("`", ""), 44)
+    if ends is None:
+        return text
+    return f"{text}\ndefect {' to '.join(dict.fromkeys(f'{end:.2f}' for end in ends))}"
 
 
 def performance_profiles(found: Comparisons) -> Figure:

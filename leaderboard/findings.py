@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from symsteer.leaderboard.advice import LeaveOut, leave_tasks_out
+from symsteer.leaderboard.answer import Gain, gains
 from symsteer.leaderboard.claims import Outcome, claims
 from symsteer.leaderboard.comparisons import Comparisons, compare_agents
 from symsteer.leaderboard.defects import Audit, DefectMap, defect_map, fingerprint
@@ -17,6 +18,8 @@ from symsteer.leaderboard.summary import Summary, success_sample
 class Findings:
     """What is computed over all tables together."""
 
+    gains: list[Gain]
+    """Advantage of symmetry by kind of break."""
     map: DefectMap
     """Advantage of symmetry against the audited defect."""
     left_out: list[LeaveOut]
@@ -38,6 +41,7 @@ def analyse(summary: Summary, audit: Audit, study: Study) -> Findings:
     """
     found = defect_map(summary, audit)
     return Findings(
+        gains(summary, audit),
         found,
         [leave_tasks_out([summary], audit, embodiment) for embodiment in found.embodiments],
         compare_agents(summary),

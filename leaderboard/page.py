@@ -116,7 +116,7 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     parts += [findings.study.notice] if findings.study.notice else []
     if notice := seed_notice(summary):
         parts.append(notice)
-    parts += answer_section(summary, findings, overall)
+    parts += answer_section(findings, overall)
     reading = [READING.strip()]
     if summary.has_reproductions:
         reading.append(MADE_AGAIN.strip())

@@ -14,8 +14,8 @@ WITHOUT_SYMMETRY = (STANDARD, "standard-matched", "augmented")
 equivariant agent, and the fair one, which learns from rotated data."""
 
 WITH_SYMMETRY = ("equivariant", "residual-pathway", "approximate")
-"""Strict and approximate. The last one is that of the first leaderboard, which `residual-pathway` has
-replaced."""
+"""Strict and approximate. The last one is that of the first leaderboard, which `residual-pathway`
+has replaced."""
 
 USING_SYMMETRY = ("augmented", *WITH_SYMMETRY)
 """The agents whose advantage over `STANDARD` is shown by kind of break and on the map: the fair

@@ -30,9 +30,7 @@ RECORD = "record.json"
 _BEGINNING = re.compile(rb'\s*\{\s*"schema_version"\s*:\s*\d+\s*,\s*"run_id"')
 
 
-def chosen_records(
-    records: Sequence[Path], verb: str, argument: str = "RUNS"
-) -> Sequence[Path]:
+def chosen_records(records: Sequence[Path], verb: str, argument: str = "RUNS") -> Sequence[Path]:
     """The records that a verb was given, in ``argument``; else the committed ones.
 
     Raises:

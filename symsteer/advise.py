@@ -46,7 +46,8 @@ def advise(
         group: Group of the base policy.
         audit: What `symsteer audit --out` wrote, the folder or its audit.json or summary.json.
         detection: What `symsteer detect --out` wrote, the folder or its detect.json.
-        records: Folders of runs or records, each a study of its own; default: the committed records.
+        records: Folders of runs or records, each a study of its own; default: the committed
+            records.
         states: States of the expert and of the base policy, each, of an audit that is measured.
         runs: Folder of the runs; base policies of an audit that is measured are kept in RUNS/base.
         json: Write everything into this file, too.

@@ -33,6 +33,9 @@ SHARED = Path(__file__).resolve().parent / "static"
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md"}
 """Files of the repository's root that are pages, too."""
 
+PICTURES = {"leaderboard/figures/answer.svg": "assets/answer.svg"}
+"""Pictures outside of `docs/` that these pages show."""
+
 RESULTS = "leaderboard/LEADERBOARD.md"
 """The committed leaderboard; of the site these are the results."""
 
@@ -66,6 +69,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
     for name, page in PAGES.items():
         files.append(File.generated(config, page, content=(ROOT / name).read_text()))
+    for name, address in PICTURES.items():
+        files.append(File.generated(config, address, abs_src_path=str(ROOT / name)))
     for path in sorted(SHARED.iterdir()):
         if path.name in ("theme.js", "header.css", "icon.svg"):
             files.append(File.generated(config, f"assets/{path.name}", abs_src_path=str(path)))
@@ -118,8 +123,8 @@ def relinked(text: str, place: str, source: str) -> str:
 
 def site_address(target: str) -> str | None:
     """The documentation's file that stands for a file of the repository; None if none does."""
-    if target in PAGES:
-        return PAGES[target]
+    if found := PAGES.get(target) or PICTURES.get(target):
+        return found
     return target.removeprefix("docs/") if target.startswith("docs/") else None
 
 

@@ -80,7 +80,7 @@ def overview(board: Board) -> Values:
             }
             for name, (above, below, cells) in page.against_references(summary).items()
         ],
-        "gains": markup.html(gains_section(summary)),
+        "gains": markup.html(gains_section(board.findings)),
         "claims": Counter(outcome.verdict for outcome in board.findings.claims),
         "agents": [(name, board.agent(name)) for name in summary.agents],
         "matrix": [_matrix_row(board, table) for table in summary.tables],

@@ -85,7 +85,7 @@ def test_a_dead_link_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     linked = ("examples", "leaderboard/site", "leaderboard/LEADERBOARD.md", "CITATION.cff")
     linked += ("leaderboard/learners/LEADERBOARD.md", "leaderboard/results/audit")
     linked += ("leaderboard/zoo/LEADERBOARD.md", "leaderboard/results/base-policies")
-    linked += ("leaderboard/first/LEADERBOARD.md",)
+    linked += ("leaderboard/first/LEADERBOARD.md", "leaderboard/PAPER.md", "leaderboard/figures")
     for name in ("docs", "README.md", "CHANGELOG.md", "mkdocs.yml", *linked):
         source = ROOT / name
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
@@ -152,3 +152,5 @@ def test_links_of_pages() -> None:
         "[whole](leaderboard/LEADERBOARD.md) [d](docs/api.md)", "README.md", "index.md"
     )
     assert readme == '<a href="../index.html">whole</a> [d](api.md)'
+    picture = relinked("![answer](leaderboard/figures/answer.svg)", "README.md", "index.md")
+    assert picture == "![answer](assets/answer.svg)"
