@@ -196,7 +196,11 @@ def advise(summaries: Sequence[Summary], audit: Audit, world: World) -> Advice:
 
 
 def choose(measure: str, expected: Sequence[Expected]) -> Choice:
-    """The agents that are clearly better than `STANDARD`; this one if all are clearly worse."""
+    """The agents that are clearly better than `STANDARD`; this one if all are clearly worse.
+
+    Agents of which no record says anything do not count, unless that is so of all.
+    """
+    expected = [e for e in expected if e.value is not None] or expected
     better = sorted((e for e in expected if e.sign > 0), key=lambda e: -(e.value or 0.0))
     if better:
         return Choice(measure, tuple(e.agent for e in better), "")

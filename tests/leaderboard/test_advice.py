@@ -10,6 +10,7 @@ import pytest
 
 from symsteer.leaderboard.advice import (
     Advice,
+    Choice,
     Expected,
     Lines,
     World,
@@ -196,6 +197,10 @@ def test_the_choice() -> None:
     )
     # An agent of which too little is known does not make the others worse.
     assert choose("auc", [below, poor]).agents == ()
+    # One of which nothing is known does not keep the others from being worse.
+    unknown = replace(poor, value=None, interval=None, reasons=("no mapped cell is like it: wind",))
+    assert choose("auc", [below, unknown]).agents == ("standard",)
+    assert choose("auc", [unknown]) == Choice("auc", (), "no mapped cell is like it: wind")
 
 
 # Left-out tasks
