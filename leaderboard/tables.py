@@ -94,7 +94,7 @@ def section(table: Table, links: Links) -> list[str]:
     rows = []
     for row in sorted(there, key=_place):
         cells = [
-            code(row.label),
+            _name(row),
             stacked(row.success),
             number(row.last.value if row.last else None),
             stacked(row.difference, True, MARKS[row.difference.sign] if row.difference else ""),
@@ -159,9 +159,14 @@ def _base_line(table: Table) -> str:
     return " ".join(text)
 
 
+def _name(row: Row) -> str:
+    """An agent's label; below it the environment steps that a reference has searched."""
+    if not row.search_steps:
+        return code(row.label)
+    return f"{code(row.label)}<br>search {count(row.search_steps)}".replace(" ", SPACE)
+
+
 def _steps(row: Row, budget: int) -> str:
-    if row.search_steps:
-        return f"search {count(row.search_steps)}".replace(" ", SPACE)
     if not row.threshold_steps:
         return NOTHING
     reached = sum(steps is not None for steps in row.threshold_steps)

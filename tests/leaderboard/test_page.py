@@ -112,14 +112,14 @@ def test_the_main_table_ranks_with_ties_and_never_references(board: Path) -> Non
     assert ranks == {
         "`base`": "\u2013",
         "`zero`": "\u2013",
-        "`golden-ticket`": "\u2013",
+        "`golden-ticket`<br>search 12.8 k": "\u2013",
         "`equivariant`": "1",
         "`residual-pathway`": "2",
         "`standard`": "3=",
         "`standard-matched`": "3=",
     }
     assert list(ranks) == [row[1] for row in rows]
-    assert shown["`golden-ticket`"][6] == "search 12.8 k"
+    assert shown["`golden-ticket`<br>search 12.8 k"][6] == "\u2013"
     assert shown["`standard`"][6] == "> 50 k (0/5)"
     assert shown["`equivariant`"][6] == "0 (5/5)"
     assert re.fullmatch(r"0\.80<br>\[0\.\d\d, 0\.\d\d\]", shown["`equivariant`"][2])
