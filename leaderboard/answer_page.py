@@ -14,6 +14,7 @@ from symsteer.leaderboard.text import (
     SPACE,
     code,
     difference,
+    folded,
     grid,
     image,
     interval,
@@ -23,27 +24,31 @@ from symsteer.leaderboard.text import (
 ANSWER = f"""\
 Advantage over `{STANDARD}` by what breaks the symmetry: mean over cells of the difference in
 success (final window) and in the area under its curve, paired by base policy and episode, with 95 %
-intervals. \u25b2 and \u25bc: the interval excludes 0, in cells with {MIN_SEEDS} pairs of runs.
-*Defect*: how differently the world answers to turned copies of a decision, the smallest and the
-largest of these cells.
+intervals. The *defect* is how differently the world answers to turned copies of a decision: the
+smallest and the largest of these cells.
+"""
+
+MARKED = f"""\
+\u25b2 and \u25bc: the interval excludes 0, in cells with {MIN_SEEDS} pairs of runs.
 """
 
 
 def answer_section(findings: Findings, figures: Mapping[str, tuple[str, str]]) -> list[str]:
-    """The picture, the gains by kind of break, and what became of the claims."""
+    """The picture of what symmetry gains, its numbers, folded, and what became of the claims."""
     parts = []
     if gained := gains_section(findings):
-        explained, table = gained
+        explained, *numbers = gained
         drawn = [image(*figures["answer"])] if "answer" in figures else []
-        parts += ["## What symmetry gains", explained, *drawn, table]
+        parts += ["## What symmetry gains", explained, *drawn]
+        parts += folded("The picture's numbers", numbers)
     verdicts = _verdicts(findings)
     return [*parts, *(["## Verdicts", verdicts] if verdicts else [])]
 
 
 def gains_section(findings: Findings) -> list[str]:
-    """What the numbers are, and their table; empty if no runs can be paired."""
+    """What is shown, what marks mean, and the table; empty if no runs can be paired."""
     found = findings.gains
-    return [ANSWER.strip(), _gains_table(found)] if found else []
+    return [ANSWER.strip(), MARKED.strip(), _gains_table(found)] if found else []
 
 
 def _gains_table(found: Sequence[Gain]) -> str:
@@ -57,21 +62,21 @@ def _gains_table(found: Sequence[Gain]) -> str:
         cells[gain.kind] = max(gain.cells, cells.get(gain.kind, 0))
     rows = [
         [
-            kind,
-            _defects(defects[kind]),
+            kind + _defects(defects[kind]),
             str(cells[kind]),
             *("<br>".join(own.get(agent, [NOTHING])) for agent in agents),
         ]
         for kind, own in texts.items()
     ]
     header = [f"{code(agent)}: AUC,<br>success" for agent in agents]
-    return grid(["World", "Defect", "Cells", *header], rows, left=1)
+    return grid(["World", "Cells", *header], rows, left=1)
 
 
 def _defects(found: tuple[float, float] | None) -> str:
     if found is None:
-        return NOTHING
-    return " to ".join(dict.fromkeys(number(defect) for defect in found)).replace(" ", SPACE)
+        return ""
+    ends = " to ".join(dict.fromkeys(number(defect) for defect in found))
+    return f"<br>defect {ends}".replace(" ", SPACE)
 
 
 def _verdicts(findings: Findings) -> str:

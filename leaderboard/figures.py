@@ -381,7 +381,7 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
     defects = {gain.kind: gain.defects for gain in found}
     kinds = list(defects)
     agents = list(dict.fromkeys(gain.agent for gain in found))
-    figure = Figure(figsize=(9.0, 1.2 + 0.44 * len(kinds)), layout="constrained")
+    figure = Figure(figsize=(9.0, 1.2 + 0.36 * len(kinds)), layout="constrained")
     names = {"auc": "area under the curve", "success": "final success"}
     axes = figure.subplots(1, len(MEASURES), sharey=True)
     for ax, measure in zip(axes, MEASURES, strict=True):

@@ -24,6 +24,7 @@ from symsteer.leaderboard.text import (
     SPACE,
     code,
     compact,
+    folded,
     grid,
     image,
     interval,
@@ -152,11 +153,6 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
         parts += folded(title, [*names, *drawn, *blocks])
     parts += folded("Provenance", _provenance(summary, findings.audit, links))
     return "\n\n".join(parts) + "\n"
-
-
-def folded(title: str, blocks: Sequence[str]) -> list[str]:
-    """Blocks of markdown that a reader opens; the title is our own."""
-    return [f"<details>\n<summary>{title}</summary>", *blocks, "</details>"]
 
 
 def effects_section(summary: Summary) -> list[str]:
