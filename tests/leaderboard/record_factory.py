@@ -80,6 +80,9 @@ def make_record(
         evaluations = [make_evaluation([1, 0, 1, 0, 1])]
     if status != "finished":
         evaluations = [e.model_copy(update={"final": False}) for e in evaluations]
+    budget = Budget(env_steps=config["env_steps"], decisions=6_250, updates=6_250 * learns)
+    if agent in ("base", "zero"):
+        budget = Budget(env_steps=0, decisions=0, updates=0)
     return RunRecord(
         run_id=re.sub(r"[^\w.=-]", "=", f"run-{config['variant']}-{agent}-{seed}", flags=re.ASCII),
         config=config,
@@ -107,7 +110,7 @@ def make_record(
         wall_clock=WallClock(
             simulate=100, decode=5, update=90, evaluate=30, diagnose=15, total=250
         ),
-        budget=Budget(env_steps=config["env_steps"], decisions=6_250, updates=6_250 * learns),
+        budget=budget,
         base_policy=BasePolicy(
             name="edp",
             group="C8",

@@ -35,7 +35,8 @@ def admissible(agent: str = "standard", seed: int = 0, **config: Any) -> RunReco
     """A record that the leaderboard admits; `seed` also decides what it measured."""
     curve = make_curve(np.random.default_rng(seed), [0.3, 0.5, 0.7])
     if agent not in LEARNING:
-        curve = [make_evaluation([1, 0] * 50)]
+        steps = make_record(agent=agent, **config).budget.env_steps
+        curve = [make_evaluation([1, 0] * 50, steps)]
     for evaluation in curve:
         number = len(evaluation.episodes.seed)
         evaluation.episodes.seed = [HELD_OUT_SEED + i for i in range(number)]
