@@ -7,6 +7,7 @@ import json
 import pytest
 
 from symsteer.cli import main
+from symsteer.leaderboard import paths
 from symsteer.leaderboard.records import write_record
 from tests.leaderboard.test_defects import CELL, cells
 
@@ -121,6 +122,13 @@ def test_mistakes(advise, tmp_path, monkeypatch, arguments, words):
     assert (code, shown.out) == (2, "")
     assert words in shown.err
     assert shown.err.count("\n") == 1
+
+
+def test_an_installed_package_has_no_committed_records(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(paths, "RECORDS", tmp_path / "nothing")
+    monkeypatch.setattr("sys.argv", ["symsteer", "advise", "--task", "PushT-v1"])
+    assert main() == 2
+    assert "name run folders: symsteer advise --records RUNS" in capsys.readouterr().err
 
 
 @pytest.mark.slow
