@@ -1,8 +1,9 @@
-"""What symmetry gains over the standard agent, by kind of break: the page's first screen."""
+"""The page's first screen: what symmetry gains by kind of break, and where learners are ahead."""
 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from symsteer.leaderboard.defects import (
@@ -14,8 +15,15 @@ from symsteer.leaderboard.defects import (
     parts_of,
 )
 from symsteer.leaderboard.paper import STANDARD, USING_SYMMETRY
-from symsteer.leaderboard.statistics import Interval, cell_estimates, combined
-from symsteer.leaderboard.summary import MIN_SEEDS, SYMMETRIC_EMBODIMENT, Key, Summary, Table
+from symsteer.leaderboard.statistics import Interval, cell_estimates, combined, crossed_bootstrap
+from symsteer.leaderboard.summary import (
+    MIN_SEEDS,
+    SYMMETRIC_EMBODIMENT,
+    Key,
+    Summary,
+    Table,
+    success_pairs,
+)
 from symsteer.leaderboard.text import code, count
 from symsteer.variant import UNBROKEN
 
@@ -59,6 +67,46 @@ def gains(summary: Summary, audit: Audit) -> list[Gain]:
                     sizes = len(used), sum(map(len, used)), bool(enough)
                     found.append(Gain(kind, agent, measure, drawn.interval(), *sizes, defects))
     return found
+
+
+@dataclass(frozen=True)
+class Tally:
+    """In how many cells an agent's final success is clearly above and clearly below another's.
+
+    Attributes:
+        cells: those with the pairs of runs that a verdict needs.
+    """
+
+    above: int
+    below: int
+    cells: int
+
+
+def against_references(summary: Summary) -> dict[str, Tally]:
+    """Each learner against a cell's best reference; agents without such a cell are left out."""
+    found = {}
+    for agent in summary.agents:
+        rows = [t.row_of(agent) for t in summary.tables if t.best_reference]
+        enough = [row for row in rows if row and row.pairs_with_best >= MIN_SEEDS]
+        found[agent] = _tally(row.against_best for row in enough)
+    return {agent: tally for agent, tally in found.items() if tally.cells}
+
+
+def against_standard(summary: Summary) -> dict[str, Tally]:
+    """Each other learner against `STANDARD`; agents without a cell in common are left out."""
+    found = {}
+    for agent in summary.agents:
+        rows = [(t.row_of(agent), t.row_of(STANDARD)) for t in summary.tables]
+        if agent != STANDARD and summary.roles[agent] != "reference":
+            pairs = [success_pairs(row, other) for row, other in rows if row and other]
+            enough = [list(own.values()) for own in pairs if len(own) >= MIN_SEEDS]
+            found[agent] = _tally(map(crossed_bootstrap, enough))
+    return {agent: tally for agent, tally in found.items() if tally.cells}
+
+
+def _tally(found: Iterable[Interval | None]) -> Tally:
+    signs = [effect.sign for effect in found if effect]
+    return Tally(signs.count(1), signs.count(-1), len(signs))
 
 
 def kinds(summary: Summary) -> dict[str, list[Table]]:

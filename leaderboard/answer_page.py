@@ -1,48 +1,76 @@
-"""The page's first screen: what symmetry gains by kind of break, and what became of the claims."""
+"""The page's first screen: what symmetry gains, learners at a glance, what became of the claims."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from symsteer.leaderboard.answer import Gain
+from symsteer.leaderboard.answer import Gain, Tally, against_references, against_standard
 from symsteer.leaderboard.claims_page import standing, statements
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import STANDARD
-from symsteer.leaderboard.summary import MIN_SEEDS
+from symsteer.leaderboard.summary import MIN_SEEDS, Summary
 from symsteer.leaderboard.text import (
+    MARKS,
     NOTHING,
     SPACE,
     code,
     difference,
+    ends,
     folded,
     grid,
     image,
     interval,
-    number,
 )
 
 ANSWER = f"""\
-Advantage over `{STANDARD}` by what breaks the symmetry: mean over cells of the difference in
-success (final window) and in the area under its curve, paired by base policy and episode, with 95 %
-intervals. The *defect* is how differently the world answers to turned copies of a decision: the
-smallest and the largest of these cells.
+Advantage over `{STANDARD}` by what breaks the symmetry, with 95 % intervals. In brackets: the
+*defect*, how differently the world answers to turned copies of a decision.
+"""
+
+GLANCE = f"""\
+In how many cells a learner's final success is clearly above (\u25b2) and clearly below (\u25bc)
+that of `{STANDARD}`, and that of the best reference, the frozen policy alone.
 """
 
 MARKED = f"""\
-\u25b2 and \u25bc: the interval excludes 0, in cells with {MIN_SEEDS} pairs of runs.
+Means over cells of the difference in the area under the success curve (AUC) and in success (final
+window), paired by base policy and episode. The defect is that of an audit, from the smallest to the
+largest of these cells. \u25b2 and \u25bc: the interval excludes 0, in cells with {MIN_SEEDS} pairs.
 """
 
 
-def answer_section(findings: Findings, figures: Mapping[str, tuple[str, str]]) -> list[str]:
-    """The picture of what symmetry gains, its numbers, folded, and what became of the claims."""
+def answer_section(
+    summary: Summary, findings: Findings, figures: Mapping[str, tuple[str, str]]
+) -> list[str]:
+    """The picture of what symmetry gains, its numbers (folded), learners at a glance, verdicts."""
     parts = []
     if gained := gains_section(findings):
         explained, *numbers = gained
         drawn = [image(*figures["answer"])] if "answer" in figures else []
         parts += ["## What symmetry gains", explained, *drawn]
         parts += folded("The picture's numbers", numbers)
+    if tallies := _glance(summary):
+        parts += ["## At a glance", GLANCE.strip(), tallies]
     verdicts = _verdicts(findings)
     return [*parts, *(["## Verdicts", verdicts] if verdicts else [])]
+
+
+def _glance(summary: Summary) -> str:
+    """The table of learners, in the page's order; empty if no cell has enough pairs of runs."""
+    rivals = [against_standard(summary), against_references(summary)]
+    rows = [
+        [code(agent), *(_tally(tallies.get(agent)) for tallies in rivals)]
+        for agent in summary.agents
+        if any(agent in tallies for tallies in rivals)
+    ]
+    header = ["Learner", f"Against {code(STANDARD)}", "Against the best reference"]
+    return grid(header, rows, left=1) if rows else ""
+
+
+def _tally(found: Tally | None) -> str:
+    if found is None:
+        return NOTHING
+    return f"{found.above}{MARKS[1]} {found.below}{MARKS[-1]} of {found.cells}".replace(" ", SPACE)
 
 
 def gains_section(findings: Findings) -> list[str]:
@@ -62,21 +90,15 @@ def _gains_table(found: Sequence[Gain]) -> str:
         cells[gain.kind] = max(gain.cells, cells.get(gain.kind, 0))
     rows = [
         [
-            kind + _defects(defects[kind]),
+            kind,
+            ends(defects[kind]).replace(" ", SPACE),
             str(cells[kind]),
             *("<br>".join(own.get(agent, [NOTHING])) for agent in agents),
         ]
         for kind, own in texts.items()
     ]
     header = [f"{code(agent)}: AUC,<br>success" for agent in agents]
-    return grid(["World", "Cells", *header], rows, left=1)
-
-
-def _defects(found: tuple[float, float] | None) -> str:
-    if found is None:
-        return ""
-    ends = " to ".join(dict.fromkeys(number(defect) for defect in found))
-    return f"<br>defect {ends}".replace(" ", SPACE)
+    return grid(["World", "Defect", "Cells", *header], rows, left=1)
 
 
 def _verdicts(findings: Findings) -> str:

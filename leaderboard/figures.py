@@ -30,7 +30,7 @@ from symsteer.leaderboard.paper import BASE, STANDARD
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import MIN_SEEDS, Row, Summary, Table
 from symsteer.leaderboard.tables import beside_variant
-from symsteer.leaderboard.text import SPACE
+from symsteer.leaderboard.text import SPACE, ends
 
 Style = tuple[str, str, Any]
 """Color, marker and line style of an agent."""
@@ -376,12 +376,12 @@ def _draw_fit(ax: Axes, fit: Fit) -> None:
 def answer_chart(found: Sequence[Gain]) -> Figure:
     """Advantage over the standard agent by kind of break, with 95 % intervals; hollow: few runs.
 
-    Beside each kind stand the smallest and the largest audited defect of its cells.
+    In brackets stand the smallest and the largest audited defect of a kind's cells.
     """
     defects = {gain.kind: gain.defects for gain in found}
     kinds = list(defects)
     agents = list(dict.fromkeys(gain.agent for gain in found))
-    figure = Figure(figsize=(9.0, 1.2 + 0.36 * len(kinds)), layout="constrained")
+    figure = Figure(figsize=(9.0, 0.9 + 0.28 * len(kinds)), layout="constrained")
     names = {"auc": "area under the curve", "success": "final success"}
     axes = figure.subplots(1, len(MEASURES), sharey=True)
     for ax, measure in zip(axes, MEASURES, strict=True):
@@ -393,7 +393,7 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
             shift = agents.index(gain.agent) - (len(agents) - 1) / 2
             ax.errorbar(
                 gain.effect.value,
-                kinds.index(gain.kind) + 0.2 * shift,
+                kinds.index(gain.kind) + 0.24 * shift,
                 xerr=_arms(gain.effect),
                 color=color,
                 marker=marker,
@@ -403,7 +403,7 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
             )
         ax.set_title(f"advantage over {STANDARD}: {names[measure]}")
         ax.grid(axis="y", visible=False)
-    labels = [_with_defects(kind, ends) for kind, ends in defects.items()]
+    labels = [_with_defects(kind, own) for kind, own in defects.items()]
     axes[0].set_yticks(range(len(kinds)), labels)
     axes[0].set_ylim(len(kinds) - 0.5, -0.5)
     handles: dict[str, Line2D | Patch] = {}
@@ -414,12 +414,10 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
     return figure
 
 
-def _with_defects(kind: str, ends: tuple[float, float] | None) -> str:
-    """A kind of break without its marks of code, and the audited defects of its cells below it."""
+def _with_defects(kind: str, defects: tuple[float, float] | None) -> str:
+    """A kind of break without its marks of code, and the audited defects of its cells."""
     text = plain(kind.replace("`", ""), 44)
-    if ends is None:
-        return text
-    return f"{text}\ndefect {' to '.join(dict.fromkeys(f'{end:.2f}' for end in ends))}"
+    return f"{text} ({ends(defects)})" if defects else text
 
 
 def performance_profiles(found: Comparisons) -> Figure:

@@ -16,6 +16,7 @@ from symsteer.leaderboard.map_page import Figures, map_section
 from symsteer.leaderboard.records import MAX_GROWTH, MAX_OVERSHOOT, Provenance
 from symsteer.leaderboard.soundness import MAX_BIAS, MAX_FALL, MIN_CORRELATION, soundness
 from symsteer.leaderboard.statistics import Spread
+from symsteer.leaderboard.study import Study
 from symsteer.leaderboard.summary import MIN_SEEDS, THRESHOLD, Row, Run, Summary, Table
 from symsteer.leaderboard.tables import Links, cell_name, heading, section, status
 from symsteer.leaderboard.text import (
@@ -114,17 +115,16 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
         "# Leaderboard",
         "This page is generated from run records by `symsteer report`; do not edit it.",
     ]
-    parts += [findings.study.notice] if findings.study.notice else []
+    parts += notices(findings.study)
     if notice := seed_notice(summary):
         parts.append(notice)
-    parts += answer_section(findings, overall)
+    parts += answer_section(summary, findings, overall)
     reading = [READING.strip()]
     if summary.has_reproductions:
         reading.append(MADE_AGAIN.strip())
     parts += ["## Details", *folded("How to read it", reading)]
     parts += folded("Claims, effects and p-values", [CLAIMS.strip(), *claims_section(findings)])
-    beaten = _beaten(summary)
-    parts += folded("Success in every cell", [_overview(summary), *([beaten] if beaten else [])])
+    parts += folded("Success in every cell", [_overview(summary)])
     against = map_section(summary, findings, figures)
     parts += folded("The advantage of symmetry against the defect", against)
     if findings.comparisons.cells:
@@ -153,6 +153,12 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
         parts += folded(title, [*names, *drawn, *blocks])
     parts += folded("Provenance", _provenance(summary, findings.audit, links))
     return "\n\n".join(parts) + "\n"
+
+
+def notices(study: Study) -> list[str]:
+    """What a study says above all results, as blocks of markdown."""
+    details = "\n\n".join(folded("In numbers, and within which limits", [study.details]))
+    return [*([study.notice] if study.notice else []), *([details] if study.details else [])]
 
 
 def effects_section(summary: Summary) -> list[str]:
@@ -215,32 +221,6 @@ def _glance(row: Row) -> str:
     mark = MARKS[row.difference.sign] if row.difference else ""
     dagger = " \u2020" if any(row.diverged) else ""
     return f"{number(row.success.value)}{mark}{dagger}".replace(" ", SPACE)
-
-
-def against_references(summary: Summary) -> dict[str, tuple[int, int, int]]:
-    """In how many cells each learner is clearly above and clearly below the best reference.
-
-    The third number counts the cells with enough pairs; agents without such a cell are left out.
-    """
-    found = {}
-    for agent in summary.agents:
-        rows = [t.row_of(agent) for t in summary.tables if t.best_reference]
-        enough = [row for row in rows if row and row.pairs_with_best >= MIN_SEEDS]
-        signs = [row.against_best.sign for row in enough if row.against_best]
-        if signs:
-            found[agent] = signs.count(1), signs.count(-1), len(signs)
-    return found
-
-
-def _beaten(summary: Summary) -> str:
-    """`against_references` as a sentence."""
-    texts = [
-        f"{code(agent)} clearly above in {above}, clearly below in {below} of {cells}"
-        for agent, (above, below, cells) in against_references(summary).items()
-    ]
-    if not texts:
-        return ""
-    return f"Against the best reference of each cell, the frozen policy alone: {'; '.join(texts)}."
 
 
 def spreads_section(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
@@ -335,6 +315,7 @@ def provenance_facts(summary: Summary, audit: str) -> str:
     hours = sum(record.wall_clock.total for record in records) / 3600
     resumed = sum(record.wall_clock.resumed > 0 for record in records)
     packages = (f"{name} {version}" for p in places for name, version in p.packages.items())
+    processors = _values(p.processor for p in places if p.processor)
     facts = [
         f"Runs: {len(records)}, {number(hours, 1)} hours in all, {started:%Y-%m-%d} to "
         f"{ended:%Y-%m-%d} (UTC)"
@@ -343,6 +324,7 @@ def provenance_facts(summary: Summary, audit: str) -> str:
         f"Devices: {_values(p.device for p in places)}; platforms: "
         f"{_values(p.platform for p in places)}; Python: {_values(p.python for p in places)}; "
         f"torch threads: {_values(str(p.torch_threads) for p in places)}",
+        *([f"Processors: {processors}"] if processors != NOTHING else []),
         f"Packages: {_values(packages)}",
         f"Audit of the defects: {code(audit)}",
     ]

@@ -94,6 +94,7 @@ class Statement(_Table):
 class _File(_Table):
     description: str = ""
     notice: str = ""
+    details: str = ""
     declared: Annotated[str, Field(pattern=r"^([0-9a-f]{7,40})?$")] = ""
     claims: str = ""
     """Another file of the same folder, which holds the claims."""
@@ -118,6 +119,7 @@ class Study:
 
     Attributes:
         notice: markdown that the page shows above all results.
+        details: markdown that the page shows below it, folded.
         declared: the commit that declared the claims, if the study names one.
         claims: in the order of the file.
         statements: of the paper, each with the claims that test it.
@@ -126,6 +128,7 @@ class Study:
     """
 
     notice: str
+    details: str
     declared: str
     claims: tuple[Claim, ...]
     statements: tuple[Statement, ...]
@@ -156,13 +159,13 @@ def read_study(name_or_path: str) -> Study:
             raise UserError(
                 f"{path.name}: claims must name a file that declares claims itself, in place of own"
             )
-        file = declaring.model_copy(update={"notice": file.notice, "declared": file.declared})
+        own = {"notice": file.notice, "details": file.details, "declared": file.declared}
+        file = declaring.model_copy(update=own)
     if file.declared:
         _check_commit(source, file.declared)
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    return Study(
-        file.notice.strip(), file.declared, file.claim, file.statement, source.name, digest
-    )
+    texts = file.notice.strip(), file.details.strip(), file.declared
+    return Study(*texts, file.claim, file.statement, source.name, digest)
 
 
 def _read(path: Path) -> _File:

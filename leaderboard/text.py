@@ -88,6 +88,11 @@ def stacked(value: Interval | None, sign: bool = False, marks: str = "", digits:
     return f"{middle}{marks}".replace(" ", SPACE) + f"<br>{ends}"
 
 
+def ends(values: tuple[float, float] | None) -> str:
+    """`0.25 to 0.79`, or the one number that both are; a dash without any."""
+    return " to ".join(dict.fromkeys(map(number, values))) if values else NOTHING
+
+
 def relative_link(path: Path, folder: Path) -> str | None:
     """URL of `path` relative to `folder`; None where it would name folders of this machine."""
     relative = Path(os.path.relpath(path, folder))

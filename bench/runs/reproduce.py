@@ -153,9 +153,10 @@ def conditions(record: RunRecord, config: RunConfig, now: Provenance) -> list[st
     for what, was, here in (
         ("Python", then.python, now.python),
         ("the platform", then.platform, now.platform),
+        ("the processor", then.processor, now.processor),
         ("the device", then.device, now.device),
     ):
-        if was != here:
+        if was and was != here:
             lines.append(f"{what} was {was}, and is {here} here")
     if then.torch_threads != now.torch_threads:
         lines.append(

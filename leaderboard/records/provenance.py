@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import platform
+import re
 import subprocess
 from collections.abc import Iterable
 from importlib import metadata
@@ -20,6 +21,10 @@ CODE = ("agents", "bench", "leaderboard", "policies", "symsteer")
 
 PACKAGES = ("torch", "mani-skill", "sapien", "escnn", "gymnasium", "numpy")
 """Packages whose versions a record names, where they are installed."""
+
+
+NUMBERED = {"family": "cpu family", "model": "model"}
+"""What a processor's kind is numbered by: a name such as "AMD EPYC" may stand for many."""
 
 
 class RecordedExtension(Block):
@@ -43,7 +48,8 @@ class Provenance(Block):
     project `commit` names the code, and `dirty` says whether tracked files differ from it or git
     does not track some of the code. Elsewhere both are null and `sha256` names the code: the hash
     of all Python files of the installed package. `together` counts the runs in the same process:
-    agents that are trained together learn the same as alone but for rounding.
+    agents that are trained together learn the same as alone but for rounding. `processor` is null
+    in older records and where the system does not tell it; another kind rounds otherwise.
     """
 
     commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
@@ -54,6 +60,7 @@ class Provenance(Block):
     packages: dict[Name, Name]
     python: Name
     platform: Name
+    processor: Name | None = None
     device: Name
     torch_threads: Annotated[Count, Field(ge=1)]
     together: Annotated[Count, Field(ge=1)] = 1
@@ -78,6 +85,7 @@ class Provenance(Block):
             packages={name: found for name in PACKAGES if (found := _version(name))},
             python=platform.python_version(),
             platform=f"{platform.system()} {platform.machine()}",
+            processor=_processor(),
             device=device,
             torch_threads=torch_threads,
             together=together,
@@ -125,6 +133,20 @@ def git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return result.stdout.strip()
+
+
+@functools.cache
+def _processor() -> str | None:
+    """Name, family and model of the first processor, as Linux tells them."""
+    try:
+        first, *_ = Path("/proc/cpuinfo").read_text().split("\n\n")
+    except OSError:
+        return None
+    facts = dict(re.findall(r"^(\S[^\t:]*?)\s*: *(.+)$", first, re.MULTILINE))
+    if "model name" not in facts:
+        return None
+    places = (f"{word} {facts[key]}" for word, key in NUMBERED.items() if key in facts)
+    return f"{facts['model name']} ({', '.join(places)})"
 
 
 def _version(distribution: str) -> str | None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from symsteer.leaderboard import page
+from symsteer.leaderboard.answer import against_references
 from symsteer.leaderboard.answer_page import gains_section
 from symsteer.leaderboard.claims_page import CLAIMS, claims_section, paper_section
 from symsteer.leaderboard.defects import MEASURES, defect_of
@@ -73,12 +74,12 @@ def overview(board: Board) -> Values:
             {
                 "agent": name,
                 "href": board.agent(name),
-                "above": above,
-                "below": below,
-                "open": cells - above - below,
-                "cells": cells,
+                "above": tally.above,
+                "below": tally.below,
+                "open": tally.cells - tally.above - tally.below,
+                "cells": tally.cells,
             }
-            for name, (above, below, cells) in page.against_references(summary).items()
+            for name, tally in against_references(summary).items()
         ],
         "gains": markup.html(gains_section(board.findings)),
         "claims": Counter(outcome.verdict for outcome in board.findings.claims),
@@ -93,7 +94,7 @@ def overview(board: Board) -> Values:
 
 def _notice(board: Board) -> str:
     """What a reader must know first, as HTML."""
-    texts = [board.findings.study.notice, page.seed_notice(board.summary)]
+    texts = [*page.notices(board.findings.study), page.seed_notice(board.summary)]
     return markup.html([text for text in texts if text], _web)
 
 

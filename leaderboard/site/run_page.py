@@ -48,6 +48,7 @@ def run_values(board: Board, run: Run) -> dict[str, Any]:
         "sha256 of the code": provenance.sha256,
         "device": provenance.device,
         "platform": f"{provenance.platform}, Python {provenance.python}",
+        "processor": provenance.processor,
         "packages": ", ".join(f"{name} {v}" for name, v in sorted(provenance.packages.items())),
         "extensions": ", ".join(
             f"{e.kind} {e.target} ({e.distribution or 'not installed'} {e.version or ''})"

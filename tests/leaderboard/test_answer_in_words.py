@@ -24,13 +24,13 @@ def of_readme() -> str:
     return text.split("## The leaderboard", 1)[1].split("\n## ", 1)[0]
 
 
-@pytest.mark.parametrize("where", ["the page's notice", "README.md"])
+@pytest.mark.parametrize("where", ["the page", "README.md"])
 def test_every_number_of_the_answer_is_on_the_page(where: str) -> None:
-    notice = read_study(STUDY).notice
+    study = read_study(STUDY)
     page = (PAGE_FOLDER / "LEADERBOARD.md").read_text()
-    assert page.count(notice) == 1
-    results = plain(page.replace(notice, ""))
-    text = plain(of_readme() if where == "README.md" else notice)
+    assert (page.count(study.notice), page.count(study.details)) == (1, 1)
+    results = plain(page.replace(study.notice, "").replace(study.details, ""))
+    text = plain(of_readme() if where == "README.md" else f"{study.notice} {study.details}")
     for pattern in (INTERVAL, SHARE):
         stated = pattern.findall(text)
         assert stated

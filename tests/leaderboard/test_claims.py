@@ -46,7 +46,7 @@ def outcomes(
     records: Sequence[RunRecord], *claimed: Claim, audit: Audit | None = None
 ) -> list[Outcome]:
     summary = summarize([Run(Path(f"{i}.json"), r) for i, r in enumerate(records)])
-    study = Study("", "", claimed, (), "study.toml", "")
+    study = Study("", "", "", claimed, (), "study.toml", "")
     return claims(study, summary, audit_of(DEFECTS) if audit is None else audit)
 
 

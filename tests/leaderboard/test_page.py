@@ -17,6 +17,7 @@ from symsteer.leaderboard.records import RunRecord, write_record
 from symsteer.leaderboard.report import generate
 from symsteer.leaderboard.study import FOLDER, PAPER, read_study
 from symsteer.leaderboard.summary import Run, summarize
+from symsteer.leaderboard.text import NOTHING
 from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 
 DEFECTS = {"none": 0.002, "wind:0.25": 0.1, "wind:0.5": 0.2, "wind:1": 0.4}
@@ -95,6 +96,12 @@ def table_after(text: str, heading: str) -> list[list[str]]:
     return rows
 
 
+def tallies(text: str) -> dict[str, list[str]]:
+    """The table of learners at a glance: against `standard`, and against the best reference."""
+    _, _, *rows = table_after(text, "## At a glance")
+    return {agent.strip("`"): [cell.replace("\u00a0", " ") for cell in row] for agent, *row in rows}
+
+
 def test_the_main_table_ranks_with_ties_and_never_references(board: Path) -> None:
     header, _, *rows = table_after(text_of(board), "### Unbroken symmetry")
     assert header == [
@@ -163,15 +170,15 @@ def test_agents_that_a_cell_does_not_have_are_named_below_its_table() -> None:
 def test_learners_are_held_against_the_best_reference(board: Path) -> None:
     text = text_of(board)
     assert "Best reference: `golden-ticket`, 0.45. Against it: `equivariant` +0.35 [" in text
-    assert "`residual-pathway` clearly above in 5, clearly below in 0 of 5" in text
+    assert tallies(text)["residual-pathway"] == ["5 ▲ 0 ▼ of 5", "5 ▲ 0 ▼ of 5"]
 
 
 def test_the_best_reference_counts_where_five_runs_steer_its_policy() -> None:
     records = make_cell({"base": 0.25, "standard": 0.75})
     text = page_of(records)
-    assert "`standard` clearly above in 1, clearly below in 0 of 1" in text
+    assert tallies(text) == {"standard": [NOTHING, "1 ▲ 0 ▼ of 1"]}
     records[-1].base_policy.content_hash = "f" * 64
-    assert "clearly above in" not in page_of(records)
+    assert "## At a glance" not in page_of(records)
 
 
 def test_the_second_table_shows_q_and_cost(board: Path) -> None:
@@ -365,7 +372,7 @@ def test_cells_with_too_few_seeds_are_not_counted_as_wins(tmp_path: Path) -> Non
     records += make_cell({"base": 0.3, "standard": 0.9}, seeds=4, variant="wind:1")
     write(tmp_path, records)
     generate([tmp_path / "results"], tmp_path, audit(tmp_path))
-    assert "`standard` clearly above in 0, clearly below in 1 of 1." in text_of(tmp_path)
+    assert tallies(text_of(tmp_path)) == {"standard": [NOTHING, "0 ▲ 1 ▼ of 1"]}
 
 
 def test_the_audit_changes_the_page_and_the_order_of_records_does_not(

@@ -66,7 +66,7 @@ def test_what_is_as_large_as_the_smallest_effect_cannot_be_excluded() -> None:
 
 def test_the_page_says_what_an_undecided_claim_needs() -> None:
     def last(outcome: Outcome) -> str:
-        study = Study("", "", (CLAIM,), (Statement(says="it", claims=(CLAIM.name,)),), "", "")
+        study = Study("", "", "", (CLAIM,), (Statement(says="it", claims=(CLAIM.name,)),), "", "")
         # What was not tested does not count in the family.
         other = Outcome(CLAIM.model_copy(update={"name": "other"}), reason="no runs")
         findings = cast(Any, SimpleNamespace(study=study, claims=[outcome, other]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -63,6 +64,16 @@ def test_only_a_checkout_that_tracks_the_code_is_its_checkout(tmp_path: Path) ->
     assert provenance._checkout_of(installed) is None
     git(tmp_path, "add", "-f", ".venv")
     assert provenance._checkout_of(installed) is None
+
+
+@pytest.mark.skipif(not Path("/proc/cpuinfo").is_file(), reason="only Linux names the processor")
+def test_the_kind_of_processor_is_recorded_where_the_system_tells_it() -> None:
+    text = Path("/proc/cpuinfo").read_text()
+    name = re.search(r"^model name\s*: (.+)$", text, re.MULTILINE)
+    found = Provenance.collect("cpu", 1).processor
+    assert (found is None) == (name is None)
+    if name and found:
+        assert found.startswith(name[1])
 
 
 def test_the_code_is_named_by_a_commit_or_by_its_hash(monkeypatch: pytest.MonkeyPatch) -> None:

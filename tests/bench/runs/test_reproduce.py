@@ -226,7 +226,7 @@ def test_other_circumstances_are_named(repeated):
     folder, again = repeated
     record, config = read_record(folder / "record.json"), tiny_config()
     here = read_record(again / "record.json").provenance
-    clean = record.provenance.model_copy(update={"dirty": False})
+    clean = record.provenance.model_copy(update={"dirty": False, "processor": "One"})
     record.provenance = clean
     here = clean.model_copy()
     assert conditions(record, config, here) == []
@@ -236,6 +236,7 @@ def test_other_circumstances_are_named(repeated):
             "commit": "f" * 40,
             "packages": packages,
             "platform": "Linux riscv64",
+            "processor": "Another (family 1, model 2)",
             "torch_threads": 7,
             "dirty": True,
         }
@@ -243,6 +244,11 @@ def test_other_circumstances_are_named(repeated):
     text = "\n".join(conditions(record, config, elsewhere))
     for words in ("commit ffffffffffff", "numpy was", "Linux riscv64", "OMP_NUM_THREADS", "local"):
         assert words in text
+    assert "the processor was One, and is Another (family 1, model 2) here" in text
+    older_record = record.model_copy(
+        update={"provenance": clean.model_copy(update={"processor": None})}
+    )
+    assert "processor" not in "\n".join(conditions(older_record, config, elsewhere))
     team = record.model_copy(update={"provenance": clean.model_copy(update={"together": 5})})
     assert "together with 4 others" in "\n".join(conditions(team, config, here))
     older = dict(record.config)
