@@ -13,6 +13,7 @@ from symsteer.agents.replay import Batch
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Group, Layout
 from tests.agents.conftest import EXECUTE, Problem
+from tests.marks import long_except
 
 C4 = Group.parse("C4")
 WORLD = Problem(
@@ -63,7 +64,7 @@ def fewer_steps(monkeypatch):
         monkeypatch.setattr(f"symsteer.agents.detectors.{module}.STEPS", 600)
 
 
-@pytest.mark.parametrize("name", list(DETECTORS))
+@pytest.mark.parametrize("name", long_except(list(DETECTORS), "ensemble", "evidential"))
 def test_they_find_the_place_where_the_symmetry_is_broken(name):
     test = decisions(1000, seed=7)
     found = fitted(name).scores(test.obs, test.actions)

@@ -36,6 +36,7 @@ def test_the_multiplier_keeps_the_mean_displacement(displacement):
     assert size == pytest.approx(displacement, rel=0.4)
 
 
+@pytest.mark.long
 def test_with_a_large_displacement_its_mean_is_almost_the_best():
     agent = reach("displaced", displacement=4.0)
     obs = states(1024, torch.Generator().manual_seed(2))

@@ -27,12 +27,10 @@ LEARNERS = [
     for name in AGENTS.builtin
     if AGENTS.get(name).role == "learner" and issubclass(AGENTS.get(name), SacAgent)
 ]
-KEPT = ("standard", "equivariant", "residual-pathway")
+MARKS = {"standard": (), "equivariant": (), "residual-pathway": pytest.mark.long}
 KINDS = [
     # Those of the others need some minutes of one core.
-    pytest.param(
-        name, AGENTS.get(name).Options().critic, marks=() if name in KEPT else pytest.mark.slow
-    )
+    pytest.param(name, AGENTS.get(name).Options().critic, marks=MARKS.get(name, pytest.mark.slow))
     for name in LEARNERS
 ]
 KINDS += [

@@ -130,6 +130,7 @@ def test_a_soft_bound_is_paid_for(problem):
     )
 
 
+@pytest.mark.long
 def test_noise_may_exceed_a_soft_bound_and_comes_back(problem):
     """The critics ask for more and more noise; the price of the excess grows faster."""
 

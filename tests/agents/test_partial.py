@@ -110,6 +110,7 @@ def auroc(score, label):
     return (wins / (positive * (len(label) - positive))).item()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("broken", slow_except(["dynamics", "reward"], "dynamics"))
 def test_the_gates_find_where_the_symmetry_is_broken(broken):
     agent, seen, windy = learned(broken)

@@ -119,6 +119,7 @@ def test_table_and_json(env_cls):
     assert data["creation"]["per_env_ms"] > 0
 
 
+@pytest.mark.long
 def test_memory_is_watched():
     """10,000 steps take minutes: `symsteer throughput --memory`."""
     growth = throughput.memory_growth(TASK, num_envs=2, steps=500)

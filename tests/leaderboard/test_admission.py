@@ -405,6 +405,7 @@ def test_the_command_refuses_two_things_at_once(capsys: pytest.CaptureFixture[st
     assert "cannot be given together" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_what_is_committed_is_admissible() -> None:
     verdicts = check([command.RECORDS], command.RECORDS)
     problems = [problem for verdict in verdicts for problem in verdict.problems]

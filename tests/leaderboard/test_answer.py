@@ -73,8 +73,8 @@ def test_gains_have_the_audited_defects_of_their_cells() -> None:
     assert found["`wind`"].defects == (0.1, 0.31)
     assert found["unbroken"].defects == (0.02, 0.02)
     page = "\n".join(gains_section(analyse(summary, audit_of(defects), read_study(PAPER))))
-    assert "| `wind`<br>defect\u00a00.10\u00a0to\u00a00.31 | 2 |" in page
-    assert "| unbroken<br>defect\u00a00.02 | 1 |" in page
+    assert "| `wind` | 0.10\u00a0to\u00a00.31 | 2 |" in page
+    assert "| unbroken | 0.02 | 1 |" in page
     # One cell that was not audited: then the range would not be that of all.
     found = {gain.kind: gain for gain in gains(summary, audit_of({"wind:1": 0.31}))}
     assert found["`wind`"].defects is None

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,8 @@ from filelock import FileLock, Timeout
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import is_finished, run_id
 from tests.bench.tiny_run import tiny_config
+
+LEARNERS = ("standard", "equivariant", "constrained")
 
 
 @pytest.fixture(scope="session")
@@ -63,12 +65,23 @@ def lend(shared) -> Callable[[Path], Path]:
 
 @pytest.fixture(scope="session")
 def broken(shared) -> dict[str, Path]:
-    """A finished run of every agent in a broken world, beside an unbroken one: folders by agent."""
+    """Finished runs of agents of all kinds in a broken world: folders by agent."""
+    return in_broken_world(shared, [*LEARNERS, "base", "zero", "golden-ticket"])
+
+
+@pytest.fixture(scope="session")
+def every(shared) -> dict[str, Path]:
+    """The same of every agent; for tests with the mark `long`."""
     from symsteer.agents import AGENTS
 
+    return in_broken_world(shared, AGENTS.builtin)
+
+
+def in_broken_world(shared: Path, agents: Iterable[str]) -> dict[str, Path]:
+    """A finished run of each agent in a broken world, beside an unbroken one: folders by agent."""
     evaluation = dataclasses.replace(tiny_config().evaluation, every=240)
     change = {"variant": "action_gain:0.5", "env_steps": 240, "evaluation": evaluation}
-    configs = {name: tiny_config(agent=name, **change) for name in AGENTS.builtin}
+    configs = {name: tiny_config(agent=name, **change) for name in agents}
     ensure(tiny_config(), shared)  # with the base policy of all
     for patience in (0, -1):  # first those that no other process executes
         for config in configs.values():

@@ -10,7 +10,7 @@ from symsteer.policies import POLICIES
 from tests.bench.tiny_run import tiny_config
 from tests.marks import slow_except
 
-MARKS = {"canonical": (), "spherical": pytest.mark.long}
+MARKS = {"canonical": pytest.mark.long, "spherical": pytest.mark.long}
 NAMES = [
     pytest.param(name, marks=MARKS.get(name, pytest.mark.slow))
     for name in POLICIES.builtin

@@ -130,9 +130,9 @@ def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
 
 
 @pytest.mark.long
-def test_every_agent_runs_on_a_broken_world(broken):
+def test_every_agent_runs_on_a_broken_world(every):
     """The base policy is shared with the unbroken run, not trained again."""
-    for agent, folder in broken.items():
+    for agent, folder in every.items():
         record = read_record(folder / "record.json")
         assert record.status == "finished"
         assert record.config["variant"] == "action_gain:0.5"
@@ -168,7 +168,10 @@ def test_a_strength_written_otherwise_is_the_same_run():
     assert len(ids) == 1
 
 
-@pytest.mark.parametrize("place", [(SacAgent, "diagnostics"), (trainer, "Evaluator")])
+@pytest.mark.parametrize(
+    "place",
+    [(SacAgent, "diagnostics"), pytest.param((trainer, "Evaluator"), marks=pytest.mark.long)],
+)
 def test_a_failed_run_says_so_and_is_continued(place, finished, monkeypatch):
     _, folder = finished
     broken = tiny_config(seed=1)

@@ -53,6 +53,7 @@ def test_cells_are_runs_with_the_options(tmp_path):
     assert [cell.seed for cell in plan.cells("standard", {}, "confirm")] == [2, 3]
 
 
+@pytest.mark.long
 def test_no_cell_of_a_plan_is_on_a_leaderboard():
     """Tuned settings would have an advantage there."""
     from symsteer.bench.sweep.grid import suite_names
