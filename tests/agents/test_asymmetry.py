@@ -162,6 +162,7 @@ def test_actor_and_critics_may_have_penalties_of_their_own(problem):
     assert asymmetry(agent.actor) > 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", slow_except(ALL, "residual-pathway"))
 def test_in_a_symmetric_problem_the_measured_error_falls(problem, name, monkeypatch):
     """From layers that are far from the symmetry."""

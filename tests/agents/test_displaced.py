@@ -22,6 +22,7 @@ def test_it_starts_as_the_base_policy(problem):
     torch.testing.assert_close(price, shift.square().sum(1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("displacement", slow_except([0.05, 0.5], 0.5))
 def test_the_multiplier_keeps_the_mean_displacement(displacement):
     """A plain climb of Q would go farther: see the next test."""

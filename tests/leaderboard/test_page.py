@@ -71,12 +71,12 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def page_of(records: list[RunRecord]) -> str:
+def page_of(records: list[RunRecord], study: str = PAPER) -> str:
     """The page without figures and links."""
     runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(records)]
     summary = summarize(runs)
     return render_page(
-        summary, analyse(summary, {}, read_study(PAPER)), {}, {run.path: None for run in runs}
+        summary, analyse(summary, {}, read_study(study)), {}, {run.path: None for run in runs}
     )
 
 
@@ -259,16 +259,18 @@ def test_the_papers_statements_have_their_tests_and_what_they_lack(board: Path) 
             assert row[5] == "\u2013"
 
 
-def test_a_study_can_say_what_a_reader_must_know(board: Path, tmp_path: Path) -> None:
+def test_a_study_can_say_what_a_reader_must_know(tmp_path: Path) -> None:
     study = tmp_path / "mine.toml"
-    study.write_text('notice = "> **Mind this.**"\ndeclared = "abcdef0"\nclaims = "other.toml"')
+    said = ['notice = "> **Mind this.**"', 'details = "*Limits*: one."']
+    study.write_text("\n".join([*said, 'declared = "abcdef0"', 'claims = "other.toml"']))
     (tmp_path / "other.toml").write_text((FOLDER / "paper.toml").read_text())
-    generate([board / "results"], tmp_path, study=str(study))
-    text = text_of(tmp_path)
+    records = make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.7})
+    text = page_of(records, str(study))
     # There is no git here that could say that the commit is another one.
-    assert text.index("> **Mind this.**") < text.index("## What symmetry gains")
+    assert "> **Mind this.**\n\n<details>" in text
+    assert text.index("*Limits*: one.\n\n</details>") < text.index("## What symmetry gains")
     assert re.search(r"declared in `other.toml` \(sha256 `[0-9a-f]{12}`, commit `abcdef0`\)", text)
-    assert "Mind this" not in text_of(board)
+    assert "Mind this" not in page_of(records)
 
 
 def spreads(records: list[RunRecord]) -> tuple[str, dict[str, list[str]]]:

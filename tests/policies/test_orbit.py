@@ -9,9 +9,6 @@ from symsteer.bench import gradient_variance
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 from symsteer.policies.training.orbit import orbit_targets
-from tests.marks import long_except
-
-VELOCITY = {"process": "flow", "prediction": "velocity"}
 
 
 def test_the_target_is_the_mean_of_the_copies_that_a_noisy_pair_may_come_from(world):
@@ -43,7 +40,8 @@ def test_a_precise_observation_leaves_the_pair_itself(world):
     assert torch.allclose(orbit_targets(pairs, layouts, Group.parse("C8")), chunks, atol=1e-6)
 
 
-@pytest.mark.parametrize("fields", long_except([{}, VELOCITY], {}))
+@pytest.mark.long
+@pytest.mark.parametrize("fields", [{}, {"process": "flow", "prediction": "velocity"}])
 def test_the_gradient_is_the_same_on_average_and_varies_less(world, fields):
     """The part of the gradient that turns: invariant numbers have one target in any case."""
     (obs, actions), *_ = world.episodes(1, length=8)

@@ -88,6 +88,7 @@ def test_the_same_arguments_give_the_same_demonstrations(tmp_path):
     assert hashes[0] == hashes[1] != hashes[2]
 
 
+@pytest.mark.long
 def test_two_processes_may_write_the_same_demonstrations(tmp_path, monkeypatch):
     """The other one comes in the middle of this one's writing."""
     path = tmp_path / "demos.h5"
@@ -145,6 +146,7 @@ def test_maniskills_tools_read_our_files(clean):
         assert torch.allclose(env.unwrapped.get_obs()[0], expected, atol=1e-5)
 
 
+@pytest.mark.long
 def test_maniskills_replay_script_replays_our_files(copy):
     """As a command of its own, which imports nothing of ours."""
     command = [sys.executable, "-W", "ignore", "-m", "mani_skill.trajectory.replay_trajectory"]

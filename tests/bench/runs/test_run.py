@@ -237,6 +237,7 @@ def test_an_unwritable_folder_is_refused(tmp_path):
         execute(tiny_config(), tmp_path / "file", progress=False)
 
 
+@pytest.mark.long
 def test_the_settings_of_a_given_base_policy_are_recorded(finished, tmp_path):
     """The run has the settings and demonstrations of the file, not the defaults."""
     config, folder = finished

@@ -416,6 +416,7 @@ while True:
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
 )

@@ -79,6 +79,7 @@ def test_pages_are_as_github_shows_them(built: Path) -> None:
         assert both[0] == both[1], path
 
 
+@pytest.mark.long
 def test_a_dead_link_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = tmp_path / "checkout"
     copy.mkdir()
