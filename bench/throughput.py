@@ -21,7 +21,6 @@ from functools import partial
 from importlib.metadata import version
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -38,6 +37,7 @@ from symsteer.bench.sim.shards.messages import divide
 from symsteer.bench.sim.shards.processes import start_process
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
+from symsteer.leaderboard.records.provenance import processor_name
 
 EPISODE = 50
 """Control steps between two resets."""
@@ -610,13 +610,8 @@ def _cpu_seconds(pid: int) -> float:
 
 
 def _machine() -> dict[str, Any]:
-    names = [
-        line.partition(":")[2].strip()
-        for line in Path("/proc/cpuinfo").read_text().splitlines()
-        if line.startswith("model name")
-    ]
     return {
-        "cpu": names[0] if names else platform.processor(),
+        "cpu": processor_name() or platform.processor(),
         "cores": len(os.sched_getaffinity(0)),
         "load": os.getloadavg()[0],
         "cuda": torch.cuda.get_device_name() if torch.cuda.is_available() else None,

@@ -59,7 +59,7 @@ def _glance(summary: Summary) -> str:
     """The table of learners, in the page's order; empty if no cell has enough pairs of runs."""
     rivals = [against_standard(summary), against_references(summary)]
     rows = [
-        [code(agent), *(_tally(tallies.get(agent)) for tallies in rivals)]
+        [code(agent), *(_counts(tallies.get(agent)) for tallies in rivals)]
         for agent in summary.agents
         if any(agent in tallies for tallies in rivals)
     ]
@@ -67,7 +67,7 @@ def _glance(summary: Summary) -> str:
     return grid(header, rows, left=1) if rows else ""
 
 
-def _tally(found: Tally | None) -> str:
+def _counts(found: Tally | None) -> str:
     if found is None:
         return NOTHING
     return f"{found.above}{MARKS[1]} {found.below}{MARKS[-1]} of {found.cells}".replace(" ", SPACE)

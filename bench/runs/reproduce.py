@@ -157,7 +157,7 @@ def conditions(record: RunRecord, config: RunConfig, now: Provenance) -> list[st
         ("the device", then.device, now.device),
     ):
         if was and was != here:
-            lines.append(f"{what} was {was}, and is {here} here")
+            lines.append(f"{what} was {was}, and is {here or 'unknown'} here")
     if then.torch_threads != now.torch_threads:
         lines.append(
             f"torch had {then.torch_threads} threads, and has {now.torch_threads} here; set "

@@ -85,7 +85,7 @@ class Provenance(Block):
             packages={name: found for name in PACKAGES if (found := _version(name))},
             python=platform.python_version(),
             platform=f"{platform.system()} {platform.machine()}",
-            processor=_processor(),
+            processor=processor_name(),
             device=device,
             torch_threads=torch_threads,
             together=together,
@@ -136,7 +136,7 @@ def git(folder: Path, *arguments: str) -> str | None:
 
 
 @functools.cache
-def _processor() -> str | None:
+def processor_name() -> str | None:
     """Name, family and model of the first processor, as Linux tells them."""
     try:
         first, *_ = Path("/proc/cpuinfo").read_text().split("\n\n")

@@ -63,7 +63,9 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if record.settings.agent == "golden-ticket":
             record.budget.env_steps = 12_800
     first = records[0]
-    other = first.provenance.model_copy(update={"commit": "f" * 40, "device": "cuda"})
+    other = first.provenance.model_copy(
+        update={"commit": "f" * 40, "device": "cuda", "processor": "One (model 2)"}
+    )
     first.continued = [other]
     first.wall_clock.resumed = 1
     write(folder, records)
@@ -340,6 +342,7 @@ def test_provenance_names_every_session(board: Path) -> None:
     assert "1 of them continued after an interruption" in text
     assert "- Commits: `0123456789ab`, `ffffffffffff`" in text
     assert "- Devices: `cpu`, `cuda`" in text
+    assert "- Processors: `One (model 2)`" in text
     assert "symsteer report" in text
 
 
@@ -370,11 +373,15 @@ def test_the_csv_holds_both_comparisons(board: Path) -> None:
 
 
 def test_cells_with_too_few_seeds_are_not_counted_as_wins(tmp_path: Path) -> None:
-    records = make_cell({"base": 0.3, "standard": 0.1}, seeds=5)
-    records += make_cell({"base": 0.3, "standard": 0.9}, seeds=4, variant="wind:1")
+    records = make_cell({"base": 0.3, "standard": 0.1, "equivariant": 0.9}, seeds=5)
+    few = {"base": 0.3, "standard": 0.9, "equivariant": 0.1}
+    records += make_cell(few, seeds=4, variant="wind:1")
     write(tmp_path, records)
     generate([tmp_path / "results"], tmp_path, audit(tmp_path))
-    assert tallies(text_of(tmp_path)) == {"standard": [NOTHING, "0 ▲ 1 ▼ of 1"]}
+    assert tallies(text_of(tmp_path)) == {
+        "standard": [NOTHING, "0 ▲ 1 ▼ of 1"],
+        "equivariant": ["1 ▲ 0 ▼ of 1", "1 ▲ 0 ▼ of 1"],
+    }
 
 
 def test_the_audit_changes_the_page_and_the_order_of_records_does_not(
