@@ -73,6 +73,7 @@ def test_worlds_of_an_audit(advise, tmp_path):
         assert shown.out.count("Tested by leaving out") == 1
 
 
+@pytest.mark.long
 def test_the_file_of_one_audit(advise, tmp_path, monkeypatch, capsys):
     small = ("--states", "expert", "--count", "8", "--resets", "16", "--out", str(tmp_path))
     words = ["symsteer", "audit", "--task", "PushCube-v1", "--variant", "wind:0.3", *small]

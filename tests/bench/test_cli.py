@@ -243,6 +243,7 @@ def test_the_module_is_the_same_program():
     assert done.stderr.startswith("error: there is no verb 'swep'; did you mean 'sweep'?")
 
 
+@pytest.mark.long
 def test_a_class_in_the_present_folder_can_be_tried(tmp_path):
     (tmp_path / "mine.py").write_text(
         "from symsteer.agents.references import ZeroAgent\n"

@@ -26,7 +26,7 @@ WAYS = {
 def default_numbers(kind):
     """A few inputs of a kind: one for each way to damage it."""
     if kind not in WAYS:
-        return range(8)
+        return range(4)
     prefix, ways = WAYS[kind]
     first = {}
     for number in range(KINDS[kind][1]):

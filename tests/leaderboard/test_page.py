@@ -384,6 +384,7 @@ def test_cells_with_too_few_seeds_are_not_counted_as_wins(tmp_path: Path) -> Non
     }
 
 
+@pytest.mark.long
 def test_the_audit_changes_the_page_and_the_order_of_records_does_not(
     board: Path, tmp_path: Path
 ) -> None:

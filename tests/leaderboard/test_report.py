@@ -146,18 +146,17 @@ def test_changed_records_give_other_bytes(page: Path, tmp_path: Path) -> None:
 
 def test_stale_figures_go_and_foreign_files_stay(page: Path, tmp_path: Path) -> None:
     out = tmp_path / "board"
-    (out / "figures").mkdir(parents=True)
+    shutil.copytree(page / "board", out)
     stale = out / "figures" / f"q-{slug('OldTask-v1', 'floating')}.svg"
     foreign = out / "figures" / "mine.svg"
     stale.write_text("")
     foreign.write_text("")
-    generate([page / "runs"], out)
-    assert not stale.exists()
-    assert foreign.exists()
     paper = out / "PAPER.md"
     assert paper.exists()
     # A study without statements has no such page; another file of this name is not ours.
     generate([page / "runs"], out, study="first")
+    assert not stale.exists()
+    assert foreign.exists()
     assert not paper.exists()
     paper.write_text("# The paper")
     generate([page / "runs"], out, study="first")

@@ -39,9 +39,9 @@ def repeated(finished, tmp_path_factory) -> tuple[Path, Path]:
 
 
 @pytest.fixture
-def changed(repeated, tmp_path):
-    """Changes a copy of the record; its reproduction is the run that was made already."""
-    folder, again = repeated
+def changed(finished, tmp_path):
+    """Changes a copy of the record; its reproduction is the run as it was."""
+    folder = finished[1]
 
     def change(edit) -> Path:
         data = json.loads((folder / "record.json").read_text())
@@ -49,12 +49,13 @@ def changed(repeated, tmp_path):
         path = tmp_path / "record.json"
         path.write_text(json.dumps(data))
         place = tmp_path / "out" / f"reproduction-{file_hash(path)[:12]}"
-        shutil.copytree(again, place / again.name)
+        shutil.copytree(folder, place / folder.name)
         return path
 
     return change
 
 
+@pytest.mark.long
 def test_a_run_is_made_again_and_agrees_exactly(repeated, tmp_path, monkeypatch, capsys):
     folder, again = repeated
     assert without_clock(folder) == without_clock(again)
@@ -113,8 +114,8 @@ def test_final_success_outside_of_the_interval_is_different(changed, tmp_path, m
 
 
 @pytest.mark.long
-def test_a_changed_hyperparameter_gives_another_run(repeated, tmp_path):
-    folder, _ = repeated
+def test_a_changed_hyperparameter_gives_another_run(finished, tmp_path):
+    folder = finished[1]
     data = json.loads((folder / "record.json").read_text())
     data["config"]["agent_options"]["lr"] *= 10
     data["config_hash"] = config_hash(data["config"])
@@ -192,8 +193,8 @@ def test_a_base_policy_that_the_run_did_not_steer_is_not_taken(
     assert not (tmp_path / "out").exists()
 
 
-def test_what_cannot_be_repeated_is_one_sentence(repeated, tmp_path, monkeypatch, capsys):
-    folder, _ = repeated
+def test_what_cannot_be_repeated_is_one_sentence(finished, tmp_path, monkeypatch, capsys):
+    folder = finished[1]
     record = read_record(folder / "record.json")
 
     def refused(**changes) -> str:
@@ -222,10 +223,8 @@ def test_what_cannot_be_repeated_is_one_sentence(repeated, tmp_path, monkeypatch
     assert not (tmp_path / "out").exists()
 
 
-def test_other_circumstances_are_named(repeated):
-    folder, again = repeated
-    record, config = read_record(folder / "record.json"), tiny_config()
-    here = read_record(again / "record.json").provenance
+def test_other_circumstances_are_named(finished):
+    record, config = read_record(finished[1] / "record.json"), tiny_config()
     clean = record.provenance.model_copy(update={"dirty": False, "processor": "One"})
     record.provenance = clean
     here = clean.model_copy()
