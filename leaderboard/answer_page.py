@@ -20,6 +20,8 @@ from symsteer.leaderboard.text import (
     grid,
     image,
     interval,
+    share,
+    without_empty,
 )
 
 ANSWER = f"""\
@@ -29,7 +31,8 @@ Advantage over `{STANDARD}` by what breaks the symmetry, with 95 % intervals. In
 
 GLANCE = f"""\
 In how many cells a learner's final success is clearly above (\u25b2) and clearly below (\u25bc)
-that of `{STANDARD}`, and that of the best reference, the frozen policy alone.
+that of `{STANDARD}`, and that of the best reference, the frozen policy alone; in how many of all
+its runs Q diverged.
 """
 
 MARKED = f"""\
@@ -57,14 +60,27 @@ def answer_section(
 
 def _glance(summary: Summary) -> str:
     """The table of learners, in the page's order; empty if no cell has enough pairs of runs."""
-    rivals = [against_standard(summary), against_references(summary)]
-    rows = [
-        [code(agent), *(_counts(tallies.get(agent)) for tallies in rivals)]
-        for agent in summary.agents
-        if any(agent in tallies for tallies in rivals)
-    ]
-    header = ["Learner", f"Against {code(STANDARD)}", "Against the best reference"]
-    return grid(header, rows, left=1) if rows else ""
+    rivals = {
+        f"Against {code(STANDARD)}": against_standard(summary),
+        "Against the best reference": against_references(summary),
+    }
+    if not any(rivals.values()):
+        return ""
+    diverged = {agent: flags for agent, flags in _diverged(summary).items() if flags}
+    columns = {"Learner": [code(agent) for agent in diverged]}
+    for name, tallies in rivals.items():
+        columns[name] = [_counts(tallies.get(agent)) for agent in diverged]
+    columns["Q diverged"] = [share(flags) for flags in diverged.values()]
+    return grid(*without_empty(columns), left=1)
+
+
+def _diverged(summary: Summary) -> dict[str, list[bool]]:
+    """Of all runs of each agent with a critic, whether Q diverged."""
+    flags: dict[str, list[bool]] = {agent: [] for agent in summary.agents}
+    for table in summary.tables:
+        for row in table.rows:
+            flags[row.agent] += row.diverged
+    return flags
 
 
 def _counts(found: Tally | None) -> str:

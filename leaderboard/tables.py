@@ -22,6 +22,7 @@ from symsteer.leaderboard.text import (
     difference,
     grid,
     number,
+    share,
     stacked,
     without_empty,
 )
@@ -231,7 +232,7 @@ def _diagnostics(table: Table) -> list[str]:
         return []
     rows.sort(key=_place)
     columns = {
-        "Q diverged": [_share(row.diverged) for row in rows],
+        "Q diverged": [share(row.diverged) for row in rows],
         _magnitude_header(table): [
             _pair(row.largest("magnitude"), row.largest("overshoot")) for row in rows
         ],
@@ -251,10 +252,6 @@ def _diagnostics(table: Table) -> list[str]:
     header, body = without_empty(columns)
     body = [[code(row.label), *texts] for row, texts in zip(rows, body, strict=True)]
     return ["Q-values, symmetry and cost:", grid(["Agent", *header], body, left=1)]
-
-
-def _share(flags: Sequence[bool]) -> str:
-    return f"{sum(flags)}/{len(flags)}" if flags else NOTHING
 
 
 def _pair(first: float | None, second: float | None) -> str:

@@ -88,6 +88,11 @@ def stacked(value: Interval | None, sign: bool = False, marks: str = "", digits:
     return f"{middle}{marks}".replace(" ", SPACE) + f"<br>{ends}"
 
 
+def share(flags: Sequence[bool]) -> str:
+    """How many of them are true, as in 3/5."""
+    return f"{sum(flags)}/{len(flags)}" if flags else NOTHING
+
+
 def ends(values: tuple[float, float] | None) -> str:
     """`0.25 to 0.79`, or the one number that both are; a dash without any."""
     return " to ".join(dict.fromkeys(map(number, values))) if values else NOTHING

@@ -209,3 +209,17 @@ def make_cell(
                 evaluations = [make_evaluation(outcomes(curve[-1]), 0)]
             records.append(make_record(evaluations, agent=agent, seed=seed, **config))
     return records
+
+
+def diverging(
+    agent: str, seeds: Sequence[int], status: str = "finished", **config: Any
+) -> list[RunRecord]:
+    """Five runs of which `seeds` diverge."""
+    records = []
+    for seed in range(5):
+        q = {"q_mean": -5.0, "q_magnitude": 1.5 if seed in seeds else 0.5}
+        curve = [make_evaluation([1, 0], 10_000 * (i + 1), i == 4, **q) for i in range(5)]
+        broke = seed in seeds and status != "finished"
+        run_status = status if broke else "finished"
+        records.append(make_record(curve, run_status, agent=agent, seed=seed, **config))
+    return records

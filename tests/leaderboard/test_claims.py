@@ -18,7 +18,7 @@ from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.statistics import Interval, ShareDifference
 from symsteer.leaderboard.study import Claim, Study, read_study
 from symsteer.leaderboard.summary import Run, summarize
-from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
+from tests.leaderboard.record_factory import diverging, make_cell, make_evaluation, make_record
 
 DEFECTS = {"none": 0.01, "wind:0.1": 0.04, "wind:0.5": 0.1, "wind:0.8": 0.26, "wind:1": 0.4}
 
@@ -246,20 +246,6 @@ def test_what_is_not_tested_says_why(changes: dict[str, Any], reason: str) -> No
     (found,) = outcomes(records, claim_of(**changes))
     assert (found.verdict, found.effect) == ("not tested", None)
     assert found.reason.startswith(reason)
-
-
-def diverging(
-    agent: str, seeds: Sequence[int], status: str = "finished", **config: Any
-) -> list[RunRecord]:
-    """Five runs of which `seeds` diverge."""
-    records = []
-    for seed in range(5):
-        q = {"q_mean": -5.0, "q_magnitude": 1.5 if seed in seeds else 0.5}
-        curve = [make_evaluation([1, 0], 10_000 * (i + 1), i == 4, **q) for i in range(5)]
-        broke = seed in seeds and status != "finished"
-        run_status = status if broke else "finished"
-        records.append(make_record(curve, run_status, agent=agent, seed=seed, **config))
-    return records
 
 
 DIVERGED = claim_of("diverged", agents=["standard", "equivariant"])

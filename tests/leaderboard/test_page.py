@@ -18,7 +18,7 @@ from symsteer.leaderboard.report import generate
 from symsteer.leaderboard.study import FOLDER, PAPER, read_study
 from symsteer.leaderboard.summary import Run, summarize
 from symsteer.leaderboard.text import NOTHING
-from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
+from tests.leaderboard.record_factory import diverging, make_cell, make_evaluation, make_record
 
 DEFECTS = {"none": 0.002, "wind:0.25": 0.1, "wind:0.5": 0.2, "wind:1": 0.4}
 HOSTILE = "x`</td><img src=x onerror=alert(1)>`|$a$\n# H [l](javascript:alert(1))"
@@ -99,7 +99,7 @@ def table_after(text: str, heading: str) -> list[list[str]]:
 
 
 def tallies(text: str) -> dict[str, list[str]]:
-    """The table of learners at a glance: against `standard`, and against the best reference."""
+    """The table of learners at a glance: against `standard` and the best reference, divergence."""
     _, _, *rows = table_after(text, "## At a glance")
     return {agent.strip("`"): [cell.replace("\u00a0", " ") for cell in row] for agent, *row in rows}
 
@@ -172,15 +172,23 @@ def test_agents_that_a_cell_does_not_have_are_named_below_its_table() -> None:
 def test_learners_are_held_against_the_best_reference(board: Path) -> None:
     text = text_of(board)
     assert "Best reference: `golden-ticket`, 0.45. Against it: `equivariant` +0.35 [" in text
-    assert tallies(text)["residual-pathway"] == ["5 ▲ 0 ▼ of 5", "5 ▲ 0 ▼ of 5"]
+    assert tallies(text)["residual-pathway"] == ["5 ▲ 0 ▼ of 5", "5 ▲ 0 ▼ of 5", "0/25"]
 
 
 def test_the_best_reference_counts_where_five_runs_steer_its_policy() -> None:
     records = make_cell({"base": 0.25, "standard": 0.75})
     text = page_of(records)
-    assert tallies(text) == {"standard": [NOTHING, "1 ▲ 0 ▼ of 1"]}
+    assert tallies(text) == {"standard": ["1 ▲ 0 ▼ of 1", "0/5"]}
     records[-1].base_policy.content_hash = "f" * 64
     assert "## At a glance" not in page_of(records)
+
+
+def test_the_glance_counts_diverged_runs_of_all_worlds() -> None:
+    records = diverging("standard", [1]) + diverging("standard", [0, 3], variant="wind:1")
+    records += diverging("equivariant", []) + diverging("equivariant", [], variant="wind:1")
+    found = tallies(page_of(records))
+    # There is no reference, and no column for it.
+    assert found == {"standard": [NOTHING, "3/10"], "equivariant": ["0 ▲ 0 ▼ of 2", "0/10"]}
 
 
 def test_the_second_table_shows_q_and_cost(board: Path) -> None:
@@ -379,8 +387,8 @@ def test_cells_with_too_few_seeds_are_not_counted_as_wins(tmp_path: Path) -> Non
     write(tmp_path, records)
     generate([tmp_path / "results"], tmp_path, audit(tmp_path))
     assert tallies(text_of(tmp_path)) == {
-        "standard": [NOTHING, "0 ▲ 1 ▼ of 1"],
-        "equivariant": ["1 ▲ 0 ▼ of 1", "1 ▲ 0 ▼ of 1"],
+        "standard": [NOTHING, "0 ▲ 1 ▼ of 1", "0/9"],
+        "equivariant": ["1 ▲ 0 ▼ of 1", "1 ▲ 0 ▼ of 1", "0/9"],
     }
 
 
