@@ -12,6 +12,21 @@ from symsteer.leaderboard.study import read_study
 INTERVAL = re.compile(r"[+\u2212]?\d\.\d+ \[[+\u2212]?\d\.\d+, [+\u2212]?\d\.\d+\]")
 SHARE = re.compile(r"\b\d+/\d+\b")
 
+ROWS = {
+    "learns faster than plain (`standard`), {}": "Symmetric agents learn faster in unbroken worlds",
+    "at equal size, {}": "Symmetric agents learn faster, at equal size",
+    "rotated data (`augmented`), {}": "Symmetric networks learn faster than symmetry from data",
+    "no difference is seen, {}": "unbroken, 120 k steps",
+    "strict ends {}": "Strictness loses to the plain agent there",
+    "(two tasks) {}": "With five times the budget the strict agent loses, broken",
+    "approximate (`residual-pathway`) {}": "Approximate equivariance beats the plain agent there",
+    "and {}. As tuned": "`perception_bias`, 120 k steps",
+    "at a defect of {}": "`equivariant` | success | all",
+    "at {} with `actuator_offset`": "`equivariant` | success | `actuator_offset`",
+    "at {} with `perception_bias`": "`equivariant` | success | `perception_bias`",
+}
+"""Words of the answer around each interval, and the beginning of the page's row that has it."""
+
 
 def plain(text: str) -> str:
     """Text on one line, without marks."""
@@ -35,3 +50,17 @@ def test_every_number_of_the_answer_is_on_the_page(where: str) -> None:
         stated = pattern.findall(text)
         assert stated
         assert [one for one in stated if one not in pattern.findall(results)] == []
+
+
+def test_every_interval_of_the_answer_is_that_of_its_row() -> None:
+    study = read_study(STUDY)
+    details = plain(study.details)
+    rows = [plain(line) for line in (PAGE_FOLDER / "LEADERBOARD.md").read_text().splitlines()]
+    found = []
+    for words, row in ROWS.items():
+        before, after = (re.escape(part) for part in words.split("{}"))
+        (stated,) = re.findall(f"{before}({INTERVAL.pattern}){after}", details)
+        assert [one for one in rows if one.startswith(f"| {row}") and stated in one], words
+        found.append(stated)
+    assert sorted(found) == sorted(INTERVAL.findall(details))
+    assert set(INTERVAL.findall(plain(study.notice) + plain(of_readme()))) <= set(found)
