@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from symsteer.leaderboard.answer import Gain, Tally, against_references, against_standard
-from symsteer.leaderboard.claims_page import standing, statements
+from symsteer.leaderboard.claims_page import standing, statements, title
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import STANDARD
 from symsteer.leaderboard.summary import MIN_SEEDS, Summary
@@ -124,7 +124,7 @@ def _verdicts(findings: Findings) -> str:
         return "\n".join(lines) + "\n\nEach with its tests: [the paper's claims](PAPER.md)."
     named: dict[str, list[str]] = {}
     for outcome in findings.claims:
-        named.setdefault(outcome.verdict, []).append(outcome.claim.name)
+        named.setdefault(outcome.verdict, []).append(title(outcome.claim))
     order = ("supported", "contradicted", "equivalent", "undecided", "not tested")
     return "\n".join(
         f"- **{verdict.capitalize()}** ({len(named[verdict])}): {'; '.join(named[verdict])}."

@@ -56,11 +56,11 @@ def claims_section(findings: Findings) -> list[str]:
     for outcome in findings.claims:
         claim, effect = outcome.claim, outcome.effect
         if effect is None:
-            untested.setdefault(outcome.reason, []).append(claim.name)
+            untested.setdefault(outcome.reason, []).append(title(claim))
             continue
         rows.append(
             [
-                f"{claim.name} ({claim.family})",
+                f"{title(claim)} ({claim.family})",
                 _test(claim),
                 stacked(effect.interval(), sign=True, digits=3)
                 + (f"<br>{outcome.counts}" if outcome.counts else ""),
@@ -86,6 +86,11 @@ def claims_section(findings: Findings) -> list[str]:
         lines = [f"- {reason}: {'; '.join(names)}" for reason, names in untested.items()]
         parts.append("Not tested:\n\n" + "\n".join(lines))
     return parts
+
+
+def title(claim: Claim) -> str:
+    """Its name, and that it predicts no effect where it does: the name may sound otherwise."""
+    return f"{claim.name} (predicted: no effect)" if claim.predicted == 0 else claim.name
 
 
 def _verdict(outcome: Outcome) -> str:
@@ -137,7 +142,7 @@ def paper_section(findings: Findings) -> list[str]:
     for text, found in own.items():
         rows = [
             [
-                outcome.claim.name,
+                title(outcome.claim),
                 _test(outcome.claim),
                 stacked(outcome.effect.interval() if outcome.effect else None, True, digits=3),
                 NOTHING if outcome.reason else _p(outcome.p),

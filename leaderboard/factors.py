@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from symsteer.leaderboard.statistics import Interval, Sample, cell_estimates, combined
+from symsteer.leaderboard.statistics import Array, Interval, Sample, cell_estimates, combined
 from symsteer.leaderboard.summary import Key, Run, Summary, agent_options, is_balanced
 
 Effect = Literal["success", "magnitude", "diverged"]
@@ -24,7 +24,8 @@ class MainEffect:
         levels: its two values; the effect is the second one's measure minus the first one's.
         measure: final-window success, largest |Q| over the largest feasible one, or the share of
             runs that diverged.
-        effect: mean over cells and base policies, 95 % interval.
+        means: of the measure with each of the two values, over cells and base policies.
+        effect: their difference, with its 95 % interval.
         runs, policies: of which it is made.
     """
 
@@ -32,6 +33,7 @@ class MainEffect:
     option: str
     levels: tuple[str, str]
     measure: Effect
+    means: tuple[float, float]
     effect: Interval
     runs: int
     policies: int
@@ -87,11 +89,13 @@ def _effect(
     options: dict[str, tuple[str, str]],
     option: str,
     measure: Effect,
-) -> tuple[Interval, int, int] | None:
+) -> tuple[tuple[float, float], Interval, int, int] | None:
+    """Means, effect, and numbers of runs and policies; None if no base policy has a whole grid."""
     samples: list[list[Sample]] = []
+    means: list[Array] = []
     number, policies = 0, set()
     for runs in cells:
-        own = []
+        own, levels = [], []
         for policy in dict.fromkeys(run.policy for run in runs):
             measured = [
                 (agent_options(run.record.config), value)
@@ -101,17 +105,20 @@ def _effect(
             if not is_balanced([settings for settings, _ in measured], options):
                 continue
             low, high = (
-                np.mean([v for settings, v in measured if settings.get(option) == level])
+                float(np.mean([v for settings, v in measured if settings.get(option) == level]))
                 for level in options[option]
             )
-            own.append(Sample.constant(float(high - low), policy))
+            levels.append((low, high))
+            own.append(Sample.constant(high - low, policy))
             number += len(measured)
             policies.add(policy)
         if own:
             samples.append(own)
+            means.append(np.mean(levels, axis=0))
     if not samples:
         return None
-    return combined(cell_estimates(samples)).interval(), number, len(policies)
+    low, high = map(float, np.mean(means, axis=0))
+    return (low, high), combined(cell_estimates(samples)).interval(), number, len(policies)
 
 
 def _of(run: Run, measure: Effect) -> float | None:

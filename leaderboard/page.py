@@ -81,10 +81,10 @@ interval of the difference in final success includes 0.
 """Shown only where it is so."""
 
 EFFECTS = f"""\
-Some agents were run in a balanced grid of options. The main effect of an option is the mean of its
-second value minus that of its first, over all settings of the others, on the same base policies:
-final success, largest |Q| as a multiple of the largest feasible one, share of diverged runs. Marks
-need {MIN_SEEDS} base policies.
+Some agents were run in a balanced grid of options. Shown are the means with both values of an
+option, over all settings of the others, on the same base policies, and the main effect, the second
+mean minus the first: of final success, of the largest |Q| as a multiple of the largest feasible
+one, and of the share of diverged runs. Marks need {MIN_SEEDS} base policies.
 """
 
 SOUND = f"""\
@@ -174,7 +174,9 @@ def _effects_table(found: Sequence[MainEffect]) -> str:
         counts = f"{one.runs}, {one.policies}"
         own = rows.setdefault((code(one.agent), change), {})
         mark = MARKS[one.effect.sign] if one.policies >= MIN_SEEDS else ""
-        own[one.measure] = stacked(one.effect, sign=True, marks=mark)
+        difference = stacked(one.effect, sign=True, marks=mark)
+        means = f"{number(one.means[0])} to {number(one.means[1])}".replace(" ", SPACE)
+        own[one.measure] = f"{means}<br>{difference}"
         own["counts"] = counts
     names = [*EFFECT_MEASURES, "counts"]
     header = ["Agent", "Change", "Success", "Largest \\|Q\\|", "Diverged", "Runs, policies"]

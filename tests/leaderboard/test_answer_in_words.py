@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
-from symsteer.leaderboard.paths import PAGE_FOLDER, STUDY
+from symsteer.leaderboard.paths import PAGE_FOLDER, RESULTS, STUDY
 from symsteer.leaderboard.study import read_study
+from symsteer.leaderboard.summary import load_runs
 
 INTERVAL = re.compile(r"[+\u2212]?\d\.\d+ \[[+\u2212]?\d\.\d+, [+\u2212]?\d\.\d+\]")
 SHARE = re.compile(r"\b\d+/\d+\b")
@@ -37,6 +40,33 @@ def of_readme() -> str:
     """README.md's section on the leaderboard."""
     text = (PAGE_FOLDER.parent / "README.md").read_text()
     return text.split("## The leaderboard", 1)[1].split("\n## ", 1)[0]
+
+
+def test_what_is_said_of_divergence_is_on_its_page_and_in_the_records() -> None:
+    study = read_study("divergence")
+    page = (PAGE_FOLDER / "stress" / "LEADERBOARD.md").read_text()
+    assert (page.count(study.notice), page.count(study.details)) == (1, 1)
+    results = plain(page.replace(study.notice, "").replace(study.details, ""))
+    text = plain(f"{study.notice} {study.details}")
+    assert set(INTERVAL.findall(text)) <= set(INTERVAL.findall(results))
+    runs = load_runs([RESULTS / "stress"])
+
+    def share(chosen: Callable[[str, dict[str, Any]], bool]) -> str:
+        configs = [(run.record.config, bool(run.diverged)) for run in runs]
+        flags = [flag for c, flag in configs if chosen(c["agent"], c["agent_options"])]
+        return f"{sum(flags)}/{len(flags)}"
+
+    hasty = {"utd": 4, "layer_norm": False, "soft_backup": False}
+    assert SHARE.findall(text) == [
+        share(lambda _, options: options["layer_norm"]),
+        share(lambda _, options: not options["layer_norm"]),
+        share(lambda agent, _: agent == "standard"),
+        share(lambda agent, _: agent == "equivariant"),
+        share(lambda agent, _: agent == "augmented"),
+        share(lambda agent, options: "standard" in agent and hasty.items() <= options.items()),
+    ]
+    worst = hasty | {"tau": 0.05, "soft_backup": True}
+    assert share(lambda _, options: worst.items() <= options.items()) == "40/40"
 
 
 @pytest.mark.parametrize("where", ["the page", "README.md"])

@@ -48,6 +48,7 @@ def test_a_fraction_of_the_grid_gives_the_main_effects(agents: Sequence[str]) ->
     norm = found["layer_norm", "success"]
     assert norm.effect.value == pytest.approx(0.2)
     assert (norm.levels, norm.runs) == (("false", "true"), 80)
+    assert norm.means == pytest.approx((0.45, 0.65))
     assert found["utd", "success"].effect.value == pytest.approx(-0.1)
     assert found["utd", "success"].levels == ("1.0", "4.0")
     assert found["tau", "success"].levels == ("0.005", "0.05")

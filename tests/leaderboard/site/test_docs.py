@@ -87,6 +87,7 @@ def test_a_dead_link_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     linked += ("leaderboard/learners/LEADERBOARD.md", "leaderboard/results/audit")
     linked += ("leaderboard/zoo/LEADERBOARD.md", "leaderboard/results/base-policies")
     linked += ("leaderboard/first/LEADERBOARD.md", "leaderboard/PAPER.md", "leaderboard/figures")
+    linked += ("leaderboard/stress/LEADERBOARD.md",)
     for name in ("docs", "README.md", "CHANGELOG.md", "mkdocs.yml", *linked):
         source = ROOT / name
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
