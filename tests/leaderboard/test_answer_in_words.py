@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 from symsteer.leaderboard.paths import PAGE_FOLDER, RESULTS, STUDY
 from symsteer.leaderboard.study import read_study
-from symsteer.leaderboard.summary import load_runs
+from symsteer.leaderboard.summary import Run, load_runs
 
 INTERVAL = re.compile(r"[+\u2212]?\d\.\d+ \[[+\u2212]?\d\.\d+, [+\u2212]?\d\.\d+\]")
 SHARE = re.compile(r"\b\d+/\d+\b")
@@ -42,31 +41,51 @@ def of_readme() -> str:
     return text.split("## The leaderboard", 1)[1].split("\n## ", 1)[0]
 
 
-def test_what_is_said_of_divergence_is_on_its_page_and_in_the_records() -> None:
+@pytest.fixture(scope="module")
+def stress() -> list[Run]:
+    return load_runs([RESULTS / "stress"])
+
+
+def share(runs: list[Run], *agents: str, large: bool = False, **options: float) -> str:
+    """In how many runs of these agents, all by default, with these options Q diverged."""
+    flags = [
+        found.magnitude > 1 if large else found.diverged
+        for run in runs
+        if (not agents or run.record.config["agent"] in agents)
+        and options.items() <= run.record.config["agent_options"].items()
+        and (found := run.record.divergence)
+    ]
+    return f"{sum(flags)}/{len(flags)}"
+
+
+def test_what_is_said_of_divergence_is_on_its_page_and_in_the_records(stress: list[Run]) -> None:
     study = read_study("divergence")
     page = (PAGE_FOLDER / "stress" / "LEADERBOARD.md").read_text()
     assert (page.count(study.notice), page.count(study.details)) == (1, 1)
     results = plain(page.replace(study.notice, "").replace(study.details, ""))
     text = plain(f"{study.notice} {study.details}")
     assert set(INTERVAL.findall(text)) <= set(INTERVAL.findall(results))
-    runs = load_runs([RESULTS / "stress"])
-
-    def share(chosen: Callable[[str, dict[str, Any]], bool]) -> str:
-        configs = [(run.record.config, bool(run.diverged)) for run in runs]
-        flags = [flag for c, flag in configs if chosen(c["agent"], c["agent_options"])]
-        return f"{sum(flags)}/{len(flags)}"
-
+    agents = ("standard", "equivariant", "augmented")
     hasty = {"utd": 4, "layer_norm": False, "soft_backup": False}
     assert SHARE.findall(text) == [
-        share(lambda _, options: options["layer_norm"]),
-        share(lambda _, options: not options["layer_norm"]),
-        share(lambda agent, _: agent == "standard"),
-        share(lambda agent, _: agent == "equivariant"),
-        share(lambda agent, _: agent == "augmented"),
-        share(lambda agent, options: "standard" in agent and hasty.items() <= options.items()),
+        *(share(stress, layer_norm=norm) for norm in (True, False)),
+        *(share(stress, agent) for agent in agents),
+        *(share(stress, agent, large=True) for agent in agents),
+        share(stress, "standard", "standard-matched", **hasty),
     ]
-    worst = hasty | {"tau": 0.05, "soft_backup": True}
-    assert share(lambda _, options: worst.items() <= options.items()) == "40/40"
+    assert share(stress, **hasty | {"tau": 0.05, "soft_backup": True}) == "40/40"
+
+
+def test_the_documentation_counts_diverged_runs_as_the_records_do(stress: list[Run]) -> None:
+    text = (PAGE_FOLDER.parent / "docs" / "divergence.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    (header,) = [row for row in rows if len(row) == 8 and row[0] == "`utd`"]
+    names, agents = ([name.strip("`") for name in part] for part in (header[:4], header[4:]))
+    settings = [row for row in rows if len(row) == 8 and row[0] in ("1", "4")]
+    assert len(settings) == 8
+    for row in settings:
+        options = dict(zip(names, map(json.loads, row[:4]), strict=True))
+        assert [f"{cell}/10" for cell in row[4:]] == [share(stress, a, **options) for a in agents]
 
 
 @pytest.mark.parametrize("where", ["the page", "README.md"])

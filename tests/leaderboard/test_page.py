@@ -191,6 +191,15 @@ def test_the_glance_counts_diverged_runs_of_all_worlds() -> None:
     assert found == {"standard": [NOTHING, "3/10"], "equivariant": ["0 ▲ 0 ▼ of 2", "0/10"]}
 
 
+def test_a_claim_of_no_effect_says_so_wherever_it_is_named() -> None:
+    """Its name alone would say the opposite of its verdict."""
+    text = page_of(diverging("standard", range(5)) + diverging("augmented", []), "stress")
+    name = "Rotated data prevent value divergence (predicted: no effect)"
+    assert f"- **Contradicted** (1): {name}." in text
+    assert f"| {name} (divergence under stress) |" in text
+    assert "Symmetry prevents value divergence (predicted" not in text
+
+
 def test_the_second_table_shows_q_and_cost(board: Path) -> None:
     text = text_of(board)
     header, _, *rows = table_after(text, "Q-values, symmetry and cost")
