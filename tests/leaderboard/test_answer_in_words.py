@@ -79,13 +79,12 @@ def test_what_is_said_of_divergence_is_on_its_page_and_in_the_records(stress: li
 def test_the_documentation_counts_diverged_runs_as_the_records_do(stress: list[Run]) -> None:
     text = (PAGE_FOLDER.parent / "docs" / "divergence.md").read_text()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
-    (header,) = [row for row in rows if len(row) == 8 and row[0] == "`utd`"]
-    names, agents = ([name.strip("`") for name in part] for part in (header[:4], header[4:]))
-    settings = [row for row in rows if len(row) == 8 and row[0] in ("1", "4")]
-    assert len(settings) == 8
-    for row in settings:
-        options = dict(zip(names, map(json.loads, row[:4]), strict=True))
-        assert [f"{cell}/10" for cell in row[4:]] == [share(stress, a, **options) for a in agents]
+    settings = [(row[0].split(", "), row[1:]) for row in rows if row and row[0].count(", ") == 3]
+    (names, agents), *found = settings
+    assert len(found) == 8
+    for values, counts in found:
+        options = dict(zip(names, map(json.loads, values), strict=True))
+        assert [f"{count}/10" for count in counts] == [share(stress, a, **options) for a in agents]
 
 
 @pytest.mark.parametrize("where", ["the page", "README.md"])
