@@ -31,8 +31,8 @@ Advantage over `{STANDARD}` by what breaks the symmetry, with 95 % intervals. In
 
 GLANCE = f"""\
 In how many cells a learner's final success is clearly above (\u25b2) and clearly below (\u25bc)
-that of `{STANDARD}`, and that of the best reference, the frozen policy alone; in how many of all
-its runs Q diverged.
+that of `{STANDARD}`, and that of the best reference, the frozen policy alone. The last column says
+in how many of all its runs Q diverged.
 """
 
 MARKED = f"""\
@@ -70,7 +70,7 @@ def _glance(summary: Summary) -> str:
     columns = {"Learner": [code(agent) for agent in diverged]}
     for name, tallies in rivals.items():
         columns[name] = [_counts(tallies.get(agent)) for agent in diverged]
-    columns["Q diverged"] = [share(flags) for flags in diverged.values()]
+    columns["Q diverged"] = [share(sum(flags), len(flags)) for flags in diverged.values()]
     return grid(*without_empty(columns), left=1)
 
 

@@ -19,6 +19,7 @@ from symsteer.leaderboard.text import (
     grid,
     image,
     number,
+    share,
     stacked,
 )
 
@@ -94,9 +95,9 @@ def _left_out(tested: Sequence[LeaveOut]) -> str:
             code(one.embodiment),
             code(row.agent),
             _measure(row.measure),
-            _share(row.right, row.cells),
-            _share(row.clear_right, row.clear),
-            _share(row.inside, row.with_interval),
+            share(row.right, row.cells),
+            share(row.clear_right, row.clear),
+            share(row.inside, row.with_interval),
             number(row.error),
         ]
         for one in tested
@@ -117,8 +118,8 @@ def _left_out(tested: Sequence[LeaveOut]) -> str:
 def _best_left_out(tested: LeaveOut) -> str:
     """How often the expected best agent was the best one, in a sentence."""
     texts = [
-        f"by {_measure(best.measure)} in {_share(best.right, best.cells)} cells (the agent that is "
-        f"best on average elsewhere: {_share(best.usual, best.cells)})"
+        f"by {_measure(best.measure)} in {share(best.right, best.cells)} cells (the agent that is "
+        f"best on average elsewhere: {share(best.usual, best.cells)})"
         for best in tested.best
     ]
     if not texts:
@@ -127,10 +128,6 @@ def _best_left_out(tested: LeaveOut) -> str:
         f"{code(tested.embodiment)}, {len(tested.tasks)} tasks: the expected best agent was the "
         f"best {', '.join(texts)}."
     )
-
-
-def _share(part: int, whole: int) -> str:
-    return f"{part}/{whole}" if whole else NOTHING
 
 
 def _measure(name: str) -> str:

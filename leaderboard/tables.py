@@ -232,7 +232,7 @@ def _diagnostics(table: Table) -> list[str]:
         return []
     rows.sort(key=_place)
     columns = {
-        "Q diverged": [share(row.diverged) for row in rows],
+        "Q diverged": [share(sum(row.diverged), len(row.diverged)) for row in rows],
         _magnitude_header(table): [
             _pair(row.largest("magnitude"), row.largest("overshoot")) for row in rows
         ],

@@ -88,9 +88,9 @@ def stacked(value: Interval | None, sign: bool = False, marks: str = "", digits:
     return f"{middle}{marks}".replace(" ", SPACE) + f"<br>{ends}"
 
 
-def share(flags: Sequence[bool]) -> str:
-    """How many of them are true, as in 3/5."""
-    return f"{sum(flags)}/{len(flags)}" if flags else NOTHING
+def share(part: int, whole: int) -> str:
+    """As in 3/5; a dash of none."""
+    return f"{part}/{whole}" if whole else NOTHING
 
 
 def ends(values: tuple[float, float] | None) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from collections import defaultdict
+from statistics import mean, median
 
 import pytest
 
@@ -85,6 +87,33 @@ def test_the_documentation_counts_diverged_runs_as_the_records_do(stress: list[R
     for values, counts in found:
         options = dict(zip(names, map(json.loads, values), strict=True))
         assert [f"{count}/10" for count in counts] == [share(stress, a, **options) for a in agents]
+
+
+def test_other_numbers_of_that_page_are_those_of_the_records(stress: list[Run]) -> None:
+    text = plain((PAGE_FOLDER.parent / "docs" / "divergence.md").read_text())
+    bonuses, success, soft, large = defaultdict(list), defaultdict(list), defaultdict(list), []
+    for run in stress:
+        config, divergence = run.record.config, run.record.divergence
+        options, last = config["agent_options"], run.record.evaluations[-1].diagnostics
+        setting = tuple(options[name] for name in ("utd", "layer_norm", "tau", "soft_backup"))
+        if options["soft_backup"]:
+            bonus = last["alpha"] * last["entropy"] / options["reward_scale"]
+            bonuses[setting].append(bonus)
+            soft[setting, config["variant"], config["agent"]].append(run.success)
+        elif config["agent"] in ("standard", "standard-matched"):
+            success[setting].append(run.success)
+        if divergence.magnitude > 1:
+            large.append((setting, divergence.magnitude))
+    worst = (4, False, 0.05, True)
+    medians = [median(values) for setting, values in bonuses.items() if setting != worst]
+    assert f"{min(medians):.0f} to {max(medians):.0f} units of reward" in text
+    assert f"at most .{max(map(mean, soft.values())) * 100:02.0f} of the episodes" in text
+    assert f"succeed in .{mean(success[4, False, 0.005, False]) * 100:.0f} of their" in text
+    assert f"which succeed in .{mean(success[1, True, 0.005, False]) * 100:.0f}." in text
+    near = max(size for setting, size in large if setting[1:3] != (True, 0.05) and setting != worst)
+    far = [size for setting, size in large if setting == worst]
+    assert f"at most {near:.2f} times" in text
+    assert f"{min(far):.1f} to {max(far):.0f} times" in text
 
 
 @pytest.mark.parametrize("where", ["the page", "README.md"])

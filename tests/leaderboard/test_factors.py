@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from symsteer.leaderboard.factors import MainEffect, main_effects
+from symsteer.leaderboard.page import effects_section
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.summary import Run, summarize
 from tests.leaderboard.record_factory import make_cell
@@ -55,6 +56,13 @@ def test_a_fraction_of_the_grid_gives_the_main_effects(agents: Sequence[str]) ->
     for option in ("tau", "soft_backup"):
         assert found[option, "success"].effect.value == pytest.approx(0, abs=1e-9)
     assert found["tau", "magnitude"].effect.value == pytest.approx(0)
+
+
+def test_the_page_has_both_means_and_their_difference() -> None:
+    runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(design())]
+    _, table = effects_section(summarize(runs))
+    (row,) = [line for line in table.replace("\u00a0", " ").splitlines() if "`layer_norm`" in line]
+    assert "| `standard` | `layer_norm` `false` to `true` | 0.45 to 0.65<br>+0.20<br>[" in row
 
 
 def test_what_is_not_balanced_is_no_design() -> None:
