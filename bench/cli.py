@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from symsteer.errors import UserError
+from symsteer.registry import allow
 from symsteer.terminal import BOARD, complain, printable
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def resume(
     workers: int = 1,
     track: Literal["wandb"] | None = None,
     quiet: bool = False,
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Continue a run that was stopped, from its last checkpoint.
 
@@ -62,7 +64,9 @@ def resume(
         workers: Processes that share the simulation; they change nothing in the record but times.
         track: Show the run in Weights & Biases, too; it continues there as well.
         quiet: No progress bars.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(*trust)
     from symsteer.bench.runs.run import resume
     from symsteer.bench.runs.tracking import checked
 
@@ -80,6 +84,7 @@ def reproduce(
     into: Path | None = None,
     workers: int = 1,
     quiet: bool = False,
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Make a run again from its record, and say what agrees (docs/runner.md).
 
@@ -97,7 +102,9 @@ def reproduce(
         into: Folder that gets a copy of reproduction.json, named after the record's hash.
         workers: Processes that share the simulation.
         quiet: No progress bars.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(*trust)
     from symsteer.bench.runs.reproduce import reproduce, text
 
     def report(line: str) -> None:
@@ -115,6 +122,7 @@ def evaluate(
     episodes: int | None = None,
     workers: int = 1,
     json: bool = False,
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Play held-out episodes with the last checkpoint of a run, in its own variant or another.
 
@@ -126,7 +134,9 @@ def evaluate(
         episodes: Number of held-out episodes; default: as many as the record's final ones.
         workers: Processes that share the simulation.
         json: Print only JSON, with every episode and diagnostic.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(variant, *trust)
     from json import dumps
 
     from scipy.stats import binomtest
@@ -160,6 +170,7 @@ def film(
     variant: str | None = None,
     episodes: int = 3,
     out: Path | None = None,
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Film held-out episodes with the last checkpoints of runs.
 
@@ -172,7 +183,9 @@ def film(
         episodes: Number of held-out episodes.
         out: The film, .mp4 or .gif; default: an .mp4 in the run's folder, for several runs beside
             the first one.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(variant, *trust)
     from symsteer.bench.runs.film import film
     from symsteer.bench.sim.capabilities import RENDERING_CURE
     from symsteer.bench.sim.headless import rendering_works
@@ -193,6 +206,7 @@ def sweep(
     together: int = 1,
     track: Literal["wandb"] | None = None,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Run all runs of a suite; the same command continues a sweep that was stopped.
 
@@ -208,7 +222,9 @@ def sweep(
             differ in seeds and variants alone.
         track: Show the runs in Weights & Biases, too, in a group with the name of the suite.
         dry_run: Only show which runs are left and how long they may take.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(*trust)
     from dataclasses import replace
 
     from symsteer.bench.runs.tracking import checked
@@ -246,6 +262,7 @@ def tune(
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
     together: int = 1,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Search for the best settings of agents, with the same number of trials for each.
 
@@ -259,7 +276,9 @@ def tune(
         together: Runs of a trial that share a process and are trained as one, which is faster, if
             they differ in seeds and variants alone.
         dry_run: Only show what would be tried.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(*trust)
     from symsteer.bench.tuning.plan import read_plan
 
     found = read_plan(plan)
@@ -355,6 +374,7 @@ def demos(
         mode: clean, or diverse (correlated noise and offsets: what steering needs).
         seed: Seed of the collection.
     """
+    allow(task)
     from tqdm import tqdm
 
     from symsteer.bench.demos import collect, load
@@ -397,6 +417,7 @@ def base(
         workers: Number of policies trained at the same time; 0: one per core.
         out: Folder for demonstrations and the table's data.
     """
+    allow(*task, *policies)
     from symsteer.bench.runs.base_study import study, table, write_study
     from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
     from symsteer.bench.runs.run import check
@@ -431,6 +452,7 @@ def export(
     policy: str | None = None,
     runs: Path = Path("runs"),
     videos: Literal["auto", "on", "off"] = "auto",
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Write a base policy and its demonstrations to one file, or demonstrations for LeRobot.
 
@@ -451,7 +473,9 @@ def export(
         policy: Base policy (default edp); `symsteer list` names them.
         runs: Folder of runs; demonstrations and policies of settings are kept in RUNS/base.
         videos: Whether a LeRobot dataset has a video; auto: where a Vulkan driver works.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(task, policy, *trust)
     from symsteer.bench.bundles.bundle import check_path, write_bundle
     from symsteer.bench.bundles.contents import contents_of_run, contents_of_settings
     from symsteer.bench.runs.config import build_config
@@ -562,6 +586,7 @@ def audit(
     json: bool = False,
     rollouts: int = 0,
     actions: Literal["expert", "random", "policy"] = "expert",
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Measure how broken the symmetry of a task is, in simulation (docs/audit.md).
 
@@ -589,7 +614,9 @@ def audit(
         rollouts: If above 0: compare this many whole episodes of the floating gripper with their
             turned copies instead.
         actions: Who acts in these episodes.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(*task, *variant, *trust)
     from json import dumps
 
     from symsteer.bench.audit.report import summary, text, to_markdown, write_table
@@ -636,6 +663,7 @@ def detect(
     seed: int = 0,
     out: Path | None = None,
     json: bool = False,
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Score detectors of broken symmetry on the decisions of runs (docs/detect.md).
 
@@ -652,7 +680,9 @@ def detect(
         out: Folder for detect.json and detect.png; of several runs, each has its own folder there,
             beside summary.json and summary.md.
         json: Print only JSON.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(*detector, *trust)
     from json import dumps
 
     from symsteer.agents.detectors import DETECTORS
@@ -717,6 +747,7 @@ def throughput(
             the GPU, in turns.
         json: Print only JSON.
     """
+    allow(task)
     from symsteer.bench import throughput as speed
 
     def report(text: str) -> None:

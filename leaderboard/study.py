@@ -15,7 +15,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.records.provenance import git
+from symsteer.leaderboard.records.provenance import committed_hash, git_hash
 from symsteer.names import unknown
 
 PAPER = "paper"
@@ -187,11 +187,8 @@ def _read(path: Path) -> _File:
 
 def _check_commit(source: Path, commit: str) -> None:
     """Compare a file that declares claims with what a commit has in its place."""
-    folder = source.resolve().parent
-    if git(folder, "rev-parse", "--is-shallow-repository") != "false":
-        return  # no git, or not all commits
-    then = git(folder, "rev-parse", "--verify", "--quiet", f"{commit}:./{source.name}")
-    if then is None or then != git(folder, "hash-object", "--", source.name):
+    known, then = committed_hash(source, commit)
+    if known and then != git_hash(source.read_bytes()):
         raise UserError(
             f"{source} is not as the commit {commit} has it, so this commit has not declared these "
             "claims; name the one that has, or restore the file"

@@ -16,7 +16,7 @@ from symsteer.files import write_atomically
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Layout
-from symsteer.registry import NotInstalledError
+from symsteer.registry import NotAllowedError, NotInstalledError
 
 FORMAT = "symsteer-policy"
 VERSION = 3
@@ -100,7 +100,7 @@ def load_policy(
 
     Raises:
         UserError: if the file is missing, damaged, no policy, of another version or layout, or if
-            its class is not installed.
+            its class is not installed or is code that nobody has consented to.
     """
     path = policy_path(folder_or_path)
     if not path.is_file():
@@ -132,6 +132,7 @@ def load_policy(
             description |= _described_by_config(description["config"])
         if found := description["extension"]:
             POLICIES.require(found["name"], found["target"], found["distribution"], path)
+        POLICIES.check_allowed(description["name"], path)
         kind = POLICIES.get(description["name"])
         obs_layout = Layout.from_json(description["obs_layout"])
         act_layout = Layout.from_json(description["act_layout"])
@@ -141,7 +142,7 @@ def load_policy(
         stored_hash = description["content_hash"]
         policy.training_record = description["training_record"]
         policy.report = description["report"]
-    except NotInstalledError:
+    except (NotAllowedError, NotInstalledError):
         raise
     except DAMAGE as error:
         reason = " ".join(str(error).split())[:200]

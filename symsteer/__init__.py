@@ -4,25 +4,33 @@ The public names are those in ``__all__``. Everything else may change between ve
 (docs/api.md). They are imported on first use, so ``import symsteer`` is fast.
 """
 
-from __future__ import annotations
+import sys
 
-import importlib
-from typing import TYPE_CHECKING, Any
+# `python -m symsteer` begins with the current folder in front of all others, whoever wrote what is
+# in it. Nothing may be imported from there, so this comes before all other imports.
+if sys.argv[:1] == ["-m"] and not sys.flags.safe_path:
+    del sys.path[0]
 
-from symsteer.errors import UserError
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from symsteer.bench.runs.trained import load
     from symsteer.bench.tasks import make
+    from symsteer.errors import UserError
 
     __version__: str
 
 __all__ = ["UserError", "__version__", "load", "make"]
 
-_HOME = {"load": "symsteer.bench.runs.trained", "make": "symsteer.bench.tasks"}
+_HOME = {
+    "UserError": "symsteer.errors",
+    "load": "symsteer.bench.runs.trained",
+    "make": "symsteer.bench.tasks",
+}
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
+    import importlib
+
     if name == "__version__":
         from importlib.metadata import version
 

@@ -1,8 +1,6 @@
 """``python -m symsteer`` is the same program as ``symsteer``."""
 
-import sys
-
-from symsteer.cli import main
+from symsteer.launch import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from symsteer.errors import UserError
+from symsteer.registry import allow
 from symsteer.terminal import printable
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ def advise(
     states: int = 32,
     runs: Path = Path("runs"),
     json: Path | None = None,
+    trust: tuple[str, ...] = (),
 ) -> int:
     """Say which agent to take in a world, and how sure that is (docs/advise.md).
 
@@ -51,7 +53,9 @@ def advise(
         states: States of the expert and of the base policy, each, of an audit that is measured.
         runs: Folder of the runs; base policies of an audit that is measured are kept in RUNS/base.
         json: Write everything into this file, too.
+        trust: Code of other authors that files name, as module:Class; it is executed.
     """
+    allow(task, variant, *trust)
     if [task, audit, detection].count(None) != 2:
         raise UserError("name one world: with --task and --variant, with --audit or --detection")
     from symsteer.leaderboard.advice import advise, leave_tasks_out

@@ -99,13 +99,11 @@ def main() -> int:
     """Run the verb that the command line names.
 
     Returns:
-        The exit code: 0 done, 1 something failed, 2 the input is wrong, 130 interrupted.
+        The exit code: 0 done, 1 something failed, 2 the input is wrong.
     """
     # Warnings of other packages about optional parts that SymSteer does not use.
     warnings.filterwarnings("ignore", message=".*py3nj.*")
     warnings.filterwarnings("ignore", message="Failed to find system libvulkan.*")
-    # For --agent module:Class: a module in the present folder, if no installed one has its name.
-    sys.path.append("")
     try:
         return _run(sys.argv[1:])
     except UserError as error:
@@ -122,8 +120,6 @@ def main() -> int:
             raise
         cure = "free space" if error.errno in DISK_FULL else "choose another path"
         return complain(error, f"error: {error.filename}: {error.strerror}; {cure}", 2)
-    except KeyboardInterrupt as error:
-        return complain(error, "interrupted", 130)
     except (MemoryError, RuntimeError) as error:
         if not _is_out_of_memory(error):
             raise
@@ -178,6 +174,8 @@ def _run(arguments: Sequence[str]) -> int:
     @functools.wraps(function)
     def work(*args: object, **options: object) -> int:
         if verb.computes:
+            # A run goes on when its terminal is closed.
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
             _limit_threads()
         return function(*args, **options)
 

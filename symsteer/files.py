@@ -4,10 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sysconfig
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TextIO
 
 from symsteer.errors import UserError
+
+
+def away() -> contextlib.AbstractContextManager[None]:
+    """Work in a folder that no stranger has written to: for packages that read settings, or look
+    for modules, in the current folder."""
+    return contextlib.chdir(sysconfig.get_path("stdlib"))
+
+
+def open_log(path: str | Path) -> TextIO:
+    """A log to append to; not through a link, which somebody may have put there."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
+    return os.fdopen(os.open(path, flags, 0o666), "a")
 
 
 def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:

@@ -7,7 +7,8 @@ A name stands for a class. It comes from one of three places:
   ``symsteer.agents.detectors.DETECTORS``;
 - an entry point of an installed distribution, in the group ``symsteer.agents``,
   ``symsteer.policies``, ``symsteer.variants``, ``symsteer.tasks`` or ``symsteer.detectors``;
-- ``package.module:Class``, to try a class that is not installed.
+- ``package.module:Class``, to try a class that is not installed. Importing it executes its code, so
+  it needs consent (:func:`allow`): what a user types has it, what a file names does not.
 
 Names and summaries are read without importing any of the classes: ``symsteer --help`` and
 ``symsteer list`` must not wait for torch or ManiSkill.
@@ -20,12 +21,14 @@ import functools
 import hashlib
 import importlib
 import importlib.util
+import json
 import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -68,6 +71,47 @@ class NotInstalledError(UserError):
     """A file names a class of a package that is not installed here."""
 
 
+class NotAllowedError(UserError):
+    """A file names code that the user has not consented to."""
+
+
+ALLOWED = "SYMSTEER_ALLOWED"
+"""Environment variable in which child processes find what :func:`allow` was told."""
+
+_allowed: dict[str, str] = json.loads(os.environ.get(ALLOWED, "{}"))
+"""``package.module:Class``, and the folder that was the current one when it was named."""
+
+
+def allow(*texts: Any) -> None:
+    """Consent to the code that texts name as ``package.module:Class``: importing it executes it.
+
+    Its module may also lie in the current folder, in which nothing else is looked for.
+
+    Args:
+        texts: what a user has typed: such a name, or a variant's text with several; others do
+            nothing.
+    """
+    for text in texts:
+        for target in TARGET.findall(text) if isinstance(text, str) else ():
+            _allowed.setdefault(target, os.getcwd())
+    if _allowed:
+        os.environ[ALLOWED] = json.dumps(_allowed)
+
+
+class _Named:
+    """Finds modules that were named as ``module:Class`` in the folder of that moment."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        folders = {t.partition(":")[0].partition(".")[0]: f for t, f in _allowed.items()}
+        known = path is None and name in folders
+        return PathFinder.find_spec(name, [folders[name]]) if known else None
+
+
+# The last one: installed packages come first.
+sys.meta_path.append(_Named)
+
+
 class Registry(Generic[T]):
     """Classes of one kind by name.
 
@@ -107,14 +151,36 @@ class Registry(Generic[T]):
             return name
         raise unknown(self.kind, name, self.names())
 
+    def check_allowed(self, name: str, where: Path | None = None) -> None:
+        """Refuse code that nobody has consented to; what is imported already harms no more.
+
+        Args:
+            name: any name.
+            where: the file that names it, for the message.
+
+        Raises:
+            NotAllowedError: naming the option that consents.
+        """
+        module = name.partition(":")[0]
+        if name in self or not TARGET.fullmatch(name):
+            return
+        if name not in _allowed and module not in sys.modules:
+            raise NotAllowedError(
+                f"{f'{where}: ' if where else ''}the {self.kind} {name} is code of another author, "
+                f"which would be executed; if you trust it, add --trust {name} (in Python: import "
+                f"{module} first)"
+            )
+
     def get(self, name: str) -> T:
         """Import and return the class of a name.
 
         Raises:
             UserError: if there is no such name, its module cannot be imported, or it is not a
                 class of this kind.
+            NotAllowedError: if it is ``module:Class`` and nobody has consented to it.
         """
         target = self.target(name)
+        self.check_allowed(name)
         if ":" not in name and not NAME.fullmatch(name):
             raise UserError(
                 f"the {self.kind} name {name!r} of {target} cannot be part of file names; use at "
@@ -181,8 +247,11 @@ class Registry(Generic[T]):
 
         Raises:
             NotInstalledError: naming the distribution to install.
+            NotAllowedError: if it is ``module:Class`` and nobody has consented to it.
         """
         package = target.partition(":")[0].partition(".")[0]
+        if name == target:
+            self.check_allowed(name, where)
         if name in self or (name == target and importlib.util.find_spec(package) is not None):
             return
         source = f"distribution {distribution}" if distribution else f"package {package}"

@@ -55,6 +55,12 @@ def fetch_bundle(path: Path, out: Path) -> tuple[Manifest, dict[str, Path]]:
     places = {n: (about if roles.get(n, "card") == "card" else out) / n for n in contents}
     missing = {}
     for name, place in places.items():
+        inside = place.resolve().is_relative_to(out.resolve())
+        if not inside or any(p.is_symlink() for p in (place, *place.parents) if out in p.parents):
+            raise UserError(
+                f"{place} is a link, or in a folder that is one, so the file would go elsewhere; "
+                "remove the link, or choose another folder with --out"
+            )
         if not place.exists():
             missing[place] = contents[name]
         elif not place.is_file() or place.read_bytes() != contents[name]:

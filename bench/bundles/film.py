@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from symsteer.bench.demos.files import opened
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.film import FRAMES_PER_SECOND
 from symsteer.bench.tasks import make
@@ -78,7 +79,7 @@ def _frames(
     env = make(config.task, num_envs=1, embodiment=config.embodiment, **RENDERING)
     try:
         env.reset(seed=0)
-        with h5py.File(demonstrations, "r") as file:
+        with opened(demonstrations) as file:
             for episode, length in enumerate(lengths):
                 states = _arrays(file[f"traj_{episode}/env_states"])
                 for step in range(length):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import io
 import json
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +16,7 @@ import h5py
 import numpy as np
 
 from symsteer.bench.tasks import gym_id
+from symsteer.errors import UserError
 from symsteer.files import write_together
 
 if TYPE_CHECKING:
@@ -24,6 +28,9 @@ FORMAT = 2
 
 SEAL = "sha256"
 """Attribute of the .h5 file that holds the checksum."""
+
+LARGEST, MOST_COMPRESSED = 2**30, 20
+"""Bytes that every file may unpack to; a larger one to so many times its size."""
 
 
 def write(
@@ -113,6 +120,45 @@ def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:
             _write_tree(group.create_group(key, track_order=True), value)
         else:
             group.create_dataset(key, data=value, dtype=np.float32)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """A trajectory file that is to be read, if all of its data are its own.
+
+    HDF5 opens other files by itself for external links, external storage and virtual datasets, so a
+    stranger's file could contain any file of its reader.
+
+    Raises:
+        UserError: if data lie elsewhere, or are much larger than the file.
+        OSError, RuntimeError, ...: as h5py, for a damaged file.
+    """
+    foreign: list[str] = []
+    sizes = [0]
+
+    def look(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Group):
+            links = {key: item.get(key, getlink=True) for key in item}
+            foreign.extend(k for k, link in links.items() if isinstance(link, h5py.ExternalLink))
+        elif isinstance(item, h5py.Dataset):
+            sizes.append(item.nbytes)
+            if item.is_virtual or item.external:
+                foreign.append(name)
+
+    with h5py.File(path, "r") as file:
+        look("/", file)
+        file.visititems(look)
+        if foreign:
+            raise UserError(
+                f"{path} takes {foreign[0]!r} from another file, so reading it could disclose any "
+                "file of yours; do not use it, or copy the data into it"
+            )
+        if sum(sizes) > max(LARGEST, MOST_COMPRESSED * os.path.getsize(path)):
+            raise UserError(
+                f"{path} unpacks to {sum(sizes) / 2**30:.1f} GiB, far more than it has bytes; do "
+                "not use it"
+            )
+        yield file
 
 
 def checksum(file: h5py.File, description: dict[str, Any]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
-from symsteer.bench.demos.files import SEAL, checksum
+from symsteer.bench.demos.files import SEAL, checksum, opened
 from symsteer.bench.tasks import check_embodiment, make, task_class, task_name
 from symsteer.bench.tasks.embodiments import BODIES
 from symsteer.errors import UserError
@@ -106,7 +106,7 @@ def load(
     layout = env_class.observation_layout
     own = description.get("symsteer", {}).get("observation_layout") == layout.to_json()
     try:
-        with h5py.File(path, "r") as file:
+        with opened(path) as file:
             groups = [_read_group(path, file, record, own) for record in records]
             seal = file.attrs.get(SEAL)
             # Both mark a file as ours: damage to one mark must not turn the check off.

@@ -18,6 +18,7 @@ from symsteer.agents import AGENTS
 from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.runs.tracking import Service
+from symsteer.registry import allow
 
 ABOUT = """Steer a base policy with one agent on one task, and record the results.
 
@@ -44,6 +45,8 @@ class Execution:
     """Show the run in Weights & Biases, too; WANDB_MODE=offline needs no network and no login."""
     quiet: bool = False
     """No progress bars."""
+    trust: tuple[str, ...] = ()
+    """Code of other authors that files name, as module:Class; it is executed."""
 
 
 def parse_run(arguments: Sequence[str]) -> tuple[RunConfig, Execution]:
@@ -57,6 +60,7 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunConfig, Execution]:
     agent = last_value(arguments, "--agent") or RunConfig.agent
     policy = last_value(arguments, "--policy.name") or RunConfig.policy_name
     preset = last_value(arguments, "--agent.preset")
+    allow(agent, policy)
     defaults = RunConfig(agent=agent, policy_name=policy)
     if preset is not None:
         options = preset_options(preset, agent, AGENTS.get(agent).Options)
@@ -82,6 +86,8 @@ def parse(arguments: Sequence[str], defaults: RunConfig) -> tuple[RunConfig, Exe
         "policy_name": defaults.policy_name,
         "policy": found.config.policy.options,
     }
+    tasks = getattr(found.config.policy.options, "tasks", ())
+    allow(found.config.task, found.config.variant, *tasks, *found.execution.trust)
     return RunConfig(**values), found.execution
 
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import multiprocessing
+import signal
 import statistics
 from collections.abc import Generator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from pebble import ProcessPool
 from tqdm import tqdm
 
 from symsteer.agents.episodes import Rollout
@@ -90,14 +91,25 @@ def study(
         files[seed] = {config.task: demonstration_file(config, out) for config in mine}
     cells = [BaseCell(n, c, s) for c in counts for n in policies for s in range(seeds)]
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    # Processes inherit the mask: Ctrl-C is for this one, which ends them.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    pool = ProcessPool(workers, context=context)
+    try:
         jobs = [
-            pool.submit(
-                _play_once, configs[0], cell, policies[cell.name], files[cell.seed], episodes, out
+            pool.schedule(
+                _play_once,
+                (configs[0], cell, policies[cell.name], files[cell.seed], episodes, out),
             )
             for cell in cells
         ]
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         parts = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
+    except BaseException:
+        pool.stop()
+        raise
+    finally:
+        pool.close()
+        pool.join()
     return [row for rows in parts for row in rows]
 
 

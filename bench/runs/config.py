@@ -15,6 +15,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentOptions
+from symsteer.bench.tasks import TASKS, task_name
+from symsteer.bench.variants import VARIANTS
 from symsteer.bench.variants.levels import with_numbers
 from symsteer.errors import UserError
 from symsteer.names import unknown
@@ -110,6 +112,8 @@ class RunConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
+        for task in self.policy_tasks:
+            TASKS.check_allowed(task_name(task))
         for kind, name, options in (
             ("agent_options", self.agent, AGENTS.get(self.agent).Options),
             ("policy", self.policy_name, POLICIES.get(self.policy_name).Options),
@@ -157,6 +161,8 @@ class RunConfig:
         object.__setattr__(self, "variant", with_numbers(self.variant, *self.place))
         # The variant is a part of the run's identity: each strength in its shortest form.
         object.__setattr__(self, "variant", variant_text(self.variants))
+        for spec in self.variants:
+            VARIANTS.check_allowed(spec.name)
 
     @property
     def place(self) -> tuple[str, str]:

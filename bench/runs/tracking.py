@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from symsteer.bench.runs.pictures import to_gif
 from symsteer.errors import UserError
-from symsteer.files import write_atomically
+from symsteer.files import away, write_atomically
 from symsteer.leaderboard.records import RunRecord
 
 Service = Literal["wandb"]
@@ -70,7 +70,9 @@ def checked(service: Service | None, group: str | None = None) -> Tracking | Non
             '--track wandb needs Weights & Biases; install it with: pip install "symsteer[wandb]"'
         ) from error
     try:
-        ready = setup().settings.mode in ("offline", "dryrun", "disabled") or login(prompt=False)
+        with away():  # W&B takes settings, such as the host that gets the key, from ./wandb
+            mode = setup().settings.mode
+        ready = mode in ("offline", "dryrun", "disabled") or login(prompt=False)
         reason = "no API key was found"
     except Exception as error:
         ready, reason = False, _one_line(error)
@@ -99,9 +101,11 @@ class WandbLog:
         self._first = self._state["step"] + 1
         self._run: Any = None
         with self._tolerant():
+            self._write()
+        folder = folder.resolve()
+        with self._tolerant(), away():
             import wandb
 
-            self._write()
             self._run = wandb.init(
                 id=self._state["id"],
                 name=record.run_id,
@@ -112,7 +116,9 @@ class WandbLog:
                 config={**record.config, "commit": record.provenance.commit},
                 resume="allow",
                 reinit="create_new",  # runs that are trained together share a process
-                settings=wandb.Settings(console="off", silent=True, finish_timeout=FINISH_SECONDS),
+                settings=wandb.Settings(
+                    console="off", silent=True, finish_timeout=FINISH_SECONDS, disable_git=True
+                ),
             )
             offline = f"`wandb sync {Path(self._run.dir).parent}` uploads it"
             place = offline if self._run.offline else self._run.url

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy
+from symsteer.registry import allow
 
 
 @dataclass(frozen=True)
@@ -84,16 +86,18 @@ class Trained:
         )
 
 
-def load(path: str | Path, device: str = "cpu") -> Trained:
+def load(path: str | Path, device: str = "cpu", trust: Sequence[str] = ()) -> Trained:
     """Load a run's folder at its last checkpoint, or a saved base policy.
 
     Args:
         path: folder of a run, or a policy file (``policy.safetensors``).
         device: for a policy file; a run comes back on its own device, or on the CPU without a GPU.
+        trust: code of other authors that the files may name, as ``module:Class``; it is executed.
 
     Raises:
-        UserError: if the path is neither of them, or a file is damaged.
+        UserError: if the path is neither of them, a file is damaged, or it names other code.
     """
+    allow(*trust)
     path = Path(path)
     if (path / CONFIG).is_file() or (path.is_dir() and not (path / "policy.safetensors").is_file()):
         run = restored(path)

@@ -241,7 +241,7 @@ def _check_rendering() -> Check:
     # In a process of its own: a broken driver may crash it.
     try:
         result = subprocess.run(
-            [sys.executable, "-c", _RENDER_PROBE],
+            [sys.executable, "-P", "-c", _RENDER_PROBE],
             capture_output=True,
             text=True,
             timeout=_PROBE_SECONDS,

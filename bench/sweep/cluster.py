@@ -16,6 +16,8 @@ import grpc
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.sweep.work import Result
 from symsteer.errors import UserError
+from symsteer.files import away
+from symsteer.registry import ALLOWED
 
 CONNECT_SECONDS = 10
 """How long to wait for an answer from an address."""
@@ -111,8 +113,12 @@ def _connect(address: str) -> Any:
         raise UserError('--ray needs Ray; install it with: pip install "symsteer[ray]"') from error
     if address != "auto" and not os.environ.get("RAY_USE_TLS"):
         _wait_for_answer(address)
+    # What was consented to on this machine holds on the others.
+    allowed = {"env_vars": {ALLOWED: os.environ[ALLOWED]}} if ALLOWED in os.environ else None
     try:
-        ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+        # Ray lets its workers import from the current folder.
+        with away():
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=allowed)
     except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
         raise UserError(
             f"the Ray cluster at {address} cannot be joined ({_first_line(error)}); start one with "

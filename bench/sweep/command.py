@@ -16,6 +16,7 @@ from symsteer.bench.sweep.pool import LocalPool
 from symsteer.bench.sweep.schedule import Outcome, Workers, execute_plan, tasks_of
 from symsteer.bench.sweep.survey import Sighting, look
 from symsteer.errors import UserError
+from symsteer.files import open_log
 
 COLUMNS = ("runs", "finished", "running", "unfinished", "missing")
 
@@ -79,7 +80,7 @@ def run_plan(
             from symsteer.bench.sweep.cluster import RayCluster
 
             # Ray prints messages about its machines.
-            stack.enter_context(contextlib.redirect_stdout(stack.enter_context(log.open("a"))))
+            stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open_log(log))))
             pool = RayCluster(ray, plan.out, limit or None)
         elif todo:
             pool = LocalPool(min(number, len(todo)), log)
@@ -103,7 +104,7 @@ def run_plan(
                     failures[outcome.run.run_id] = outcome.reason
                     write_manifest(plan, limit, failures)
                 if outcome.trace:
-                    with log.open("a") as file:
+                    with open_log(log) as file:
                         file.write(f"{outcome.run.label}\n{outcome.trace}\n")
         except KeyboardInterrupt as error:
             error.add_note("the same command continues the sweep")

@@ -16,6 +16,7 @@ from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
 from symsteer.bench.sweep.work import Result, one_thread
+from symsteer.files import open_log
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -36,7 +37,7 @@ class LocalPool:
     def __init__(self, workers: int, log: Path):
         self.capacity: int | None = workers
         # Processes read these before they import anything.
-        os.environ.update(dict.fromkeys(THREADS, "1"))
+        os.environ.update(dict.fromkeys((*THREADS, "PYTHONSAFEPATH"), "1"))
         self._log = log
         self._idle: list[ProcessPool] = [self._start() for _ in range(workers)]
         self._busy: dict[Future, ProcessPool] = {}
@@ -89,10 +90,9 @@ def _begin(log: str) -> None:
     """Prepare a new process."""
     one_thread()
     # Warnings of libraries and the output of a crash must not damage the display.
-    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    for stream in (1, 2):
-        os.dup2(file, stream)
-    os.close(file)
+    with open_log(log) as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
     # tqdm's default lock is a system semaphore. A killed process would not remove it.
     tqdm.set_lock(threading.RLock())
     threading.Thread(target=_end_with_parent, daemon=True).start()

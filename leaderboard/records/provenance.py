@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import os
 import platform
 import re
 import subprocess
+import tempfile
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
@@ -102,6 +105,8 @@ def _checkout_of(code: Path) -> Path | None:
     # An installed copy may lie inside of a checkout, in its virtual environment, but git does not
     # track it there.
     root = code.parent.parent
+    if not (root / ".git").exists():
+        return None
     top = git(code.parent, "rev-parse", "--show-toplevel")
     if top is None or Path(top).resolve() != root:
         return None
@@ -120,8 +125,13 @@ def commit_of(root: Path) -> tuple[str | None, bool | None]:
     return commit, bool(changes or untracked)
 
 
-def git(folder: Path, *arguments: str) -> str | None:
-    """What a git command prints; None if it fails or takes longer than 20 s."""
+def git(folder: Path, *arguments: str, **variables: str) -> str | None:
+    """What a git command prints; None if it fails or takes longer than 20 s.
+
+    A repository's configuration can name programs that git then runs. So this is for the checkout
+    that our own code is in, or with variables that keep the repository's configuration out.
+    """
+    own = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:
         result = subprocess.run(
             ["git", "-C", str(folder), *arguments],
@@ -129,10 +139,38 @@ def git(folder: Path, *arguments: str) -> str | None:
             text=True,
             timeout=20,
             check=True,
+            env={**own, "GIT_NO_LAZY_FETCH": "1", "GIT_ALLOW_PROTOCOL": "", **variables},
         )
-    except (OSError, subprocess.SubprocessError):
+    except (OSError, ValueError, subprocess.SubprocessError):
         return None
     return result.stdout.strip()
+
+
+def committed_hash(file: Path, commit: str) -> tuple[bool, str | None]:
+    """Whether the repository around a file can be asked, and git's hash of the file in a commit.
+
+    The repository may be anyone's: git reads its objects from an empty repository of ours, so that
+    none of its configuration is in force.
+    """
+    file = file.resolve()
+    top = next((folder for folder in file.parents if (folder / ".git").exists()), file)
+    if not (top / ".git/objects").is_dir() or (top / ".git/shallow").exists():
+        return False, None
+    with tempfile.TemporaryDirectory() as name:
+        empty = Path(name)
+        for part in ("objects", "refs"):
+            (empty / part).mkdir()
+        (empty / "HEAD").write_text("ref: refs/heads/none\n")
+        places = {"GIT_DIR": name, "GIT_ALTERNATE_OBJECT_DIRECTORIES": str(top / ".git/objects")}
+        if git(empty, "version") is None:
+            return False, None
+        place = f"{commit}:{file.relative_to(top).as_posix()}"
+        return True, git(empty, "rev-parse", "--verify", "--quiet", place, **places)
+
+
+def git_hash(data: bytes) -> str:
+    """The hash that git gives to a file's content."""
+    return hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
 
 
 @functools.cache

@@ -10,6 +10,7 @@ from symsteer.agents import AGENTS
 from symsteer.agents.agent import Agent
 from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.errors import UserError
+from symsteer.registry import NotAllowedError, allow
 
 MINE = """
 from symsteer.agents.standard import StandardAgent
@@ -29,6 +30,7 @@ class NoAgent:
 @pytest.fixture
 def module(monkeypatch, tmp_path):
     """Writes a module that can be imported for the length of a test."""
+    monkeypatch.setattr(symsteer.registry, "_allowed", {})
     monkeypatch.syspath_prepend(tmp_path)
     before = set(sys.modules)
 
@@ -93,8 +95,12 @@ def test_an_entry_point_is_an_agent(module, entry_points):
     assert len(extension.sha256) == 64
 
 
-def test_a_class_can_be_tried_by_its_place(module):
+def test_a_class_can_be_tried_by_its_place_once_it_is_allowed(module):
     module(MINE)
+    with pytest.raises(NotAllowedError, match="add --trust my_agents:Mine"):
+        AGENTS.get("my_agents:Mine")
+    assert "my_agents" not in sys.modules
+    allow("my_agents:Mine")
     assert AGENTS.get("my_agents:Mine").name == "mine"
     first = AGENTS.extension("my_agents:Mine")
     assert (first.distribution, first.version) == (None, None)
@@ -114,6 +120,7 @@ def test_a_class_can_be_tried_by_its_place(module):
 )
 def test_what_cannot_be_an_agent_is_named(module, text, name, sentence):
     module(text)
+    allow(name)
     with pytest.raises(UserError, match=sentence):
         AGENTS.get(name)
 

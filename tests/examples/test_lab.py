@@ -15,6 +15,9 @@ from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Field, Layout
+from symsteer.registry import allow
+
+CLASSES = ("smooth:SmoothAgent", "flow:FlowPolicy", "dead_zone:DeadZone", "wide_pick:WidePick")
 
 OBS = Layout([Field("xy", 1), Field("height", 0)])
 ACT = Layout([Field("xy", 1), Field("z", 0), Field("gripper", 0)])
@@ -23,6 +26,7 @@ ACT = Layout([Field("xy", 1), Field("z", 0), Field("gripper", 0)])
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples" / "symsteer-lab")
+    allow(*(f"symsteer_lab.{name}" for name in CLASSES))
 
 
 def test_the_smooth_agent_learns_noise_that_decodes_to_smooth_chunks():

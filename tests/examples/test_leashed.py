@@ -14,6 +14,7 @@ from symsteer.agents.diagnostics import actor_equivariance_error
 from symsteer.agents.replay import Transition
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.registry import allow
 
 REPOSITORY = Path(__file__).parents[2]
 PAGE = (REPOSITORY / "docs" / "submit.md").read_text()
@@ -27,6 +28,7 @@ ACT = Layout([Field("xy", 1), Field("z", 0)])
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
     monkeypatch.syspath_prepend(EXAMPLES)
+    allow(LEASHED)
 
 
 def built(**options):

@@ -16,6 +16,7 @@ from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Field, Layout
+from symsteer.registry import allow
 
 
 def decode(policy, world):
@@ -195,6 +196,7 @@ def test_the_policy_of_the_documentation(world, tmp_path, monkeypatch):
     (tmp_path / "stranger.py").write_text(code.partition("```")[0])
     with monkeypatch.context() as patch:
         patch.syspath_prepend(tmp_path)
+        allow("stranger:Mean")
         kind = POLICIES.get("stranger:Mean")
         options = kind.Options(horizon=4, execute=1)
         policy = kind.fit(options, world.episodes(2), world.obs_layout, world.act_layout)

@@ -23,7 +23,9 @@ from typing import Any
 
 _WORKER = "symsteer.bench.sim.shards.worker"
 
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+_SETTINGS = dict.fromkeys(
+    ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PYTHONSAFEPATH"), "1"
+)
 
 _CONTEXT = multiprocessing.get_context("forkserver")
 
@@ -54,9 +56,9 @@ def start_process(
 
 @contextmanager
 def _worker_settings() -> Iterator[None]:
-    """What the fork server inherits: one thread, SIGINT blocked."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)
+    """What the fork server inherits: one thread, no import from here, SIGINT blocked."""
+    before = {name: os.environ.get(name) for name in _SETTINGS}
+    os.environ.update(_SETTINGS)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -13,6 +13,7 @@ STRANGER = '''
 """A policy from outside of SymSteer."""
 
 from symsteer.policies.contract import ChunkPolicy
+from symsteer.registry import allow
 
 
 class Echo(ChunkPolicy):
@@ -34,6 +35,7 @@ def test_a_policy_from_another_package(tmp_path, monkeypatch):
     (tmp_path / "stranger_policy.py").write_text(STRANGER)
     monkeypatch.syspath_prepend(tmp_path)
     name = "stranger_policy:Echo"
+    allow(name)
     data = tiny_config().to_json() | {"policy": {"name": name, "horizon": 4, "execute": 2}}
     config = build_config(data, "test")
     assert find_base(config, tmp_path) is None
