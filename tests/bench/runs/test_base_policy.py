@@ -7,13 +7,13 @@ from symsteer.bench.runs.config import build_config
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.files import policy_path
+from symsteer.registry import allow
 from tests.bench.tiny_run import tiny_config
 
 STRANGER = '''
 """A policy from outside of SymSteer."""
 
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.registry import allow
 
 
 class Echo(ChunkPolicy):

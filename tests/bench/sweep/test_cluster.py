@@ -68,6 +68,16 @@ def machine_of(run, machines):
 
 
 @pytest.mark.slow
+def test_machines_do_not_import_from_the_current_folder(cluster, tmp_path, monkeypatch):
+    canary = tmp_path / "canary"
+    monkeypatch.chdir(tmp_path)
+    for name in ("grpc", "torch", "numpy"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(canary)!r}, 'w')")
+    RayCluster(cluster.address, tmp_path, None).stop()  # has asked every machine
+    assert not canary.exists()
+
+
+@pytest.mark.slow
 def test_a_folder_that_is_not_shared_is_refused(cluster, tmp_path):
     """The sweep alone sees a file system of its own where the runs are to lie."""
     own = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
