@@ -342,6 +342,25 @@ def test_other_files_of_the_same_name_stay(bundle, tmp_path):
 # ------------------------------------------------------------------ the command line
 
 
+def test_links_in_the_target_are_not_followed(bundle, tmp_path):
+    manifest, _ = fetch_bundle(bundle, tmp_path / "intact")
+    policy, demos = manifest.path("policy"), manifest.path("demonstrations", ".h5")
+    for number, planted in enumerate((policy, Path(policy).parent, demos, "bundles")):
+        out, elsewhere = tmp_path / f"out-{number}", tmp_path / f"elsewhere-{number}"
+        link = out / planted
+        link.parent.mkdir(parents=True)
+        link.symlink_to(elsewhere)
+        if link.suffix == "":
+            elsewhere.mkdir()
+        with pytest.raises(UserError, match="is a link, or in a folder that is one"):
+            fetch_bundle(bundle, out)
+        assert [p for folder in (out, elsewhere) for p in folder.rglob("*") if p.is_file()] == []
+    # The folder itself may be one.
+    (tmp_path / "named").symlink_to(tmp_path / "real")
+    (tmp_path / "real").mkdir()
+    fetch_bundle(bundle, tmp_path / "named")
+
+
 def test_export_and_fetch_on_the_command_line(run, bundle, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert command(monkeypatch, "export", run, "--out", "mine.zip") == 0

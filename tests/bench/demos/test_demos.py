@@ -255,6 +255,35 @@ def test_wrong_embodiment_is_refused(clean):
     assert "no embodiment 'hand'" in refusal(clean, embodiment="hand")
 
 
+def test_data_in_other_files_are_refused(copy, tmp_path):
+    """Links and virtual datasets at any depth; external storage, also of what is not read."""
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file["rows"] = np.zeros((4, 3), np.float32)
+
+    def link(group):
+        group["env_states/actors/cube"] = h5py.ExternalLink(str(other), "rows")
+
+    def storage(group):
+        group.create_dataset("more", (4,), np.float32, external=[(str(other), 0, 16)])
+
+    def virtual(group):
+        layout = h5py.VirtualLayout((4, 3), np.float32)
+        layout[:] = h5py.VirtualSource(str(other), "rows", (4, 3))
+        group.create_virtual_dataset("more", layout)
+
+    def bomb(group):
+        group.create_dataset("more", (2**32, 2**8), np.float32, chunks=(1024, 256))
+
+    intact = copy.read_bytes()
+    for change in (link, storage, virtual, bomb):
+        copy.write_bytes(intact)
+        with h5py.File(copy, "r+") as file:
+            change(file["traj_0"])
+        word = "unpacks to 4096.0 GiB" if change is bomb else "from another file"
+        assert word in refusal(copy), change.__name__
+
+
 def test_missing_files_are_refused(copy, tmp_path):
     copy.with_suffix(".json").unlink()
     assert "clean.json is missing" in refusal(copy)
