@@ -262,7 +262,7 @@ def test_data_in_other_files_are_refused(copy, tmp_path):
         file["rows"] = np.zeros((4, 3), np.float32)
 
     def link(group):
-        group["env_states/actors/cube"] = h5py.ExternalLink(str(other), "rows")
+        group["env_states/actors/other"] = h5py.ExternalLink(str(other), "rows")
 
     def storage(group):
         group.create_dataset("more", (4,), np.float32, external=[(str(other), 0, 16)])
