@@ -92,14 +92,16 @@ def reproduce(
     every episode and number agrees exactly, 1 if not.
 
     Args:
-        record: A record.json, or the folder of a run.
+        record: A record.json, the folder of a run, or a folder of submitted records: then one of
+            them, drawn at random.
         out: Folder for the new run and reproduction.json; default: a temporary folder, which is
             kept. The same command continues a reproduction that was stopped there.
         demos: The trajectory file that the run began from, if it did.
         base_policy: The saved base policy that the run began from, if it did.
         base_from: Folder of runs whose demonstrations and base policy (in its folder base) are
             taken, because a policy that is trained on another kind of processor differs.
-        into: Folder that gets a copy of reproduction.json, named after the record's hash.
+        into: Folder that gets, named after the record's hash, what the leaderboard reads: a copy of
+            reproduction.json, the new record, and the line for the list of the study.
         workers: Processes that share the simulation.
         quiet: No progress bars.
         trust: Code of other authors that files name, as module:Class; it is executed.

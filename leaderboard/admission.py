@@ -1,6 +1,7 @@
-"""Whether a record may join the leaderboard: every rule of docs/submit.md, one function each.
+"""Whether a record may join the leaderboard: the rules of docs/submit.md, an entry each.
 
-A problem keeps a record out; a note does not. Both are one sentence.
+A problem keeps a record out; a note does not. Both are one sentence. The rules find what cannot be
+true. Numbers that are invented and agree with each other are found by making a run again.
 """
 
 from __future__ import annotations
@@ -10,34 +11,140 @@ import hashlib
 import json
 import math
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from symsteer.errors import UserError
+from symsteer.leaderboard import catalogue
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import (
+    DERIVED,
     HELD_OUT_SEED,
+    Evaluation,
     Provenance,
     RunRecord,
     canonical_json,
+    flat,
     portable,
     read_record,
 )
 from symsteer.leaderboard.records.provenance import checkout, git
+from symsteer.leaderboard.records.repeat import KEYS
+from symsteer.leaderboard.records.schema import Q_VALUES
+from symsteer.leaderboard.records.values import Count, Sha256, first_problem
 from symsteer.leaderboard.summary import MIN_SEEDS, Key, recipe_of, row_place, seeds_of
-from symsteer.variant import file_name
+from symsteer.variant import file_name, parse_variant, specs_at, variant_text
 
 MIN_EPISODES = 100
 """Held-out episodes of an admissible record's final evaluation."""
+
+MANY_ENVS = 8
+"""The episodes of so many environments all end in one decision at the time limit alone."""
+
+SURPRISE, COPIED = 64, 0.9
+"""Final returns that take so many bits to guess are copied, if another run has more of them."""
+
+DRIFT = {"initial states": 1e-3, "successes of the base policy": 0.15}
+"""By how much two records may differ, because processors round differently."""
+
+MEND = "take the record as `symsteer run` wrote it, or run it again"
+
+NEEDED = (*Q_VALUES, "q_magnitude", "q_overshoot")
+"""Diagnostics that say whether Q diverged."""
 
 RELEASE = re.compile(r"\d+(\.\d+)*((a|b|rc)\d+)?(\.post\d+)?")
 """Versions that a package index accepts and that are not of a development state."""
 
 RowKey = tuple[Key, str, str]
 """Table, agent, recipe: what the runs of one row have in common."""
+
+Positive = Annotated[Count, Field(gt=0, le=10**12)]
+
+
+class Configuration(BaseModel):
+    """What a record's configuration must have, so that the rest can be judged by it."""
+
+    model_config = ConfigDict(strict=True, frozen=True)
+    seed: Annotated[Count, Field(lt=2**32)]
+    policy_seed: Annotated[Count, Field(lt=2**32)]
+    env_steps: Positive
+    num_envs: Annotated[Positive, Field(le=100_000)]
+    device: Annotated[str, Field(pattern="^(cpu|cuda)$")]
+    evaluation_variant: str
+    policy: str = Field(alias="policy.name")
+    horizon: Positive = Field(alias="policy.horizon")
+    execute: Positive = Field(alias="policy.execute")
+    every: Positive = Field(alias="evaluation.every")
+    episodes: Positive = Field(alias="evaluation.episodes")
+    final_episodes: Positive = Field(alias="evaluation.final_episodes")
+    states: Positive = Field(alias="evaluation.steerability_states")
+    demonstrations: Sha256 = Field("", alias="files.demonstrations")
+    weights: Sha256 = Field("", alias="files.policy")
+    utd: float = Field(0.0, alias="agent_options.utd", ge=0)
+    warmup: Count = Field(0, alias="agent_options.warmup")
+    learning_starts: Count | None = Field(None, alias="agent_options.learning_starts")
+    gamma: float = Field(0.0, alias="agent_options.gamma", ge=0, le=1)
+    timeouts_terminal: bool = Field(False, alias="agent_options.timeouts_terminal")
+
+
+class Judged:
+    """A record, and what follows from its configuration.
+
+    Attributes:
+        own: whether the agent is one of SymSteer's, not an extension.
+        learns: whether it is one of SymSteer's and has a critic.
+        limit: time limit of an episode; of a task from elsewhere that of its longest episode.
+        step: environment steps of one decision in all environments.
+        cost: the most that a step before success may cost.
+
+    Raises:
+        UserError, ValueError: if the configuration cannot be read.
+    """
+
+    def __init__(self, file: Path, record: RunRecord):
+        self.file, self.record, self.settings = file, record, record.settings
+        # Version 0.1 called the agent's options `sac`.
+        options = "agent_options" if "agent_options" in record.config else "sac"
+        if strange := record.config.keys() - KEYS - {*DERIVED, options}:
+            raise UserError(f"it has a key {min(strange)!r}")
+        values = {re.sub("^sac", "agent_options", k): v for k, v in flat(record.config).items()}
+        self.config = c = Configuration.model_validate(values)
+        self.specs = parse_variant(self.settings.variant)
+        self.parts = [record.provenance, *record.continued]
+        self.extensions = [extension for part in self.parts for extension in part.extensions]
+        self.own = self.settings.agent in catalogue.AGENTS
+        self.learns = self.own and self.settings.agent not in catalogue.REFERENCES
+        lengths = [n for evaluation in record.evaluations for n in evaluation.episodes.episode_len]
+        self.limit = catalogue.TASKS.get(self.settings.task, max(lengths, default=1))
+        self.step = c.num_envs * c.execute
+        present = specs_at(self.specs, 1)
+        costs = (catalogue.VARIANTS.get(s.name, 1e6) * float(np.max(s.strength)) for s in present)
+        self.cost = 1 + sum(costs)
+        self.known_world = all(spec.name in catalogue.VARIANTS for spec in self.specs)
+        kept = [spec for spec in present if spec.name not in catalogue.TRAINING_ONLY]
+        self.evaluated_in = variant_text(kept)
+        s, own = self.settings, {k: v for k, v in record.config.items() if k not in DERIVED}
+        digest = hashlib.sha256(canonical_json([own, record.config.get("files")]).encode())
+        names = map(file_name, (s.task, s.embodiment, s.variant, s.agent, f"s{s.seed}"))
+        self.run_id = "-".join([*names, digest.hexdigest()[:12]])
+        self.seeds = {"run": c.seed, "policy": c.policy_seed, "first_held_out": HELD_OUT_SEED}
+        self.seeds["demonstrations"] = s.demonstrations.seed
+        self.names: list[tuple[str, str, Iterable[str]]] = [
+            ("task", s.task, catalogue.TASKS),
+            ("embodiment", s.embodiment, catalogue.EMBODIMENTS),
+            ("agent", s.agent, catalogue.AGENTS),
+            ("policy", c.policy, catalogue.POLICIES),
+            *(("variant", spec.name, catalogue.VARIANTS) for spec in self.specs),
+        ]
 
 
 @dataclass
@@ -77,9 +184,8 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
         except UserError as error:
             verdict.problems.append(str(error))
             continue
-        for rule in RULES:
-            verdict.problems += rule(file, record)
-        verdict.problems += known.duplicates(record)
+        problems = *_problems(file, record), *known.duplicates(record)
+        verdict.problems += [*problems, *known.contradictions(record)]
         known.add(file, record)
     for verdict in verdicts:
         if judged := records.get(verdict.path):
@@ -87,129 +193,298 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
     return verdicts
 
 
-# The rules that look at one record alone: (file, record) -> problems.
-
-
-def named_after_its_run(file: Path, record: RunRecord) -> Iterator[str]:
-    """The file is called RUN_ID.json."""
+def _problems(file: Path, record: RunRecord) -> Iterator[str]:
+    """What breaks the rules that look at one record alone."""
     if file.name != f"{record.run_id}.json":
         yield f"the file must be named after its run: rename it to {record.run_id}.json"
-
-
-def finished(file: Path, record: RunRecord) -> Iterator[str]:
-    """The run came to its end."""
     if record.status != "finished":
         yield (
             f"the run is {record.status}, not finished: continue it with `symsteer resume "
             "RUN_FOLDER` and take the record from there"
         )
-
-
-def reproducible(file: Path, record: RunRecord) -> Iterator[str]:
-    """Others can look up all code that the parts of the run used.
-
-    That is a commit without local changes or a released version of SymSteer, and extensions from
-    installed distributions.
-    """
-    parts = [("", record.provenance)]
-    parts += [(f"part {n} of ", p) for n, p in enumerate(record.continued, 2)]
-    for part, provenance in parts:
-        if provenance.commit is None:
-            if not _is_released(provenance):
-                yield (
-                    f"{part}the run names neither a commit nor a released version, so nobody knows "
-                    "its code: run it again in a git clone of the repository"
-                )
-        elif provenance.dirty is not False:
-            yield (
-                f"{part}the run used code that is not in commit {provenance.commit[:12]}: "
-                "commit all changes and new files, then run it again"
-            )
-        for extension in provenance.extensions:
-            if extension.distribution is None or extension.version is None:
-                yield (
-                    f"{part}the run used the {extension.kind} {extension.target}, which belongs to "
-                    "no installed distribution: install it as a package with an entry point, or "
-                    "add it to the repository, then run it again"
-                )
-
-
-def scored_on_held_out_episodes(file: Path, record: RunRecord) -> Iterator[str]:
-    """Evaluations use the first of the held-out seeds, the final one at least 100."""
-    for evaluation in record.evaluations:
-        seeds = evaluation.episodes.seed
-        if seeds != list(range(HELD_OUT_SEED, HELD_OUT_SEED + len(seeds))):
-            yield (
-                f"the evaluation at step {evaluation.env_steps} is not on the held-out seeds "
-                f"{HELD_OUT_SEED}, {HELD_OUT_SEED + 1}, ... in order: evaluate with `symsteer run`"
-            )
-            break
-    if record.final and len(record.final.episodes.seed) < MIN_EPISODES:
-        yield (
-            f"the final evaluation has {len(record.final.episodes.seed)} episodes, fewer than "
-            f"{MIN_EPISODES}: run it again with --evaluation.final-episodes {MIN_EPISODES}"
-        )
-
-
-def consistent(file: Path, record: RunRecord) -> Iterator[str]:
-    """Name and seeds of the run are those of its configuration."""
-    settings, seed = record.settings, record.settings.seed
-    keys = (settings.task, settings.embodiment, settings.variant, settings.agent, f"s{seed}")
-    named = file_name("-".join(keys))
-    if not file_name(record.run_id).startswith(f"{named}-"):
-        yield (
-            f"the run is named {record.run_id}, but its configuration is that of {named}: take the "
-            "record as `symsteer run` wrote it"
-        )
-    elif record.seeds.get("run") != seed:
-        yield (
-            f"the run drew from seed {record.seeds.get('run')}, but its configuration says "
-            f"{seed}: take the record as `symsteer run` wrote it"
-        )
-
-
-def budget_used_up(file: Path, record: RunRecord) -> Iterator[str]:
-    """A learner was scored at the end of its budget, a reference after what it searched."""
-    final, budget = record.final, record.settings.env_steps
-    if final is None:
         return
-    if final.env_steps != record.budget.env_steps:
+    try:
+        judged = Judged(file, record)
+    except (ValidationError, ValueError, UserError) as error:
         yield (
-            f"the final evaluation stands at step {final.env_steps}, but the run used "
-            f"{record.budget.env_steps}: run it again"
+            f"its configuration is none of `symsteer run` ({first_problem(error)}): take the "
+            "record as it was written"
         )
-    elif final.env_steps >= budget + _steps_of_a_decision(record):
-        yield (
-            f"the run used {final.env_steps} environment steps, more than the {budget} of its "
-            "budget: run it again"
-        )
-    elif _learns(record) and final.env_steps < budget:
-        yield (
-            f"the run ended after {final.env_steps} of the {budget} environment steps of its "
-            "budget: run it again to the end, or with --env-steps as large as what it uses"
-        )
+        return
+    for rule in RULES:
+        if found := rule.broken(judged):
+            yield f"{'the run' if found is True else found} breaks the rule that {rule}"
+    for rule in EVALUATION_RULES:
+        for e in record.evaluations:
+            if found := rule.broken(judged, e):
+                detail = "" if found is True else f" ({found})"
+                yield f"the evaluation at step {e.env_steps}{detail} breaks the rule that {rule}"
+                break
 
 
-def names_no_machine(file: Path, record: RunRecord) -> Iterator[str]:
-    """No text of the file holds an absolute path."""
-    for text in _texts(json.loads(file.read_bytes())):
-        if portable(text) != text:
-            yield (
-                f"the text {text[:60]!r} holds a path of the machine: leave it out where the run "
-                "is configured, and run it again"
-            )
-            return
+# Checks: what is wrong, in words or as True; anything else means that the rule is kept.
 
 
-RULES: tuple[Callable[[Path, RunRecord], Iterator[str]], ...] = (
-    named_after_its_run,
-    finished,
-    reproducible,
-    consistent,
-    scored_on_held_out_episodes,
-    budget_used_up,
-    names_no_machine,
+def _unknown_code(j: Judged) -> str | None:
+    for number, part in enumerate(j.parts, 1):
+        of = f"part {number} of the run" if number > 1 else "the run"
+        if part.commit is None and not _is_released(part):
+            return f"{of}, which names neither a commit nor a released version,"
+        if part.commit is not None and part.dirty is not False:
+            return f"{of}, whose code is not in commit {part.commit[:12]},"
+        for extension in part.extensions:
+            if extension.distribution is None or extension.version is None:
+                return f"{of}, whose {extension.target} belongs to no installed distribution,"
+    return None
+
+
+def _unknown_name(j: Judged) -> str | None:
+    outside = {(extension.kind, extension.name) for extension in j.extensions}
+    for kind, name, known in j.names:
+        if (name in known) == ((kind, name) in outside):
+            return f"the {kind} {name!r}"
+    unused = outside - {(kind, name) for kind, name, _ in j.names}
+    return f"the extension {min(unused)[1]!r}, which no setting names," if unused else None
+
+
+def _hash_of_nothing(j: Judged) -> str | None:
+    hashes = [j.record.base_policy.content_hash, j.config.demonstrations, j.config.weights]
+    hashes += [text or "" for part in j.parts for text in (part.commit, part.sha256)]
+    hashes += [extension.sha256 for extension in j.extensions]
+    return next((f"the hash {text}" for text in hashes if text and len(set(text)) < 9), None)
+
+
+def _machine_path(j: Judged) -> str | None:
+    texts = _texts(json.loads(j.file.read_bytes()))
+    return next((f"the text {text[:60]!r}" for text in texts if portable(text) != text), None)
+
+
+def _budget(j: Judged) -> str | None:
+    used, budget, record = j.record.budget.env_steps, j.config.env_steps, j.record
+    evidence = not j.own and (record.parameters.total > 0 or record.has_critic)
+    learns = j.learns or record.role != "reference" or evidence
+    none_needed = j.settings.agent in ("base", "zero") and used > 0
+    if (learns and used < budget) or used >= budget + j.step or none_needed:
+        return f"a run of {used} environment steps with a budget of {budget}"
+    if 10 * j.step > budget or j.config.execute > min(j.config.horizon, j.limit):
+        return f"a decision of {j.step} steps in {j.config.num_envs} environments"
+    return None
+
+
+def _schedule(j: Judged) -> str | None:
+    before = [evaluation.env_steps for evaluation in j.record.evaluations][:-1]
+    if j.record.role == "reference":
+        return "a reference that was evaluated twice" if j.own and before else None
+    if not before or (j.own and before[0]):
+        return "a run without an evaluation before its first decision"
+    for number, (was, at) in enumerate([*pairwise(before), (before[-1], None)], 1):
+        # At the first whole decision that reaches the planned step, one evaluation a decision.
+        due = max(number * j.config.every, was + 1)
+        if at is not None and not due <= at < min(due + j.step, j.config.env_steps):
+            return f"a run that was evaluated at step {at} where {due} was due"
+        if at is None and due + j.step <= j.config.env_steps:
+            return f"a run without an evaluation at step {due}"
+    return None
+
+
+def _bounds(j: Judged) -> bool:
+    bounds, c = j.record.feasible_q, j.config
+    if bounds is None or not (j.own and j.known_world):
+        return (bounds is None) == j.record.has_critic
+    number = math.ceil(j.limit / c.execute) if c.timeouts_terminal else 10_000
+    lowest = -j.cost * c.execute * sum(c.gamma**i for i in range(number))
+    return bounds.high != 0 or not math.isclose(bounds.low, lowest, rel_tol=1e-4)
+
+
+def _base(j: Judged) -> bool:
+    base, states = j.record.base_policy, j.config.states
+    if base.base_success is None or base.solvable is None or base.episodes != states * base.draws:
+        return True
+    successes, solved = base.base_success * base.episodes, base.solvable * states
+    whole = all(abs(count - round(count)) < 1e-3 for count in (successes, solved))
+    # A state that is solved has one success or more, at most one of each draw.
+    possible = solved - 1e-3 <= successes <= solved * base.draws + 1e-3
+    return base.name != j.config.policy or not (whole and possible)
+
+
+def _clock(j: Judged) -> bool:
+    clock, record = j.record.wall_clock, j.record
+    parts = clock.simulate + clock.decode + clock.update + clock.evaluate + (clock.diagnose or 0)
+    times = [evaluation.wall_clock for evaluation in record.evaluations]
+    lasted = ((record.ended or record.started) - record.started).total_seconds()
+    ordered = times == sorted(times) and max(parts, *times) <= clock.total + 1
+    fast = record.budget.env_steps > 100_000 * clock.total or record.started > datetime.now(UTC)
+    resumed = clock.resumed >= len(record.continued)
+    return fast or not (ordered and resumed and (lasted + 2 >= clock.total or clock.resumed))
+
+
+def _counts(j: Judged, e: Evaluation) -> bool:
+    # A chunk is cut short where the episodes of all environments end within it.
+    number, execute = j.config.num_envs, j.config.execute
+    shortest = j.limit / math.ceil(j.limit / execute) if number >= MANY_ENVS else 1
+    fits = shortest * e.decisions - 1e-6 <= e.env_steps <= execute * e.decisions
+    return bool(e.decisions % number or e.env_steps % number or not fits)
+
+
+def _updates(j: Judged, e: Evaluation) -> bool:
+    c = j.config
+    first = c.warmup if c.learning_starts is None else c.learning_starts
+    # Whole updates are made, of a sum that is rounded.
+    owed = max(0, e.decisions - first) * c.utd * j.learns
+    return j.own and not -1e-6 <= owed - e.updates < 2
+
+
+def _returns(j: Judged, e: Evaluation) -> bool:
+    once, end = np.array(e.episodes.success_once), np.array(e.episodes.success_at_end)
+    value, length = np.array(e.episodes.return_, float), np.array(e.episodes.episode_len)
+    least = np.where(once, 1 - length, -length) * j.cost
+    fits = (value >= least - 0.01) & (value <= np.where(once, 0, -length))
+    if j.cost == 1:
+        # Whole steps; and a success in the very last one is a success at the end.
+        fits &= (value % 1 == 0) & (end | ~once | (value > least))
+    return not fits.all()
+
+
+def _unmeasured(j: Judged, e: Evaluation) -> str | None:
+    wanted = {*j.record.evaluations[0].diagnostics, *(NEEDED if j.learns else ())}
+    there = {k for k, v in e.diagnostics.items() if v is not None or k not in NEEDED}
+    there |= {flag.removeprefix("diagnostics/") for flag in e.nonfinite}
+    return min(wanted - there, default=None)
+
+
+def _q(j: Judged, e: Evaluation) -> str | None:
+    found = {name: value for name, value in e.diagnostics.items() if value is not None}
+    fits = {name: abs(v) < 1 + 1e-6 for name, v in found.items() if name.endswith("correlation")}
+    fits |= {name: v >= 0 for name, v in found.items() if name.endswith(("_std", "td_error"))}
+    fits |= {name: 0 <= v <= 1 for name, v in found.items() if name.endswith("overestimated")}
+    if (bounds := j.record.feasible_q) and found.keys() >= set(NEEDED):
+        mean, low, high, most, magnitude, overshoot = (found[name] for name in NEEDED)
+        allowance, slack = found.get("q_allowance", 0.0), 1e-3 * max(1.0, most)
+        bottom, top = bounds.low - allowance, bounds.high + allowance
+        size, outside = max(-bottom, top) or 1, max(bottom - low, high - top)
+        fits["q_mean"] = low - slack <= mean <= high + slack
+        fits["q_abs_max"] = most >= max(-low, high) - slack
+        fits["q_magnitude"] = math.isclose(magnitude, most / size, rel_tol=1e-3)
+        fits["q_overshoot"] = overshoot * (top - bottom) >= outside - slack
+    return next((name for name, fit in fits.items() if not fit), None)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule of docs/submit.md: what must be so, why, the check, and how to mend it."""
+
+    what: str
+    why: str
+    broken: Callable[..., object]
+    mend: str = MEND
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.mend}"
+
+
+RULES = (
+    Rule(
+        "its code can be looked up",
+        "everybody can read and run it",
+        _unknown_code,
+        "commit all changes, or install a release; install extensions as packages with entry "
+        "points; then run it again",
+    ),
+    Rule(
+        "names are SymSteer's, or else those of extensions",
+        "a row of an agent is of this agent's code",
+        _unknown_name,
+    ),
+    Rule(
+        "the run's name is that of its configuration",
+        "a record describes the run that it names",
+        lambda j: j.record.run_id != j.run_id and f"{j.record.run_id}, which is not {j.run_id},",
+    ),
+    Rule(
+        "seeds are those of the configuration",
+        "agents are compared on equal seeds",
+        lambda j: j.record.seeds != j.seeds,
+    ),
+    Rule(
+        "the role is the agent's",
+        "a learner is no reference",
+        lambda j: catalogue.AGENTS.get(j.settings.agent, j.record.role) != j.record.role,
+    ),
+    Rule(
+        "the variant is written in its shortest form, and evaluations are in it",
+        "all runs of a table are of one world",
+        lambda j: (
+            j.settings.variant != variant_text(j.specs)
+            or (j.known_world and j.config.evaluation_variant != j.evaluated_in)
+        ),
+    ),
+    Rule("hashes have many different digits", "no file has a hash of zeros", _hash_of_nothing),
+    Rule(
+        "the device is that of the configuration, and at most 100 runs share a process",
+        "the machine is part of the record",
+        lambda j: any(
+            p.together > 100 or (p.device == "cpu") != (j.config.device == "cpu") for p in j.parts
+        ),
+    ),
+    Rule(
+        "a learner uses its whole budget, no run more, and a decision at most a tenth of it",
+        "the last checkpoint counts; all agents get the same",
+        _budget,
+    ),
+    Rule("evaluations are those of the configuration", "none is left out or chosen", _schedule),
+    Rule("feasible Q-values are those of the reward", "divergence is measured by them", _bounds),
+    Rule("the base policy's shares are of its draws", "learners are compared with it", _base),
+    Rule(
+        "numbers of parameters add up",
+        "sizes are compared",
+        lambda j: (
+            (p := j.record.parameters).total != p.actor + p.critic
+            or (j.own and not j.learns and p.total > 0)
+        ),
+    ),
+    Rule("times are in order and not longer than the run", "a run takes time", _clock),
+    Rule(
+        "no text holds a path of a machine",
+        "records are public",
+        _machine_path,
+        "leave it out where the run is configured, and run it again",
+    ),
 )
+"""About a record alone, in words that follow "that"."""
+
+EVALUATION_RULES = (
+    Rule(
+        "it is on the held-out seeds in order, a final one on at least 100",
+        "the same initial states for everybody",
+        lambda j, e: (
+            (number := len(e.episodes.seed)) < MIN_EPISODES * e.final
+            or e.episodes.seed != list(range(HELD_OUT_SEED, HELD_OUT_SEED + number))
+        ),
+    ),
+    Rule(
+        "it has as many episodes as the configuration says",
+        "none is left out",
+        lambda j, e: (
+            len(e.episodes.seed) != (j.config.final_episodes if e.final else j.config.episodes)
+        ),
+    ),
+    Rule(
+        "a final one counts what the whole run used",
+        "the last checkpoint counts",
+        lambda j, e: e.final and any(getattr(e, k) != used for k, used in j.record.budget),
+    ),
+    Rule("so many decisions take so many steps", "steps are counted as simulated", _counts),
+    Rule("so many decisions lead to so many updates", "settings say how many", _updates),
+    Rule(
+        "episodes last to the task's time limit",
+        "success at the end is measured there",
+        lambda j, e: set(e.episodes.episode_len) != {j.limit},
+    ),
+    Rule("returns are the reward's", "a step costs 1, or what the variant says", _returns),
+    Rule("no diagnostic is left out", "diverged runs must not hide", _unmeasured),
+    Rule("diagnostics agree with each other", "they were measured", _q),
+)
+"""About each evaluation."""
 
 
 class _Known:
@@ -223,6 +498,8 @@ class _Known:
         self._committed_seeds: dict[Key, set[int]] = defaultdict(set)
         self._references: dict[Key, set[str]] = defaultdict(set)
         self._agents: dict[tuple[Key, str], set[str]] = defaultdict(set)
+        self._facts: dict[tuple[str, ...], tuple[Path, list[float]]] = {}
+        self._finals: dict[tuple[str, ...], dict[Path, list[float]]] = defaultdict(dict)
 
     def add(self, file: Path, record: RunRecord, committed: bool = False) -> None:
         row = _row(record)
@@ -238,6 +515,12 @@ class _Known:
             self._seeds[row].add(record.settings.seed)
             policy = record.base_policy.content_hash
             self._agents[row[0], policy].add(record.settings.agent)
+            for fact, values in _facts(record).items():
+                if values:
+                    self._facts.setdefault(fact, (file, values))
+            if record.role != "reference":
+                place, returns = _final_returns(record)
+                self._finals[place][file] = returns
 
     def duplicates(self, record: RunRecord) -> Iterator[str]:
         twin = self._runs.get(_identity(record))
@@ -254,6 +537,31 @@ class _Known:
                 f"its evaluations equal those of {self._outcomes[outcome]} to the last digit: a "
                 "copy, or a setting that changes nothing; keep one of the two"
             )
+        elif file := self._copied(record):
+            yield (
+                f"its final episodes are those of {file} but for a few, which chance does not "
+                "explain: a copy, or a setting that changes nothing; keep one of the two"
+            )
+
+    def _copied(self, record: RunRecord) -> Path | None:
+        """The learner's record whose final returns are the same in nearly all episodes."""
+        place, mine = _final_returns(record)
+        counts, others = Counter(mine), self._finals[place]
+        bits = np.array([math.log2(len(mine) / counts[value]) for value in mine])
+        if not others or bits.sum() < SURPRISE:
+            return None
+        shared = (np.array(list(others.values())) == np.array(mine)) @ bits
+        return next(
+            (f for f, s in zip(others, shared, strict=True) if s > COPIED * bits.sum()), None
+        )
+
+    def contradictions(self, record: RunRecord) -> Iterator[str]:
+        """What another record says differently, though it must be the same in both."""
+        for fact, mine in _facts(record).items():
+            file, theirs = self._facts.get(fact, (None, mine))
+            largest = max((abs(a - b) for a, b in zip(mine, theirs, strict=False)), default=9)
+            if theirs and largest > DRIFT.get(fact[0], 0):
+                yield f"its {fact[0]} are not those of {file}: {MEND}"
 
     def notes(self, record: RunRecord) -> Iterator[str]:
         row = _row(record)
@@ -295,6 +603,29 @@ def _row(record: RunRecord) -> RowKey:
     return Key.of(record), record.settings.agent, recipe_of(record.config)
 
 
+def _facts(record: RunRecord) -> dict[tuple[str, ...], list[float]]:
+    """Numbers of a finished record that others with the same settings must have as well."""
+    s, base, sizes = record.settings, record.base_policy, record.parameters
+    place = s.task, s.embodiment
+    options = record.config.get("agent_options", record.config.get("sac"))
+    settings = canonical_json([options, record.config.get("policy")])
+    directions = record.final.episodes.direction if record.final else None
+    world = str(record.config.get("evaluation_variant"))
+    return {
+        ("sizes of networks", *place, s.agent, settings): [sizes.actor, sizes.critic],
+        ("parameters of the base policy", base.content_hash): [base.parameters or 0],
+        ("successes of the base policy", *place, base.content_hash): [base.base_success or 0],
+        ("initial states", *place, world): [abs(angle or 0.0) for angle in directions or ()],
+    }
+
+
+def _final_returns(record: RunRecord) -> tuple[tuple[str, ...], list[float]]:
+    """Where the final episodes were played, and their returns."""
+    returns = record.final.episodes.return_ if record.final else []
+    place = record.settings.task, record.settings.embodiment, str(len(returns))
+    return place, [value or 0.0 for value in returns]
+
+
 def _code_from_elsewhere(record: RunRecord) -> Iterator[str]:
     """Notes on code that is not in the repository."""
     parts = [record.provenance, *record.continued]
@@ -304,27 +635,22 @@ def _code_from_elsewhere(record: RunRecord) -> Iterator[str]:
     extensions = [e for p in parts for e in p.extensions if e.distribution]
     used = {(e.kind, e.name, e.distribution, e.version, e.sha256[:12]) for e in extensions}
     for kind, name, distribution, version, sha256 in sorted(used, key=str):
-        yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}"
+        known = (
+            "" if _is_installed(str(distribution), version) else ", unresolved: not installed here"
+        )
+        yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}{known}"
+
+
+def _is_installed(distribution: str, version: str | None) -> bool:
+    try:
+        return metadata.version(distribution) == version
+    except (metadata.PackageNotFoundError, ValueError):
+        return False
 
 
 def _is_released(provenance: Provenance) -> bool:
     version, sha256 = provenance.version, provenance.sha256
     return sha256 is not None and version is not None and RELEASE.fullmatch(version) is not None
-
-
-def _learns(record: RunRecord) -> bool:
-    evidence = record.parameters.total > 0 or record.budget.updates > 0 or record.has_critic
-    return record.role == "learner" or evidence
-
-
-def _steps_of_a_decision(record: RunRecord) -> int:
-    """Environment steps of one decision in all environments; a run ends with a complete one."""
-    policy = record.config.get("policy")
-    factors = (
-        record.config.get("num_envs"),
-        policy.get("execute") if isinstance(policy, dict) else None,
-    )
-    return math.prod(factor for factor in factors if type(factor) is int and factor > 0)
 
 
 def _outcome(record: RunRecord) -> str | None:

@@ -78,7 +78,7 @@ def _diverged(summary: Summary) -> dict[str, list[bool]]:
     """Of all runs of each agent with a critic, whether Q diverged."""
     flags: dict[str, list[bool]] = {agent: [] for agent in summary.agents}
     for table in summary.tables:
-        for row in table.rows:
+        for row in table.trusted:
             flags[row.agent] += row.diverged
     return flags
 

@@ -237,7 +237,7 @@ def _without_pairs(tables: Sequence[Table], claim: Claim, cells: Cells) -> str:
     """Why no runs of the two agents can be compared."""
     place = "" if cells == Cells() else f" in {where(cells)}"
     for agent in claim.agents:
-        if not any(row.agent == agent and row.runs for table in tables for row in table.rows):
+        if not any(row.agent == agent and row.runs for table in tables for row in table.trusted):
             return f"no runs of {code(agent)}" + place
     if claim.measure == "bias":
         return "not measured over all decisions"
@@ -271,7 +271,7 @@ def _values(table: Table, agent: str, measure: str) -> dict[Pair, float]:
         biases = run.in_window("q_bias")
         return abs(float(np.mean(biases))) if biases else None
 
-    rows = [row for row in table.rows if row.agent == agent]
+    rows = [row for row in table.trusted if row.agent == agent]
     found = [
         (row.usual, len(values), values)
         for row in rows

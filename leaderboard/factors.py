@@ -50,7 +50,7 @@ def main_effects(summary: Summary) -> list[MainEffect]:
         # The settings of a grid are tables of their own; here they belong together.
         worlds: dict[Key, list[Run]] = defaultdict(list)
         for table in summary.tables:
-            runs = [run for row in table.rows if row.agent == agent for run in row.runs]
+            runs = [run for row in table.trusted if row.agent == agent for run in row.runs]
             worlds[replace(table.key, settings="")] += runs
         cells = [runs for runs in worlds.values() if runs]
         options = _varied([run for runs in cells for run in runs])

@@ -80,6 +80,12 @@ interval of the difference in final success includes 0.
 """
 """Shown only where it is so."""
 
+SUBMITTED = """\
+Rows that are marked *not reproduced* hold submitted runs that no maintainer has made again. They
+have no rank, come last in their tables, and nothing is concluded from them.
+"""
+"""Shown only where it is so."""
+
 EFFECTS = f"""\
 Some agents were run in a balanced grid of options. Shown are the means with both values of an
 option, over all settings of the others, on the same base policies, and the main effect, the second
@@ -122,6 +128,8 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     reading = [READING.strip()]
     if summary.has_reproductions:
         reading.append(MADE_AGAIN.strip())
+    if summary.has_marks:
+        reading.append(SUBMITTED.strip())
     parts += ["## Details", *folded("How to read it", reading)]
     parts += folded("Claims, effects and p-values", [CLAIMS.strip(), *claims_section(findings)])
     parts += folded("Success in every cell", [_overview(summary)])
@@ -186,7 +194,7 @@ def _effects_table(found: Sequence[MainEffect]) -> str:
 
 def seed_notice(summary: Summary) -> str:
     """A quotation in markdown that says who is not ranked; empty where all are."""
-    rows = [row for table in summary.tables for row in table.rows if row.runs]
+    rows = [row for table in summary.tables for row in table.trusted if row.runs]
     ranked = [row for row in rows if row.role == "learner"]
     few = [row for row in ranked if len(row.finished) < MIN_SEEDS]
     if not few:
@@ -212,8 +220,12 @@ def _overview(summary: Summary) -> str:
 
 
 def at_a_glance(table: Table, agent: str) -> list[Row]:
-    """The rows that stand for an agent in a table: those with its usual settings, or all."""
+    """The rows that stand for an agent in a table: those with its usual settings, or all.
+
+    Marked ones only where there is no other.
+    """
     rows = [row for row in table.rows if row.agent == agent]
+    rows = [row for row in rows if not row.marked and row.runs] or rows
     return [row for row in rows if row.usual] or rows
 
 
@@ -222,6 +234,7 @@ def _glance(row: Row) -> str:
         return status(row) if row.runs else NOTHING
     mark = MARKS[row.difference.sign] if row.difference else ""
     dagger = " \u2020" if any(row.diverged) else ""
+    mark += " not reproduced" * row.marked
     return f"{number(row.success.value)}{mark}{dagger}".replace(" ", SPACE)
 
 

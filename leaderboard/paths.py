@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.records import REPEATED
 
 PAGE_FOLDER = Path(__file__).resolve().parent
 """The folder of the committed leaderboard, in a checkout of the repository."""
@@ -113,7 +114,7 @@ def _in_folder(folder: Path) -> list[Path]:
         Path(parent, name)
         for parent, _, names in os.walk(folder, onerror=refuse)
         for name in names
-        if name.endswith(".json")
+        if name.endswith(".json") and not name.endswith(REPEATED)
     )
     named = [file for file in files if file.name == RECORD]
     if not named:

@@ -55,9 +55,10 @@ def generate(
         UserError: for bad records, a full disk or a folder that cannot be written; `out` is then
             as it was (`write_together`).
     """
-    runs = load_runs(records, reproductions_for(records, reproductions))
+    claims = read_study(study)
+    runs = load_runs(records, reproductions_for(records, reproductions), claims.listed)
     out = _folder(out)
-    files = render(runs, out, read_audit(audit), read_study(study))
+    files = render(runs, out, read_audit(audit), claims)
     if (out / "figures").is_symlink():
         raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it")
     stale = [out / name for name in _stale(out, files)]
@@ -76,9 +77,10 @@ def verify(
 
     Arguments and errors are those of `generate`.
     """
-    runs = load_runs(records, reproductions_for(records, reproductions))
+    claims = read_study(study)
+    runs = load_runs(records, reproductions_for(records, reproductions), claims.listed)
     out = _folder(out)
-    files = render(runs, out, read_audit(audit), read_study(study))
+    files = render(runs, out, read_audit(audit), claims)
     found = differences(files, _stale(out, files), out)
     return Verification(len(runs), len(files), found)
 

@@ -7,6 +7,7 @@ keys.
 from __future__ import annotations
 
 import hashlib
+import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,6 +126,8 @@ class Study:
         statements: of the paper, each with the claims that test it.
         source: name of the file that declares the claims.
         sha256: of its content.
+        listed: hashes of the records and reproductions of the study's own (`read_list`); None if
+            the study has no list.
     """
 
     notice: str
@@ -134,6 +137,7 @@ class Study:
     statements: tuple[Statement, ...]
     source: str
     sha256: str
+    listed: frozenset[str] | None = None
 
 
 def study_names() -> list[str]:
@@ -165,7 +169,31 @@ def read_study(name_or_path: str) -> Study:
         _check_commit(source, file.declared)
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
     texts = file.notice.strip(), file.details.strip(), file.declared
-    return Study(*texts, file.claim, file.statement, source.name, digest)
+    return Study(*texts, file.claim, file.statement, source.name, digest, read_list(path))
+
+
+def read_list(study: Path) -> frozenset[str] | None:
+    """The hashes in the list beside a study, as `sha256sum` writes it; None if there is no list.
+
+    Raises:
+        UserError: if it cannot be read, or is no such list.
+    """
+    path = study.with_suffix(".sha256")
+    try:
+        lines = path.read_text().splitlines()
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise UserError(f"the list {path} cannot be read ({error}); restore it") from error
+    for number, line in enumerate(lines, 1):
+        if not re.fullmatch(r"[0-9a-f]{64} [ *]\S.*", line):
+            raise UserError(f"{path}, line {number} is none of `sha256sum`; correct it")
+    return frozenset(line[:64] for line in lines)
+
+
+def all_listed() -> frozenset[str]:
+    """The hashes in the lists of all studies that come with SymSteer."""
+    return frozenset().union(*(read_list(path) or () for path in FOLDER.glob("*.toml")))
 
 
 def _read(path: Path) -> _File:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -24,6 +24,7 @@ from symsteer.leaderboard.records import (
     Reproduction,
     Role,
     RunRecord,
+    check_reproduction,
     config_hash,
     file_hash,
     flat,
@@ -44,6 +45,7 @@ from symsteer.leaderboard.statistics import (
     steps_to_threshold,
     success_interval,
 )
+from symsteer.leaderboard.study import all_listed
 
 SYMMETRIC_EMBODIMENT = "floating"
 """The embodiment without an arm: its states rotate with the world."""
@@ -76,6 +78,9 @@ OPTIONS = "agent_options."
 """What the configuration keys of an agent's options begin with."""
 
 
+Group = tuple[str, str, bool]
+"""Agent, recipe and mark: what the runs of one row have in common."""
+
 Pair = tuple[str, int]
 """Content hash of the base policy and run seed."""
 
@@ -94,6 +99,8 @@ class Run:
     record: RunRecord
     reproduction: Reproduction | None = None
     """What the same run said when it was made again."""
+    trusted: bool = True
+    """Whether it counts: all do but submitted ones that no maintainer has reproduced."""
 
     @property
     def seed(self) -> int:
@@ -289,6 +296,8 @@ class Row:
     recipe: str
     runs: list[Run]
     missing: int = 0
+    marked: bool = False
+    """Whether its runs are submitted ones that no maintainer has reproduced."""
     label: str = ""
     usual: bool = False
     """Whether most runs of the agent, in all tables, have the settings of this row."""
@@ -356,7 +365,7 @@ class Row:
 
 @dataclass
 class Table:
-    """All rows of one task, embodiment, variant and base policy."""
+    """All rows of one task, embodiment, variant and base policy; marked ones come last."""
 
     key: Key
     rows: list[Row]
@@ -364,16 +373,21 @@ class Table:
     best_reference: Row | None = None
 
     @property
+    def trusted(self) -> list[Row]:
+        """The rows that are not marked: all that is concluded is about them."""
+        return [row for row in self.rows if not row.marked]
+
+    @property
     def learners(self) -> list[Row]:
-        """Rows with finished runs of agents that are no references."""
-        return [row for row in self.rows if row.finished and not row.is_reference]
+        """Trusted rows with finished runs of agents that are no references."""
+        return [row for row in self.trusted if row.finished and not row.is_reference]
 
     def row_of(self, agent: str) -> Row | None:
-        """The agent's row with its usual settings, else that with the most finished runs.
+        """The agent's trusted row with its usual settings, else that with the most finished runs.
 
         None if the agent finished none.
         """
-        rows = [row for row in self.rows if row.agent == agent and row.finished]
+        rows = [row for row in self.trusted if row.agent == agent and row.finished]
         return max(rows, key=lambda row: (row.usual, len(row.finished)), default=None)
 
     @property
@@ -381,9 +395,14 @@ class Table:
         return [run for row in self.rows for run in row.runs]
 
     @property
+    def counted(self) -> list[Run]:
+        """The runs of trusted rows, or all where there are none."""
+        return [run for row in self.trusted for run in row.runs] or self.runs
+
+    @property
     def feasible(self) -> tuple[float, float] | None:
         """The widest feasible Q bounds of the runs, entropy allowance included."""
-        bounds = [found for run in self.runs if (found := run.feasible)]
+        bounds = [found for run in self.counted if (found := run.feasible)]
         if not bounds:
             return None
         return min(low for low, _ in bounds), max(high for _, high in bounds)
@@ -408,21 +427,26 @@ class Summary:
     @cached_property
     def usual_budget(self) -> int:
         """The budget of most tables."""
-        budgets = Counter(table.key.env_steps for table in self.tables)
+        budgets = Counter(table.key.env_steps for table in self._trusted_tables)
         return max(budgets, key=lambda steps: (budgets[steps], steps), default=0)
+
+    @property
+    def _trusted_tables(self) -> list[Table]:
+        """Those with a trusted run."""
+        return [table for table in self.tables if any(row.runs for row in table.trusted)]
 
     @cached_property
     def _demonstrations(self) -> dict[tuple[str, ...], int]:
         """The largest number of demonstrations of each place."""
         most: dict[tuple[str, ...], int] = {}
-        for table in self.tables:
+        for table in self._trusted_tables:
             key = table.key
             most[key.place] = max(key.demonstrations, most.get(key.place, 0))
         return most
 
     def has_few_demonstrations(self, key: Key) -> bool:
         """Whether other tables of the same place have more."""
-        return key.demonstrations < self._demonstrations[key.place]
+        return key.demonstrations < self._demonstrations.get(key.place, 0)
 
     @cached_property
     def usual_tables(self) -> list[Table]:
@@ -440,6 +464,11 @@ class Summary:
         return any(run.reproduction for run in self.runs)
 
     @property
+    def has_marks(self) -> bool:
+        """Whether any row is marked."""
+        return any(row.marked for table in self.tables for row in table.rows)
+
+    @property
     def roles(self) -> dict[str, Role]:
         """Role by agent, in the order of the rows."""
         roles = {row.agent: row.role for table in self.tables for row in table.rows}
@@ -450,21 +479,40 @@ class Summary:
         return list(self.roles)
 
 
-def load_runs(paths: Iterable[Path], reproductions: Path | None = None) -> list[Run]:
+def load_runs(
+    paths: Iterable[Path],
+    reproductions: Path | None = None,
+    listed: Collection[str] | None = None,
+) -> list[Run]:
     """Read the records that `paths` name: files, run folders, folders of either.
 
     `record_files` says which files those are. Raises UserError for a path that names none, for a
-    file that is not a valid record, and for a reproduction of another version of a record.
+    file that is not a valid record, and for a reproduction that does not say what its records say.
 
     Args:
         paths: of the records.
         reproductions: folder of their reproductions (`read_reproductions`).
+        listed: hashes of the records and reproductions that are the study's own (`Study.listed`).
+            Others are submitted. A submitted run is trusted if one of its row was reproduced by a
+            listed reproduction. None: nothing is known, and all are trusted.
     """
     known = read_reproductions(reproductions) if reproductions else {}
-    runs = [
-        Run(file, read_record(file), known.get(file_hash(file)) if known else None)
-        for file in record_files(paths)
-    ]
+    vouched = listed if listed is not None or not known else all_listed()
+    runs = []
+    for file in record_files(paths):
+        digest = file_hash(file) if known or listed is not None else ""
+        runs.append(
+            Run(file, read_record(file), known.get(digest), listed is None or digest in listed)
+        )
+        if reproductions and digest in known:
+            path = reproductions / f"{digest}.json"
+            check_reproduction(path, file, file_hash(path) in (vouched or ()), listed is None)
+    confirmed = {
+        _row_of(run)
+        for run in runs
+        if not run.trusted and run.reproduction and run.reproduction.verdict != "different"
+    }
+    runs = [run if run.trusted else replace(run, trusted=_row_of(run) in confirmed) for run in runs]
     used = {run.reproduction.record.sha256 for run in runs if run.reproduction}
     present = {run.record.run_id for run in runs}
     for digest in sorted(known.keys() - used):
@@ -474,6 +522,10 @@ def load_runs(paths: Iterable[Path], reproductions: Path | None = None) -> list[
                 "then: make it again with `symsteer reproduce`, or remove the file"
             )
     return runs
+
+
+def _row_of(run: Run) -> tuple[Key, str, str]:
+    return Key.of(run.record), run.agent, recipe_of(run.record.config)
 
 
 def recipe_of(config: Mapping[str, Any]) -> str:
@@ -524,14 +576,16 @@ def grouped(
         grid: the options of a grid; None finds them in the runs.
     """
     chosen, set_aside = _one_per_cell(runs)
-    grid = grid_of(chosen) if grid is None else grid
-    tables: dict[Key, dict[tuple[str, str], list[Run]]] = defaultdict(lambda: defaultdict(list))
+    trusted = [run for run in chosen if run.trusted] or chosen
+    grid = grid_of(trusted) if grid is None else grid
+    tables: dict[Key, dict[Group, list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in chosen:
-        tables[Key.of(run.record, grid)][run.agent, recipe_of(run.record.config)].append(run)
-    # An agent has one role: that of its newest run.
-    by_age = sorted(chosen, key=lambda run: (run.record.started, run.record.run_id))
+        _, agent, recipe = _row_of(run)
+        tables[Key.of(run.record, grid)][agent, recipe, not run.trusted].append(run)
+    # An agent has one role: that of its newest trusted run.
+    by_age = sorted(chosen, key=lambda run: (run.trusted, run.record.started, run.record.run_id))
     roles = {run.agent: run.record.role for run in by_age}
-    usual = _usual_settings(chosen)
+    usual = _usual_settings(trusted)
     return [_table(key, rows, roles, usual) for key, rows in sorted(tables.items())], set_aside
 
 
@@ -591,11 +645,10 @@ def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
     The others are set aside. A base policy that is trained again with its seed on another kind of
     processor differs, and runs are compared only on the same one: so both count.
     """
-    cells: dict[tuple[Key, str, str, str, str], list[Run]] = defaultdict(list)
+    cells: dict[tuple[Any, ...], list[Run]] = defaultdict(list)
     for run in runs:
-        record = run.record
-        recipe, seeds = recipe_of(record.config), seeds_of(record.config)
-        cells[Key.of(record), run.agent, recipe, seeds, run.policy].append(run)
+        seeds = seeds_of(run.record.config)
+        cells[*_row_of(run), seeds, run.policy, not run.trusted].append(run)
     chosen, set_aside = [], []
     for cell in sorted(cells):
         candidates = sorted(
@@ -611,34 +664,38 @@ def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
 
 def _table(
     key: Key,
-    groups: Mapping[tuple[str, str], list[Run]],
+    groups: Mapping[Group, list[Run]],
     roles: Mapping[str, Role],
     usual: Mapping[str, Mapping[str, str]],
 ) -> Table:
-    seeds = {run.seed for runs in groups.values() for run in runs}
+    seeds = {run.seed for (*_, marked), runs in groups.items() for run in runs if not marked}
     rows = []
-    for (agent, recipe), runs in groups.items():
+    for (agent, recipe, marked), runs in groups.items():
         have = {run.seed for run in runs}
         runs = sorted(runs, key=lambda run: run.seed)
-        rows.append(Row(agent, roles[agent], recipe, runs, len(seeds - have)))
-    for agent in roles.keys() - {agent for agent, _ in groups}:
+        rows.append(Row(agent, roles[agent], recipe, runs, len(seeds - have), marked))
+    for agent in roles.keys() - {agent for agent, *_ in groups}:
         rows.append(Row(agent, roles[agent], "", [], len(seeds)))
-    for agent in {row.agent for row in rows}:
-        _label([row for row in rows if row.agent == agent], usual.get(agent))
-    rows.sort(key=lambda row: (row_place(row.agent, row.role), not row.usual, row.label))
+    for agent, marked in {(row.agent, row.marked) for row in rows}:
+        twins = [row for row in rows if (row.agent, row.marked) == (agent, marked)]
+        _label(twins, usual.get(agent))
+    rows.sort(key=lambda r: (r.marked, row_place(r.agent, r.role), not r.usual, r.label))
     return Table(key, rows)
 
 
 def _complete(table: Table) -> None:
     """Compute every number of a table."""
-    rows = table.rows
-    for row in rows:
+    rows = table.trusted
+    for row in table.rows:
         _fill(row)
     table.threshold = _threshold(rows)
     base = table.row_of(BASE)
-    for row in rows:
-        if base and row.agent != BASE:
-            _against_base(row, base)
+    for row in table.rows:
+        bases = [other for other in table.rows if row.marked and other.agent == BASE]
+        known = [run for other in bases for run in other.runs]
+        if row.agent != BASE and (beside := replace(bases[0], runs=known) if bases else base):
+            # A submitted run on a base policy of its own is compared with what came with it.
+            _against_base(row, beside)
         if table.threshold is not None and not row.is_reference:
             row.threshold_steps = [
                 steps_to_threshold(*_points(run), table.threshold) for run in row.finished
@@ -679,6 +736,7 @@ def _label(twins: Sequence[Row], common: Mapping[str, str] | None) -> None:
         texts = [f"{key} {value}" for key, value in values.items() if value != usual[key]]
         if len(texts) > MOST_SETTINGS:
             texts = [f"{len(texts)} other settings", row.recipe[:6]]
+        texts += ["not reproduced"] * row.marked
         row.label = row.agent + (f" ({', '.join(texts)})" if texts else "")
 
 

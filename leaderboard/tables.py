@@ -114,9 +114,9 @@ def section(table: Table, links: Links) -> list[str]:
     return parts
 
 
-def _place(row: Row) -> tuple[bool, float]:
-    """References first, then by rank; otherwise the order stays as it is."""
-    return not row.is_reference, row.rank or float("inf")
+def _place(row: Row) -> tuple[bool, bool, float]:
+    """References first, then by rank, marked rows last; otherwise the order stays as it is."""
+    return row.marked, not row.is_reference, row.rank or float("inf")
 
 
 def _rank(row: Row, table: Table) -> str:
@@ -128,7 +128,7 @@ def _rank(row: Row, table: Table) -> str:
 
 def _base_line(table: Table) -> str:
     key = table.key
-    policies = {run.record.base_policy.content_hash: run.record.base_policy for run in table.runs}
+    policies = {run.policy: run.record.base_policy for run in table.counted}
     group = f", group {code(key.group)}" if key.group else ""
     text = [
         f"Base policy {code(key.base)}{group}, from {key.demonstrations} {code(key.mode)} "
@@ -303,8 +303,8 @@ def _notes(table: Table) -> list[str]:
             )
         if row.runs and row.agent != BASE and row.finished and row.difference is None:
             notes.append(f"{code(row.label)}: no base run on the same episodes to compare with")
-    if any(row.label != row.agent for row in table.rows):
-        split = ", ".join(code(row.label) for row in table.rows if row.label != row.agent)
+    if any(row.label != row.agent for row in table.trusted):
+        split = ", ".join(code(row.label) for row in table.trusted if row.label != row.agent)
         notes.append(f"Same agent with different settings, in rows of their own: {split}")
     return notes
 
@@ -342,6 +342,8 @@ def render_csv(summary: Summary) -> str:
     left_out = set() if summary.has_reproductions else set(REPRODUCTION_COLUMNS)
     if not any(table.key.settings for table in summary.tables):
         left_out.add("settings")
+    if not summary.has_marks:
+        left_out.add("marked")
     rows = [{k: v for k, v in row.items() if k not in left_out} for row in rows]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -368,6 +370,7 @@ def _csv_row(table: Table, row: Row) -> dict[str, object]:
         "agent": row.agent,
         "recipe": row.recipe[:12],
         "rank": row.rank,
+        "marked": int(row.marked),
         "runs": len(row.runs),
         **{s: statuses.count(s) for s in ("finished", "failed", "interrupted", "running")},
         "missing": row.missing,

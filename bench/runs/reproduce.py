@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import secrets
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,6 +23,7 @@ from symsteer.files import write_together
 from symsteer.leaderboard.records import (
     FILES,
     PARTS,
+    REPEATED,
     Provenance,
     Reproduction,
     RunRecord,
@@ -82,10 +85,12 @@ def reproduce(
     reproduction that was stopped.
 
     Args:
-        path: of a record, or of a run's folder.
+        path: of a record, of a run's folder, or of a folder of submitted records, one of which is
+            drawn.
         out: where to put a folder with the new run and the comparison; default: a temporary one.
         demonstrations, policy: the files that the run began from, if it did.
-        into: a folder that gets a copy of the comparison, named after the record's hash.
+        into: a folder that gets what the leaderboard reads, named after the record's hash: the
+            comparison, the repeated record, and the line for the list of the study.
         progress: whether to show progress bars.
         workers: processes that share the environments.
         base_from: a folder of runs whose demonstrations and base policy are taken.
@@ -95,7 +100,12 @@ def reproduce(
         UserError: if the record is not that of a finished run, this version of SymSteer cannot
             repeat it, or the files or the base policy are not those that the run began from.
     """
-    path = path / RECORD if path.is_dir() else path
+    path = path / RECORD if (path / RECORD).is_file() else path
+    if path.is_dir():
+        records = sorted(set(path.glob("*.json")) - set(path.glob(f"*{REPEATED}")))
+        path = secrets.choice(records or [path / RECORD])
+        if records:
+            report(f"drawn at random from {len(records)} records: {path.name}")
     if not path.is_file():
         raise UserError(f"there is no record {path}; name a record.json, or the folder of a run")
     record = read_record(path)
@@ -127,9 +137,15 @@ def reproduce(
         execute(config, place, demonstrations, policy, progress, workers)
     made = read_record(folder / RECORD).provenance
     found = reproduction_of(path, folder / RECORD, taken + conditions(record, config, made))
-    targets = [place / RESULT] + ([into / f"{found.record.sha256}.json"] if into else [])
-    write_together(dict.fromkeys(targets, dump_reproduction(found)))
-    return Reproduced(record, folder, tuple(targets), found)
+    written = {place / RESULT: dump_reproduction(found)}
+    if into is not None:
+        digest = hashlib.sha256(dump_reproduction(found)).hexdigest()
+        line = f"{digest}  {into.resolve().name}/{found.record.sha256}.json\n"
+        contents = dump_reproduction(found), (folder / RECORD).read_bytes(), line.encode()
+        names = (f"{found.record.sha256}{end}" for end in (".json", REPEATED, ".sha256"))
+        written |= {into / name: data for name, data in zip(names, contents, strict=True)}
+    write_together(written)
+    return Reproduced(record, folder, tuple(written), found)
 
 
 def conditions(record: RunRecord, config: RunConfig, now: Provenance) -> list[str]:

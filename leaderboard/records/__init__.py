@@ -14,9 +14,11 @@ from symsteer.leaderboard.records.provenance import Provenance, RecordedExtensio
 from symsteer.leaderboard.records.repeat import DERIVED, FILES, repeat_command
 from symsteer.leaderboard.records.reproductions import (
     PARTS,
+    REPEATED,
     REPRODUCED,
     VERDICTS,
     Reproduction,
+    check_reproduction,
     compare_records,
     dump_reproduction,
     file_hash,
@@ -50,6 +52,7 @@ __all__ = [
     "MAX_GROWTH",
     "MAX_OVERSHOOT",
     "PARTS",
+    "REPEATED",
     "REPRODUCED",
     "ROLES",
     "SCHEMA_VERSION",
@@ -69,6 +72,7 @@ __all__ = [
     "RunSettings",
     "WallClock",
     "canonical_json",
+    "check_reproduction",
     "compare_records",
     "config_hash",
     "dump_record",

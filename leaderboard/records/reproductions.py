@@ -7,6 +7,7 @@ and packages, a run on the CPU repeats to the last digit; elsewhere its final su
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -32,6 +33,7 @@ from symsteer.leaderboard.records.values import (
     Text,
     canonical_json,
     first_problem,
+    flat,
 )
 
 Verdict = Literal["exact", "alike", "different"]
@@ -49,6 +51,9 @@ Part = Literal[
 ]
 PARTS: tuple[Part, ...] = get_args(Part)
 """What is compared. Times, provenance and the name of the machine are not."""
+
+REPEATED = ".record.json"
+"""What the name of the repeated record ends with, beside the file of a reproduction."""
 
 IGNORED = {"base_policy": {"training_seconds"}}
 
@@ -120,8 +125,6 @@ class Reproduction(Block):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if self.verdict != _verdict(self.differences, self.success):
-            raise ValueError("the verdict does not follow from the differences")
         if self.record.sha256 == self.repeated.sha256:
             raise ValueError("the record was compared with itself")
         return self
@@ -167,12 +170,7 @@ def reproduction_of(path: Path, again: Path, conditions: Sequence[str]) -> Repro
     differences, success, area = compare_records(record, repeated)
     return Reproduction(
         verdict=_verdict(differences, success),
-        record=Original(
-            run_id=record.run_id,
-            sha256=file_hash(path),
-            config_hash=record.config_hash,
-            commit=record.provenance.commit,
-        ),
+        record=_original(path, record),
         repeated=Repeated(
             sha256=file_hash(again),
             started=repeated.started,
@@ -183,6 +181,15 @@ def reproduction_of(path: Path, again: Path, conditions: Sequence[str]) -> Repro
         success=success,
         area=area,
         differences=differences,
+    )
+
+
+def _original(path: Path, record: RunRecord) -> Original:
+    return Original(
+        run_id=record.run_id,
+        sha256=file_hash(path),
+        config_hash=record.config_hash,
+        commit=record.provenance.commit,
     )
 
 
@@ -200,7 +207,7 @@ def read_reproductions(folder: Path) -> dict[str, Reproduction]:
         UserError: for a file that is damaged, or is not named after the hash of its record.
     """
     found = {}
-    for path in sorted(folder.glob("*.json")):
+    for path in sorted(set(folder.glob("*.json")) - set(folder.glob(f"*{REPEATED}"))):
         try:
             reproduction = Reproduction.model_validate_json(path.read_bytes())
         except OSError as error:
@@ -217,6 +224,57 @@ def read_reproductions(folder: Path) -> dict[str, Reproduction]:
             )
         found[path.stem] = reproduction
     return found
+
+
+def check_reproduction(path: Path, record: Path, vouched: bool, alone: bool) -> None:
+    """Compute a reproduction again from its record and the repeated one, which lies beside it.
+
+    Args:
+        path: of the reproduction.
+        record: of the record that it names.
+        vouched: whether a maintainers' list has it: then it may be without the repeated record.
+        alone: whether one that no list has counts as well.
+
+    Raises:
+        UserError: if the records give another one, or it does not count.
+    """
+    again, found = path.with_suffix(REPEATED), Reproduction.model_validate_json(path.read_bytes())
+    if not vouched and not alone:
+        raise UserError(
+            f"{path} does not count, because the list of the study, which maintainers keep, lacks "
+            "it: add its line to the list (docs/submit.md), or remove it"
+        )
+    if not vouched and not again.is_file():
+        raise UserError(
+            f"{path} cannot be computed again, because the repeated record {again.name} is not "
+            "beside it: make it again with `symsteer reproduce RECORD --into`, or remove it"
+        )
+    if again.is_file():
+        wanted = reproduction_of(record, again, found.conditions)
+        first, second = (flat(read_record(file).config) for file in (record, again))
+        same_run = first.items() <= second.items()
+    else:
+        one, theirs, same_run = read_record(record), found.success.repeated, True
+        _, success, area = compare_records(one, one)
+        trials = len(_final(one).episodes.seed)
+        low, high = newcombe((theirs * trials, trials), (success.recorded * trials, trials))
+        success = success.model_copy(update={"repeated": theirs, "low": low, "high": high})
+        area = area.model_copy(update={"repeated": found.area.repeated})
+        known = {"record": _original(record, one), "success": success, "area": area}
+        verdict = _verdict(found.differences, success)
+        wanted = found.model_copy(update=known | {"verdict": verdict})
+    if not same_run or _rounded(wanted) != _rounded(found):
+        raise UserError(
+            f"{path} says something else than the records that it is about: make it again with "
+            "`symsteer reproduce RECORD --into`, or remove it"
+        )
+
+
+def _rounded(reproduction: Reproduction) -> Any:
+    """Plain data without the last digits, which differ between versions of libraries."""
+    return json.loads(
+        dump_reproduction(reproduction), parse_float=lambda text: f"{float(text):.9f}"
+    )
 
 
 def _verdict(differences: Sequence[Difference], success: Success) -> Verdict:

@@ -80,9 +80,11 @@ def generate(
     reading = Documentation.of_checkout(docs)
     needs("jinja2", "markdown_it", *(["mkdocs", "material"] if reading.built else []))
     _check_folder(out)
-    summary = summarize(load_runs(records, reproductions_for(records, reproductions)))
+    claims = read_study(study)
+    marks = reproductions_for(records, reproductions)
+    summary = summarize(load_runs(records, marks, claims.listed))
     defects = read_audit(_summary_of(audit))
-    found = analyse(summary, defects, read_study(study))
+    found = analyse(summary, defects, claims)
     board = Board(summary, found, defects, Path(study).stem, reading, tuple(_maps(audit)))
     files = {out / name: data for name, data in render(board).items()}
     clips = [clip for run in board.runs for clip in media(run)]

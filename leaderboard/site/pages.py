@@ -115,6 +115,7 @@ def _matrix_row(board: Board, table: Table) -> Values:
             if row.success:
                 mark = MARKS[row.difference.sign] if row.difference else ""
                 mark += " \u2020" if any(row.diverged) else ""
+                mark += " not reproduced" * row.marked
                 value, ends = interval(row.success).split("\u00a0", 1)
                 level = round(10 * row.success.value)
                 shown.append({"value": value, "mark": mark, "ends": ends, "level": level})
@@ -207,7 +208,13 @@ def findings(board: Board) -> Values:
     spreads = page.spreads_section(summary, found.spreads) if found.spreads else []
     return {
         "notice": _notice(board),
-        "reading": markup.html([page.READING, page.MADE_AGAIN][: 1 + summary.has_reproductions]),
+        "reading": markup.html(
+            [
+                page.READING,
+                *[page.MADE_AGAIN] * summary.has_reproductions,
+                *[page.SUBMITTED] * summary.has_marks,
+            ]
+        ),
         "claims": markup.html([CLAIMS, *claims_section(found)]),
         "sound": markup.html([page.SOUND, sound])
         if (sound := page.soundness_table(summary))

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import csv
 import io
+import json
+import re
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from symsteer.errors import UserError
+from symsteer.leaderboard import study
+from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.records import (
+    REPEATED,
     Reproduction,
     RunRecord,
     compare_records,
     dump_reproduction,
     file_hash,
+    read_record,
     read_reproductions,
     reproduction_of,
     write_record,
@@ -23,7 +31,8 @@ from symsteer.leaderboard.records import (
 from symsteer.leaderboard.report import generate
 from symsteer.leaderboard.site.build import generate as generate_site
 from symsteer.leaderboard.statistics import ShareDifference
-from symsteer.leaderboard.summary import load_runs, summarize
+from symsteer.leaderboard.study import read_study
+from symsteer.leaderboard.summary import Table, load_runs, summarize
 from symsteer.leaderboard.tables import status
 from tests.leaderboard.command_line import main
 from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
@@ -172,11 +181,18 @@ def results(tmp_path: Path) -> Path:
             again.wall_clock.total += 1
             if seed == 1:
                 again.evaluations[1].diagnostics["q_mean"] = -1.0
-            write_record(again, tmp_path / "again" / f"{seed}.json")
-            path = tmp_path / "records" / f"{record.run_id}.json"
-            found = reproduction_of(path, tmp_path / "again" / f"{seed}.json", ["a note"])
-            (marks / f"{file_hash(path)}.json").write_bytes(dump_reproduction(found))
+            reproduce(tmp_path, record, again)
     return tmp_path
+
+
+def reproduce(folder: Path, record: RunRecord, again: RunRecord) -> Path:
+    """The file that says how a record agrees with another one, which is put beside it."""
+    path = folder / "records" / f"{record.run_id}.json"
+    mark = folder / "marks" / f"{file_hash(path)}.json"
+    write_record(again, mark.with_suffix(REPEATED))
+    found = reproduction_of(path, mark.with_suffix(REPEATED), ["a note"])
+    mark.write_bytes(dump_reproduction(found))
+    return mark
 
 
 def test_the_verdicts_and_the_round_trip_of_a_file(results: Path) -> None:
@@ -225,6 +241,18 @@ def test_the_site_marks_rows_and_runs(results: Path) -> None:
     assert "made again from their records" in (site / "findings.html").read_text()
 
 
+def repeated_of(results: Path) -> set[Path]:
+    return set((results / "marks").glob(f"*{REPEATED}"))
+
+
+def lists(results: Path, *files: Path) -> Path:
+    """A study with a list of these files."""
+    lines = (f"{file_hash(path)}  {path.name}\n" for path in files)
+    (results / "own.sha256").write_text("".join(lines))
+    (results / "own.toml").touch()
+    return results / "own.toml"
+
+
 def report(results: Path, *more: str) -> int:
     out = str(results / "board")
     marks = ("--reproductions", str(results / "marks"))
@@ -249,15 +277,12 @@ def test_a_stale_reproduction_is_named(results: Path, capsys: pytest.CaptureFixt
 
 
 def test_a_bad_reproduction_is_one_sentence(results: Path) -> None:
-    good = next((results / "marks").iterdir())
+    good = next(iter(sorted({*(results / "marks").glob("*.json")} - repeated_of(results))))
     text = good.read_text()
     for damaged in (
         "",
         text[:-9],
         "3",
-        text.replace('"verdict": "exact"', '"verdict": "alike"').replace(
-            '"verdict": "alike",\n "record"', '"verdict": "different",\n "record"', 1
-        ),
         text.replace('"schema_version": 1', '"schema_version": 2'),
         # A copy of the record is no second run.
         text.replace(Reproduction.model_validate_json(text).repeated.sha256, good.stem),
@@ -272,3 +297,195 @@ def test_a_bad_reproduction_is_one_sentence(results: Path) -> None:
         read_reproductions(results / "marks")
     with pytest.raises(UserError, match=r"is no folder"):
         generate([results / "records"], results / "board", reproductions=results / "nowhere")
+
+
+def edited(mark: Path, **changes: Any) -> None:
+    """A reproduction that says something else, in the form that it should have."""
+    data = json.loads(mark.read_text())
+    for key, value in changes.items():
+        data[key] = value if isinstance(value, str | list) else data[key] | value
+    mark.write_bytes(dump_reproduction(Reproduction.model_validate_json(json.dumps(data))))
+
+
+OTHER_NUMBERS: list[dict[str, Any]] = [
+    {"verdict": "different"},
+    {"verdict": "exact", "differences": []},
+    {"success": {"repeated": 1.0, "low": -0.1, "high": 0.4}},
+    {"success": {"recorded": 0.9}},
+    {"success": {"low": -0.5}},
+    {"area": {"recorded": 0.9}},
+    {"record": {"commit": None}},
+    {"record": {"run_id": "run-none-equivariant-4"}},
+    {"repeated": {"sha256": "ab" * 32}},
+    {"repeated": {"started": "2020-01-01T00:00:00+00:00"}},
+]
+
+
+@pytest.mark.parametrize("changes", OTHER_NUMBERS)
+def test_numbers_that_the_records_do_not_give_are_refused(
+    changes: dict[str, Any], results: Path
+) -> None:
+    mark = {one.verdict: p for p, one in marks_of(results).items()}["alike"]
+    assert len(load_runs([results / "records"], results / "marks")) == 15
+    edited(mark, **changes)
+    with pytest.raises(UserError, match=rf"{mark.name} says something else than the records"):
+        load_runs([results / "records"], results / "marks")
+
+
+def marks_of(results: Path) -> dict[Path, Reproduction]:
+    found = read_reproductions(results / "marks")
+    return {results / "marks" / f"{digest}.json": one for digest, one in found.items()}
+
+
+def test_the_repeated_run_has_the_configuration_of_the_record(results: Path) -> None:
+    record = read_record(results / "records" / "run-none-equivariant-2.json")
+    config = record.config | {"learning_rate": 1.0}
+    again = copy_of(record).model_dump(by_alias=True) | {"config": config}
+    del again["config_hash"]
+    reproduce(results, record, RunRecord.model_validate(again))
+    with pytest.raises(UserError, match="says something else"):
+        load_runs([results / "records"], results / "marks")
+
+
+def test_without_the_repeated_record_the_list_decides(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The oldest reproductions lack it; what they say of the record is compared."""
+    for path in repeated_of(results):
+        path.unlink()
+    own = sorted((results / "records").iterdir())
+    with pytest.raises(UserError, match=r"the repeated record .* is not beside it"):
+        load_runs([results / "records"], results / "marks")
+    listed = read_study(str(lists(results, *own, *marks_of(results)))).listed
+    counted = load_runs([results / "records"], results / "marks", listed)
+    assert sorted(r.reproduction.verdict for r in counted if r.reproduction) == ["alike", "exact"]
+    monkeypatch.setattr(study, "FOLDER", results)
+    assert len(load_runs([results / "records"], results / "marks")) == 15
+    mark = {one.verdict: p for p, one in marks_of(results).items()}["alike"]
+    text = mark.read_bytes()
+    for changes in OTHER_NUMBERS[:1] + OTHER_NUMBERS[3:8]:
+        edited(mark, **changes)
+        vouched = {*map(file_hash, own), *map(file_hash, marks_of(results))}
+        with pytest.raises(UserError, match="says something else"):
+            load_runs([results / "records"], results / "marks", vouched)
+        mark.write_bytes(text)
+
+
+# Marks of submitted runs
+
+
+@pytest.fixture
+def submitted(results: Path) -> Path:
+    """Runs of a wonderful agent and bad ones of a known agent are handed in."""
+    others = make_cell({"wonder": 1.0, "equivariant": 0.1, "base": 0.9}, seeds=6)
+    for record in others:
+        record.started += timedelta(days=9)
+        record.ended = record.started + timedelta(seconds=1)
+        record.run_id = f"new-{record.run_id}"
+        write_record(record, results / "records" / f"{record.run_id}.json")
+    return results
+
+
+def own_files(results: Path) -> list[Path]:
+    return [*sorted((results / "records").glob("run-*")), *marks_of(results)]
+
+
+def tables_of(results: Path, *listed: Path) -> Table:
+    found = read_study(str(lists(results, *listed))).listed
+    runs = load_runs([results / "records"], results / "marks", found)
+    (table,) = summarize(runs).tables
+    return table
+
+
+@pytest.mark.long
+def test_submitted_rows_are_marked_last_and_change_nothing(submitted: Path) -> None:
+    own = own_files(submitted)
+    study_file = str(lists(submitted, *own))
+    both = {
+        path.name: path.read_text()
+        for path in generate(
+            [submitted / "records"], submitted / "board", None, study_file, submitted / "marks"
+        )
+        if path.suffix in (".md", ".csv")
+    }
+    table = tables_of(submitted, *own)
+    assert [row.label for row in table.rows if row.marked] == [
+        "base (not reproduced)",
+        "equivariant (not reproduced)",
+        "wonder (not reproduced)",
+    ]
+    assert [row.marked for row in table.rows] == [False] * 3 + [True] * 3
+    assert table.best_reference is table.row_of("base") is table.rows[0]
+    assert (table.row_of("wonder"), table.rows[5].rank) == (None, None)
+    assert table.rows[5].difference is not None
+    page = both["LEADERBOARD.md"].replace("\u00a0", " ")
+    assert "submitted runs that no maintainer has made again" in page
+    (glance,) = [line for line in page.splitlines() if line.startswith("| Unbroken | 0.40 |")]
+    print(glance)
+    shown = re.findall(r"^\| (\S+) \| `([^`]+)`", page, re.M)
+    assert [name for _, name in shown[:6]] == [row.label for row in table.rows]
+    assert {rank for rank, name in shown if "not reproduced" in name} == {"\u2013"}
+    rows = list(csv.DictReader(io.StringIO(both["leaderboard.csv"])))
+    assert [(row["agent"], row["marked"], row["rank"]) for row in rows][3:] == [
+        (agent, "1", "") for agent in ("base", "equivariant", "wonder")
+    ]
+    # The rows of the maintainers' own runs are what they are without the others.
+    for path in (submitted / "records").glob("new-*"):
+        path.unlink()
+    alone = tables_of(submitted, *own)
+    for row, other in zip(alone.rows, table.rows, strict=False):
+        names = ("label", "rank", "success", "difference", "against_best", "missing", "area")
+        assert [getattr(row, n) for n in names] == [getattr(other, n) for n in names]
+    assert (alone.threshold, alone.feasible) == (table.threshold, table.feasible)
+    generate([submitted / "records"], submitted / "alone", None, study_file, submitted / "marks")
+    files = [submitted / "alone" / name for name in ("LEADERBOARD.md", "leaderboard.csv")]
+    assert not any(re.search("marked|not reproduced", file.read_text()) for file in files)
+
+
+def test_a_maintainers_reproduction_of_one_run_takes_the_mark_of_its_row(submitted: Path) -> None:
+    own = own_files(submitted)
+    record = read_record(submitted / "records" / "new-run-none-wonder-3.json")
+    again = copy_of(record)
+    again.wall_clock.total += 1
+    mark = reproduce(submitted, record, again)
+    with pytest.raises(UserError, match=rf"{mark.name} does not count, because the list"):
+        tables_of(submitted, *own)
+    table = tables_of(submitted, *own, mark)
+    assert {row.agent for row in table.rows if row.marked} == {"base", "equivariant"}
+    row = table.row_of("wonder")
+    assert row is not None
+    assert (row.rank, len(row.runs), row.label) == (1, 6, "wonder")
+    # One that does not agree takes no mark.
+    (mark.with_suffix(REPEATED)).unlink()
+    again.evaluations[-1].episodes = make_evaluation([0] * 40).episodes
+    mark = reproduce(submitted, record, again)
+    assert marks_of(submitted)[mark].verdict == "different"
+    assert tables_of(submitted, *own, mark).row_of("wonder") is None
+
+
+def test_nothing_is_marked_without_a_list(submitted: Path) -> None:
+    runs = load_runs([submitted / "records"], submitted / "marks")
+    (table,) = summarize(runs).tables
+    assert not any(row.marked for row in table.rows)
+    assert table.row_of("wonder").rank == 1
+
+
+@pytest.mark.parametrize("line", ["", "0" * 64, "x" * 64 + "  name.json", "0" * 63 + "  name"])
+def test_a_bad_list_is_one_sentence(line: str, results: Path) -> None:
+    path = lists(results)
+    path.with_suffix(".sha256").write_text(f"{'0' * 64}  name\n{line}\n")
+    with pytest.raises(UserError, match=r"own\.sha256, line 2 is none of `sha256sum`"):
+        read_study(str(path))
+
+
+@pytest.mark.long
+def test_the_lists_name_what_is_committed() -> None:
+    folders = {"answer": "records", "field": "zoo", "divergence": "stress"}
+    folders |= {name: name for name in ("learners", "first")}
+    for name, folder in folders.items():
+        lines = (study.FOLDER / f"{name}.sha256").read_text().splitlines()
+        files = [RESULTS / line[66:] for line in lines]
+        assert [file_hash(file) for file in files] == [line[:64] for line in lines]
+        assert {*(RESULTS / folder).rglob("*.json")} == {
+            file for file in files if file.parent.name != "reproductions"
+        }

@@ -25,7 +25,12 @@ def test_the_wheel_is_complete_and_installs_one_name(wheel, source):
             found = (source / folder).rglob(f"*.{suffix}")
             wanted |= {inside + file.relative_to(source).as_posix() for file in found}
     site = "leaderboard/site/"
-    for pattern in (f"{site}templates/*.html", f"{site}static/*", "agents/templates/*.txt"):
+    for pattern in (
+        f"{site}templates/*.html",
+        f"{site}static/*",
+        "agents/templates/*.txt",
+        "leaderboard/studies/*.sha256",
+    ):
         wanted |= {f"symsteer/{file.relative_to(source)}" for file in source.glob(pattern)}
     assert names == wanted
 

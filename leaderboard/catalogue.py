@@ -1,0 +1,41 @@
+"""What SymSteer comes with, by name: records are judged by it without importing tasks or agents."""
+
+from __future__ import annotations
+
+from symsteer.leaderboard.records import Role
+
+EMBODIMENTS = ("floating", "panda")
+
+TASKS = {
+    **dict.fromkeys(("PushCube-v1", "PullCube-v1", "PickCube-v1", "PlaceSphere-v1"), 50),
+    **dict.fromkeys(("LiftPegUpright-v1", "TiltedPushCube-v1", "TiltedPickCube-v1"), 50),
+    **dict.fromkeys(("SeenPushCube-v1", "SeenPickCube-v1"), 50),
+    **{"StackCube-v1": 60, "PokeCube-v1": 60, "PushT-v1": 100},
+}
+"""The time limit of each task, in control steps."""
+
+VARIANTS = {
+    **dict.fromkeys(("gravity_tilt", "wind", "action_gain", "actuator_offset", "obstacle"), 0.0),
+    **dict.fromkeys(("friction_patch", "perception_bias", "frame_offset", "frame_rotation"), 0.0),
+    **{"directional_reward": 1.0, "spawn_sector": 0.0, "observation_noise": 0.0},
+}
+"""What a step before success may cost besides 1, at full strength."""
+
+TRAINING_ONLY = frozenset({"spawn_sector"})
+"""Variants in which agents are not evaluated."""
+
+POLICIES = (
+    *("edp", "escnn", "frame-averaged", "so2", "spherical", "canonical", "plain"),
+    *("plain-augmented", "edp-joint", "plain-joint"),
+)
+
+REFERENCES = ("base", "zero", "golden-ticket")
+
+AGENTS: dict[str, Role] = {
+    **dict.fromkeys(REFERENCES, "reference"),
+    **dict.fromkeys(("standard", "standard-matched", "augmented", "equivariant"), "learner"),
+    **dict.fromkeys(("residual-pathway", "relaxed", "projected", "constrained"), "learner"),
+    **dict.fromkeys(("partial", "ensemble", "displaced", "residual", "best-of-n"), "learner"),
+    **{"best-of-n-kernel": "learner", "approximate": "learner", "wrong-group": "control"},
+}
+"""The role of each agent; `approximate` is that of version 0.1."""
