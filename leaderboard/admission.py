@@ -97,17 +97,10 @@ class Configuration(BaseModel):
 
 
 class Judged:
-    """A record, and what follows from its configuration.
+    """A record, and what follows from its configuration; UserError or ValueError if it is none.
 
-    Attributes:
-        own: whether the agent is one of SymSteer's, not an extension.
-        learns: whether it is one of SymSteer's and has a critic.
-        limit: time limit of an episode; of a task from elsewhere that of its longest episode.
-        step: environment steps of one decision in all environments.
-        cost: the most that a step before success may cost.
-
-    Raises:
-        UserError, ValueError: if the configuration cannot be read.
+    `own`: the agent is one of SymSteer's, and if it `learns`, has a critic. `limit`: steps of an
+    episode. `step`: environment steps of a decision. `cost`: the most that a step may cost.
     """
 
     def __init__(self, file: Path, record: RunRecord):
@@ -211,30 +204,30 @@ def _problems(file: Path, record: RunRecord) -> Iterator[str]:
             "record as it was written"
         )
         return
-    for rule in RULES:
-        if found := rule.broken(judged):
-            yield f"{'the run' if found is True else found} breaks the rule that {rule}"
-    for rule in EVALUATION_RULES:
-        for e in record.evaluations:
-            if found := rule.broken(judged, e):
-                detail = "" if found is True else f" ({found})"
-                yield f"the evaluation at step {e.env_steps}{detail} breaks the rule that {rule}"
-                break
-
-
-# Checks: what is wrong, in words or as True; anything else means that the rule is kept.
+    found = [("the run", rule, broken(judged)) for rule, broken in RULES.items()]
+    for rule, broken in EVALUATION_RULES.items():
+        each = ((f"the evaluation at step {e.env_steps}", e) for e in record.evaluations)
+        wrong = ((where, rule, why) for where, e in each if (why := broken(judged, e)))
+        found += [first] if (first := next(wrong, None)) else []
+    for where, rule, why in found:
+        if why:
+            detail = "" if why is True else f" ({why})"
+            yield f"{where}{detail} breaks the rule that {rule.partition(' | ')[0]}: {MEND}"
 
 
 def _unknown_code(j: Judged) -> str | None:
     for number, part in enumerate(j.parts, 1):
-        of = f"part {number} of the run" if number > 1 else "the run"
+        of = f"part {number}: " if number > 1 else ""
         if part.commit is None and not _is_released(part):
-            return f"{of}, which names neither a commit nor a released version,"
+            return f"{of}it names neither a commit nor a released version; use a git clone"
         if part.commit is not None and part.dirty is not False:
-            return f"{of}, whose code is not in commit {part.commit[:12]},"
+            return f"{of}its code is not in commit {part.commit[:12]}; commit all files first"
         for extension in part.extensions:
             if extension.distribution is None or extension.version is None:
-                return f"{of}, whose {extension.target} belongs to no installed distribution,"
+                return (
+                    f"{of}its {extension.kind} {extension.target} belongs to no installed "
+                    "distribution; install it as a package with an entry point"
+                )
     return None
 
 
@@ -244,46 +237,72 @@ def _unknown_name(j: Judged) -> str | None:
         if (name in known) == ((kind, name) in outside):
             return f"the {kind} {name!r}"
     unused = outside - {(kind, name) for kind, name, _ in j.names}
-    return f"the extension {min(unused)[1]!r}, which no setting names," if unused else None
+    return f"no setting names the extension {min(unused)[1]!r}" if unused else None
+
+
+def _name(j: Judged) -> str | None:
+    return f"it is that of {j.run_id}" if j.record.run_id != j.run_id else None
+
+
+def _seeds(j: Judged) -> bool:
+    return j.record.seeds != j.seeds
+
+
+def _role(j: Judged) -> bool:
+    world = j.config.evaluation_variant, variant_text(j.specs)
+    wanted = j.evaluated_in if j.known_world else world[0], j.settings.variant
+    role = catalogue.AGENTS.get(j.settings.agent, j.record.role)
+    return (role, *wanted) != (j.record.role, *world)
 
 
 def _hash_of_nothing(j: Judged) -> str | None:
     hashes = [j.record.base_policy.content_hash, j.config.demonstrations, j.config.weights]
     hashes += [text or "" for part in j.parts for text in (part.commit, part.sha256)]
     hashes += [extension.sha256 for extension in j.extensions]
-    return next((f"the hash {text}" for text in hashes if text and len(set(text)) < 9), None)
+    return next((text for text in hashes if text and len(set(text)) < 9), None)
+
+
+def _machine(j: Judged) -> bool:
+    cpu = j.config.device == "cpu"
+    return any(part.together > 100 or (part.device == "cpu") != cpu for part in j.parts)
 
 
 def _machine_path(j: Judged) -> str | None:
     texts = _texts(json.loads(j.file.read_bytes()))
-    return next((f"the text {text[:60]!r}" for text in texts if portable(text) != text), None)
+    return next((f"{text[:60]!r}" for text in texts if portable(text) != text), None)
 
 
 def _budget(j: Judged) -> str | None:
     used, budget, record = j.record.budget.env_steps, j.config.env_steps, j.record
     evidence = not j.own and (record.parameters.total > 0 or record.has_critic)
     learns = j.learns or record.role != "reference" or evidence
-    none_needed = j.settings.agent in ("base", "zero") and used > 0
-    if (learns and used < budget) or used >= budget + j.step or none_needed:
-        return f"a run of {used} environment steps with a budget of {budget}"
-    if 10 * j.step > budget or j.config.execute > min(j.config.horizon, j.limit):
-        return f"a decision of {j.step} steps in {j.config.num_envs} environments"
-    return None
+    needless = j.settings.agent in ("base", "zero") and used > 0
+    wrong = (learns and used < budget) or used >= budget + j.step or needless
+    return f"{used} environment steps of {budget}" if wrong else None
+
+
+def _decision(j: Judged) -> bool:
+    return 10 * j.step > j.config.env_steps or j.config.execute > min(j.config.horizon, j.limit)
+
+
+def _sizes(j: Judged) -> bool:
+    sizes, reference = j.record.parameters, j.own and not j.learns
+    return sizes.total != sizes.actor + sizes.critic or (reference and sizes.total > 0)
 
 
 def _schedule(j: Judged) -> str | None:
     before = [evaluation.env_steps for evaluation in j.record.evaluations][:-1]
     if j.record.role == "reference":
-        return "a reference that was evaluated twice" if j.own and before else None
+        return "a reference has one" if j.own and before else None
     if not before or (j.own and before[0]):
-        return "a run without an evaluation before its first decision"
+        return "none before the first decision"
     for number, (was, at) in enumerate([*pairwise(before), (before[-1], None)], 1):
         # At the first whole decision that reaches the planned step, one evaluation a decision.
         due = max(number * j.config.every, was + 1)
         if at is not None and not due <= at < min(due + j.step, j.config.env_steps):
-            return f"a run that was evaluated at step {at} where {due} was due"
+            return f"one at step {at} where {due} was due"
         if at is None and due + j.step <= j.config.env_steps:
-            return f"a run without an evaluation at step {due}"
+            return f"none at step {due}"
     return None
 
 
@@ -316,6 +335,23 @@ def _clock(j: Judged) -> bool:
     fast = record.budget.env_steps > 100_000 * clock.total or record.started > datetime.now(UTC)
     resumed = clock.resumed >= len(record.continued)
     return fast or not (ordered and resumed and (lasted + 2 >= clock.total or clock.resumed))
+
+
+def _held_out(j: Judged, e: Evaluation) -> bool:
+    return e.episodes.seed != [HELD_OUT_SEED + i for i in range(len(e.episodes.seed))]
+
+
+def _number(j: Judged, e: Evaluation) -> str | None:
+    number, wanted = len(e.episodes.seed), j.config.final_episodes if e.final else j.config.episodes
+    return f"{number} of them" if number != wanted or number < MIN_EPISODES * e.final else None
+
+
+def _end(j: Judged, e: Evaluation) -> bool:
+    return e.final and any(getattr(e, name) != used for name, used in j.record.budget)
+
+
+def _lengths(j: Judged, e: Evaluation) -> bool:
+    return set(e.episodes.episode_len) != {j.limit}
 
 
 def _counts(j: Judged, e: Evaluation) -> bool:
@@ -369,122 +405,39 @@ def _q(j: Judged, e: Evaluation) -> str | None:
     return next((name for name, fit in fits.items() if not fit), None)
 
 
-@dataclass(frozen=True)
-class Rule:
-    """A rule of docs/submit.md: what must be so, why, the check, and how to mend it."""
+Check = Callable[..., object]
 
-    what: str
-    why: str
-    broken: Callable[..., object]
-    mend: str = MEND
+RULES: dict[str, Check] = {
+    "its code can be looked up | everybody can read and run it": _unknown_code,
+    "names are SymSteer's, or extensions' | a row is of its agent's code": _unknown_name,
+    "its name is its configuration's | a record describes the run that it names": _name,
+    "seeds are the configuration's | agents are compared on equal seeds": _seeds,
+    "role and variant are its agent's and its evaluations' | all of a table do the same": _role,
+    "hashes have many different digits | no file has a hash of zeros": _hash_of_nothing,
+    "the device is the configuration's, runs in a process at most 100 | machines differ": _machine,
+    "the whole budget is used, and not exceeded | all agents get the same": _budget,
+    "a decision takes at most a tenth of the budget | long ones would hide steps": _decision,
+    "evaluations are the configuration's | none is left out or chosen": _schedule,
+    "feasible Q-values are the reward's | divergence is measured by them": _bounds,
+    "the base policy's shares are its draws' | learners are compared with it": _base,
+    "numbers of parameters add up | sizes are compared": _sizes,
+    "times are in order and within the run | a run takes time": _clock,
+    "no text holds a path of a machine | records are public": _machine_path,
+}
+"""What must be so of a record, why, and what is wrong: words, or True; else it is so."""
 
-    def __str__(self) -> str:
-        return f"{self.what}: {self.mend}"
-
-
-RULES = (
-    Rule(
-        "its code can be looked up",
-        "everybody can read and run it",
-        _unknown_code,
-        "commit all changes, or install a release; install extensions as packages with entry "
-        "points; then run it again",
-    ),
-    Rule(
-        "names are SymSteer's, or else those of extensions",
-        "a row of an agent is of this agent's code",
-        _unknown_name,
-    ),
-    Rule(
-        "the run's name is that of its configuration",
-        "a record describes the run that it names",
-        lambda j: j.record.run_id != j.run_id and f"{j.record.run_id}, which is not {j.run_id},",
-    ),
-    Rule(
-        "seeds are those of the configuration",
-        "agents are compared on equal seeds",
-        lambda j: j.record.seeds != j.seeds,
-    ),
-    Rule(
-        "the role is the agent's",
-        "a learner is no reference",
-        lambda j: catalogue.AGENTS.get(j.settings.agent, j.record.role) != j.record.role,
-    ),
-    Rule(
-        "the variant is written in its shortest form, and evaluations are in it",
-        "all runs of a table are of one world",
-        lambda j: (
-            j.settings.variant != variant_text(j.specs)
-            or (j.known_world and j.config.evaluation_variant != j.evaluated_in)
-        ),
-    ),
-    Rule("hashes have many different digits", "no file has a hash of zeros", _hash_of_nothing),
-    Rule(
-        "the device is that of the configuration, and at most 100 runs share a process",
-        "the machine is part of the record",
-        lambda j: any(
-            p.together > 100 or (p.device == "cpu") != (j.config.device == "cpu") for p in j.parts
-        ),
-    ),
-    Rule(
-        "a learner uses its whole budget, no run more, and a decision at most a tenth of it",
-        "the last checkpoint counts; all agents get the same",
-        _budget,
-    ),
-    Rule("evaluations are those of the configuration", "none is left out or chosen", _schedule),
-    Rule("feasible Q-values are those of the reward", "divergence is measured by them", _bounds),
-    Rule("the base policy's shares are of its draws", "learners are compared with it", _base),
-    Rule(
-        "numbers of parameters add up",
-        "sizes are compared",
-        lambda j: (
-            (p := j.record.parameters).total != p.actor + p.critic
-            or (j.own and not j.learns and p.total > 0)
-        ),
-    ),
-    Rule("times are in order and not longer than the run", "a run takes time", _clock),
-    Rule(
-        "no text holds a path of a machine",
-        "records are public",
-        _machine_path,
-        "leave it out where the run is configured, and run it again",
-    ),
-)
-"""About a record alone, in words that follow "that"."""
-
-EVALUATION_RULES = (
-    Rule(
-        "it is on the held-out seeds in order, a final one on at least 100",
-        "the same initial states for everybody",
-        lambda j, e: (
-            (number := len(e.episodes.seed)) < MIN_EPISODES * e.final
-            or e.episodes.seed != list(range(HELD_OUT_SEED, HELD_OUT_SEED + number))
-        ),
-    ),
-    Rule(
-        "it has as many episodes as the configuration says",
-        "none is left out",
-        lambda j, e: (
-            len(e.episodes.seed) != (j.config.final_episodes if e.final else j.config.episodes)
-        ),
-    ),
-    Rule(
-        "a final one counts what the whole run used",
-        "the last checkpoint counts",
-        lambda j, e: e.final and any(getattr(e, k) != used for k, used in j.record.budget),
-    ),
-    Rule("so many decisions take so many steps", "steps are counted as simulated", _counts),
-    Rule("so many decisions lead to so many updates", "settings say how many", _updates),
-    Rule(
-        "episodes last to the task's time limit",
-        "success at the end is measured there",
-        lambda j, e: set(e.episodes.episode_len) != {j.limit},
-    ),
-    Rule("returns are the reward's", "a step costs 1, or what the variant says", _returns),
-    Rule("no diagnostic is left out", "diverged runs must not hide", _unmeasured),
-    Rule("diagnostics agree with each other", "they were measured", _q),
-)
-"""About each evaluation."""
+EVALUATION_RULES: dict[str, Check] = {
+    "seeds are the held-out ones in order | the same initial states for everybody": _held_out,
+    "episodes are as many as configured, 100 at the end | none is left out": _number,
+    "the final one counts what the run used | the last checkpoint counts": _end,
+    "so many decisions take so many steps | steps are counted as simulated": _counts,
+    "so many decisions lead to so many updates | settings say how many": _updates,
+    "episodes last to the time limit | success at the end is measured there": _lengths,
+    "returns are the reward's | a step costs 1, or what the variant says": _returns,
+    "no diagnostic is left out | diverged runs must not hide": _unmeasured,
+    "diagnostics agree with each other | they were measured": _q,
+}
+"""The same of each evaluation."""
 
 
 class _Known:

@@ -180,15 +180,13 @@ def read_list(study: Path) -> frozenset[str] | None:
     """
     path = study.with_suffix(".sha256")
     try:
-        lines = path.read_text().splitlines()
-    except FileNotFoundError:
-        return None
+        lines = path.read_text().splitlines() if path.exists() else None
     except (OSError, ValueError) as error:
         raise UserError(f"the list {path} cannot be read ({error}); restore it") from error
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(lines or (), 1):
         if not re.fullmatch(r"[0-9a-f]{64} [ *]\S.*", line):
             raise UserError(f"{path}, line {number} is none of `sha256sum`; correct it")
-    return frozenset(line[:64] for line in lines)
+    return None if lines is None else frozenset(line[:64] for line in lines)
 
 
 def all_listed() -> frozenset[str]:

@@ -691,11 +691,8 @@ def _complete(table: Table) -> None:
     table.threshold = _threshold(rows)
     base = table.row_of(BASE)
     for row in table.rows:
-        bases = [other for other in table.rows if row.marked and other.agent == BASE]
-        known = [run for other in bases for run in other.runs]
-        if row.agent != BASE and (beside := replace(bases[0], runs=known) if bases else base):
-            # A submitted run on a base policy of its own is compared with what came with it.
-            _against_base(row, beside)
+        if base and row.agent != BASE:
+            _against_base(row, base)
         if table.threshold is not None and not row.is_reference:
             row.threshold_steps = [
                 steps_to_threshold(*_points(run), table.threshold) for run in row.finished

@@ -60,7 +60,8 @@ def advise(
         raise UserError("name one world: with --task and --variant, with --audit or --detection")
     from symsteer.leaderboard.advice import advise, leave_tasks_out
     from symsteer.leaderboard.defects import read_audit
-    from symsteer.leaderboard.paths import chosen_records
+    from symsteer.leaderboard.paths import REPRODUCTIONS, STUDY, chosen_records
+    from symsteer.leaderboard.study import FOLDER, read_list
     from symsteer.leaderboard.summary import load_runs, summarize
 
     folders = chosen_records(records, "advise", "--records RUNS")
@@ -72,7 +73,10 @@ def advise(
         if detection is not None:
             task, embodiment, variant, group = _detected(detection)
         settings = _named(task or "", embodiment, variant, group, states)
-    summaries = [summarize(load_runs([folder])) for folder in folders]
+    # Of the committed records, submitted ones that nobody has made again give no advice.
+    listed = None if records else read_list(FOLDER / f"{STUDY}.toml")
+    marks = None if records else REPRODUCTIONS
+    summaries = [summarize(load_runs([folder], marks, listed)) for folder in folders]
     defects = read_audit()
     if settings is not None:
         worlds = [_world(settings, runs, defects)]

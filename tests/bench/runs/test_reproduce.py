@@ -20,6 +20,7 @@ from symsteer.leaderboard.records import (
     read_record,
     read_reproductions,
 )
+from symsteer.leaderboard.summary import load_runs
 from tests.bench.tiny_run import tiny_config, without_clock
 
 
@@ -69,7 +70,13 @@ def test_a_run_is_made_again_and_agrees_exactly(repeated, tmp_path, monkeypatch,
     assert "compared without making it again" in shown.err
     assert "Everything agrees exactly." in shown.out
     digest = hashlib.sha256(record.read_bytes()).hexdigest()
-    assert [path.name for path in marks.iterdir()] == [f"{digest}.json"]
+    names = [f"{digest}{end}" for end in (".json", ".record.json", ".sha256")]
+    assert sorted(path.name for path in marks.iterdir()) == names
+    assert (marks / names[1]).read_bytes() == (again / "record.json").read_bytes()
+    line = f"{file_hash(marks / names[0])}  marks/{names[0]}\n"
+    assert (marks / names[2]).read_text() == line
+    (run,) = load_runs([record], marks)
+    assert run.reproduction is not None
     assert (marks / f"{digest}.json").read_bytes() == (
         again.parent / "reproduction.json"
     ).read_bytes()
@@ -154,6 +161,21 @@ def test_files_that_the_run_began_from_are_checked(finished, tmp_path, monkeypat
     out = tmp_path / "out"
     code, shown = call(monkeypatch, capsys, run, "--base-policy", policy, "--out", out)
     assert code == 0
+
+
+def test_of_submitted_records_one_is_drawn(changed, tmp_path, monkeypatch, capsys):
+    path = changed(lambda data: data.update(run_id="first"))
+    folder = tmp_path / "submitted"
+    folder.mkdir()
+    path = path.rename(folder / "first.json")
+    for name in ("second.json", "third.json", "repeated.record.json"):
+        (folder / name).write_text("{}")
+    offered = []
+    monkeypatch.setattr("secrets.choice", lambda found: offered.extend(found) or found[0])
+    code, shown = call(monkeypatch, capsys, folder, "--out", tmp_path / "out")
+    assert code == 0
+    assert "drawn at random from 3 records: first.json" in shown.err
+    assert [one.name for one in offered] == ["first.json", "second.json", "third.json"]
 
 
 def test_the_base_policy_of_other_runs_is_taken(finished, tmp_path, monkeypatch, capsys):
