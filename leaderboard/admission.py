@@ -47,9 +47,6 @@ from symsteer.variant import file_name, parse_variant, specs_at, variant_text
 MIN_EPISODES = 100
 """Held-out episodes of an admissible record's final evaluation."""
 
-MANY_ENVS = 8
-"""The episodes of so many environments all end in one decision at the time limit alone."""
-
 SURPRISE, COPIED = 64, 0.9
 """Final returns that take so many bits to guess are copied, if another run has more of them."""
 
@@ -79,6 +76,8 @@ class Configuration(BaseModel):
     env_steps: Positive
     num_envs: Annotated[Positive, Field(le=100_000)]
     device: Annotated[str, Field(pattern="^(cpu|cuda)$")]
+    sim: Annotated[str, Field(pattern="^(cpu|cuda)$")]
+    mode: str = Field(alias="demonstrations.mode", pattern="^(clean|diverse)$")
     evaluation_variant: str
     policy: str = Field(alias="policy.name")
     horizon: Positive = Field(alias="policy.horizon")
@@ -240,14 +239,6 @@ def _unknown_name(j: Judged) -> str | None:
     return f"no setting names the extension {min(unused)[1]!r}" if unused else None
 
 
-def _name(j: Judged) -> str | None:
-    return f"it is that of {j.run_id}" if j.record.run_id != j.run_id else None
-
-
-def _seeds(j: Judged) -> bool:
-    return j.record.seeds != j.seeds
-
-
 def _role(j: Judged) -> bool:
     world = j.config.evaluation_variant, variant_text(j.specs)
     wanted = j.evaluated_in if j.known_world else world[0], j.settings.variant
@@ -337,27 +328,16 @@ def _clock(j: Judged) -> bool:
     return fast or not (ordered and resumed and (lasted + 2 >= clock.total or clock.resumed))
 
 
-def _held_out(j: Judged, e: Evaluation) -> bool:
-    return e.episodes.seed != [HELD_OUT_SEED + i for i in range(len(e.episodes.seed))]
-
-
 def _number(j: Judged, e: Evaluation) -> str | None:
     number, wanted = len(e.episodes.seed), j.config.final_episodes if e.final else j.config.episodes
     return f"{number} of them" if number != wanted or number < MIN_EPISODES * e.final else None
 
 
-def _end(j: Judged, e: Evaluation) -> bool:
-    return e.final and any(getattr(e, name) != used for name, used in j.record.budget)
-
-
-def _lengths(j: Judged, e: Evaluation) -> bool:
-    return set(e.episodes.episode_len) != {j.limit}
-
-
 def _counts(j: Judged, e: Evaluation) -> bool:
-    # A chunk is cut short where the episodes of all environments end within it.
+    # A chunk is cut short where all environments end their episodes in it. Eight or more do so at
+    # the time limit alone.
     number, execute = j.config.num_envs, j.config.execute
-    shortest = j.limit / math.ceil(j.limit / execute) if number >= MANY_ENVS else 1
+    shortest = j.limit / math.ceil(j.limit / execute) if number >= 8 else 1
     fits = shortest * e.decisions - 1e-6 <= e.env_steps <= execute * e.decisions
     return bool(e.decisions % number or e.env_steps % number or not fits)
 
@@ -392,7 +372,8 @@ def _q(j: Judged, e: Evaluation) -> str | None:
     found = {name: value for name, value in e.diagnostics.items() if value is not None}
     fits = {name: abs(v) < 1 + 1e-6 for name, v in found.items() if name.endswith("correlation")}
     fits |= {name: v >= 0 for name, v in found.items() if name.endswith(("_std", "td_error"))}
-    fits |= {name: 0 <= v <= 1 for name, v in found.items() if name.endswith("overestimated")}
+    shares = "overestimated", "violation", "saturated"
+    fits |= {name: 0 <= v <= 1 for name, v in found.items() if name.endswith(shares)}
     if (bounds := j.record.feasible_q) and found.keys() >= set(NEEDED):
         mean, low, high, most, magnitude, overshoot = (found[name] for name in NEEDED)
         allowance, slack = found.get("q_allowance", 0.0), 1e-3 * max(1.0, most)
@@ -401,7 +382,9 @@ def _q(j: Judged, e: Evaluation) -> str | None:
         fits["q_mean"] = low - slack <= mean <= high + slack
         fits["q_abs_max"] = most >= max(-low, high) - slack
         fits["q_magnitude"] = math.isclose(magnitude, most / size, rel_tol=1e-3)
-        fits["q_overshoot"] = overshoot * (top - bottom) >= outside - slack
+        fits["q_overshoot"] = outside - slack <= overshoot * (top - bottom) <= most + size
+        means = [name for name in found if "bias" in name or name.startswith("return_")]
+        fits |= {name: abs(found[name]) <= most + size + slack for name in means}
     return next((name for name, fit in fits.items() if not fit), None)
 
 
@@ -410,8 +393,12 @@ Check = Callable[..., object]
 RULES: dict[str, Check] = {
     "its code can be looked up | everybody can read and run it": _unknown_code,
     "names are SymSteer's, or extensions' | a row is of its agent's code": _unknown_name,
-    "its name is its configuration's | a record describes the run that it names": _name,
-    "seeds are the configuration's | agents are compared on equal seeds": _seeds,
+    "its name is its configuration's | a record describes the run that it names": lambda j: (
+        j.record.run_id != j.run_id and f"it is that of {j.run_id}"
+    ),
+    "seeds are the configuration's | agents are compared on equal seeds": lambda j: (
+        j.record.seeds != j.seeds
+    ),
     "role and variant are its agent's and its evaluations' | all of a table do the same": _role,
     "hashes have many different digits | no file has a hash of zeros": _hash_of_nothing,
     "the device is the configuration's, runs in a process at most 100 | machines differ": _machine,
@@ -427,12 +414,18 @@ RULES: dict[str, Check] = {
 """What must be so of a record, why, and what is wrong: words, or True; else it is so."""
 
 EVALUATION_RULES: dict[str, Check] = {
-    "seeds are the held-out ones in order | the same initial states for everybody": _held_out,
+    "seeds are the held-out ones in order | the same initial states for everybody": lambda j, e: (
+        e.episodes.seed != [HELD_OUT_SEED + i for i in range(len(e.episodes.seed))]
+    ),
     "episodes are as many as configured, 100 at the end | none is left out": _number,
-    "the final one counts what the run used | the last checkpoint counts": _end,
+    "the final one counts what the run used | the last checkpoint counts": lambda j, e: (
+        e.final and any(getattr(e, name) != used for name, used in j.record.budget)
+    ),
     "so many decisions take so many steps | steps are counted as simulated": _counts,
     "so many decisions lead to so many updates | settings say how many": _updates,
-    "episodes last to the time limit | success at the end is measured there": _lengths,
+    "episodes last to the time limit | success at the end is measured there": lambda j, e: (
+        set(e.episodes.episode_len) != {j.limit}
+    ),
     "returns are the reward's | a step costs 1, or what the variant says": _returns,
     "no diagnostic is left out | diverged runs must not hide": _unmeasured,
     "diagnostics agree with each other | they were measured": _q,
@@ -445,7 +438,6 @@ class _Known:
 
     def __init__(self) -> None:
         self._runs: dict[tuple[RowKey, str, str], tuple[Path, RunRecord]] = {}
-        self._outcomes: dict[str, Path] = {}
         self._seeds: dict[RowKey, set[int]] = defaultdict(set)
         self._committed: dict[Key, set[str]] = defaultdict(set)
         self._committed_seeds: dict[Key, set[int]] = defaultdict(set)
@@ -457,8 +449,6 @@ class _Known:
     def add(self, file: Path, record: RunRecord, committed: bool = False) -> None:
         row = _row(record)
         self._runs.setdefault(_identity(record), (file, record))
-        if outcome := _outcome(record):
-            self._outcomes.setdefault(outcome, file)
         if committed:
             if record.role == "reference":
                 self._references[row[0]].add(record.settings.agent)
@@ -477,7 +467,6 @@ class _Known:
 
     def duplicates(self, record: RunRecord) -> Iterator[str]:
         twin = self._runs.get(_identity(record))
-        outcome = _outcome(record)
         if twin and twin[1] == record:
             yield f"it is a copy of {twin[0]}: remove one of the two"
         elif twin:
@@ -485,15 +474,10 @@ class _Known:
                 f"{twin[0]} holds the same configuration, seeds and base policy already: remove "
                 "one of the two (to replace a committed record, say why in the pull request)"
             )
-        elif outcome in self._outcomes:
-            yield (
-                f"its evaluations equal those of {self._outcomes[outcome]} to the last digit: a "
-                "copy, or a setting that changes nothing; keep one of the two"
-            )
         elif file := self._copied(record):
             yield (
-                f"its final episodes are those of {file} but for a few, which chance does not "
-                "explain: a copy, or a setting that changes nothing; keep one of the two"
+                f"its final episodes are nearly all those of {file}, more than chance explains: a "
+                "copy, or a setting that changes nothing; keep one of the two"
             )
 
     def _copied(self, record: RunRecord) -> Path | None:
@@ -565,7 +549,11 @@ def _facts(record: RunRecord) -> dict[tuple[str, ...], list[float]]:
     directions = record.final.episodes.direction if record.final else None
     world = str(record.config.get("evaluation_variant"))
     return {
-        ("sizes of networks", *place, s.agent, settings): [sizes.actor, sizes.critic],
+        ("sizes of networks", *place, s.agent, settings): [
+            sizes.actor,
+            sizes.critic,
+            sizes.width or 0,
+        ],
         ("parameters of the base policy", base.content_hash): [base.parameters or 0],
         ("successes of the base policy", *place, base.content_hash): [base.base_success or 0],
         ("initial states", *place, world): [abs(angle or 0.0) for angle in directions or ()],
@@ -604,15 +592,6 @@ def _is_installed(distribution: str, version: str | None) -> bool:
 def _is_released(provenance: Provenance) -> bool:
     version, sha256 = provenance.version, provenance.sha256
     return sha256 is not None and version is not None and RELEASE.fullmatch(version) is not None
-
-
-def _outcome(record: RunRecord) -> str | None:
-    """A hash of all that a learner's evaluations measured; None where chance alone could agree."""
-    if not record.has_critic:
-        return None
-    data = [evaluation.model_dump(mode="json") for evaluation in record.evaluations]
-    measured = [[evaluation["episodes"], evaluation["diagnostics"]] for evaluation in data]
-    return hashlib.sha256(canonical_json(measured).encode()).hexdigest()
 
 
 def _texts(data: Any) -> Iterator[str]:
