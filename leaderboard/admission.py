@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -75,8 +75,8 @@ class Configuration(BaseModel):
     policy_seed: Annotated[Count, Field(lt=2**32)]
     env_steps: Positive
     num_envs: Annotated[Positive, Field(le=100_000)]
-    device: Annotated[str, Field(pattern="^(cpu|cuda)$")]
-    sim: Annotated[str, Field(pattern="^(cpu|cuda)$")]
+    device: Literal["cpu", "cuda"]
+    sim: Literal["cpu", "cuda"]
     mode: str = Field(alias="demonstrations.mode", pattern="^(clean|diverse)$")
     evaluation_variant: str
     policy: str = Field(alias="policy.name")
@@ -487,10 +487,8 @@ class _Known:
         bits = np.array([math.log2(len(mine) / counts[value]) for value in mine])
         if not others or bits.sum() < SURPRISE:
             return None
-        shared = (np.array(list(others.values())) == np.array(mine)) @ bits
-        return next(
-            (f for f, s in zip(others, shared, strict=True) if s > COPIED * bits.sum()), None
-        )
+        shared = (np.array(list(others.values())) == np.array(mine)) @ bits / bits.sum()
+        return next((f for f, s in zip(others, shared, strict=True) if s > COPIED), None)
 
     def contradictions(self, record: RunRecord) -> Iterator[str]:
         """What another record says differently, though it must be the same in both."""
@@ -548,12 +546,9 @@ def _facts(record: RunRecord) -> dict[tuple[str, ...], list[float]]:
     settings = canonical_json([options, record.config.get("policy")])
     directions = record.final.episodes.direction if record.final else None
     world = str(record.config.get("evaluation_variant"))
+    networks: list[float] = [sizes.actor, sizes.critic, sizes.width or 0]
     return {
-        ("sizes of networks", *place, s.agent, settings): [
-            sizes.actor,
-            sizes.critic,
-            sizes.width or 0,
-        ],
+        ("sizes of networks", *place, s.agent, settings): networks,
         ("parameters of the base policy", base.content_hash): [base.parameters or 0],
         ("successes of the base policy", *place, base.content_hash): [base.base_success or 0],
         ("initial states", *place, world): [abs(angle or 0.0) for angle in directions or ()],
@@ -575,18 +570,10 @@ def _code_from_elsewhere(record: RunRecord) -> Iterator[str]:
             yield f"it ran symsteer {version} as installed, not a checkout; sha256 {sha256[:12]}"
     extensions = [e for p in parts for e in p.extensions if e.distribution]
     used = {(e.kind, e.name, e.distribution, e.version, e.sha256[:12]) for e in extensions}
+    here = {found.name: found.version for found in metadata.distributions()} if used else {}
     for kind, name, distribution, version, sha256 in sorted(used, key=str):
-        known = (
-            "" if _is_installed(str(distribution), version) else ", unresolved: not installed here"
-        )
+        known = "" if here.get(str(distribution)) == version else ", unresolved: not installed here"
         yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}{known}"
-
-
-def _is_installed(distribution: str, version: str | None) -> bool:
-    try:
-        return metadata.version(distribution) == version
-    except (metadata.PackageNotFoundError, ValueError):
-        return False
 
 
 def _is_released(provenance: Provenance) -> bool:

@@ -249,24 +249,30 @@ def check_reproduction(path: Path, record: Path, vouched: bool, alone: bool) -> 
             f"{path} cannot be computed again, because the repeated record {again.name} is not "
             "beside it: make it again with `symsteer reproduce RECORD --into`, or remove it"
         )
+    try:
+        if _rounded(_wanted(found, record, again)) == _rounded(found):
+            return
+    except ValueError:  # one of them is not finished, or they are the same file
+        pass
+    raise UserError(
+        f"{path} says something else than the records that it is about: make it again with "
+        "`symsteer reproduce RECORD --into`, or remove it"
+    )
+
+
+def _wanted(found: Reproduction, record: Path, again: Path) -> Reproduction:
+    """What the two records say; without the repeated one, what it must say of the record."""
+    one = read_record(record)
     if again.is_file():
-        wanted = reproduction_of(record, again, found.conditions)
-        first, second = (flat(read_record(file).config) for file in (record, again))
-        same_run = first.items() <= second.items()
-    else:
-        # Nobody can compute more than what it says of the record itself.
-        one, same_run = read_record(record), True
-        _, success, area = compare_records(one, one)
-        success = found.success.model_copy(update={"recorded": success.recorded})
-        area = found.area.model_copy(update={"recorded": area.recorded})
-        known = {"record": _original(record, one), "success": success, "area": area}
-        verdict = _verdict(found.differences, success)
-        wanted = found.model_copy(update=known | {"verdict": verdict})
-    if not same_run or _rounded(wanted) != _rounded(found):
-        raise UserError(
-            f"{path} says something else than the records that it is about: make it again with "
-            "`symsteer reproduce RECORD --into`, or remove it"
-        )
+        if not flat(one.config).items() <= flat(read_record(again).config).items():
+            raise ValueError("another run")
+        return reproduction_of(record, again, found.conditions)
+    _, success, area = compare_records(one, one)
+    success = found.success.model_copy(update={"recorded": success.recorded})
+    area = found.area.model_copy(update={"recorded": area.recorded})
+    verdict = _verdict(found.differences, success)
+    known = {"verdict": verdict, "record": _original(record, one)}
+    return found.model_copy(update=known | {"success": success, "area": area})
 
 
 def _rounded(reproduction: Reproduction) -> Any:

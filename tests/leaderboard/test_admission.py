@@ -437,6 +437,7 @@ def test_the_form_of_a_record(tmp_path: Path) -> None:
         (config(policy__execute="4"), "policy.execute"),
         (config(num_envs=10**6), "num_envs"),
         (config(sim="tpu"), "sim"),
+        (config(policy_seed=2**32), "policy_seed"),
         (config(demonstrations={"mode": "best", "count": 50, "seed": 25}), "demonstrations.mode"),
         (config(secret=1), "a key 'secret'"),
         (config(sac={"utd": 9.0}), "a key 'sac'"),

@@ -347,6 +347,16 @@ def test_the_repeated_run_has_the_configuration_of_the_record(results: Path) -> 
         load_runs([results / "records"], results / "marks")
 
 
+def test_an_unfinished_repeated_run_is_one_sentence(results: Path) -> None:
+    mark = next(iter(marks_of(results)))
+    data = json.loads(mark.with_suffix(REPEATED).read_text())
+    data["evaluations"][-1]["final"] = False
+    data.update(status="failed", failure="stopped")
+    mark.with_suffix(REPEATED).write_text(json.dumps(data))
+    with pytest.raises(UserError, match="says something else"):
+        load_runs([results / "records"], results / "marks")
+
+
 def test_without_the_repeated_record_the_list_decides(
     results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
