@@ -121,7 +121,7 @@ def test_of_several_settings_the_usual_ones_stand_for_an_agent() -> None:
         return SimpleNamespace(agent=agent, usual=usual, runs=runs)
 
     def stands(*rows: SimpleNamespace) -> dict[Any, float]:
-        return _values(cast(Any, SimpleNamespace(rows=rows)), "standard", "diverged")
+        return _values(cast(Any, SimpleNamespace(trusted=rows)), "standard", "diverged")
 
     assert stands(row(False, True, 3), row(True, False, 2)) == {("p", 0): 0.0, ("p", 1): 0.0}
     assert stands(row(False, True, 2), row(False, False, 1)) == {("p", 0): 1.0, ("p", 1): 1.0}
