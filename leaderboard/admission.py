@@ -214,20 +214,23 @@ def _problems(file: Path, record: RunRecord) -> Iterator[str]:
             yield f"{where}{detail} breaks the rule that {rule.partition(' | ')[0]}: {MEND}"
 
 
-def _unknown_code(j: Judged) -> str | None:
+def _unknown_code(j: Judged) -> str:
+    found = []
     for number, part in enumerate(j.parts, 1):
         of = f"part {number}: " if number > 1 else ""
         if part.commit is None and not _is_released(part):
-            return f"{of}it names neither a commit nor a released version; use a git clone"
+            found.append(f"{of}it names neither a commit nor a released version; use a git clone")
         if part.commit is not None and part.dirty is not False:
-            return f"{of}its code is not in commit {part.commit[:12]}; commit all files first"
-        for extension in part.extensions:
-            if extension.distribution is None or extension.version is None:
-                return (
-                    f"{of}its {extension.kind} {extension.target} belongs to no installed "
-                    "distribution; install it as a package with an entry point"
-                )
-    return None
+            found.append(
+                f"{of}its code is not in commit {part.commit[:12]}; commit all files first"
+            )
+        found += [
+            f"{of}its {extension.kind} {extension.target} belongs to no installed distribution; "
+            "install it as a package with an entry point"
+            for extension in part.extensions
+            if extension.distribution is None or extension.version is None
+        ]
+    return ", and ".join(found)
 
 
 def _unknown_name(j: Judged) -> str | None:

@@ -166,14 +166,17 @@ def test_run_sweep_report_and_admission(site, tmp_path):
         shutil.copy(path, tmp_path / "committed" / f"{path.parent.name}.json")
     said = symsteer(tmp_path, "report", "--check", "committed", expect=2)
     assert "it uses the agent smooth of symsteer-lab 0.1.0" in said
-    expected = ("not in commit", "3 episodes, fewer than 100")
+    expected = (
+        "(3 of them) breaks the rule that episodes are as many as configured",
+        "; commit all files first) breaks the rule",
+    )
     unfair = {
         agent: [text for text in texts if not any(part in text for part in expected)]
         for agent, texts in problems(said).items()
     }
     assert unfair["smooth"] == []
     (refused,) = unfair["leashed"]
-    assert "leashed:LeashedAgent, which belongs to no installed distribution" in refused
+    assert "agent leashed:LeashedAgent belongs to no installed distribution" in refused
 
     # Without the package, as here.
     missing = "'smooth' of the distribution symsteer-lab, which is not installed; install it"
