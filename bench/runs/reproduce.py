@@ -15,7 +15,7 @@ import torch
 from symsteer.bench.runs.base_policy import origin, take_base
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.extensions import extensions_of
-from symsteer.bench.runs.folder import RECORD, is_finished, run_id
+from symsteer.bench.runs.folder import CONFIG, RECORD, is_finished, run_id
 from symsteer.bench.runs.run import check, check_device, execute
 from symsteer.bench.runs.stored import newer_options, read_back
 from symsteer.errors import UserError
@@ -101,11 +101,12 @@ def reproduce(
             repeat it, or the files or the base policy are not those that the run began from.
     """
     path = path / RECORD if (path / RECORD).is_file() else path
-    if path.is_dir():
+    if path.is_dir() and not (path / CONFIG).is_file():
         records = sorted(set(path.glob("*.json")) - set(path.glob(f"*{REPEATED}")))
-        path = secrets.choice(records or [path / RECORD])
+        path = secrets.choice(records or [path])
         if records:
             report(f"drawn at random from {len(records)} records: {path.name}")
+    path = path / RECORD if path.is_dir() else path
     if not path.is_file():
         raise UserError(f"there is no record {path}; name a record.json, or the folder of a run")
     record = read_record(path)

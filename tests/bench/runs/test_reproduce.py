@@ -238,7 +238,10 @@ def test_what_cannot_be_repeated_is_one_sentence(finished, tmp_path, monkeypatch
     assert "SymSteer 0.1" in refused(config=record.config | {"sac": {"width": 3}})
     strange = {**record.config, "files": {"weights": "0" * 64}}
     assert "files of a kind" in refused(config=strange)
-    for path in (tmp_path / "nowhere", tmp_path.parent):
+    unfinished = tmp_path / "unfinished"
+    unfinished.mkdir()
+    (unfinished / "config.json").write_text("{}")
+    for path in (tmp_path / "nowhere", tmp_path.parent, unfinished):
         code, shown = call(monkeypatch, capsys, path)
         assert code == 2
         assert "record.json" in shown.err or "nowhere" in shown.err
