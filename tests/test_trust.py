@@ -77,7 +77,10 @@ SMALL = {
 
 TEMPORARY = f"{tempfile.gettempdir()}/tmp"
 
-HARMLESS = ("/proc", "/ldconfig", "ffmpeg", "/gcc", "/ld", "uname", "lscpu")
+HARMLESS = (
+    *("/proc", "/ldconfig", "ffmpeg", "/gcc", "/ld", "uname", "lscpu", "nvidia-smi", "fc-list"),
+)
+"""Programs that torch, matplotlib and Python's platform module ask about the machine."""
 
 
 @pytest.fixture(scope="session")
@@ -102,7 +105,7 @@ def strangers(intact, tmp_path, monkeypatch) -> types.SimpleNamespace:
     monkeypatch.setenv("HOME", str(home))
     monkeypatch.setenv("CANARY", str(tmp_path / "CANARY"))
     monkeypatch.setenv("AUDIT", str(tmp_path / "audit"))
-    monkeypatch.setenv("HOMES", os.pathsep.join((str(place), "/dev", TEMPORARY)))
+    monkeypatch.setenv("HOMES", os.pathsep.join((str(place), f"{home}/.", "/dev", TEMPORARY)))
     artefacts = hostile.make(place, intact, intact.parent / "bundle.zip", secret)
     (tmp_path / "audit").touch()
     monkeypatch.chdir(place)
