@@ -151,9 +151,13 @@ class BatchedCpuMixin(BaseEnv):
         if self._camera_device is not None or _count(_DROPPED_SCENES) > MAX_DROPPED:
             gc.collect()
 
+    def _reconfigure(self, options: dict | None = None) -> None:
+        # Before the scenes are dropped: after a refusal they can still be used.
+        _make_room(self.num_envs)
+        super()._reconfigure(options or {})
+
     def _setup_scene(self) -> None:
         self._set_scene_config()
-        _make_room(self.num_envs)
         sub_scenes = []
         for _ in range(self.num_envs):
             systems: list[sapien.System] = [physx.PhysxCpuSystem()]

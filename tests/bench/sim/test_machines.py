@@ -126,6 +126,9 @@ def test_more_scenes_than_a_process_can_hold(monkeypatch):
     env = create(PickCubeEnv, 7, obs_mode="state")
     with pytest.raises(UserError, match=r"7 were asked for.*workers"):
         env.reset(seed=0, options={"reconfigure": True})
+    # The refused environment can still be used.
+    env.reset(seed=0)
+    assert env.step(torch.zeros(7, 8))[0].isfinite().all()
     with pytest.raises(UserError, match="workers"):
         create(PickCubeEnv, 13, obs_mode="state")
 
