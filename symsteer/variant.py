@@ -131,7 +131,7 @@ def parse_variant(
         raise UserError(
             f"variants must be joined with +, e.g. action_gain:0.5+wind:0.5, not {text!r}"
         )
-    parts = text.split("+")
+    parts = parts_of(text)
     specs: list[VariantSpec] = []
     for part in parts:
         # The name may be package.module:Class, so the strength follows the last colon.
@@ -151,6 +151,21 @@ def parse_variant(
         else:
             raise UserError(f"the variant {name!r} needs a strength in [0, 1], e.g. {name}:0.5")
     return tuple(specs)
+
+
+def parts_of(text: str) -> list[str]:
+    """The parts that ``+`` joins.
+
+    Raises:
+        UserError: if ``none`` is joined with others, or has a strength.
+    """
+    parts = text.split("+")
+    if text != UNBROKEN and any(part.partition(":")[0] == UNBROKEN for part in parts):
+        raise UserError(
+            f"none is the unbroken task and must stand alone, without a strength; leave it out of "
+            f"{text!r}, or write none"
+        )
+    return parts
 
 
 def specs_at(specs: Iterable[VariantSpec], share: float) -> tuple[VariantSpec, ...]:

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from symsteer.errors import UserError
-from symsteer.variant import UNBROKEN
+from symsteer.variant import UNBROKEN, parts_of
 
 LEVELS = {"easy": 0.1, "medium": 0.25, "hard": 0.5}
 """The defect of a decision, for the group C8."""
@@ -38,7 +38,7 @@ def with_numbers(text: str, task: str, embodiment: str) -> str:
         UserError: if the task was not audited with a variant, or no strength has such a defect.
     """
     parts = []
-    for part in text.split("+"):
+    for part in parts_of(text):
         name, colon, number = part.rpartition(":")
 
         def found(match: re.Match[str], name: str = name) -> str:

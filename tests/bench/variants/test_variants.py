@@ -34,7 +34,13 @@ NAMES = sorted(VARIANTS)
         ("wind:0.1+gravity_tilt:7", r"'gravity_tilt' must lie in \[0, 1\]"),
         ("action_gain:0.1+action_gain:0.2", "named twice"),
         ("action_gain:0.1+", "there is no variant ''"),
-        ("none+action_gain:0.1", "there is no variant 'none'"),
+        (
+            "none+action_gain:0.1",
+            "none .* must stand alone.* leave it out of 'none\\+action_gain:0",
+        ),
+        ("wind:0.1+none", "must stand alone"),
+        ("none:0.5", "must stand alone"),
+        ("none:hard", "must stand alone"),
         ("wind:0.5..0.2", r"must be a range such as 0.2..0.8 within \[0, 1\]; they are 0.5..0.2"),
         ("wind:0.5..", "no strength can be read"),
         ("wind:0..1.5", r"must lie in \[0, 1\]"),
@@ -45,7 +51,7 @@ NAMES = sorted(VARIANTS)
     ],
 )
 def test_bad_text_is_explained(text, part):
-    for reader in (parse, read):
+    for reader in (parse, read, functools.partial(read, place=("PickCube-v1", "floating"))):
         with pytest.raises(UserError, match=part) as error:
             reader(text)
         assert "\n" not in str(error.value)
