@@ -13,12 +13,14 @@ from symsteer.bench.audit.result import AuditResult, AuditSettings
 from symsteer.bench.audit.rollout import Actions, RolloutError, rotated_rollout_error
 from symsteer.bench.runs.base_policy import prepare_base
 from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.sim.environment import MAX_SCENES
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, task_class
 from symsteer.bench.variants import VARIANTS, read
 from symsteer.bench.variants.levels import with_numbers
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy
+from symsteer.policies.geometry import Group
 from symsteer.variant import UNBROKEN, lacks_strength, variant_text
 
 Progress = Callable[[AuditResult], None]
@@ -173,7 +175,7 @@ def compare_rollouts(
         group=settings.group,
         seed=settings.seed,
         variant=settings.variant,
-        batch=min(episodes, 25),
+        batch=min(episodes, 25, MAX_SCENES // Group.parse(settings.group).order),
         policy=policy,
     )
 

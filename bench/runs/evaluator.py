@@ -4,22 +4,64 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 
+from symsteer.agents import AGENTS
 from symsteer.agents.agent import Agent, Deterministic, HasCritic
 from symsteer.agents.episodes import LongEpisodes, Played, Rollout
 from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.sim.environment import MAX_SCENES
 from symsteer.bench.steering.evaluation import Act, long_episodes, long_limit, rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import DIAGNOSTIC_SEED, diagnostic_seeds, held_out_seeds
 from symsteer.bench.tasks import make
+from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.variant import VariantSpec
 
 LONG_ENVS = 32
 """Parallel environments of long episodes, at most."""
+
+
+def check_room(
+    configs: Sequence[RunConfig], workers: int = 1, trains: bool = True, cure: str = ""
+) -> None:
+    """Check that the processes of runs can hold all scenes, before anything is made.
+
+    Args:
+        configs: of the runs that share a process.
+        workers: processes that share the environments of a run.
+        trains: whether there are training environments.
+        cure: what to do instead; default: the options of `symsteer run`.
+
+    Raises:
+        UserError: if they cannot; it says how many scenes are needed.
+    """
+    held, most = 0, 1
+    for config in configs:
+        wanted, agent = config.evaluation, AGENTS.get(config.agent)
+        # The plain base policy has no training environments.
+        training = config.num_envs if trains and agent.prepare is not Agent.prepare else 0
+        limit = LONG_ENVS if issubclass(agent, HasCritic) else 0
+        long = min(wanted.diagnostic_episodes, limit)
+        final = min(wanted.final_diagnostic_episodes, limit)
+        # The final evaluation begins after the training environments are closed.
+        held += wanted.episodes + max(training + long, final)
+        most = max(most, training, wanted.episodes, final)
+    # A process has all environments, or a share of one kind. Fresh scenes are made before the
+    # former ones are freed.
+    needed = held + most if workers == 1 else 2 * math.ceil(most / min(workers, most))
+    if needed > MAX_SCENES and configs[0].sim == "cpu":
+        processes = max(2, math.ceil(most / (MAX_SCENES // 2)))
+        divide = f"use --workers {processes}, or " if processes <= configs[0].num_envs else ""
+        cure = cure or f"{divide}make fewer (--num-envs, --evaluation.episodes)"
+        raise UserError(
+            f"one process holds at most {MAX_SCENES} PhysX scenes, but {needed} are needed while "
+            f"those of {most} environments are replaced; {cure}"
+        )
 
 
 def make_env(

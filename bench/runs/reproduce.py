@@ -16,7 +16,7 @@ from symsteer.bench.runs.base_policy import origin, take_base
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.extensions import extensions_of
 from symsteer.bench.runs.folder import CONFIG, RECORD, is_finished, run_id
-from symsteer.bench.runs.run import check, check_device, execute
+from symsteer.bench.runs.run import check, check_all, check_device, execute
 from symsteer.bench.runs.stored import newer_options, read_back
 from symsteer.errors import UserError
 from symsteer.files import write_together
@@ -117,8 +117,11 @@ def reproduce(
         )
     config, files = _configuration(path, record)
     _check_files(record, files, demonstrations, policy)
-    place = _place(path, out, base_from is not None)
-    folder = place / run_id(config, files)
+    name, taking = run_id(config, files), base_from is not None
+    if out is None or not is_finished(_place(path, out, taking) / name):
+        check_all(config, workers)
+    place = _place(path, out, taking)
+    folder = place / name
     report(f"repeating {record.run_id} in {place}")
     report(f"the recorded run took {record.wall_clock.total / 60:.1f} minutes")
     here = Provenance.collect(config.device, torch.get_num_threads(), extensions_of(config))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ from symsteer.bench.runs.base_policy import (
 )
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.evaluator import Evaluator
+from symsteer.bench.runs.evaluator import Evaluator, check_room
 from symsteer.bench.runs.folder import (
     CONFIG,
     RECORD,
@@ -135,7 +136,7 @@ def execute(
         if demonstrations is not None:
             raise UserError("a base policy of yours needs no demonstrations; leave one of them out")
         config = with_policy_of(config, policy)
-    _check_all(config, workers)
+    check_all(config, workers)
     files = origin(demonstrations, policy)
 
     def prepare() -> ChunkPolicy:
@@ -169,7 +170,7 @@ def opened(
         together: number of runs in this process.
         tracking: a service that shows the run.
     """
-    _check_all(config, workers=1)
+    check_all(config, workers=1)
 
     def prepare() -> ChunkPolicy:
         return prepare_base(config, out, progress=False)
@@ -200,7 +201,7 @@ def resume(
     folder = named(folder)
     config, files = stored_config(folder)
     check_device(config, f"the run {folder.name}")
-    _check_all(config, workers)
+    check_all(config, workers)
 
     def check_own() -> None:
         if files:
@@ -269,7 +270,7 @@ def evaluate(
     run = restored(folder)
     config, folder = run.config, run.folder
     check_device(config, f"the run {folder.name}")
-    _check_all(config, workers)
+    check_all(config, workers, trains=False)
     share = 1.0 if run.state["final"] else run.state["env_steps"] / config.env_steps
     own = evaluation_variants(config.variants, share)
     variants = own if variant is None else read(variant, place=config.place)
@@ -310,7 +311,8 @@ def _alike(one: Episodes, other: Episodes) -> bool:
     return parts[0] == parts[1]
 
 
-def _check_all(config: RunConfig, workers: int) -> None:
+def check_all(config: RunConfig, workers: int, trains: bool = True) -> None:
+    """:func:`check`, and whether these processes can hold the run's environments."""
     check(config)
     if not 1 <= workers <= config.num_envs:
         raise UserError(
@@ -319,6 +321,7 @@ def _check_all(config: RunConfig, workers: int) -> None:
         )
     if workers > 1 and config.sim == "cuda":
         raise UserError("--workers needs --sim cpu: on CUDA one process simulates all environments")
+    check_room([config], workers, trains)
 
 
 @contextlib.contextmanager
@@ -365,5 +368,7 @@ def _opened(
             yield trainer
         except BaseException as error:
             trainer.stop(error)
-            error.add_note(f"continue the run with: symsteer resume {folder}")
+            words = ["symsteer", "resume", str(folder)]
+            words += ["--workers", str(workers)] if workers > 1 else []
+            error.add_note(f"continue the run with: {shlex.join(words)}")
             raise

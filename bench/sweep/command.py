@@ -9,11 +9,12 @@ import sys
 from rich.console import Console
 
 from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.evaluator import check_room
 from symsteer.bench.sweep.display import Display, LiveDisplay
 from symsteer.bench.sweep.estimate import Estimate, duration
 from symsteer.bench.sweep.plan import Plan, PlannedRun, manifest_path, write_manifest
 from symsteer.bench.sweep.pool import LocalPool
-from symsteer.bench.sweep.schedule import Outcome, Workers, execute_plan, tasks_of
+from symsteer.bench.sweep.schedule import Outcome, Workers, execute_plan, tasks_of, teams_of
 from symsteer.bench.sweep.survey import Sighting, look
 from symsteer.errors import UserError
 from symsteer.files import open_log
@@ -70,6 +71,8 @@ def run_plan(
             outcomes.append(Outcome(run, "skipped", seen.success))
         else:
             todo.append(run)
+    for team in teams_of(plan, todo, together):
+        check_room([plan.configs[run] for run in team], cure="lower --together")
     limit = workers if ray is not None else number
     log = manifest_path(plan.out, plan.name).with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)

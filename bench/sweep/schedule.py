@@ -127,7 +127,7 @@ def tasks_of(
             if shared:
                 shared.needed_by.append(run)
     runs = []
-    for team in _teams(plan, todo, together):
+    for team in teams_of(plan, todo, together):
         runs.append(_run_task(plan, team, patience))
         for base in {id(needs[run]): needs[run] for run in team}.values():
             _join(base, runs[-1])
@@ -140,7 +140,7 @@ def _run_task(plan: Plan, team: tuple[PlannedRun, ...], patience: float) -> Task
     return Task("run", team[0].label, play, args, team)
 
 
-def _teams(plan: Plan, todo: list[PlannedRun], together: int) -> list[tuple[PlannedRun, ...]]:
+def teams_of(plan: Plan, todo: list[PlannedRun], together: int) -> list[tuple[PlannedRun, ...]]:
     """Runs that differ in seeds and variants alone, up to ``together`` of them; others alone."""
     teams: list[list[PlannedRun]] = []
     open_teams: dict[RunConfig, list[PlannedRun]] = {}

@@ -236,6 +236,8 @@ def test_what_cannot_be_repeated_is_one_sentence(finished, tmp_path, monkeypatch
     assert "there is no agent 'approximate'" in gone
     assert f"commit {record.provenance.commit[:12]}: use that" in gone
     assert "SymSteer 0.1" in refused(config=record.config | {"sac": {"width": 3}})
+    many = refused(config=record.config | {"num_envs": 500, "env_steps": 10**6})
+    assert "PhysX scenes" in many
     strange = {**record.config, "files": {"weights": "0" * 64}}
     assert "files of a kind" in refused(config=strange)
     unfinished = tmp_path / "unfinished"

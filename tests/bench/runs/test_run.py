@@ -1,6 +1,8 @@
 """One run from demonstrations to the record: its files, its errors, its repeatability."""
 
+import contextlib
 import dataclasses
+import gc
 import itertools
 import json
 import shutil
@@ -9,13 +11,14 @@ import pytest
 import torch
 
 from symsteer.agents.sac import SacAgent
-from symsteer.bench.runs import trainer
+from symsteer.bench.runs import evaluator, trainer
 from symsteer.bench.runs.base_policy import prepare_base
 from symsteer.bench.runs.checkpoint import load_checkpoint
-from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
 from symsteer.bench.runs.folder import DEMONSTRATIONS, is_finished, run_id, state_of
-from symsteer.bench.runs.run import evaluate, execute, resume
+from symsteer.bench.runs.run import check_all, evaluate, execute, resume
 from symsteer.bench.runs.stored import stored_demonstrations
+from symsteer.bench.sim import environment
 from symsteer.bench.steering import evaluation
 from symsteer.bench.steering.seeds import HELD_OUT_SEED, held_out_seeds
 from symsteer.bench.tasks import task_class
@@ -229,6 +232,53 @@ def test_bad_numbers_of_workers_are_refused(change, tmp_path, monkeypatch):
     workers = change.pop("workers")
     with pytest.raises(UserError, match=r"--workers (is|needs)"):
         execute(tiny_config(**change), tmp_path, progress=False, workers=workers)
+
+
+ROOMY = {"num_envs": 500, "env_steps": 10**6}
+
+
+@pytest.mark.parametrize(
+    ("change", "workers", "words"),
+    [
+        (ROOMY, 1, "1005 are needed while those of 500 environments are replaced; use --workers 2"),
+        (ROOMY | {"num_envs": 3000}, 4, "but 1500 are needed .* use --workers 7"),
+        (
+            {"evaluation": EvaluationConfig(episodes=3000)},
+            1,
+            "; make fewer .*--evaluation.episodes",
+        ),
+        (ROOMY, 2, None),
+        (ROOMY | {"num_envs": 450, "evaluation": EvaluationConfig(episodes=450)}, 2, None),
+        (ROOMY | {"agent": "base"}, 1, None),
+    ],
+)
+def test_more_environments_than_processes_can_hold(change, workers, words, tmp_path):
+    config = tiny_config(**change)
+    if words is None:
+        return check_all(config, workers)
+    with pytest.raises(UserError, match=words):
+        execute(config, tmp_path, progress=False, workers=workers)
+    folder = tmp_path / run_id(config, {})
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps({**config.to_json(), "files": {}}))
+    with pytest.raises(UserError, match=words):
+        resume(folder, progress=False, workers=workers)
+    assert [p.name for p in tmp_path.rglob("*")] == [folder.name, "config.json"]
+
+
+@pytest.mark.long
+def test_a_run_needs_just_as_many_scenes_as_is_said(lend, tmp_path, monkeypatch):
+    lend(tmp_path)
+    monkeypatch.setattr(evaluator, "MAX_SCENES", 26)
+    with pytest.raises(UserError, match="at most 26 PhysX scenes, but 27 are"):
+        execute(tiny_config(num_envs=11), tmp_path, progress=False)
+    gc.collect()
+    there = environment._count(environment._LIVE_SCENES)
+    monkeypatch.setattr(evaluator, "MAX_SCENES", 27)
+    for spare in (0, -1):
+        monkeypatch.setattr(environment, "MAX_SCENES", there + 27 + spare)
+        with contextlib.nullcontext() if spare == 0 else pytest.raises(UserError, match="exist"):
+            execute(tiny_config(num_envs=11, seed=-spare), tmp_path, progress=False)
 
 
 def test_an_unwritable_folder_is_refused(tmp_path):
