@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from codecs import BOM_UTF8
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
@@ -135,7 +136,7 @@ def read_audit(path: Path | None = None) -> Audit:
 def parse_audit(data: bytes, path: Path) -> dict[Place, Defect]:
     """`read_audit` of a file's content; `path` is for messages."""
     try:
-        cells = _CELLS.validate_json(data)
+        cells = _CELLS.validate_json(data.removeprefix(BOM_UTF8))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         if first["loc"][1:] == ("version",):

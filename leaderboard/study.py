@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -16,6 +15,7 @@ from typing import Annotated, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from symsteer.errors import UserError
+from symsteer.files import read_toml
 from symsteer.leaderboard.records.provenance import committed_hash, git_hash
 from symsteer.names import unknown
 
@@ -153,13 +153,11 @@ def read_study(name_or_path: str) -> Study:
             measure, the message has the nearest valid one. Where git is there, also if the commit
             that the study names does not hold the claims as they are.
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml":
-        path = FOLDER / f"{name_or_path}.toml"
-    file, source = _read(path), path
+    file, source = _read(name_or_path)
+    path = source
     if file.claims:
-        source = path.parent / file.claims
-        if file.claim or (declaring := _read(source)).claims:
+        declaring, source = _read(str(path.parent / file.claims))
+        if file.claim or declaring.claims:
             raise UserError(
                 f"{path.name}: claims must name a file that declares claims itself, in place of own"
             )
@@ -194,19 +192,10 @@ def all_listed() -> frozenset[str]:
     return frozenset().union(*(read_list(path) or () for path in FOLDER.glob("*.toml")))
 
 
-def _read(path: Path) -> _File:
+def _read(name_or_path: str) -> tuple[_File, Path]:
+    data, path = read_toml(name_or_path, "study", FOLDER)
     try:
-        data = tomllib.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise unknown("study", path.stem, study_names()) from error
-    except OSError as error:
-        raise UserError(
-            f"the study {path} cannot be read: {error.strerror}; name another"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"the study {path} cannot be read as TOML: {error}; correct it") from error
-    try:
-        return _File.model_validate(data)
+        return _File.model_validate(data), path
     except ValidationError as error:
         raise UserError(f"{path.name}: {_problem(error)}") from error
 

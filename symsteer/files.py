@@ -1,15 +1,51 @@
-"""Atomic writing: a file has its complete old or its complete new content, never a part."""
+"""Reading TOML, and atomic writing: a file has its complete old or new content, never a part."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import sysconfig
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from symsteer.errors import UserError
+from symsteer.names import nearest
+
+
+def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any], Path]:
+    """The content of a TOML file, which may begin with a byte order mark, and its path.
+
+    Args:
+        name_or_path: name of a file in ``folder``, or the path of a ``.toml`` file.
+        kind: what the file is, for messages.
+        folder: of the files that come with SymSteer.
+
+    Raises:
+        UserError: if there is no such file, or it cannot be read.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        path = folder / f"{name_or_path}.toml"
+    try:
+        return tomllib.loads(path.read_text("utf-8-sig")), path
+    except FileNotFoundError as error:
+        names = sorted(path.stem for path in folder.glob("*.toml"))
+        close = nearest(path.stem, names)
+        hint = f"did you mean {close!r}? " if close else ""
+        raise UserError(
+            f"there is no {kind} {name_or_path!r}; {hint}use one of {', '.join(names)} or "
+            "the path of a .toml file"
+        ) from error
+    except OSError as error:
+        raise UserError(
+            f"the {kind} {path} cannot be read: {error.strerror}; name another file"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(
+            f"the {kind} {path} cannot be read as TOML: {error}; correct it there"
+        ) from error
 
 
 def away() -> contextlib.AbstractContextManager[None]:

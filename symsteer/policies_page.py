@@ -448,7 +448,7 @@ def finished(folder: Path) -> dict[str, Path]:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    return json.loads(path.read_text())["rows"] if path.is_file() else []
+    return json.loads(path.read_text("utf-8-sig"))["rows"] if path.is_file() else []
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -7,11 +7,10 @@ options for this agent only and has priority.
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-from symsteer.errors import UserError
+from symsteer.files import read_toml
 from symsteer.names import unknown
 
 T = TypeVar("T", bound=Any)
@@ -36,13 +35,7 @@ def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
         UserError: if there is no such preset, it is damaged, or it sets an option of the agent's
             own table that the agent does not have.
     """
-    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
-    try:
-        tables = tomllib.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise unknown("preset", name, preset_names()) from error
-    except (OSError, ValueError) as error:
-        raise UserError(f"the preset {path} cannot be read as TOML: {error}; correct it") from error
+    tables, path = read_toml(name, "preset", FOLDER)
     valid = [field.name for field in dataclasses.fields(options)]
     own = tables.get(agent, {})
     for key in own:

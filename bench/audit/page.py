@@ -133,7 +133,7 @@ def read_summary(path: Path) -> list[dict[str, Any]]:
         UserError: the file cannot be read, or is of another version.
     """
     try:
-        rows = json.loads(path.read_text())
+        rows = json.loads(path.read_text("utf-8-sig"))
         versions = {row.get("version", 1) for row in rows}
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(

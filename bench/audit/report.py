@@ -335,7 +335,7 @@ def read_result(path: Path) -> AuditResult:
         UserError: the file is missing or damaged.
     """
     try:
-        return AuditResult.from_json(json.loads(path.read_text()))
+        return AuditResult.from_json(json.loads(path.read_text("utf-8-sig")))
     except OSError as error:
         raise UserError(
             f"cannot read the audit {path}: {error.strerror}; name another, or run it again"

@@ -160,7 +160,7 @@ def _read_description(path: Path) -> dict[str, Any]:
             f"{side} is missing; ManiSkill trajectories are a pair of .h5 and .json, so copy both"
         )
     try:
-        description = json.loads(side.read_text(encoding="utf-8"))
+        description = json.loads(side.read_text("utf-8-sig"))
         return _Description.model_validate(description).model_dump(exclude_unset=True)
     except (ValueError, RecursionError) as error:
         problem = str(error)

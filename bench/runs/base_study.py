@@ -203,7 +203,7 @@ def _play_once(
     name = f"{file_name(cell.name)}-{cell.count}-s{cell.seed}-{key}.json"
     path = out / "base" / "study" / name
     if path.is_file():
-        found: list[dict[str, Any]] = json.loads(path.read_text())
+        found: list[dict[str, Any]] = json.loads(path.read_text("utf-8-sig"))
         return found
     rows = _play(config, cell, options, demos, episodes)
     write_json(path, rows)

@@ -126,7 +126,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG
     try:
-        data = json.loads(path.read_text())
+        data = json.loads(path.read_text("utf-8-sig"))
     except (FileNotFoundError, NotADirectoryError) as error:
         raise UserError(
             f"{folder} is not the folder of a run: it has no {CONFIG}; name a folder that "
@@ -144,7 +144,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 def read_progress(folder: Path) -> dict[str, Any] | None:
     """The contents of ``progress.json``; None if it is missing or damaged."""
     try:
-        data = json.loads((folder / PROGRESS).read_text())
+        data = json.loads((folder / PROGRESS).read_text("utf-8-sig"))
     except (OSError, ValueError, RecursionError):
         return None
     return data if isinstance(data, dict) and "env_steps" in data else None

@@ -192,7 +192,7 @@ class WandbLog:
 def _read(path: Path) -> dict[str, Any]:
     """The state of a run that was tracked before; nothing if there is none that can be read."""
     try:
-        state = json.loads(path.read_text())
+        state = json.loads(path.read_text("utf-8-sig"))
         return {"id": str(state["id"]), "group": state["group"], "step": int(state["step"])}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}

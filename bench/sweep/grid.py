@@ -12,14 +12,14 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from symsteer.errors import UserError
-from symsteer.names import nearest, unknown
+from symsteer.files import read_toml
+from symsteer.names import unknown
 from symsteer.variant import with_strength
 
 SUITES = Path(__file__).parent.parent / "suites"
@@ -79,40 +79,6 @@ def read_suite(name_or_path: str) -> SuiteData:
         UserError: if there is no such suite, or the file is not a suite.
     """
     return suite_data(*read_toml(name_or_path, "suite", SUITES))
-
-
-def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any], Path]:
-    """The content of a TOML file, and its path.
-
-    Args:
-        name_or_path: name of a file in ``folder``, or the path of a ``.toml`` file.
-        kind: what the file is, for messages.
-        folder: of the files that come with SymSteer.
-
-    Raises:
-        UserError: if there is no such file, or it cannot be read.
-    """
-    path = Path(name_or_path)
-    if path.suffix != ".toml":
-        path = folder / f"{name_or_path}.toml"
-    try:
-        return tomllib.loads(path.read_text()), path
-    except FileNotFoundError as error:
-        names = sorted(path.stem for path in folder.glob("*.toml"))
-        close = nearest(name_or_path, names)
-        hint = f"did you mean {close!r}? " if close else ""
-        raise UserError(
-            f"there is no {kind} {name_or_path!r}; {hint}use one of {', '.join(names)} or "
-            "the path of a .toml file"
-        ) from error
-    except OSError as error:
-        raise UserError(
-            f"the {kind} {path} cannot be read: {error.strerror}; name another file"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(
-            f"the {kind} {path.name} cannot be read as TOML: {error}; correct it there"
-        ) from error
 
 
 def suite_data(data: dict[str, Any], path: Path) -> SuiteData:

@@ -204,7 +204,7 @@ def read_manifest(path: Path) -> Manifest:
         UserError: if the file is not such a list.
     """
     try:
-        return TypeAdapter(Manifest).validate_python(json.loads(path.read_text()))
+        return TypeAdapter(Manifest).validate_python(json.loads(path.read_text("utf-8-sig")))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path} is not the list of a sweep; run the sweep again to replace it"

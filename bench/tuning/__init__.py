@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
+
+from symsteer.files import read_toml
 
 FOLDER = Path(__file__).parent / "plans"
 
@@ -11,6 +12,6 @@ FOLDER = Path(__file__).parent / "plans"
 def plan_summaries() -> dict[str, str]:
     """The tuning plans that come with SymSteer, and their descriptions. Light to import."""
     return {
-        path.stem: tomllib.loads(path.read_text())["description"]
+        path.stem: read_toml(path.stem, "tuning plan", FOLDER)[0]["description"]
         for path in sorted(FOLDER.glob("*.toml"))
     }

@@ -227,7 +227,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _read(path: Path) -> Any:
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text("utf-8-sig"))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as trials: {error}") from None
 

@@ -22,10 +22,11 @@ from typing import Any
 
 from symsteer.agents import AGENTS
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.sweep.grid import read_toml, suite_data
+from symsteer.bench.sweep.grid import suite_data
 from symsteer.bench.sweep.suite import suite_of
 from symsteer.bench.tuning import FOLDER
 from symsteer.errors import UserError
+from symsteer.files import read_toml
 from symsteer.names import unknown
 
 NUMBERS = {"trials": 20, "exchange": 0, "batch": 4, "probe": 2, "seed": 0}

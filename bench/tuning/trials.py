@@ -133,7 +133,8 @@ def read_scores(path: Path) -> dict[str, Score]:
     if not path.is_file():
         return {}
     try:
-        return {name: Score(**score) for name, score in json.loads(path.read_text()).items()}
+        scores = json.loads(path.read_text("utf-8-sig"))
+        return {name: Score(**score) for name, score in scores.items()}
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path} is not a file of scores ({error}); delete it, and the search goes on with the "

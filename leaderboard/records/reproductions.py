@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from codecs import BOM_UTF8
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
@@ -209,7 +210,8 @@ def read_reproductions(folder: Path) -> dict[str, Reproduction]:
     found = {}
     for path in sorted(set(folder.glob("*.json")) - set(folder.glob(f"*{REPEATED}"))):
         try:
-            reproduction = Reproduction.model_validate_json(path.read_bytes())
+            data = path.read_bytes().removeprefix(BOM_UTF8)
+            reproduction = Reproduction.model_validate_json(data)
         except OSError as error:
             raise UserError(f"{path} cannot be read: {error.strerror}") from error
         except ValidationError as error:

@@ -155,7 +155,7 @@ def _maps(audit: Path | None) -> Iterator[MapPicture]:
     for folder in found:
         path = folder / RESULT
         try:
-            settings = json.loads(path.read_text())["settings"]
+            settings = json.loads(path.read_text("utf-8-sig"))["settings"]
             words = [settings[key] for key in ("task", "embodiment", "variant")]
             if not all(isinstance(word, str) for word in words):
                 raise ValueError("names must be texts")

@@ -498,6 +498,13 @@ def test_foreign_files_are_refused(tmp_path: Path, text: bytes, word: str) -> No
         read_record(path)
 
 
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    path, _ = stored(tmp_path)
+    before = read_record(path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert read_record(path) == before
+
+
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.json", tmp_path):
         with pytest.raises(UserError, match="cannot be read"):

@@ -1,5 +1,6 @@
 """Suites as data: products, defaults, mistakes."""
 
+import functools
 import json
 import re
 from dataclasses import replace
@@ -7,18 +8,22 @@ from dataclasses import replace
 import pytest
 
 from symsteer.agents import AGENTS
+from symsteer.agents.presets import FOLDER as PRESETS
 from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.base_policy import find_base
 from symsteer.bench.runs.config import build_config
 from symsteer.bench.sweep.command import preview
-from symsteer.bench.sweep.grid import read_suite, suite_names
+from symsteer.bench.sweep.grid import SUITES, read_suite, suite_names
 from symsteer.bench.sweep.plan import BASIC, make_plan
 from symsteer.bench.sweep.schedule import tasks_of
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.bench.tasks import task_class
+from symsteer.bench.tuning import FOLDER as PLANS
+from symsteer.bench.tuning.plan import read_plan
 from symsteer.errors import UserError
 from symsteer.leaderboard.paths import RECORDS, RESULTS
 from symsteer.leaderboard.records import read_record
+from symsteer.leaderboard.study import FOLDER as STUDIES
 from symsteer.leaderboard.study import read_study
 from symsteer.leaderboard.summary import Key
 from symsteer.policies import POLICIES
@@ -269,6 +274,38 @@ def test_options_in_which_runs_differ_are_shown(tmp_path):
 def test_mistakes_in_a_suite(text, words, tmp_path):
     with pytest.raises(UserError, match=words):
         load_suite(write(tmp_path, text))
+
+
+READERS = {
+    "suite": (read_suite, SUITES / "smoke.toml"),
+    "tuning plan": (read_plan, PLANS / "core.toml"),
+    "study": (read_study, STUDIES / "explored.toml"),
+    "preset": (
+        functools.partial(preset_options, agent="standard", options=AGENTS.get("standard").Options),
+        PRESETS / "dsrl.toml",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_every_kind_of_toml_file_is_read_alike(kind, tmp_path):
+    read, shipped = READERS[kind]
+    content, path = shipped.read_bytes(), tmp_path / shipped.name
+    path.write_bytes(b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n"))
+    assert read(str(path)) is not None
+    bad = [b"not toml", content.decode().encode("utf-16"), b"\xff", b"a = " + b"[" * 5000]
+    for wrong in bad:
+        path.write_bytes(wrong)
+        with pytest.raises(UserError, match=f"the {kind} {path} cannot be read as TOML: .*correct"):
+            read(str(path))
+    path.unlink()
+    with pytest.raises(UserError, match=f"there is no {kind} '{path}'; .*use one of .*{path.stem}"):
+        read(str(path))
+    path.mkdir()
+    with pytest.raises(
+        UserError, match=f"the {kind} {path} cannot be read: Is a dir.*name another"
+    ):
+        read(str(path))
 
 
 def test_an_unknown_suite_lists_the_known_ones():
