@@ -12,6 +12,7 @@ import tyro
 
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.terminal import to_paste
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 
@@ -93,12 +94,12 @@ def new(
             texts[test].replace(unused, "").replace("Field, Group, Layout", "Field, Layout")
         )
     write_together({path: text.encode() for path, text in texts.items()})
-    where = "" if out == Path() else f"cd {out}\n"
+    where = "" if out == Path() else f"{to_paste('cd', out)}\n"
     target = f"{module}:{values['Class']}"
     print(
         f"wrote {' and '.join(map(str, files))}\n\n"
         f"{where}python -m pytest test_{module}.py\n"
-        f"symsteer run --agent {target} --env-steps 10000\n"
+        f"{to_paste('symsteer', 'run', '--agent', target, '--env-steps', 10000)}\n"
         "symsteer site runs   # its page: site/index.html\n\n"
         "docs/submit.md: what an agent can override, how to compare it with others and submit it"
     )

@@ -18,7 +18,7 @@ import tyro
 
 from symsteer.errors import UserError
 from symsteer.registry import allow
-from symsteer.terminal import BOARD, complain, printable
+from symsteer.terminal import BOARD, complain, printable, to_paste
 
 if TYPE_CHECKING:
     from symsteer.registry import Registry
@@ -249,8 +249,8 @@ def sweep(
     elsewhere = sum(outcome.status == "elsewhere" for outcome in outcomes)
     if elsewhere:
         print(
-            f"another process works on {elsewhere} of the runs; `symsteer status {out}` shows "
-            "when they are finished",
+            f"another process works on {elsewhere} of the runs; this shows when they are finished: "
+            f"{to_paste('symsteer', 'status', out)}",
             file=sys.stderr,
         )
     return 1 if failed or elsewhere else 0
@@ -517,7 +517,7 @@ def export(
         print(f"the bundle has no demonstrations: {found.left_out}", file=sys.stderr)
     held = [file.path for file in manifest.files]
     print(f"wrote {out} ({out.stat().st_size / 2**20:.1f} MiB): {', '.join(held)}")
-    print(f"unpack it anywhere with: symsteer fetch-bundle {out}")
+    print(f"unpack it anywhere with: {to_paste('symsteer', 'fetch-bundle', out)}")
     return 0
 
 
@@ -825,8 +825,8 @@ def _print_places(folder: Path) -> None:
     """Print where the results of a finished run are."""
     out = folder.parent
     print(f"record:      {folder / 'record.json'}")
-    print(f"TensorBoard: tensorboard --logdir {out}  then {BOARD}")
-    print(f"leaderboard: symsteer report {out} --out {out / 'leaderboard'}")
+    print(f"TensorBoard: {to_paste('tensorboard', '--logdir', out)}  then {BOARD}")
+    print(f"leaderboard: {to_paste('symsteer', 'report', out, '--out', out / 'leaderboard')}")
 
 
 def _summaries(registry: Registry[Any]) -> list[tuple[str, str]]:

@@ -41,6 +41,7 @@ from symsteer.leaderboard.summary import (
     area_pairs,
     success_pairs,
 )
+from symsteer.terminal import to_paste
 from symsteer.variant import UNBROKEN, VariantSpec, parse_variant, variant_text
 
 AUDIT = Path(__file__).resolve().parent / "results" / "audit" / "summary.json"
@@ -212,8 +213,10 @@ def audit_commands(keys: Sequence[Key]) -> list[str]:
             if key.variant not in variants:
                 variants.append(key.variant)
     return [
-        f"symsteer audit --task {task} --embodiment {embodiment} --group {group} "
-        f"--variant {' '.join(variants)} --out runs/audit"
+        to_paste(
+            *("symsteer", "audit", "--task", task, "--embodiment", embodiment, "--group", group),
+            *("--variant", *variants, "--out", "runs/audit"),
+        )
         for (task, embodiment, group), variants in wanted.items()
     ]
 

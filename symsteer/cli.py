@@ -23,7 +23,7 @@ from pathlib import Path
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
 from symsteer.names import unknown
-from symsteer.terminal import BOARD, complain
+from symsteer.terminal import BOARD, complain, to_paste
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
@@ -148,7 +148,7 @@ def demo(out: Path = Path("runs/demo")) -> int:
     print(f"\n{glance((out,))}")
     print(
         f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
-        f"\nSee the runs:          {_script('tensorboard')} --logdir {out}"
+        f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', out)}"
         f"  then {BOARD}"
     )
     return exit_code

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from typing import Any
 
@@ -31,6 +32,11 @@ def option_words(name: str, value: Any) -> list[str]:
         return ["--" + ".".join([*tables, last if value else f"no-{last}"])]
     values = value if isinstance(value, list) else [value]
     return ["--" + ".".join([*tables, last]), *map(str, values)]
+
+
+def to_paste(*words: object) -> str:
+    """Words as a command that can be pasted into a shell."""
+    return shlex.join(map(str, words))
 
 
 def complain(error: BaseException, text: str, code: int) -> int:

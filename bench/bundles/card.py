@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from symsteer.bench.bundles.manifest import BundledFile, Code, next_commands
 from symsteer.bench.bundles.measure import Measured
 from symsteer.bench.tasks import TASKS
 from symsteer.leaderboard.records import flat
-from symsteer.terminal import option_words
+from symsteer.terminal import option_words, to_paste
 
 LICENCE = "Apache-2.0"
 """Of SymSteer, and so of the demonstrations and policies that it makes."""
@@ -88,11 +87,11 @@ def how_made(contents: Contents) -> str:
     """The command that makes the same files, or where they came from."""
     config = contents.config
     wanted = config.demonstrations
-    world = f"--task {shlex.quote(config.task)} --embodiment {config.embodiment}"
+    world = ("--task", config.task, "--embodiment", config.embodiment)
     if contents.policy is None:
-        command = (
-            f"symsteer demos {shlex.quote(contents.name)}.h5 {world} --count {wanted.count} "
-            f"--mode {wanted.mode} --seed {wanted.seed}"
+        command = to_paste(
+            *("symsteer", "demos", f"{contents.name}.h5", *world, "--count", wanted.count),
+            *("--mode", wanted.mode, "--seed", wanted.seed),
         )
         return f"```sh\n{command}\n```"
     if contents.origin:
@@ -100,15 +99,16 @@ def how_made(contents: Contents) -> str:
         return f"The run that it was taken from began with files of its user: {files}."
     defaults = flat(type(config.policy)().to_json())
     options = [
-        f" {shlex.join(option_words(f'policy.{key}', value))}"
+        word
         for key, value in flat(config.policy.to_json()).items()
         if value != defaults[key]
+        for word in option_words(f"policy.{key}", value)
     ]
-    command = (
-        f"symsteer run {world} --policy.name {shlex.quote(config.policy_name)} "
-        f"--policy-seed {config.policy_seed} --demonstrations.mode {wanted.mode} "
-        f"--demonstrations.count {wanted.count} --demonstrations.seed {wanted.seed}"
-        f"{''.join(options)}"
+    command = to_paste(
+        *("symsteer", "run", *world, "--policy.name", config.policy_name),
+        *("--policy-seed", config.policy_seed, "--demonstrations.mode", wanted.mode),
+        *("--demonstrations.count", wanted.count, "--demonstrations.seed", wanted.seed),
+        *options,
     )
     return f"`symsteer run` trains this policy before it steers it:\n\n```sh\n{command}\n```"
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import re
-import shlex
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from symsteer.leaderboard.records import Provenance
+from symsteer.terminal import to_paste
 
 FORMAT: Final = "symsteer-bundle"
 VERSION: Final = 1
@@ -109,11 +109,10 @@ def next_commands(
     task: str, embodiment: str, policy: Path | None, demonstrations: Path | None, count: int
 ) -> list[str]:
     """Commands that use an unpacked base policy, and ``count`` unpacked demonstrations."""
-    run = f"symsteer run --task {shlex.quote(task)} --embodiment {embodiment}"
+    run = ("symsteer", "run", "--task", task, "--embodiment", embodiment)
     commands = []
     if policy is not None:
-        commands.append(f"{run} --base-policy {shlex.quote(str(policy))}")
+        commands.append(to_paste(*run, "--base-policy", policy))
     if demonstrations is not None:
-        file = shlex.quote(str(demonstrations))
-        commands.append(f"{run} --demos {file} --demonstrations.count {count}")
+        commands.append(to_paste(*run, "--demos", demonstrations, "--demonstrations.count", count))
     return commands

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shlex
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -49,6 +48,7 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, read_record
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import save_policy
+from symsteer.terminal import to_paste
 from symsteer.variant import specs_at, variant_text
 
 
@@ -368,7 +368,6 @@ def _opened(
             yield trainer
         except BaseException as error:
             trainer.stop(error)
-            words = ["symsteer", "resume", str(folder)]
-            words += ["--workers", str(workers)] if workers > 1 else []
-            error.add_note(f"continue the run with: {shlex.join(words)}")
+            how = ("--workers", workers) if workers > 1 else ()
+            error.add_note(f"continue the run with: {to_paste('symsteer', 'resume', folder, *how)}")
             raise

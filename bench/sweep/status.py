@@ -13,6 +13,7 @@ from symsteer.bench.sweep.plan import BASIC, PlannedRun, manifest_path, read_man
 from symsteer.bench.sweep.survey import Sighting, look
 from symsteer.errors import UserError
 from symsteer.names import unknown
+from symsteer.terminal import to_paste
 
 STATES = ("finished", "running", "interrupted", "failed", "missing")
 
@@ -127,7 +128,8 @@ def _unlisted(folder: Path) -> dict[PlannedRun, Sighting]:
 def to_text(found: list[Status], folder: Path) -> str:
     """:attr:`Overview.found` as text."""
     if not found:
-        return f"there are no runs in {folder} yet; start some: symsteer sweep SUITE --out {folder}"
+        start = to_paste("symsteer", "sweep", "SUITE", "--out", folder)
+        return f"there are no runs in {folder} yet; start some: {start}"
     return "\n\n".join(_text(status) for status in found)
 
 

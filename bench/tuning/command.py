@@ -34,6 +34,7 @@ from symsteer.bench.tuning.trials import (
 )
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
+from symsteer.terminal import to_paste
 
 STATES: Mapping[TrialState, State] = {
     TrialState.COMPLETE: "complete",
@@ -257,7 +258,7 @@ class Tuner:
         write_json(places["trials"], {**about, **to_json(self.results, chosen)})
         if chosen:
             words = (
-                f"Chosen by `symsteer tune {self.plan.name}`, "
+                f"Chosen by `{to_paste('symsteer', 'tune', self.plan.name)}`, "
                 f"{self.plan.listed + self.plan.exchange} trials an agent."
             )
             write_atomically(places["preset"], to_preset(chosen, words).encode())

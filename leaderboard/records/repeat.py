@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Mapping
 from typing import Any
 
 from symsteer.leaderboard.records.values import flat
-from symsteer.terminal import option_words
+from symsteer.terminal import option_words, to_paste
 
 DERIVED = ("evaluation_variant", "files")
 """Keys that the run adds to its configuration."""
@@ -60,4 +59,4 @@ def repeat_command(config: Mapping[str, Any]) -> str | None:
         if key not in FILES:
             return None
         words += FILES[key]
-    return shlex.join(words)
+    return to_paste(*words)

@@ -1,7 +1,11 @@
 """What a user sees: verbs, and one sentence with exit code 2 for each mistake."""
 
+import ast
+import itertools
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 from importlib.metadata import version
@@ -11,6 +15,8 @@ import h5py
 import pytest
 import torch
 
+import symsteer as symsteer_package
+from symsteer import bench
 from symsteer.bench.demos import collect
 from symsteer.bench.tasks import task_class
 from symsteer.cli import VERBS, _threads, main
@@ -229,6 +235,40 @@ def test_doctor_names_what_there_is(monkeypatch, capsys):
     out = capsys.readouterr().out
     assert "CUDA" in out
     assert "rendering" in out.lower()
+
+
+def test_commands_can_be_pasted(monkeypatch, capsys, tmp_path):
+    out = tmp_path / "my runs; x$(y)'s"
+    out.mkdir()
+    assert symsteer(monkeypatch, "status", out) == 0
+    *_, command = capsys.readouterr().out.partition("start some: ")
+    assert shlex.split(command) == ["symsteer", "sweep", "SUITE", "--out", str(out)]
+    bench.cli._print_places(out / "run")
+    board, page = capsys.readouterr().out.splitlines()[1:]
+    assert shlex.split(board)[1:4] == ["tensorboard", "--logdir", str(out)]
+    expected = ["symsteer", "report", str(out), "--out", str(out / "leaderboard")]
+    assert shlex.split(page)[1:] == expected
+    assert symsteer(monkeypatch, "new", "agent", "mine", "--out", out) == 0
+    move = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("cd "))
+    assert shlex.split(move) == ["cd", str(out)]
+
+
+COMMAND = re.compile(r"(symsteer [a-z][a-z-]+|tensorboard|\bcd)( [\w.-]+)* $")
+
+
+def test_no_command_has_words_that_are_not_quoted():
+    """In no text of the source a value follows the words of a command, but one of to_paste."""
+    root = Path(symsteer_package.__file__).parents[1]
+    files = [f for f in root.glob("[!.]*/**/*.py") if f.parts[len(root.parts)] != "tests"]
+    found = []
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_bytes())):
+            parts = node.values if isinstance(node, ast.JoinedStr) else []
+            for before, value in itertools.pairwise(parts):
+                text = before.value if isinstance(before, ast.Constant) else ""
+                if COMMAND.search(str(text)) and isinstance(value, ast.FormattedValue):
+                    found.append(f"{file}:{value.lineno}")
+    assert (len(files) > 200, found) == (True, [])
 
 
 def test_the_module_is_the_same_program():
