@@ -78,10 +78,6 @@ def new(
     for path in files:
         if path.exists():
             raise UserError(f"{path} is there already; choose another name, or a folder with --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"no folder {out} can be made: {error.strerror}; choose another") from error
     texts = {
         path: Template((TEMPLATES / template).read_text()).substitute(values)
         for path, template in files.items()

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from symsteer.errors import UserError
+from symsteer.files import prepare_folder, write_atomically
 from symsteer.registry import allow
 from symsteer.terminal import BOARD, complain, printable, to_paste
 
@@ -500,6 +501,7 @@ def export(
     else:
         write_dataset = _lerobot(out)
         wanted = "demonstrations"
+    prepare_folder(out.parent)
     if run is not None:
         found = contents_of_run(run, wanted)
     else:
@@ -691,7 +693,6 @@ def detect(
     from symsteer.bench.detect import report
     from symsteer.bench.detect.study import detect
     from symsteer.bench.runs.folder import write_json
-    from symsteer.files import write_atomically
 
     if not runs:
         raise UserError("name the folder of a run, e.g. symsteer detect runs/PushCube-v1-...")
@@ -699,6 +700,8 @@ def detect(
     def progress(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
+    if out is not None:
+        prepare_folder(out)
     found = []
     for run in runs:
         if len(runs) > 1:

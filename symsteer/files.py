@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import shutil
 import sysconfig
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -80,7 +82,7 @@ def write_together(
             files then keep their old content. One exception: if a rename fails, some files are
             old and some are new.
     """
-    staged: list[tuple[Path, Path]] = []
+    written: list[tuple[Path, Path]] = []
     path = Path()
     try:
         for path, data in files.items():
@@ -88,13 +90,13 @@ def write_together(
             if path.is_dir():
                 raise UserError(f"{path} is a folder; remove it or choose another path")
             temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-            staged.append((temporary, path))
+            written.append((temporary, path))
             with open(temporary, "wb") as file:
                 file.write(data)
                 if durable:
                     file.flush()
                     os.fsync(file.fileno())
-        for temporary, path in staged:
+        for temporary, path in written:
             os.replace(temporary, path)
         for path in stale:
             path.unlink()
@@ -102,13 +104,52 @@ def write_together(
             for path in {path.parent for path in files}:
                 _sync_folder(path)
     except OSError as error:
-        raise UserError(
-            f"{path} cannot be written: {error.strerror}; free space or choose another folder"
-        ) from error
+        raise _unwritable(path, error) from error
     finally:
-        for temporary, _ in staged:
+        for temporary, _ in written:
             with contextlib.suppress(OSError):
                 temporary.unlink()
+
+
+@contextlib.contextmanager
+def staged(path: Path) -> Iterator[Path]:
+    """A temporary name beside a file or folder, for libraries that write by themselves.
+
+    What is there at the end of the block gets the right name. After an error it is removed.
+
+    Raises:
+        UserError: if it cannot be written; an earlier file keeps its content.
+    """
+    temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")  # libraries look at its ending
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make a folder, before what is written to it is computed.
+
+    Raises:
+        UserError: if it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> UserError:
+    reason = error.strerror or str(error).partition("\n")[0]
+    return UserError(f"{path} cannot be written: {reason}; free space or choose another folder")
 
 
 def _sync_folder(folder: Path) -> None:

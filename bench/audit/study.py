@@ -18,6 +18,7 @@ from symsteer.bench.tasks import EMBODIMENTS, TASKS, task_class
 from symsteer.bench.variants import VARIANTS, read
 from symsteer.bench.variants.levels import with_numbers
 from symsteer.errors import UserError
+from symsteer.files import prepare_folder
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy
 from symsteer.policies.geometry import Group
@@ -102,12 +103,7 @@ def run_audits(
         # Refuse a bad file before the simulation starts.
         _policy(wanted[0], runs, base_policy, progress)
     if out is not None:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(
-                f"cannot write to {out}: {error.strerror}; choose another folder with --out"
-            ) from error
+        prepare_folder(out)
     folders = {
         settings: None if out is None else out / settings.name if len(wanted) > 1 else out
         for settings in wanted

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import imageio.v2 as imageio
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from symsteer.bench.demos.files import opened
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.film import FRAMES_PER_SECOND
+from symsteer.bench.runs.film import write_video
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA
 
@@ -51,24 +50,19 @@ def film_demonstrations(
         A part of the pixels of each episode, ``[T, height, width, 3]`` uint8.
 
     Raises:
-        UserError: if there is no Vulkan driver.
+        UserError: if there is no Vulkan driver, or the file cannot be written.
     """
-    out.parent.mkdir(parents=True, exist_ok=True)
-    writer = imageio.get_writer(
-        out,
-        fps=FRAMES_PER_SECOND,
-        codec="libx264",
-        pixelformat="yuv420p",
-        quality=None,
-        macro_block_size=1,
-        output_params=list(ENCODING),
-    )
     pixels: list[list[np.ndarray]] = [[] for _ in lengths]
-    with writer, tqdm(total=sum(lengths), desc="video", disable=None) as bar:
-        for episode, frame in _frames(config, demonstrations, lengths):
-            writer.append_data(frame)
-            pixels[episode].append(frame[::STRIDE, ::STRIDE])
-            bar.update()
+
+    def frames() -> Iterator[np.ndarray]:
+        with tqdm(total=sum(lengths), desc="video", disable=None) as bar:
+            for episode, frame in _frames(config, demonstrations, lengths):
+                pixels[episode].append(frame[::STRIDE, ::STRIDE])
+                yield frame
+                bar.update()
+
+    how = {"codec": "libx264", "pixelformat": "yuv420p", "quality": None}
+    write_video(out, frames(), **how, output_params=list(ENCODING))
     return [np.stack(frames) for frames in pixels]
 
 

@@ -8,8 +8,6 @@ last observation of an episode is left out. The gripper's fields are LeRobot's
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -31,6 +29,7 @@ from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import TASKS, task_class
 from symsteer.bench.tasks.embodiments import BODIES
 from symsteer.errors import UserError
+from symsteer.files import staged
 from symsteer.policies.geometry import Field, Layout
 
 VERSION = "v3.0"
@@ -74,7 +73,8 @@ def write_dataset(
         What was written, in one line.
 
     Raises:
-        UserError: if ``out`` exists, or a video is wanted and nothing renders here.
+        UserError: if ``out`` exists or cannot be written, or a video is wanted and nothing renders
+            here.
     """
     check_folder(out)
     assert contents.demonstrations is not None
@@ -82,8 +82,7 @@ def write_dataset(
     demos = load(path, config.task, config.embodiment, config.demonstrations.count)
     lengths = [len(actions) for _, actions in demos.episodes]
     film = videos == "on" or (videos == "auto" and rendering_works())
-    partial = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    try:
+    with staged(out) as partial:
         pixels = None
         if film:
             file = partial / "videos" / IMAGE / f"{FIRST}.mp4"
@@ -92,9 +91,6 @@ def write_dataset(
         card = dataset_card(contents, len(lengths), sum(lengths), film)
         (partial / "README.md").write_text(card)
         _write_json(partial / "meta/symsteer.json", _origin(config))
-        os.replace(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     seen = "with a video" if film else "without a video"
     why = "" if film or videos == "off" else ", because no Vulkan driver was found"
     return f"wrote {out}: {len(lengths)} episodes, {sum(lengths)} frames, {seen}{why}"

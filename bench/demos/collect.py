@@ -22,6 +22,7 @@ from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
+from symsteer.files import prepare_folder
 from symsteer.names import unknown
 
 
@@ -115,14 +116,7 @@ def collect(
     if mode not in MODES:
         raise unknown("mode", mode, MODES)
     settings = diversity or MODES[mode]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"no folder can be made for {path}: {error.strerror}; choose another place"
-        ) from error
-    if not os.access(path.parent, os.W_OK):
-        raise UserError(f"{path.parent} cannot be written to; choose another folder")
+    prepare_folder(path.parent)
     env = make(
         task, num_envs=min(num_envs, 2 * count), embodiment=embodiment, variant=variant, sim=sim
     )

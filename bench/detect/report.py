@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from symsteer.bench.audit.result import BIN
 from symsteer.bench.detect.study import Detection, Found, mean_of_runs
 from symsteer.bench.detect.truth import BODIES
 from symsteer.bench.runs.folder import write_json
+from symsteer.files import write_atomically
 
 LEAST_COPIES = 3
 """A square with fewer copies is left out of a map."""
@@ -114,9 +116,10 @@ def _range(values: Sequence[float], form: str) -> str:
 
 def write(folder: Path, found: Found) -> None:
     """Write ``detect.json`` and ``detect.png``."""
-    folder.mkdir(parents=True, exist_ok=True)
+    picture = io.BytesIO()
+    maps(found).savefig(picture, format="png", dpi=120)
+    write_atomically(folder / "detect.png", picture.getvalue())
     write_json(folder / "detect.json", to_json(found))
-    maps(found).savefig(folder / "detect.png", dpi=120)
 
 
 def maps(found: Found) -> Figure:

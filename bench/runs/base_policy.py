@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from symsteer.bench.steering.evaluation import DRAWS, Steerability, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
+from symsteer.files import write_together
 from symsteer.leaderboard.records import BasePolicy, flat
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
@@ -175,13 +175,12 @@ def take_base(config: RunConfig, content_hash: str, runs: Path, out: Path) -> No
             "demonstrations; name a folder of runs that has, or leave --base-from out to make them "
             "anew"
         )
-    (out / "base").mkdir(parents=True, exist_ok=True)
-    for path in demos.values():
-        for source in (path, path.with_suffix(".json")):
-            shutil.copyfile(source, out / "base" / source.name)
     count = config.demonstrations.count
     loaded = {name: load(path, name, config.embodiment, count) for name, path in demos.items()}
-    shutil.copytree(same[0], _policy_folder(config, out, loaded), dirs_exist_ok=True)
+    pairs = [file for path in demos.values() for file in (path, path.with_suffix(".json"))]
+    files = {out / "base" / file.name: file.read_bytes() for file in pairs}
+    place = _policy_folder(config, out, loaded)
+    write_together(files | {place / file.name: file.read_bytes() for file in same[0].iterdir()})
 
 
 def demonstration_path(config: RunConfig, out: Path) -> Path:

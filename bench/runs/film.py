@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import errno
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
+from imageio_ffmpeg import count_frames_and_secs
 
 from symsteer.bench.caption import captioned
 from symsteer.bench.runs.evaluator import Evaluator
@@ -26,7 +29,7 @@ from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.variants import evaluation_variants, read
 from symsteer.errors import UserError
-from symsteer.files import write_atomically
+from symsteer.files import prepare_folder, staged, write_atomically
 from symsteer.variant import VariantSpec, file_name, variant_text
 
 COLUMNS = 4
@@ -96,9 +99,11 @@ def film(
         else:
             stem = f"{kind}-{'-'.join(first.config.place)}-{name}"
             out = first.folder.parent / f"{file_name(stem)}.mp4"
+    prepare_folder(out.parent)
     if kind == "paths":
         out = out.with_suffix(".png")
-        imageio.imwrite(out, _in_rows([_paths(run, variants, episodes) for run in runs]))
+        with staged(out) as file:
+            imageio.imwrite(file, _in_rows([_paths(run, variants, episodes) for run in runs]))
         return out
     moving = out.suffix == ".gif"
     every = GIF_EVERY if moving else 1
@@ -110,8 +115,33 @@ def film(
     if moving:
         write_atomically(out, to_gif(frames, FRAMES_PER_SECOND / every))
     else:
-        imageio.mimwrite(out, frames, fps=FRAMES_PER_SECOND, macro_block_size=1)
+        write_video(out, frames)
     return out
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], **options: Any) -> None:
+    """Write an .mp4.
+
+    Args:
+        path: of the file.
+        frames: ``[height, width, 3]`` uint8.
+        options: of imageio's writer.
+
+    Raises:
+        UserError: if the file cannot be written.
+    """
+    with staged(path) as file:
+        count = 0
+        writer = imageio.get_writer(file, fps=FRAMES_PER_SECOND, macro_block_size=1, **options)
+        with writer:
+            for frame in frames:
+                writer.append_data(frame)
+                count += 1
+        # imageio does not say whether ffmpeg has failed.
+        with contextlib.suppress(RuntimeError):
+            if count_frames_and_secs(file)[0] == count:
+                return
+        raise OSError(errno.EIO, "ffmpeg failed")
 
 
 def _captions(runs: Sequence[Restored]) -> list[str]:

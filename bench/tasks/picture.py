@@ -24,6 +24,7 @@ from symsteer.bench.tasks.clouds import CAMERAS, PIXELS
 from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.tasks.tilted import Tilted
 from symsteer.errors import UserError
+from symsteer.files import staged
 
 SIZE = 320
 CAMERA = {
@@ -136,7 +137,8 @@ def main() -> int:
             picture = (seen_picture if seen else task_picture)(sys.argv[2])
         # The texture of the table would take most of the bytes.
         small = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
-        small.save(Path(sys.argv[1]), optimize=True)
+        with staged(Path(sys.argv[1])) as file:
+            small.save(file, optimize=True)
     except (UserError, OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 
 from symsteer.errors import UserError
-from symsteer.files import write_together
+from symsteer.files import staged, write_atomically, write_together
 from symsteer.leaderboard.defects import read_audit
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.paths import reproductions_for
@@ -92,9 +92,12 @@ def generate(
     copies = {out / address: path for address, _, _, path in clips}
     copies |= {out / picture.address: picture.path for picture in board.maps}
     write_together(files, _stale(out, {*files, *copies}), durable=False)
-    _copy(copies)
+    for target, source in copies.items():
+        write_atomically(target, source.read_bytes(), durable=False)
     if reading.built:
-        build_documentation(out / FOLDER)
+        with staged(out / FOLDER) as folder:
+            build_documentation(folder)
+            shutil.rmtree(out / FOLDER, ignore_errors=True)
     else:
         # That of an earlier site, which no page links any more.
         shutil.rmtree(out / FOLDER, ignore_errors=True)
@@ -128,7 +131,7 @@ def render(board: Board) -> dict[str, bytes]:
 def _check_folder(out: Path) -> None:
     """Refuse folders with other contents: a site replaces what is in its folder."""
     try:
-        if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        if not out.exists() or (out.is_dir() and all(p.is_dir() for p in out.rglob("*"))):
             return
         index = out / "index.html"
         if out.is_dir() and index.is_file() and GENERATOR in index.read_text(errors="replace"):
@@ -169,15 +172,3 @@ def _stale(out: Path, wanted: set[Path]) -> list[Path]:
     """Files of an earlier site in `out` that this one does not have."""
     found = (path for folder in FOLDERS for path in sorted((out / folder).glob("*")))
     return [path for path in found if OWN.fullmatch(path.name) and path not in wanted]
-
-
-def _copy(files: dict[Path, Path]) -> None:
-    for target, source in files.items():
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
-        except OSError as error:
-            raise UserError(
-                f"{source} cannot be copied into the site: {error.strerror}; make it readable, or "
-                "free space"
-            ) from error

@@ -57,5 +57,5 @@ def test_nothing_is_overwritten(tmp_path):
         new("agent", "my-agent", out=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["test_my_agent.py"]
     blocked = tmp_path / "test_my_agent.py" / "folder"
-    with pytest.raises(UserError, match="no folder"):
+    with pytest.raises(UserError, match="cannot be written"):
         new("agent", "my-agent", out=blocked)

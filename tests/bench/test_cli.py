@@ -153,7 +153,7 @@ def test_report_checks_and_verifies_from_any_folder(monkeypatch, capsys, tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["/proc/nowhere/a.h5"], "no folder can be made"),
+        (["/proc/nowhere/a.h5"], "/proc/nowhere cannot be written"),
         (["a.h5", "--seed", "-1"], "seed"),
         (["a.txt"], ".h5"),
         (["a.h5", "--count", "0"], "at least 1"),

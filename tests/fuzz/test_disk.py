@@ -6,6 +6,7 @@ import contextlib
 import errno
 import io
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -13,18 +14,22 @@ import sys
 from dataclasses import replace
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 
 from symsteer import cli
 from symsteer.bench.demos import load
 from symsteer.bench.runs.checkpoint import load_checkpoint
+from symsteer.bench.runs.film import write_video
 from symsteer.bench.runs.folder import state_of
 from symsteer.bench.runs.run import execute, resume
 from symsteer.bench.runs.trainer import Trainer
-from symsteer.leaderboard.records import read_record
+from symsteer.errors import UserError
+from symsteer.leaderboard.records import dump_record, read_record
 from tests.bench.tiny_run import without_clock
 from tests.fuzz.conftest import CONFIG, options_of
 from tests.fuzz.judge import CURE, one_sentence
+from tests.leaderboard.record_factory import make_record
 
 pytestmark = pytest.mark.long
 
@@ -138,7 +143,8 @@ def complaint(*arguments):
 
 def leftovers(folder):
     """Files that only a write that failed can have left."""
-    return [p.name for p in folder.rglob("*") if p.name.endswith((".tmp", ".partial", ".part"))]
+    found = re.compile(r"\.(tmp|partial|part)(\.|$)")
+    return [p.name for p in folder.rglob("*") if found.search(p.name)]
 
 
 def full_after_the_first_checkpoint(full):
@@ -253,6 +259,79 @@ def test_an_earlier_leaderboard_survives(workshop, tmp_path):
     assert {p: p.read_bytes() for p in board.rglob("*") if p.is_file()} == before
 
 
+SMALL_AUDIT = ("--states", "expert", "--count", 8, "--resets", 16, "--group", "C2")
+
+PAIR = ("standard", "equivariant")
+
+WRITERS = {
+    "film": ("film", "RUN", "--episodes", 1, "--out", "OUT/a.gif"),
+    "bundle": ("export", "RUN", "--contents", "demonstrations", "--out", "OUT/a.zip"),
+    "lerobot": ("export", "RUN", "--format", "lerobot", "--videos", "off", "--out", "OUT/set"),
+    "audit": ("audit", "--task", "PushCube-v1", *SMALL_AUDIT, "--out", "OUT"),
+    "report": ("report", "RESULTS", "--out", "OUT"),
+    "site": ("site", "RESULTS", "--no-docs", "--out", "OUT"),
+    "compare": (
+        "compare",
+        "standard",
+        "equivariant",
+        "--runs",
+        "RESULTS",
+        "--picture",
+        "OUT/a.png",
+    ),
+    "new": ("new", "agent", "mine", "--out", "OUT"),
+}
+
+
+@pytest.mark.parametrize("verb", WRITERS)
+def test_what_a_verb_writes_is_whole_or_not_there(verb, undisturbed, tmp_path):
+    """A full disk, and a file in the place of the folder; what was written before stays."""
+    results = tmp_path / "results"
+    results.mkdir()
+    for agent in PAIR:
+        (results / f"{agent}.json").write_text(dump_record(make_record(agent=agent)))
+
+    def arguments(out):
+        places = {"RUN": str(undisturbed), "RESULTS": str(results), "OUT": str(out)}
+        return [places.get(str(w), str(w).replace("OUT/", f"{out}/")) for w in WRITERS[verb]]
+
+    out = tmp_path / "out"
+    with files_end_at(200):
+        sentence, _ = complaint(*arguments(out))
+    assert str(out) in sentence
+    assert [p for p in tmp_path.rglob("*") if p.is_file() and p.parent != results] == []
+    code, lines = called(*arguments(out))
+    assert code in (0, 1), lines
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    assert before
+    if verb not in ("lerobot", "new"):
+        with files_end_at(200):
+            complaint(*arguments(out))
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+    (tmp_path / "file").write_text("in the way")
+    sentence, _ = complaint(*arguments(tmp_path / "file" / "out"))
+    assert str(tmp_path / "file") in sentence
+    assert not leftovers(tmp_path)
+
+
+def test_a_video_is_whole_or_not_there(tmp_path):
+    """imageio does not tell of an encoder that fails."""
+    frames = np.random.default_rng(0).integers(0, 255, (30, 64, 64, 3), dtype=np.uint8)
+    path = tmp_path / "new" / "a.mp4"
+    for size in (0, 20_000):
+        with (
+            files_end_at(size),
+            pytest.raises(UserError, match=f"{path} cannot be written: "),
+        ):
+            write_video(path, frames)
+    write_video(path, frames)
+    before = path.read_bytes()
+    with files_end_at(20_000), pytest.raises(UserError, match="cannot be written"):
+        write_video(path, frames)
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == ["a.mp4"]
+
+
 def test_read_only_folders(undisturbed, workshop, read_only, tmp_path):
     """Writing fails; commands that only read still work."""
     runs = tmp_path / "runs"
@@ -267,6 +346,12 @@ def test_read_only_folders(undisturbed, workshop, read_only, tmp_path):
         ("demos", runs / "a.h5", "--count", 1),
         ("report", finished, "--out", runs / "board"),
         ("audit", "--out", runs / "audit"),
+        ("film", finished, "--episodes", 1),
+        ("export", finished, "--out", runs / "a.zip"),
+        ("export", finished, "--format", "lerobot", "--out", runs / "set"),
+        ("detect", finished, "--out", runs / "detect"),
+        ("site", finished, "--no-docs", "--out", runs / "site"),
+        ("new", "agent", "mine", "--out", runs),
     ):
         sentence, _ = complaint(*arguments)
         assert str(runs) in sentence
