@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
+from collections.abc import Sequence
 
+from symsteer.files import csv_text
 from symsteer.leaderboard.summary import Summary
-from symsteer.leaderboard.tables import Links, csv_cell
+from symsteer.leaderboard.tables import Links
 
 HEADER = (
     *("task", "embodiment", "variant", "demonstrations", "env_steps", "agent", "row", "seed"),
@@ -17,9 +17,7 @@ HEADER = (
 
 def render_records(summary: Summary, links: Links) -> str:
     """The records of all tables; `record` is the file's place relative to the page."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(HEADER)
+    rows: list[Sequence[object]] = [HEADER]
     for table in summary.tables:
         key = table.key
         place = key.task, key.embodiment, key.variant, key.demonstrations, key.env_steps
@@ -35,5 +33,5 @@ def render_records(summary: Summary, links: Links) -> str:
                     int(any(p.dirty for p in made)),
                     *(run.record.config_hash, run.record.run_id, links.get(run.path)),
                 ]
-                writer.writerow(map(csv_cell, values))
-    return out.getvalue()
+                rows.append(values)
+    return csv_text(rows)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from symsteer.files import csv_text
 from symsteer.leaderboard.paper import BASE
 from symsteer.leaderboard.records import REPRODUCED, VERDICTS
 from symsteer.leaderboard.records.reproductions import Verdict
@@ -345,11 +344,7 @@ def render_csv(summary: Summary) -> str:
     if not summary.has_marks:
         left_out.add("marked")
     rows = [{k: v for k, v in row.items() if k not in left_out} for row in rows]
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(rows[0])
-    writer.writerows([csv_cell(value) for value in row.values()] for row in rows)
-    return out.getvalue()
+    return csv_text([rows[0], *(row.values() for row in rows)])
 
 
 def _csv_row(table: Table, row: Row) -> dict[str, object]:
@@ -408,15 +403,3 @@ def _ends(name: str, found: Interval | None) -> dict[str, object]:
     """A column each for a value and the ends of its interval."""
     ends = (found.value, found.low, found.high) if found else (None, None, None)
     return dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
-
-
-def csv_cell(value: object) -> str:
-    """A value of a CSV file: six significant digits, no formulas."""
-    if value is None:
-        return ""
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    text = str(value)
-    # A spreadsheet runs a text that starts like a formula, even after blanks.
-    formula = isinstance(value, str) and text.lstrip()[:1] in ("=", "+", "-", "@")
-    return f"'{text}" if formula else text

@@ -1,10 +1,13 @@
-"""Reading TOML, and atomic writing: a file has its complete old or new content, never a part."""
+"""TOML, CSV, and atomic writing: a file has its complete old or new content, never a part."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
+import io
 import os
+import re
 import shutil
 import sysconfig
 import tomllib
@@ -60,6 +63,27 @@ def open_log(path: str | Path) -> TextIO:
     """A log to append to; not through a link, which somebody may have put there."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW
     return os.fdopen(os.open(path, flags, 0o666), "a")
+
+
+FORMULA = re.compile("(^|;)(?= *[-=+@\uff0d\uff1d\uff0b\uff20])")
+"""What a spreadsheet runs, in half or full width, also where it takes ``;`` for a separator."""
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows of a CSV file: numbers with six significant digits, no formulas, no raw line breaks."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(map(_csv_cell, row) for row in rows)
+    return out.getvalue()
+
+
+def _csv_cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if not isinstance(value, str):
+        return "" if value is None else str(value)
+    # Also what a spreadsheet skips before a formula: spaces without width, controls.
+    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in value)
+    return FORMULA.sub(r"\1'", "".join(shown))
 
 
 def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from matplotlib.patches import Rectangle
 from symsteer.bench.audit.estimates import Estimate
 from symsteer.bench.audit.result import BIN, AuditResult, Defect
 from symsteer.errors import UserError
-from symsteer.files import write_together
+from symsteer.files import csv_text, write_together
 
 EXACT = 1e-3
 """Reward and observation defects below this are rounding errors, also of inverse kinematics."""
@@ -231,18 +230,12 @@ def summary(result: AuditResult) -> dict[str, Any]:
 
 def to_csv(rows: Sequence[dict[str, Any]]) -> str:
     """Rows of :func:`summary` as CSV: three columns for each interval."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    head: list[str] = list(PLAIN)
-    for name in ESTIMATES:
-        head += [name, f"{name}_low", f"{name}_high"]
-    writer.writerow(head)
-    for row in rows:
-        values = [row[name] for name in PLAIN]
-        for name in ESTIMATES:
-            values += row[name] or [None] * 3
-        writer.writerow(["" if v is None else v for v in values])
-    return out.getvalue()
+    head = [*PLAIN, *(f"{name}{end}" for name in ESTIMATES for end in ("", "_low", "_high"))]
+    table = [
+        [row[name] for name in PLAIN] + [v for name in ESTIMATES for v in row[name] or [None] * 3]
+        for row in rows
+    ]
+    return csv_text([head, *table])
 
 
 def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
@@ -314,13 +307,15 @@ def write_result(result: AuditResult, folder: Path) -> None:
     Raises:
         UserError: the folder cannot be written.
     """
-    rows = ["body,x_mm,y_mm,copies,mm"]
-    rows += [f"{b.body},{b.x_mm:g},{b.y_mm:g},{b.copies},{b.mm:.4g}" for b in result.map]
+    rows: list[list[object]] = [["body", "x_mm", "y_mm", "copies", "mm"]]
+    rows += [[b.body, b.x_mm, b.y_mm, b.copies, float(f"{b.mm:.4g}")] for b in result.map]
     picture = io.BytesIO()
     map_figure(result).savefig(picture, format="png", dpi=110, metadata={"Software": None})
     write_together(
         {
-            folder / "map.csv": ("\n".join(rows) + "\n").encode(),
+            folder / "map.csv": csv_text(
+                [["body", "x_mm", "y_mm", "copies", "mm"], *rows]
+            ).encode(),
             folder / "map.png": picture.getvalue(),
             # Last: a folder with this file is complete, and is not measured again.
             folder / "audit.json": (json.dumps(result.to_json(), indent=1) + "\n").encode(),

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from symsteer.files import csv_text
 from symsteer.leaderboard import command, paths
 from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.findings import analyse
@@ -430,10 +431,28 @@ def test_a_cross_marks_a_q_that_is_not_finite_and_no_missing_bias() -> None:
     assert crosses(q_max=-4.0, q_bias=math.nan) == 0
 
 
+FORMULAS = {
+    "=1+1": "'=1+1",
+    " @SUM(1)": "' @SUM(1)",
+    "\t=1+1": "\\t=1+1",
+    "-1+1|x": "'-1+1|x",
+    "\uff1d1+1": "'\uff1d1+1",
+    "\u200b=1": "\\u200b=1",
+    "\ufeff=1": "\\ufeff=1",
+    "\x00+1": "\\x00+1",
+    "a\r\n=1": "a\\r\\n=1",
+    "a; =1": "a;' =1",
+    "a=1; b-2": "a=1; b-2",
+}
+
+
 def test_a_formula_stays_text_in_the_csv(tmp_path: Path) -> None:
-    for index, agent in enumerate(("=1+1", "\t=1+1", " @SUM(1)")):
+    for index, agent in enumerate(FORMULAS):
         write_record(make_record(agent=agent), tmp_path / "runs" / str(index) / "record.json")
     generate([tmp_path / "runs"], tmp_path / "board")
-    with open(tmp_path / "board" / "leaderboard.csv", newline="") as file:
-        agents = [row["agent"] for row in csv.DictReader(file)]
-    assert sorted(agents) == ["'\t=1+1", "' @SUM(1)", "'=1+1"]
+    for name in ("leaderboard.csv", "records.csv"):
+        with open(tmp_path / "board" / name, newline="") as file:
+            agents = [row["agent"] for row in csv.DictReader(file)]
+        assert sorted(agents) == sorted(FORMULAS.values())
+    numbers = csv_text([(-1, -0.25, np.float64(-1e-9), None, True)])
+    assert numbers == "-1,-0.25,-1e-09,,True\n"
