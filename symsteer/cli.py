@@ -23,7 +23,7 @@ from pathlib import Path
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
 from symsteer.names import unknown
-from symsteer.terminal import BOARD, complain, to_paste
+from symsteer.terminal import BOARD, careful_output, complain, to_paste
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
@@ -105,14 +105,14 @@ def main() -> int:
     warnings.filterwarnings("ignore", message=".*py3nj.*")
     warnings.filterwarnings("ignore", message="Failed to find system libvulkan.*")
     try:
-        return _run(sys.argv[1:])
+        with careful_output():
+            return _run(sys.argv[1:])
     except UserError as error:
         return complain(error, f"error: {error}", 2)
     except WorkerLostError as error:
         return complain(error, f"error: {error}", 1)
     except BrokenPipeError:
-        # The reader closed the pipe. Without this, Python would print an error at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The reader closed the pipe.
         return 128 + signal.SIGPIPE
     except OSError as error:
         # A path that cannot be read or written. An error without a path is a bug.

@@ -1,16 +1,71 @@
-"""Printing plain lines without control characters."""
+"""What is printed: plain lines without control characters, to a place that may fail."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import io
+import os
 import shlex
+import shutil
 import sys
+from collections.abc import Iterator
 from typing import Any
+
+from symsteer.errors import UserError
 
 BOARD = "http://localhost:6006/#custom_scalars&_smoothingWeight=0"
 """Where `tensorboard` shows the charts of runs, without smoothing."""
 
 LONGEST_LINE = 900
 """Characters of an error message; the middle of a longer one is left out."""
+
+
+NARROWEST = 20
+"""Columns; in a terminal of fewer the help would never end."""
+
+
+class _Output(io.FileIO):
+    """Standard output or error. After an error nothing is written; Python would try it at exit."""
+
+    failed = False
+
+    def write(self, data: Any) -> int:
+        """A terminal that is gone, or a full disk below stderr, must not end a run."""
+        try:
+            return len(data) if self.failed else super().write(data)
+        except OSError as error:
+            self.failed = True
+            if isinstance(error, BrokenPipeError):
+                raise
+            if error.errno == errno.EIO or self.fileno() == 2:
+                return len(data)
+            raise UserError(
+                f"the output cannot be written: {error.strerror}; free space or write it elsewhere"
+            ) from error
+
+
+@contextlib.contextmanager
+def careful_output() -> Iterator[None]:
+    """Inside, output behaves as :class:`_Output`, and at the end it is written."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper) and stream is getattr(sys, f"__{name}__"):
+            raw = _Output(stream.fileno(), "wb", closefd=False)
+            buffer: Any = raw if stream.write_through else io.BufferedWriter(raw)
+            how = (stream.encoding, stream.errors, None, stream.line_buffering)
+            setattr(sys, name, io.TextIOWrapper(buffer, *how, stream.write_through))
+    widths = [shutil.get_terminal_size().columns]
+    for descriptor in () if "COLUMNS" in os.environ else range(3):
+        with contextlib.suppress(OSError):
+            widths.append(os.get_terminal_size(descriptor).columns)
+    if any(0 < width < NARROWEST for width in widths):
+        os.environ["COLUMNS"] = str(NARROWEST)
+    try:
+        yield
+    finally:
+        if sys.stdout is not None:
+            sys.stdout.flush()
 
 
 def printable(text: str) -> str:

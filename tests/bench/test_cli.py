@@ -1,13 +1,17 @@
 """What a user sees: verbs, and one sentence with exit code 2 for each mistake."""
 
 import ast
+import fcntl
 import itertools
 import json
 import os
+import pty
 import re
 import shlex
+import struct
 import subprocess
 import sys
+import termios
 from importlib.metadata import version
 from pathlib import Path
 
@@ -305,15 +309,48 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     reading, writing = os.pipe()
     os.close(reading)
     with open(writing, "wb") as output:
-        done = subprocess.run(
-            [sys.executable, "-m", "symsteer", "list"],
-            stdout=output,
-            stderr=subprocess.PIPE,
-            text=True,
-            timeout=120,
-            check=False,
-        )
+        done = run_cli(["list"], None, stdout=output, stderr=subprocess.PIPE)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+STATUS = pytest.param(["status", "."], marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["list"], ["--version"], ["--help"], ["status", "--help"], STATUS, ["x"]]
+)
+@pytest.mark.parametrize("full", ["stdout", "stderr", "both"])
+def test_a_full_device_is_one_sentence(arguments, full, tmp_path):
+    with open("/dev/full", "wb") as device:
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        streams |= dict.fromkeys(streams if full == "both" else [full], device)
+        done = run_cli(arguments, tmp_path, **streams)
+    wrong = arguments == ["x"]
+    assert done.returncode == (2 if wrong or full != "stderr" else 0)
+    if full == "stdout":
+        words = "there is no verb 'x'" if wrong else "error: the output cannot be written: No space"
+        assert words in done.stderr
+        assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["film", "--help"], ["list"]])
+@pytest.mark.parametrize("columns", ["variable", "terminal"])
+def test_a_narrow_terminal_has_help(arguments, columns, tmp_path):
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 1, 1, 0, 0))
+    variables = {k: v for k, v in os.environ.items() if k != "COLUMNS"}
+    variables |= {"COLUMNS": "1"} if columns == "variable" else {}
+    how = {"stdin": theirs, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": variables}
+    done = run_cli(arguments, tmp_path, **how)
+    os.close(ours)
+    os.close(theirs)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(done.stdout.splitlines()) > 20
+
+
+def run_cli(arguments, folder, **how):
+    words = [sys.executable, "-m", "symsteer", *arguments]
+    return subprocess.run(words, cwd=folder, text=True, timeout=120, check=False, **how)
 
 
 @pytest.mark.parametrize(("wanted", "threads"), [("", 1), ("3", 3), ("2,1", 2), ("0", 1), ("x", 1)])

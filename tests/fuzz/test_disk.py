@@ -6,9 +6,11 @@ import contextlib
 import errno
 import io
 import os
+import pty
 import re
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -220,6 +222,23 @@ def test_demonstrations_and_base_policies_appear_whole(kept, size, blamed, undis
     assert blamed in sentence
     assert sorted(p for p in base.rglob("*") if p.is_file()) == before
     assert not (tmp_path / undisturbed.name).exists()
+
+
+def test_a_run_outlives_its_terminal(undisturbed, tmp_path):
+    shutil.copytree(undisturbed.parent / "base", tmp_path / "base")
+    ours, theirs = pty.openpty()
+    words = [sys.executable, "-m", "symsteer", "run", *options_of(SHORT), "--out", str(tmp_path)]
+    hangup = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        streams = {"stdin": theirs, "stdout": theirs, "stderr": theirs}
+        process = subprocess.Popen(words, **streams, start_new_session=True)
+    finally:
+        signal.signal(signal.SIGHUP, hangup)
+    os.close(theirs)
+    os.read(ours, 1)  # the first sign of progress
+    os.close(ours)
+    assert process.wait(300) == 0
+    assert without_clock(tmp_path / undisturbed.name) == without_clock(undisturbed)
 
 
 # The other verbs.
