@@ -20,6 +20,7 @@ from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.utils.structs import Actor
 
 from symsteer.bench.sim import patches, rendering
+from symsteer.bench.sim.errors import Unique
 from symsteer.bench.sim.headless import prepare_headless
 from symsteer.bench.sim.scene import BatchedScene
 from symsteer.bench.sim.versions import check_versions
@@ -72,7 +73,7 @@ class _BatchedDevice:
         return False
 
 
-class BatchedCpuMixin(BaseEnv):
+class BatchedCpuMixin(Unique, BaseEnv):
     """Runs a ManiSkill task for N environments in one process on CPU physics.
 
     Mix in before a `BaseEnv` subclass: ``class MyEnv(BatchedCpuMixin, PickCubeEnv)``. Takes the
@@ -234,7 +235,7 @@ class BatchedCpuMixin(BaseEnv):
         )
 
 
-class CudaMixin(BaseEnv):
+class CudaMixin(Unique, BaseEnv):
     """Runs a ManiSkill task on ManiSkill's own GPU simulation, also for one environment.
 
     Raises:

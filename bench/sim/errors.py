@@ -1,4 +1,6 @@
-"""Errors of worker processes. Light to import: the command line handles them."""
+"""Errors of worker processes, and of copies. Light to import: the command line handles them."""
+
+from symsteer.errors import UserError
 
 
 class WorkerError(Exception):
@@ -7,3 +9,13 @@ class WorkerError(Exception):
 
 class WorkerLostError(WorkerError):
     """A worker process ended, and its environments with it."""
+
+
+class Unique:
+    """Cannot be copied or pickled: its simulation is in one process."""
+
+    def __reduce_ex__(self, protocol: object) -> str:
+        raise UserError(
+            "an environment cannot be copied or pickled; make another one, and give it the state: "
+            "other.unwrapped.set_state_dict(env.unwrapped.get_state_dict())"
+        )

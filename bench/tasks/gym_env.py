@@ -116,7 +116,16 @@ class EpisodeLimit(gym.Wrapper, gym.utils.RecordConstructorArgs):
         spec = super().spec
         if spec is not None:
             spec.max_episode_steps = self.max_episode_steps
+            strength: Any = spec.kwargs.get("strength")
+            if hasattr(strength, "tolist"):
+                spec.kwargs["strength"] = strength.tolist()  # JSON has no tensors
         return spec
+
+    def __getattr__(self, name: str) -> Any:
+        """What ManiSkill's wrapper for Stable-Baselines3 reads of the environment."""
+        if name in ("num_envs", "single_observation_space", "single_action_space"):
+            return getattr(self.env, name)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def step(self, action: Any) -> tuple:
         """As the environment's; ``truncated`` ``[N]`` depends on the limit only."""

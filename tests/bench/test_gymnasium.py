@@ -1,6 +1,8 @@
 """Environments for others: gymnasium's API, ManiSkill's wrappers, NumPy."""
 
+import copy
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -12,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from mani_skill import logger
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
@@ -242,6 +245,26 @@ def test_a_spec_makes_the_same_environment_again():
     single = gym.make(gym.make(SINGLE, max_episode_steps=4, **BROKEN).spec)
     assert single.unwrapped.variants[0].strength == 0.5
     assert [len(rollout(single, seed=0)) for _ in range(2)] == [5, 5]
+
+
+def test_a_spec_with_tensors_is_json():
+    env = gym.make(BATCHED, num_envs=2, variant="wind", strength=torch.tensor([0.25, 1]))
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.variants[0].strength.tolist() == [0.25, 1]
+    single = gym.make(SINGLE, variant="wind", strength=np.float32(0.25))
+    assert EnvSpec.from_json(single.spec.to_json()).kwargs["strength"] == 0.25
+
+
+@pytest.mark.parametrize("options", [{}, {"workers": 2}])
+def test_environments_cannot_be_copied(options):
+    env = gym.make(BATCHED, num_envs=2, **options)
+    for copied in (copy.deepcopy, pickle.dumps):
+        for one in (env, env.unwrapped):
+            with pytest.raises(UserError, match="cannot be copied or pickled; make another"):
+                copied(one)
+    with pytest.raises(AttributeError, match="'EpisodeLimit' object has no attribute 'nothing'"):
+        _ = env.nothing
+    env.close()
 
 
 @pytest.mark.parametrize("limit", [4, 60])

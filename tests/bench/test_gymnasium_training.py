@@ -10,6 +10,7 @@ import pytest
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
+from mani_skill.vector.wrappers.sb3 import ManiSkillSB3VectorEnv
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -40,6 +41,19 @@ class Losses(BaseCallback):
 
 def test_stable_baselines3s_checker_passes():
     check_env(gym.make(SINGLE, **OPTIONS), warn=True)
+
+
+def test_maniskills_wrapper_for_stable_baselines3():
+    env = ManiSkillSB3VectorEnv(gym.make("SymSteer/PushCube-dense-v1", num_envs=3, **OPTIONS))
+    env.seed(0)
+    first = env.reset()
+    assert first.shape == (3, env.observation_space.shape[0])
+    ends = 0
+    for _ in range(LIMIT + 1):
+        obs, rewards, dones, infos = env.step(np.stack([env.action_space.sample()] * 3))
+        ends += dones.sum()
+    assert (rewards.shape, obs.shape, len(infos)) == ((3,), first.shape, 3)
+    assert ends >= 3
 
 
 @pytest.mark.slow

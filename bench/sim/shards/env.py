@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from symsteer.bench.sim.errors import WorkerError, WorkerLostError
+from symsteer.bench.sim.errors import Unique, WorkerError, WorkerLostError
 from symsteer.bench.sim.shards.block import Field, SharedBlock, put_together, select
 from symsteer.bench.sim.shards.messages import FAILURE, MISTAKE, SAME, Recipe, divide
 from symsteer.bench.sim.shards.processes import start_process
@@ -35,7 +35,7 @@ class NotHereError(UserError, AttributeError):
     """The attribute exists in the worker processes only."""
 
 
-class ShardedEnv(gym.Env):
+class ShardedEnv(Unique, gym.Env):
     """N environments of a ManiSkill task in W worker processes.
 
     It behaves as one process with all environments: resets (seeds, partial resets,
