@@ -7,9 +7,7 @@ imported inside the functions, so that help, ``list`` and ``doctor`` do not wait
 from __future__ import annotations
 
 import os
-import shutil
 import sys
-import textwrap
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,7 +17,7 @@ import tyro
 from symsteer.errors import UserError
 from symsteer.files import prepare_folder, write_atomically
 from symsteer.registry import allow
-from symsteer.terminal import BOARD, complain, printable, to_paste
+from symsteer.terminal import BOARD, complain, folded, printable, to_paste
 
 if TYPE_CHECKING:
     from symsteer.registry import Registry
@@ -110,10 +108,7 @@ def reproduce(
     allow(*trust)
     from symsteer.bench.runs.reproduce import reproduce, text
 
-    def report(line: str) -> None:
-        print(printable(line), file=sys.stderr, flush=True)
-
-    done = reproduce(record, out, demos, base_policy, into, not quiet, workers, base_from, report)
+    done = reproduce(record, out, demos, base_policy, into, not quiet, workers, base_from, _tell)
     print(printable(text(done)))
     return 0 if done.reproduction.verdict == "exact" else 1
 
@@ -641,7 +636,7 @@ def audit(
 
     def done(result: Any) -> None:
         if several:
-            print(f"{result.settings.name}: {result.seconds:.1f} s", file=sys.stderr, flush=True)
+            _tell(f"{result.settings.name}: {result.seconds:.1f} s")
 
     found = run_audits(wanted, runs, base_policy, out, resume, progress=not json, done=done)
     if several and out is not None:
@@ -697,16 +692,13 @@ def detect(
     if not runs:
         raise UserError("name the folder of a run, e.g. symsteer detect runs/PushCube-v1-...")
 
-    def progress(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
-
     if out is not None:
         prepare_folder(out)
     found = []
     for run in runs:
         if len(runs) > 1:
-            progress(str(run))
-        found.append(detect(run, detector or tuple(DETECTORS), count, group, seed, progress))
+            _tell(str(run))
+        found.append(detect(run, detector or tuple(DETECTORS), count, group, seed, _tell))
         if out is not None:
             report.write(out if len(runs) == 1 else out / run.resolve().name, found[-1])
     rows = report.summary(found)
@@ -755,9 +747,6 @@ def throughput(
     allow(task)
     from symsteer.bench import throughput as speed
 
-    def report(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
     if device == "cuda":
         import torch
 
@@ -769,28 +758,26 @@ def throughput(
                 "(`symsteer doctor` says what is missing)"
             )
     devices = ("cpu",) if device == "cpu" else ("cpu", "cuda")
-    if learner:
-        from symsteer.bench import learner_throughput
+    if learner or decode or run:
+        part: Any
+        if learner:
+            from symsteer.bench import learner_throughput as part
 
-        rows = learner_throughput.measure(task, 20, repeats, report, devices=devices)
-        print(speed.dump({"rows": rows}) if json else learner_throughput.table(rows))
-        return 0
-    if decode:
-        from symsteer.bench import decode_throughput
+            rows = part.measure(task, 20, repeats, _tell, devices=devices)
+        elif decode:
+            from symsteer.bench import decode_throughput as part
 
-        rows = decode_throughput.measure(task, 10, repeats, report, devices=devices)
-        print(speed.dump({"rows": rows}) if json else decode_throughput.table(rows))
-        return 0
-    if run:
-        from symsteer.bench import run_throughput
-        from symsteer.bench.runs.config import RunConfig
+            rows = part.measure(task, 10, repeats, _tell, devices=devices)
+        else:
+            from symsteer.bench import run_throughput as part
+            from symsteer.bench.runs.config import RunConfig
 
-        configs = [RunConfig(task=task, agent=agent) for agent in ("standard", "equivariant")]
-        rows = run_throughput.measure(configs, repeats, runs, report)
-        print(speed.dump({"rows": rows}) if json else run_throughput.table(rows))
+            configs = [RunConfig(task=task, agent=agent) for agent in ("standard", "equivariant")]
+            rows = part.measure(configs, repeats, runs, _tell)
+        print(speed.dump({"rows": rows}) if json else part.table(rows))
         return 0
     if memory:
-        growth = speed.memory_growth(task, report=report)
+        growth = speed.memory_growth(task, report=_tell)
         print(
             speed.dump(growth)
             if json
@@ -798,7 +785,7 @@ def throughput(
             f"{growth['steps'][-1]} of {growth['num_envs']} environments"
         )
         return 0
-    data = speed.measure(task, num_envs, repeats, seconds, cores or None, report)
+    data = speed.measure(task, num_envs, repeats, seconds, cores or None, _tell)
     print(speed.dump(data) if json else speed.table(data))
     return 0
 
@@ -813,15 +800,18 @@ def doctor(quiet: bool = False) -> int:
 
     checks = probe()
     for check in checks:
-        if check.ok and quiet:
-            continue
-        if not check.ok and quiet and not check.required:
+        if quiet and (check.ok or not check.required):
             continue
         mark = "ok     " if check.ok else "MISSING" if check.required else "absent "
         print(f"{mark} {check.name:18s} {check.detail}")
         if not check.ok and check.cure:
             print(f"{'':26s} -> {check.cure}")
     return 0 if all(check.ok or not check.required for check in checks) else 1
+
+
+def _tell(line: str) -> None:
+    """Print a line of progress."""
+    print(printable(line), file=sys.stderr, flush=True)
 
 
 def _print_places(folder: Path) -> None:
@@ -839,7 +829,5 @@ def _summaries(registry: Registry[Any]) -> list[tuple[str, str]]:
 def _print_names(title: str, names: Iterable[tuple[str, str]]) -> None:
     """Print names with their summaries, folded to the width of the terminal."""
     print(title)
-    columns = max(60, shutil.get_terminal_size().columns)
     for name, text in names:
-        head = f"  {name:18s} "
-        print(textwrap.fill(text, columns, initial_indent=head, subsequent_indent=" " * len(head)))
+        print(folded(f"  {name:18s} ", text))

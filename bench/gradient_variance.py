@@ -29,6 +29,7 @@ from symsteer.policies import POLICIES
 from symsteer.policies.contract import Episode
 from symsteer.policies.geometry import Layout
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
+from symsteer.terminal import complain
 
 NAMES = ("edp", "plain-augmented")
 DEVIATIONS = (0.1, 0.5, 1.0, 2.0)
@@ -143,8 +144,7 @@ def main(arguments: Sequence[str]) -> int:
                     rows.append({"policy": name, **asked, "seed": seed, **found})
                     print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return complain(error, f"error: {error}", 2)
     print(json.dumps({"task": given.task, "demonstrations": given.demonstrations, "rows": rows}))
     return 0
 

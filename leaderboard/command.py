@@ -52,7 +52,6 @@ def report(
     """
     if verify and check:
         raise UserError("--verify and --check cannot be given together; give one of them")
-    _accept_any_text()
     paths = chosen_records(records, "report")
     if check:
         return _show_verdicts(paths)
@@ -102,7 +101,6 @@ def compare(
         raise UserError(f"--margin is {margin}; it must be a number of at least 0, such as 0.05")
     if picture is not None and picture.suffix.lower() not in (".png", ".svg"):
         raise UserError(f"--picture is {picture}; its name must end with .png or .svg")
-    _accept_any_text()
     from json import dumps
 
     from symsteer.leaderboard.compare.changes import find_changes
@@ -124,13 +122,6 @@ def compare(
         if picture is not None:
             _say(f"wrote {picture}")
     return 1 if changes.verdict == "worse" else 0
-
-
-def _accept_any_text() -> None:
-    """Print what the encoding of the terminal does not have: a path may hold any bytes."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def _folder_for(records: Sequence[Path]) -> Path:

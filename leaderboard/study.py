@@ -140,11 +140,6 @@ class Study:
     listed: frozenset[str] | None = None
 
 
-def study_names() -> list[str]:
-    """The studies that come with SymSteer."""
-    return sorted(path.stem for path in FOLDER.glob("*.toml"))
-
-
 def read_study(name_or_path: str) -> Study:
     """Read a study by name or from a TOML file.
 

@@ -11,10 +11,8 @@ import functools
 import importlib
 import os
 import re
-import shutil
 import signal
 import sys
-import textwrap
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +21,7 @@ from pathlib import Path
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
 from symsteer.names import unknown
-from symsteer.terminal import BOARD, careful_output, complain, to_paste
+from symsteer.terminal import BOARD, careful_output, complain, folded, to_paste
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
@@ -188,14 +186,8 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _overview() -> str:
     """The help text of ``symsteer``."""
-    columns = max(60, shutil.get_terminal_size().columns)
-    lines = ["usage: symsteer VERB [OPTIONS]", "", *textwrap.wrap(ABOUT, columns), "", "verbs:"]
-    for name, verb in VERBS.items():
-        head = f"  {name:12s} "
-        text = textwrap.fill(
-            verb.summary, columns, initial_indent=head, subsequent_indent=" " * len(head)
-        )
-        lines.append(text)
+    lines = ["usage: symsteer VERB [OPTIONS]", "", folded("", ABOUT), "", "verbs:"]
+    lines += [folded(f"  {name:12s} ", verb.summary) for name, verb in VERBS.items()]
     lines += ["", "symsteer VERB --help: the options of a verb; symsteer --version: the version"]
     return "\n".join(lines)
 

@@ -20,7 +20,7 @@ from symsteer.names import nearest
 
 
 def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any], Path]:
-    """The content of a TOML file, which may begin with a byte order mark, and its path.
+    """The content of a TOML file, and its path; a byte order mark is skipped.
 
     Args:
         name_or_path: name of a file in ``folder``, or the path of a ``.toml`` file.
@@ -31,8 +31,7 @@ def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any
         UserError: if there is no such file, or it cannot be read.
     """
     path = Path(name_or_path)
-    if path.suffix != ".toml":
-        path = folder / f"{name_or_path}.toml"
+    path = path if path.suffix == ".toml" else folder / f"{name_or_path}.toml"
     try:
         return tomllib.loads(path.read_text("utf-8-sig")), path
     except FileNotFoundError as error:
@@ -48,9 +47,8 @@ def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any
             f"the {kind} {path} cannot be read: {error.strerror}; name another file"
         ) from error
     except (ValueError, RecursionError) as error:
-        raise UserError(
-            f"the {kind} {path} cannot be read as TOML: {error}; correct it there"
-        ) from error
+        problem = f"the {kind} {path} cannot be read as TOML: {error}"
+        raise UserError(f"{problem}; correct it there") from error
 
 
 def away() -> contextlib.AbstractContextManager[None]:
@@ -71,19 +69,17 @@ FORMULA = re.compile("(^|;)(?= *[-=+@\uff0d\uff1d\uff0b\uff20])")
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
     """Rows of a CSV file: numbers with six significant digits, no formulas, no raw line breaks."""
+
+    def cell(value: object) -> object:
+        if not isinstance(value, str):
+            return f"{value:.6g}" if isinstance(value, float) else value
+        # Also what a spreadsheet skips before a formula: spaces without width, controls.
+        shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in value)
+        return FORMULA.sub(r"\1'", "".join(shown))
+
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(map(_csv_cell, row) for row in rows)
+    csv.writer(out, lineterminator="\n").writerows(map(cell, row) for row in rows)
     return out.getvalue()
-
-
-def _csv_cell(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if not isinstance(value, str):
-        return "" if value is None else str(value)
-    # Also what a spreadsheet skips before a formula: spaces without width, controls.
-    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in value)
-    return FORMULA.sub(r"\1'", "".join(shown))
 
 
 def write_atomically(path: Path, data: bytes, durable: bool = True) -> None:
@@ -106,51 +102,37 @@ def write_together(
             files then keep their old content. One exception: if a rename fails, some files are
             old and some are new.
     """
-    written: list[tuple[Path, Path]] = []
-    path = Path()
-    try:
-        for path, data in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        # The stack ends with what it began with: files get their names in the order given.
+        for path, data in reversed(list(files.items())):
             if path.is_dir():
                 raise UserError(f"{path} is a folder; remove it or choose another path")
-            temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-            written.append((temporary, path))
-            with open(temporary, "wb") as file:
+            with open(stack.enter_context(staged(path)), "wb") as file:
                 file.write(data)
                 if durable:
                     file.flush()
                     os.fsync(file.fileno())
-        for temporary, path in written:
-            os.replace(temporary, path)
-        for path in stale:
+    for path in stale:
+        with _explained(path):
             path.unlink()
-        if durable:
-            for path in {path.parent for path in files}:
-                _sync_folder(path)
-    except OSError as error:
-        raise _unwritable(path, error) from error
-    finally:
-        for temporary, _ in written:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
+    for folder in {path.parent for path in files} if durable else ():
+        with _explained(folder):
+            _sync_folder(folder)
 
 
 @contextlib.contextmanager
 def staged(path: Path) -> Iterator[Path]:
-    """A temporary name beside a file or folder, for libraries that write by themselves.
+    """A temporary name beside a file or folder, also for libraries that write by themselves.
 
-    What is there at the end of the block gets the right name. After an error it is removed.
-
-    Raises:
-        UserError: if it cannot be written; an earlier file keeps its content.
+    It becomes the right name at the end of the block; after an error what is there is removed, an
+    earlier file stays as it was, and a `UserError` says why.
     """
-    temporary = path.with_name(f".{os.getpid()}.tmp.{path.name}")  # libraries look at its ending
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise _unwritable(path, error) from error
+        with _explained(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         with contextlib.suppress(OSError):
@@ -158,22 +140,23 @@ def staged(path: Path) -> Iterator[Path]:
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make a folder, before what is written to it is computed.
-
-    Raises:
-        UserError: if it cannot be made or written to.
-    """
-    try:
+    """Make a folder before the work whose results go there; a `UserError` if it is not possible."""
+    with _explained(folder):
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
             raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Say in one sentence why a path cannot be written."""
+    try:
+        yield
     except OSError as error:
-        raise _unwritable(folder, error) from error
-
-
-def _unwritable(path: Path, error: OSError) -> UserError:
-    reason = error.strerror or str(error).partition("\n")[0]
-    return UserError(f"{path} cannot be written: {reason}; free space or choose another folder")
+        reason = error.strerror or str(error).partition("\n")[0]
+        raise UserError(
+            f"{path} cannot be written: {reason}; free space or choose another folder"
+        ) from error
 
 
 def _sync_folder(folder: Path) -> None:

@@ -36,6 +36,7 @@ from symsteer.leaderboard.statistics import (
 )
 from symsteer.leaderboard.text import difference, number
 from symsteer.policies import POLICIES
+from symsteer.terminal import complain
 
 PAGE = CHECKOUT / "docs" / "base-policies.md"
 RESULTS = CHECKOUT / "leaderboard" / "results"
@@ -480,8 +481,7 @@ def main(arguments: Sequence[str]) -> int:
         text = with_tables(PAGE.read_text(), tables, "docs/base-policies.md")
         write_together({PAGE: text.encode()})
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return complain(error, f"error: {error}", 2)
     print(f"wrote the tables of {len(records)} records to {PAGE}")
     return 0
 

@@ -9,6 +9,7 @@ import os
 import shlex
 import shutil
 import sys
+import textwrap
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,20 +27,22 @@ NARROWEST = 20
 
 
 class _Output(io.FileIO):
-    """Standard output or error. After an error nothing is written; Python would try it at exit."""
+    """Standard output or error. After an error nothing is written: Python would try it at exit.
+
+    A terminal that is gone ends no run, nor does stderr on a full disk.
+    """
 
     failed = False
 
     def write(self, data: Any) -> int:
-        """A terminal that is gone, or a full disk below stderr, must not end a run."""
         try:
             return len(data) if self.failed else super().write(data)
         except OSError as error:
             self.failed = True
-            if isinstance(error, BrokenPipeError):
-                raise
             if error.errno == errno.EIO or self.fileno() == 2:
                 return len(data)
+            if isinstance(error, BrokenPipeError):
+                raise
             raise UserError(
                 f"the output cannot be written: {error.strerror}; free space or write it elsewhere"
             ) from error
@@ -53,13 +56,10 @@ def careful_output() -> Iterator[None]:
         if isinstance(stream, io.TextIOWrapper) and stream is getattr(sys, f"__{name}__"):
             raw = _Output(stream.fileno(), "wb", closefd=False)
             buffer: Any = raw if stream.write_through else io.BufferedWriter(raw)
-            how = (stream.encoding, stream.errors, None, stream.line_buffering)
+            # A path may hold what the encoding of the terminal does not have.
+            how = (stream.encoding, "backslashreplace", None, stream.line_buffering)
             setattr(sys, name, io.TextIOWrapper(buffer, *how, stream.write_through))
-    widths = [shutil.get_terminal_size().columns]
-    for descriptor in () if "COLUMNS" in os.environ else range(3):
-        with contextlib.suppress(OSError):
-            widths.append(os.get_terminal_size(descriptor).columns)
-    if any(0 < width < NARROWEST for width in widths):
+    if shutil.get_terminal_size().columns < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)
     try:
         yield
@@ -87,6 +87,12 @@ def option_words(name: str, value: Any) -> list[str]:
         return ["--" + ".".join([*tables, last if value else f"no-{last}"])]
     values = value if isinstance(value, list) else [value]
     return ["--" + ".".join([*tables, last]), *map(str, values)]
+
+
+def folded(head: str, text: str) -> str:
+    """An entry of a list, folded to the width of the terminal."""
+    columns = max(60, shutil.get_terminal_size().columns)
+    return textwrap.fill(text, columns, initial_indent=head, subsequent_indent=" " * len(head))
 
 
 def to_paste(*words: object) -> str:

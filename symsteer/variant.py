@@ -154,11 +154,7 @@ def parse_variant(
 
 
 def parts_of(text: str) -> list[str]:
-    """The parts that ``+`` joins.
-
-    Raises:
-        UserError: if ``none`` is joined with others, or has a strength.
-    """
+    """The parts that ``+`` joins; a `UserError` if ``none`` is one of them."""
     parts = text.split("+")
     if text != UNBROKEN and any(part.partition(":")[0] == UNBROKEN for part in parts):
         raise UserError(

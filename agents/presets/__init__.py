@@ -18,16 +18,11 @@ T = TypeVar("T", bound=Any)
 FOLDER = Path(__file__).parent
 
 
-def preset_names() -> list[str]:
-    """The presets that come with SymSteer."""
-    return sorted(path.stem for path in FOLDER.glob("*.toml"))
-
-
 def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
     """What a preset sets for an agent.
 
     Args:
-        name: one of :func:`preset_names`, or the path of a ``.toml`` file.
+        name: one of those of this folder, or the path of a ``.toml`` file.
         agent: name of the agent.
         options: its dataclass of options.
 

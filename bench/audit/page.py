@@ -28,6 +28,7 @@ from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.bench.variants.levels import table
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.terminal import complain
 
 PAGE = CHECKOUT / "docs" / "audit.md"
 VARIANTS_PAGE = CHECKOUT / "docs" / "variants.md"
@@ -159,8 +160,7 @@ def main(arguments: Sequence[str]) -> int:
             pages[SUMMARY] = summary_json(rows)
         write_together({path: text.encode() for path, text in pages.items()})
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return complain(error, f"error: {error}", 2)
     print(f"wrote the tables of {len(rows)} audits to {PAGE}")
     return 0
 

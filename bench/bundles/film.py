@@ -61,8 +61,7 @@ def film_demonstrations(
                 yield frame
                 bar.update()
 
-    how = {"codec": "libx264", "pixelformat": "yuv420p", "quality": None}
-    write_video(out, frames(), **how, output_params=list(ENCODING))
+    write_video(out, frames(), ENCODING)
     return [np.stack(frames) for frames in pixels]
 
 

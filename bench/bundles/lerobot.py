@@ -7,7 +7,6 @@ last observation of an episode is left out. The gripper's fields are LeRobot's
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +24,7 @@ from symsteer.bench.bundles.manifest import Code
 from symsteer.bench.demos import load
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.film import FRAMES_PER_SECOND
+from symsteer.bench.runs.folder import write_json
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import TASKS, task_class
 from symsteer.bench.tasks.embodiments import BODIES
@@ -90,7 +90,7 @@ def write_dataset(
         _write_tables(config, _columns(demos.episodes, config.task), lengths, pixels, partial)
         card = dataset_card(contents, len(lengths), sum(lengths), film)
         (partial / "README.md").write_text(card)
-        _write_json(partial / "meta/symsteer.json", _origin(config))
+        write_json(partial / "meta/symsteer.json", _origin(config))
     seen = "with a video" if film else "without a video"
     why = "" if film or videos == "off" else ", because no Vulkan driver was found"
     return f"wrote {out}: {len(lengths)} episodes, {sum(lengths)} frames, {seen}{why}"
@@ -168,8 +168,8 @@ def _write_tables(
         file.parent.mkdir(parents=True, exist_ok=True)
         parquet.write_table(content, file)
     seen = {} if pixels is None else {IMAGE: np.concatenate(pixels)}
-    _write_json(out / "meta/stats.json", _statistics(columns, seen))
-    _write_json(
+    write_json(out / "meta/stats.json", _statistics(columns, seen))
+    write_json(
         out / "meta/info.json",
         {
             "codebase_version": VERSION,
@@ -266,8 +266,3 @@ def _origin(config: RunConfig) -> dict[str, Any]:
         "observation_layout": task.observation_layout.to_json(),
         "action_layout": task.action_layout.to_json(),
     }
-
-
-def _write_json(path: Path, data: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n")

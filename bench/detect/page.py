@@ -17,6 +17,7 @@ from symsteer.bench.detect.report import summary_text
 from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.terminal import complain
 
 PAGE = CHECKOUT / "docs" / "detect.md"
 SUMMARY = CHECKOUT / "leaderboard" / "results" / "detectors" / "summary.json"
@@ -37,8 +38,7 @@ def main(arguments: Sequence[str]) -> int:
         page = with_tables(PAGE.read_text(), tables, "docs/detect.md")
         write_together({SUMMARY: text.encode(), PAGE: page.encode()})
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return complain(error, f"error: {error}", 2)
     print(f"wrote the tables of {PAGE}")
     return 0
 

@@ -29,25 +29,22 @@ LONG_ENVS = 32
 def check_room(
     configs: Sequence[RunConfig], workers: int = 1, trains: bool = True, cure: str = ""
 ) -> None:
-    """Check that the processes of runs can hold all scenes, before anything is made.
+    """Refuse runs that need more scenes than their processes can hold (`UserError`).
 
     Args:
         configs: of the runs that share a process.
         workers: processes that share the environments of a run.
         trains: whether there are training environments.
         cure: what to do instead; default: the options of `symsteer run`.
-
-    Raises:
-        UserError: if they cannot; it says how many scenes are needed.
     """
     held, most = 0, 1
     for config in configs:
         wanted, agent = config.evaluation, AGENTS.get(config.agent)
         # The plain base policy has no training environments.
         training = config.num_envs if trains and agent.prepare is not Agent.prepare else 0
+        counts = wanted.diagnostic_episodes, wanted.final_diagnostic_episodes
         limit = LONG_ENVS if issubclass(agent, HasCritic) else 0
-        long = min(wanted.diagnostic_episodes, limit)
-        final = min(wanted.final_diagnostic_episodes, limit)
+        long, final = (min(count, limit) for count in counts)
         # The final evaluation begins after the training environments are closed.
         held += wanted.episodes + max(training + long, final)
         most = max(most, training, wanted.episodes, final)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
-from imageio_ffmpeg import count_frames_and_secs
+from imageio_ffmpeg import count_frames_and_secs, write_frames
 
 from symsteer.bench.caption import captioned
 from symsteer.bench.runs.evaluator import Evaluator
@@ -103,7 +104,8 @@ def film(
     if kind == "paths":
         out = out.with_suffix(".png")
         with staged(out) as file:
-            imageio.imwrite(file, _in_rows([_paths(run, variants, episodes) for run in runs]))
+            rows = _in_rows([_paths(run, variants, episodes) for run in runs])
+            imageio.imwrite(file, rows, "PNG")
         return out
     moving = out.suffix == ".gif"
     every = GIF_EVERY if moving else 1
@@ -115,29 +117,22 @@ def film(
     if moving:
         write_atomically(out, to_gif(frames, FRAMES_PER_SECOND / every))
     else:
-        write_video(out, frames)
+        write_video(out, iter(frames))
     return out
 
 
-def write_video(path: Path, frames: Iterable[np.ndarray], **options: Any) -> None:
-    """Write an .mp4.
-
-    Args:
-        path: of the file.
-        frames: ``[height, width, 3]`` uint8.
-        options: of imageio's writer.
-
-    Raises:
-        UserError: if the file cannot be written.
-    """
+def write_video(path: Path, frames: Iterator[np.ndarray], encoding: Sequence[str] = ()) -> None:
+    """Write ``[height, width, 3]`` uint8 frames as .mp4, with further parameters of ffmpeg."""
     with staged(path) as file:
-        count = 0
-        writer = imageio.get_writer(file, fps=FRAMES_PER_SECOND, macro_block_size=1, **options)
-        with writer:
-            for frame in frames:
-                writer.append_data(frame)
+        first, count = next(frames), 0
+        how: dict[str, Any] = {"quality": None, "macro_block_size": 1, "fps": FRAMES_PER_SECOND}
+        how["output_params"] = [*encoding, "-f", "mp4"]
+        with contextlib.closing(write_frames(file, first.shape[1::-1], **how)) as writer:
+            writer.send(None)
+            for frame in itertools.chain([first], frames):
+                writer.send(np.ascontiguousarray(frame))
                 count += 1
-        # imageio does not say whether ffmpeg has failed.
+        # An ffmpeg that fails says nothing.
         with contextlib.suppress(RuntimeError):
             if count_frames_and_secs(file)[0] == count:
                 return

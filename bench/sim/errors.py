@@ -15,7 +15,5 @@ class Unique:
     """Cannot be copied or pickled: its simulation is in one process."""
 
     def __reduce_ex__(self, protocol: object) -> str:
-        raise UserError(
-            "an environment cannot be copied or pickled; make another one, and give it the state: "
-            "other.unwrapped.set_state_dict(env.unwrapped.get_state_dict())"
-        )
+        cure = "make another one, and give it the state: set_state_dict(env.get_state_dict())"
+        raise UserError(f"an environment cannot be copied or pickled; {cure}")

@@ -9,7 +9,6 @@ import sys
 from rich.console import Console
 
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.evaluator import check_room
 from symsteer.bench.sweep.display import Display, LiveDisplay
 from symsteer.bench.sweep.estimate import Estimate, duration
 from symsteer.bench.sweep.plan import Plan, PlannedRun, manifest_path, write_manifest
@@ -71,8 +70,7 @@ def run_plan(
             outcomes.append(Outcome(run, "skipped", seen.success))
         else:
             todo.append(run)
-    for team in teams_of(plan, todo, together):
-        check_room([plan.configs[run] for run in team], cure="lower --together")
+    teams_of(plan, todo, together)  # before anything is written: they may be too large
     limit = workers if ray is not None else number
     log = manifest_path(plan.out, plan.name).with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,6 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.evaluator import check_room
 from symsteer.bench.runs.folder import run_id, write_json
 from symsteer.bench.runs.run import check
 from symsteer.bench.runs.tracking import Tracking
@@ -138,7 +137,6 @@ def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
     for config in suite.runs:
         try:
             check(replace(config, sim="cpu", device="cpu") if elsewhere else config)
-            check_room([config], cure="lower num_envs, or use `symsteer run` with --workers")
         except UserError as error:
             raise UserError(f"{suite.name}: {error}") from error
         settings.append(_settings(config.to_json()))

@@ -16,6 +16,7 @@ from symsteer.agents import AGENTS
 from symsteer.agents.team import can_join
 from symsteer.bench.runs.base_policy import demonstration_path, find_base
 from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.evaluator import check_room
 from symsteer.bench.sweep.plan import Plan, PlannedRun
 from symsteer.bench.sweep.work import Result, build_base, build_demonstrations, play
 
@@ -141,7 +142,7 @@ def _run_task(plan: Plan, team: tuple[PlannedRun, ...], patience: float) -> Task
 
 
 def teams_of(plan: Plan, todo: list[PlannedRun], together: int) -> list[tuple[PlannedRun, ...]]:
-    """Runs that differ in seeds and variants alone, up to ``together`` of them; others alone."""
+    """Runs that differ in seeds and variants alone, up to ``together``; refuses too large teams."""
     teams: list[list[PlannedRun]] = []
     open_teams: dict[RunConfig, list[PlannedRun]] = {}
     for run in todo:
@@ -155,6 +156,9 @@ def teams_of(plan: Plan, todo: list[PlannedRun], together: int) -> list[tuple[Pl
         team.append(run)
         if not can_join(AGENTS.get(config.agent)):
             del open_teams[key]
+    for team in teams:
+        cures = "lower num_envs, or use `symsteer run` with --workers", "lower --together"
+        check_room([plan.configs[run] for run in team], cure=cures[len(team) > 1])
     return [tuple(team) for team in teams]
 
 

@@ -25,6 +25,7 @@ from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.tasks.tilted import Tilted
 from symsteer.errors import UserError
 from symsteer.files import staged
+from symsteer.terminal import complain
 
 SIZE = 320
 CAMERA = {
@@ -138,10 +139,9 @@ def main() -> int:
         # The texture of the table would take most of the bytes.
         small = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
         with staged(Path(sys.argv[1])) as file:
-            small.save(file, optimize=True)
+            small.save(file, "PNG", optimize=True)
     except (UserError, OSError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return complain(error, f"error: {error}", 2)
     return 0
 
 

@@ -29,6 +29,7 @@ from symsteer.bench.tuning.trials import (
 )
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.terminal import complain
 
 PAGE = CHECKOUT / "docs" / "tuning.md"
 TRIALS = CHECKOUT / "leaderboard" / "results" / "tuning"
@@ -219,8 +220,7 @@ def main(arguments: Sequence[str]) -> int:
         copies = {TRIALS / path.name: path.read_bytes() for path in new}
         write_together({**copies, PAGE: page.encode()})
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return complain(error, f"error: {error}", 2)
     print(f"wrote the tables of {', '.join(plans)} to {PAGE}")
     return 0
 

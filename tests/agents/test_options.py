@@ -13,12 +13,13 @@ import torch
 from symsteer.agents import AGENTS, presets
 from symsteer.agents.agent import Budget
 from symsteer.agents.options import SacOptions
-from symsteer.agents.presets import preset_names, preset_options
+from symsteer.agents.presets import preset_options
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.standard import StandardAgent
 from symsteer.errors import UserError
 
 ROOT = Path(__file__).parents[2]
+PRESETS = sorted(path.stem for path in presets.FOLDER.glob("*.toml"))
 PAGE = (ROOT / "docs" / "agents.md").read_text()
 RESULTS = ROOT / "leaderboard" / "results"
 TRAINED = [name for name in AGENTS.builtin if issubclass(AGENTS.get(name), SacAgent)]
@@ -183,7 +184,7 @@ REFUSED = {
 """What a preset sets contradicts what the agent is."""
 
 
-@pytest.mark.parametrize("preset", preset_names())
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("name", AGENTS.builtin)
 def test_presets_load_for_every_agent(problem, name, preset):
     kind = AGENTS.get(name)
@@ -323,5 +324,5 @@ def test_the_control_has_the_settings_of_the_agent_that_it_controls():
 def test_the_page_names_every_agent_option_and_preset():
     kinds = [AGENTS.get(name).Options for name in AGENTS.builtin]
     options = [field.name for kind in kinds for field in dataclasses.fields(kind)]
-    for name in {*AGENTS.builtin, *preset_names(), *options}:
+    for name in {*AGENTS.builtin, *PRESETS, *options}:
         assert f"`{name}`" in PAGE, name

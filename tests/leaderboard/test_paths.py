@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -122,7 +124,8 @@ def test_a_name_that_is_no_text(
     assert "not UTF-8: rename it" in refused(capsys, good, "--out", tmp_path / "out")
     strange.rename(good / "caf\u00e9 [x](y).json")
     out = tmp_path / os.fsdecode(b"out\xe9")
-    assert main([str(good), "--out", str(out)]) == 0
+    words = [sys.executable, "-m", "symsteer", "report", good, "--out", out]
+    assert b"wrote" in subprocess.run(words, check=True, capture_output=True).stdout
     assert "](../good/caf%C3%A9%20%5Bx%5D%28y%29.json)" in (out / "LEADERBOARD.md").read_text()
 
 
