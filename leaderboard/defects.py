@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.leaderboard.paper import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.records import canonical_json
 from symsteer.leaderboard.statistics import (
@@ -145,9 +145,8 @@ def parse_audit(data: bytes, path: Path) -> dict[Place, Defect]:
                 f"{path} holds an audit of another version of SymSteer, without the defects of "
                 "decisions: measure it again with `symsteer audit`."
             ) from error
-        where = ".".join(map(str, first["loc"]))[:120]
         raise UserError(
-            f"{path} is no summary of an audit ({where}: {first['msg']}): "
+            f"{path} is no summary of an audit ({first_problem(error)}): "
             "name the summary.json that `symsteer audit --out` wrote."
         ) from error
     audit: dict[Place, Defect] = {}

@@ -14,7 +14,7 @@ from symsteer.bench.audit.estimates import Estimate
 from symsteer.bench.sim.environment import Simulator
 from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import read
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.policies.geometry import Group
 from symsteer.variant import file_name
 
@@ -245,10 +245,8 @@ class AuditResult:
         try:
             return TypeAdapter(cls).validate_python(data)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
             raise UserError(
-                f"an audit file is damaged ({where}: {first['msg']}); run the audit again"
+                f"an audit file is damaged ({first_problem(error)}); run the audit again"
             ) from error
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from symsteer.bench.bundles.manifest import FORMAT, MANIFEST, VERSION, Manifest
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.files import write_together
 
 LARGEST_MANIFEST = 2**20
@@ -116,10 +116,8 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
     try:
         return Manifest.model_validate_json(text)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"]))
         raise UserError(
-            f"the {MANIFEST} of {path} is wrong in {where} ({first['msg']}); copy it again"
+            f"the {MANIFEST} of {path} is wrong ({first_problem(error)}); copy it again"
         ) from error
 
 

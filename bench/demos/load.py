@@ -12,12 +12,12 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, field_validator
 
 from symsteer.bench.demos.files import SEAL, checksum, opened
 from symsteer.bench.tasks import check_embodiment, make, task_class, task_name
 from symsteer.bench.tasks.embodiments import BODIES
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.policies.geometry import Layout
 
 # Same joints and tool centre point as the Panda; ManiSkill records StackCube with it.
@@ -163,12 +163,8 @@ def _read_description(path: Path) -> dict[str, Any]:
         description = json.loads(side.read_text("utf-8-sig"))
         return _Description.model_validate(description).model_dump(exclude_unset=True)
     except (ValueError, RecursionError) as error:
-        problem = str(error)
-        if isinstance(error, ValidationError):
-            first = error.errors(include_url=False, include_input=False)[0]
-            problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise UserError(
-            f"{side} does not describe ManiSkill trajectories ({problem}); "
+            f"{side} does not describe ManiSkill trajectories ({first_problem(error)}); "
             "collect or download the pair again"
         ) from error
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.files import write_atomically
 from symsteer.leaderboard.records.migrations import MIGRATIONS
 from symsteer.leaderboard.records.schema import SCHEMA_VERSION, RunRecord
-from symsteer.leaderboard.records.values import canonical_json, first_problem
+from symsteer.leaderboard.records.values import canonical_json
 
 MAX_BYTES = 64 * 2**20
 """A record has some ten to a few hundred kilobytes; a larger file is something else."""

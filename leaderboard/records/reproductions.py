@@ -16,7 +16,7 @@ from typing import Any, Literal, Self, get_args
 
 from pydantic import ValidationError, model_validator
 
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.leaderboard.records.curves import area_under_curve
 from symsteer.leaderboard.records.files import read_record
 from symsteer.leaderboard.records.provenance import Provenance
@@ -33,7 +33,6 @@ from symsteer.leaderboard.records.values import (
     Share,
     Text,
     canonical_json,
-    first_problem,
     flat,
 )
 

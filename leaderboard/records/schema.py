@@ -16,6 +16,7 @@ from pydantic import (
     model_validator,
 )
 
+from symsteer.errors import first_problem
 from symsteer.leaderboard.records.provenance import Provenance
 from symsteer.leaderboard.records.values import (
     MAX_TEXT,
@@ -34,7 +35,6 @@ from symsteer.leaderboard.records.values import (
     Text,
     canonical_json,
     config_hash,
-    first_problem,
     plain,
     portable,
 )
@@ -344,6 +344,17 @@ class RunRecord(Block):
             for evaluation in self.evaluations
             for name in Q_VALUES
         )
+
+    @property
+    def not_finite(self) -> str:
+        """Measured numbers that were not finite, and when first; those of Q are its divergence."""
+        found = {f"{name} of the base policy": 0 for name in self.base_policy.nonfinite}
+        for evaluation in self.evaluations:
+            for path in (*evaluation.nonfinite, *evaluation.episodes.nonfinite):
+                name = path.removeprefix("diagnostics/").partition("/")[0]
+                if not name.startswith("q_"):
+                    found.setdefault(name, evaluation.env_steps)
+        return ", ".join(f"{name} (first after {steps} steps)" for name, steps in found.items())
 
     @property
     def divergence(self) -> Divergence | None:

@@ -20,7 +20,6 @@ from pydantic import (
     ConfigDict,
     Field,
     PlainSerializer,
-    ValidationError,
     model_validator,
 )
 
@@ -191,16 +190,3 @@ def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def portable(text: str) -> str:
     """Shorten absolute paths in `text` to their last part, so that records name no machine."""
     return re.sub(r"(?<![\w.:/])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:'\",;()]+[/\\])+", "", text)
-
-
-def first_problem(error: Exception) -> str:
-    """The first validation error as a phrase: where, what, how many more."""
-    if not isinstance(error, ValidationError):
-        return str(error)
-    first = error.errors(include_url=False, include_input=False)[0]
-    where = ".".join(str(part) for part in first["loc"])[:120]
-    what = first["msg"].removeprefix("Value error, ")
-    more = error.error_count() - 1
-    return (
-        f"{where}: {what}" * bool(where) + what * (not where) + f" (and {more} more)" * bool(more)
-    )
