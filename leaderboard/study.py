@@ -36,7 +36,7 @@ Numbers = Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_length=1)
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Cells(_Table):
@@ -97,7 +97,7 @@ class _File(_Table):
     notice: str = ""
     details: str = ""
     declared: Annotated[str, Field(pattern=r"^([0-9a-f]{7,40})?$")] = ""
-    claims: str = ""
+    claims: Annotated[str, Field(pattern=r"^([\w-][\w.-]*)?$")] = ""
     """Another file of the same folder, which holds the claims."""
     claim: tuple[Claim, ...] = ()
     statement: tuple[Statement, ...] = ()
@@ -192,7 +192,7 @@ def _read(name_or_path: str) -> tuple[_File, Path]:
     try:
         return _File.model_validate(data), path
     except ValidationError as error:
-        raise UserError(f"{path.name}: {_problem(error)}") from error
+        raise UserError(f"{path.name}: {_problem(error)}; correct it there") from error
 
 
 def _check_commit(source: Path, commit: str) -> None:

@@ -33,7 +33,7 @@ def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any
     path = Path(name_or_path)
     path = path if path.suffix == ".toml" else folder / f"{name_or_path}.toml"
     try:
-        return tomllib.loads(path.read_text("utf-8-sig")), path
+        return shallow(tomllib.loads(path.read_text("utf-8-sig"))), path
     except FileNotFoundError as error:
         names = sorted(path.stem for path in folder.glob("*.toml"))
         close = nearest(path.stem, names)
@@ -157,6 +157,16 @@ def _explained(path: Path) -> Iterator[None]:
         raise UserError(
             f"{path} cannot be written: {reason}; free space or choose another folder"
         ) from error
+
+
+def shallow(data: Any, levels: int = 32) -> Any:
+    """The same plain data; a ValueError if they are nested deeper than recursive code can go."""
+    if not levels:
+        raise ValueError("it is nested more than 32 levels deep")
+    inner = data.values() if isinstance(data, dict) else data if isinstance(data, list) else ()
+    for value in inner:
+        shallow(value, levels - 1)
+    return data
 
 
 def _sync_folder(folder: Path) -> None:

@@ -10,6 +10,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
+from pydantic import TypeAdapter, ValidationError
+
+from symsteer.errors import UserError, first_problem
 from symsteer.files import read_toml
 from symsteer.names import unknown
 
@@ -30,7 +33,12 @@ def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
         UserError: if there is no such preset, it is damaged, or it sets an option of the agent's
             own table that the agent does not have.
     """
-    tables, path = read_toml(name, "preset", FOLDER)
+    found, path = read_toml(name, "preset", FOLDER)
+    try:
+        tables = TypeAdapter(dict[str, dict[str, Any]]).validate_python(found)
+    except ValidationError as error:
+        problem = f"the preset {path} is not made of tables of TOML: {first_problem(error)}"
+        raise UserError(f"{problem}; correct it") from error
     valid = [field.name for field in dataclasses.fields(options)]
     own = tables.get(agent, {})
     for key in own:

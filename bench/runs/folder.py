@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 
 from symsteer.bench.runs.config import RunConfig, content_key
 from symsteer.errors import UserError
-from symsteer.files import write_atomically
+from symsteer.files import shallow, write_atomically
 from symsteer.leaderboard.records import read_record
 from symsteer.variant import file_name
 
@@ -126,7 +126,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG
     try:
-        data = json.loads(path.read_text("utf-8-sig"))
+        data = shallow(json.loads(path.read_text("utf-8-sig")))
     except (FileNotFoundError, NotADirectoryError) as error:
         raise UserError(
             f"{folder} is not the folder of a run: it has no {CONFIG}; name a folder that "

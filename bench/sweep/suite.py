@@ -109,6 +109,7 @@ class _Options:
         if self.kind == "agent" and "preset" in options:
             preset = self._text(options["preset"], "preset")
             start = preset_options(preset, name, self.classes[name])
+            build_config({"agent": name, "agent_options": start}, f"preset {preset}")
         valid = _fields(self.classes[name])
         return name, start | {key: value for key, value in options.items() if key in valid}
 

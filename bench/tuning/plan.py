@@ -15,30 +15,49 @@ import copy
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import AliasPath, BaseModel, ConfigDict, Field, ValidationError
 
 from symsteer.agents import AGENTS
-from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.sweep.grid import suite_data
 from symsteer.bench.sweep.suite import suite_of
 from symsteer.bench.tuning import FOLDER
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.files import read_toml
 from symsteer.names import unknown
-
-NUMBERS = {"trials": 20, "exchange": 0, "batch": 4, "probe": 2, "seed": 0}
-"""Whole numbers of a plan and their defaults."""
 
 LATER = ("description", "trials", "further", "exchange", "batch", "singles")
 """What may change after the first trial."""
 
-KEYS = (
-    *("description", "agents", "singles", *NUMBERS),
-    *("grid", "run", "confirm", "start", "further", "space"),
-)
+Table = dict[str, Any]
+Grid = Annotated[Table | list[Table], Field(min_length=1)]
+Number = Annotated[int, Field(ge=1, le=10**6)]
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    description: str = ""
+    agents: Annotated[list[str], Field(min_length=1)]
+    singles: list[str] = []
+    trials: Number = 20
+    exchange: Annotated[int, Field(ge=0, le=10**6)] = 0
+    batch: Number = 4
+    probe: Number = 2
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    grid: Grid
+    run: Table = {}
+    options: dict[str, Any] = Field({}, validation_alias=AliasPath("run", "agent"))
+    confirm: Grid
+    start: Table = {}
+    further: list[Table] = []
+    space: Annotated[Table, Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -145,27 +164,32 @@ def read_plan(name_or_path: str) -> TuningPlan:
     data, path = read_toml(name_or_path, "tuning plan", FOLDER)
     source = path.name
     for key in data:
-        if key not in KEYS:
-            raise unknown("key", key, KEYS, source)
-    for key in ("agents", "grid", "confirm", "space"):
-        if not data.get(key):
-            raise UserError(f"{source}: {key} is missing; every tuning plan has it")
-    agents = data["agents"]
-    names = dict.fromkeys(name for agent in agents for name in _option_names(agent))
+        if key not in _File.model_fields:
+            raise unknown("key", key, set(_File.model_fields) - {"options"}, source)
+    try:
+        file = _File.model_validate(data)
+    except ValidationError as error:
+        raise UserError(f"{source}: {first_problem(error)}; correct it there") from error
+    agents = file.agents
+    try:
+        names = dict.fromkeys(name for agent in agents for name in _option_names(agent))
+    except UserError as error:
+        raise UserError(f"{source}: agents: {error}") from error
     for key in data["space"]:
         if key not in names and key not in agents:
             raise unknown("option or agent", key, [*names, *agents], f"{source}, space")
-    numbers = {
-        key: _number(data.get(key, default), key, source) for key, default in NUMBERS.items()
-    }
+    for where, table in (("space", file.space), ("run.agent", file.options)):
+        for agent in agents:
+            if not isinstance(table.get(agent, {}), dict):
+                raise UserError(f"{source}: {where}.{agent} must be a table of options")
     plan = TuningPlan(
         name=path.stem,
         source=source,
-        description=str(data.get("description", "")),
+        description=file.description,
         spaces={agent: _space(agent, data, agents, source) for agent in agents},
-        singles=tuple(data.get("singles", ())),
+        singles=tuple(file.singles),
         data=data,
-        **numbers,
+        **{key: getattr(file, key) for key in ("trials", "exchange", "batch", "probe", "seed")},
     )
     shared = {name for space in plan.spaces.values() for name in space}
     tables = [("start", data.get("start", {})), *(("further", f) for f in data.get("further", ()))]
@@ -188,15 +212,6 @@ def read_plan(name_or_path: str) -> TuningPlan:
     return plan
 
 
-def _number(value: Any, key: str, source: str) -> int:
-    least = 0 if key in ("seed", "exchange") else 1
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise UserError(
-            f"{source}: {key} must be a whole number of at least {least}, not {value!r}"
-        )
-    return value
-
-
 def _first(data: Mapping[str, Any], agent: str, name: str) -> Any:
     default = getattr(AGENTS.get(agent).Options(), name)
     return data.get("start", {}).get(name, default)
@@ -204,7 +219,6 @@ def _first(data: Mapping[str, Any], agent: str, name: str) -> Any:
 
 def _space(agent: str, data: Mapping[str, Any], agents: Sequence[str], source: str) -> Space:
     tables = data["space"]
-    options = AGENTS.get(agent).Options
     fields = _option_names(agent)
     own = tables.get(agent, {})
     for name in own:
@@ -217,9 +231,9 @@ def _space(agent: str, data: Mapping[str, Any], agents: Sequence[str], source: s
             continue
         space[name] = found = _values(name, value, source)
         ends = found.values if isinstance(found, Choices) else (found.low, found.high)
-        for end in ends:
-            options(**{name: end})
-        if not _contains(found, first := _first(data, agent, name)):
+        for end in (*ends, first := _first(data, agent, name)):
+            build_config({"agent": agent, "agent_options": {name: end}}, f"{source}: space")
+        if not _contains(found, first):
             raise UserError(
                 f"{source}: space.{name} does not contain {first!r}, with which the first trial of "
                 f"{agent} begins; widen it, or give start.{name}"
@@ -236,7 +250,9 @@ def _values(name: str, value: Any, source: str) -> Range | Choices:
         return Choices(tuple(value))
     try:
         found = Range(**value)
-        if found.low < found.high and (found.low > 0 or not found.log):
+        least = 0 if found.log else -math.inf
+        numbers = all(type(end) in (int, float) for end in (found.low, found.high))
+        if numbers and least < found.low < found.high < math.inf:
             return found
     except TypeError:
         pass
@@ -249,4 +265,4 @@ def _values(name: str, value: Any, source: str) -> Range | Choices:
 def _contains(values: Range | Choices, value: Any) -> bool:
     if isinstance(values, Choices):
         return value in values.values
-    return values.low <= value <= values.high
+    return isinstance(value, int | float) and values.low <= value <= values.high

@@ -24,6 +24,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from symsteer.bench.tuning.plan import LATER, Choices, Range, TuningPlan
 from symsteer.errors import UserError
+from symsteer.policies.files import DAMAGE
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -113,7 +114,13 @@ class Search:
 def open_storage(path: Path) -> JournalStorage:
     """Open the journal, or begin one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    return JournalStorage(JournalFileBackend(str(path)))
+    try:
+        return JournalStorage(JournalFileBackend(str(path)))
+    except DAMAGE as error:
+        raise UserError(
+            f"{path} is not a journal of trials ({type(error).__name__}: {error}); restore it, or "
+            "delete it to begin the search again"
+        ) from error
 
 
 def _distribution(values: Range | Choices) -> BaseDistribution:

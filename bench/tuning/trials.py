@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from pydantic import TypeAdapter
 from scipy.stats import rankdata
 
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import RECORD, run_id
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.records.curves import area_under_curve
 
@@ -133,12 +133,11 @@ def read_scores(path: Path) -> dict[str, Score]:
     if not path.is_file():
         return {}
     try:
-        scores = json.loads(path.read_text("utf-8-sig"))
-        return {name: Score(**score) for name, score in scores.items()}
-    except (ValueError, TypeError, AttributeError) as error:
+        return TypeAdapter(dict[str, Score]).validate_json(path.read_bytes())
+    except ValueError as error:
         raise UserError(
-            f"{path} is not a file of scores ({error}); delete it, and the search goes on with the "
-            "runs whose folders are there"
+            f"{path} is not a file of scores ({first_problem(error)}); delete it, and the search "
+            "goes on with the runs whose folders are there"
         ) from None
 
 

@@ -235,6 +235,22 @@ def test_more_trials_can_be_added_later(play):
     assert 4 <= len(runs.played) <= 16
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("tiny-scores.json", '{"run": {"auc": "high"}}'),
+        ("tiny-scores.json", "[" * 100_000),
+        ("tiny.journal", "{}\n"),
+        ("tiny.journal", "nothing\n[]\n"),
+    ],
+)
+def test_a_damaged_file_of_a_search_is_named(play, tmp_path, name, text):
+    play()
+    (tmp_path / "runs" / "tuning" / name).write_text(text)
+    with pytest.raises(UserError, match=rf"{name} is not a .*; (restore it, or )?delete it"):
+        play()
+
+
 def test_trials_of_another_plan_are_refused(play):
     play()
     with pytest.raises(
