@@ -13,9 +13,10 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Self, TypeAlias
 
 import torch
+from pydantic import Field, TypeAdapter
 from torch import nn
 
 from symsteer.errors import UserError
@@ -44,7 +45,7 @@ class PolicyOptions:
         UserError: if a value is out of range.
     """
 
-    horizon: int = 8
+    horizon: Annotated[int, Field(le=1000)] = 8
     """Tp: actions in a chunk."""
     execute: int = 4
     """Ta: actions executed before the next decision."""
@@ -78,12 +79,12 @@ class PolicyOptions:
 
         Raises:
             UserError: if a value is out of range.
-            TypeError: if a field is unknown.
+            ValueError: if it has another type, or a field is unknown.
         """
-        fields: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
-        }
-        return cls(**fields)
+        if unknown := data.keys() - {field.name for field in dataclasses.fields(cls)}:
+            raise ValueError(f"there is no option {min(unknown)!r}")
+        # As JSON: strict mode then accepts 1 for 1.0 and lists for tuples.
+        return TypeAdapter(cls).validate_json(json.dumps(data, allow_nan=False), strict=True)
 
 
 class ChunkPolicy(nn.Module, abc.ABC):

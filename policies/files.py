@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import BaseModel, Field
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from symsteer.errors import UserError
-from symsteer.files import write_atomically
+from symsteer.errors import UserError, first_problem
+from symsteer.files import shallow, write_atomically
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Layout
@@ -24,15 +28,52 @@ READABLE = ("1", "2", "3")
 FILE_NAME = "policy.safetensors"
 
 DAMAGE = (
+    ArithmeticError,
     AttributeError,
-    KeyError,
+    LookupError,
     RuntimeError,
     StopIteration,
     TypeError,
     UserError,
     ValueError,
 )
-"""What a description or tensors of the wrong form raise while a policy is built from them."""
+"""What a description or tensors of the wrong form raise while something is built from them."""
+
+
+Count = Annotated[int, Field(ge=0, le=10**12)]
+Size = Annotated[float, Field(ge=0, le=1e30)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class _Steerability(BaseModel):
+    success: Share | None = None
+    episodes: Count | None = None
+    solvable: Share | None = None
+    states: Count | None = None
+    draws: Count | None = None
+    action_std: Size | None = None
+    equivariance_error: Size | None = None
+    jump: Size | None = None
+    warning: Annotated[str, Field(max_length=2000)] | None = None
+
+
+class _Report(BaseModel):
+    world: dict[str, str | int | dict[str, Any]] = {}
+    steerability: _Steerability = _Steerability()
+
+
+class _Training(BaseModel):
+    seconds: Size | None = None
+
+
+class _Description(BaseModel):
+    """What is read of a description; files of earlier versions have a part of the report."""
+
+    name: str
+    options: dict[str, Any]
+    training_record: _Training
+    report: _Report
+    content_hash: str
 
 
 def policy_path(folder_or_path: str | Path) -> Path:
@@ -127,16 +168,22 @@ def load_policy(
             f"{path} is damaged: its description does not match its checksum; copy it again"
         )
     try:
-        description = json.loads(metadata["policy"])
+        description = shallow(json.loads(metadata["policy"]))
         if "config" in description:
             description |= _described_by_config(description["config"])
+        _Description.model_validate(description, strict=True)
         if found := description["extension"]:
             POLICIES.require(found["name"], found["target"], found["distribution"], path)
         POLICIES.check_allowed(description["name"], path)
         kind = POLICIES.get(description["name"])
         obs_layout = Layout.from_json(description["obs_layout"])
         act_layout = Layout.from_json(description["act_layout"])
-        policy = kind(kind.Options.from_json(description["options"]), obs_layout, act_layout)
+        for side, layout in (("obs", obs_layout), ("act", act_layout)):
+            if layout.dim != len(tensors[f"{side}_normalizer.scale"]):
+                raise ValueError(f"{side}_layout does not fit the normaliser")
+        options = kind.Options.from_json(description["options"])
+        with _no_larger_than(10 * sum(tensor.numel() for tensor in tensors.values())):
+            policy = kind(options, obs_layout, act_layout)
         policy.to(next(t.dtype for t in tensors.values() if t.is_floating_point()))
         policy.load_state_dict(tensors)
         stored_hash = description["content_hash"]
@@ -145,7 +192,7 @@ def load_policy(
     except (NotAllowedError, NotInstalledError):
         raise
     except DAMAGE as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = " ".join(first_problem(error).split())[:200]
         raise UserError(
             f"{path} is a damaged SymSteer policy ({reason}); train it again"
         ) from error
@@ -160,7 +207,37 @@ def load_policy(
             )
     if policy.content_hash() != stored_hash:
         raise UserError(f"{path} is damaged: its contents do not match its checksum; copy it again")
+    if not _is_finite(policy):
+        raise UserError(
+            f"{path} decodes to NaN or infinity, so nothing can be steered; train it again, with a "
+            "lower policy.learning_rate if it diverged"
+        )
     return policy.freeze().to(device)
+
+
+def _is_finite(policy: ChunkPolicy) -> bool:
+    """Whether parameters and actions are finite, at a few observations like those of the data."""
+    draw = torch.Generator().manual_seed(0)
+    like = policy.act_normalizer.scale
+    obs = torch.rand(8, policy.obs_layout.dim, generator=draw).to(like)
+    noise = torch.randn(8, policy.horizon, policy.act_layout.dim, generator=draw).to(like)
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        actions = policy.freeze().decode(policy.obs_normalizer.unnormalize(obs), noise)
+    return all(bool(t.isfinite().all()) for t in (actions, *policy.parameters()))
+
+
+@contextlib.contextmanager
+def _no_larger_than(numbers: int) -> Iterator[None]:
+    """Refuse to build networks of more parameters, before their memory is used."""
+
+    def register(module: Any, name: str, parameter: torch.Tensor | None) -> None:
+        nonlocal numbers
+        numbers -= 0 if parameter is None else parameter.numel()
+        if numbers < 0:
+            raise ValueError("its options ask for a larger network than the file holds")
+
+    with register_module_parameter_registration_hook(register):
+        yield
 
 
 def _described_by_config(config: dict[str, Any]) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
     """
     task = task_class(config.task)
     base = load_policy(path, task.observation_layout, task.action_layout)
-    world = base.report.get("world", {})
+    world = base.report.get("world") or {}
     for key in ("task", "embodiment"):
         here, there = getattr(config, key), world.get(key, getattr(config, key))
         if here != there:
@@ -104,7 +104,7 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
     }
     if "demonstrations" in world:
         own["demonstrations"] = world["demonstrations"]
-        own["policy_seed"] = world["policy_seed"]
+        own["policy_seed"] = world.get("policy_seed")
     told = build_config(config.to_json() | own, str(path))
     # A setting with its default value was not asked for: the value of the file is used.
     plain = RunConfig(agent=config.agent, policy_name=config.policy_name, seed=config.seed)
@@ -230,21 +230,21 @@ def demonstrated_decisions(
 
 def describe_base(policy: ChunkPolicy) -> BasePolicy:
     """The record's block on a base policy."""
-    report = policy.report["steerability"]
+    report = policy.report.get("steerability") or {}
     return BasePolicy(
         name=policy.name,
         group=str(policy.group),
         content_hash=policy.content_hash(),
-        base_success=report["success"],
-        episodes=report["episodes"],
-        action_std=report["action_std"],
-        solvable=report["solvable"],
-        draws=report["draws"],
+        base_success=report.get("success"),
+        episodes=report.get("episodes"),
+        action_std=report.get("action_std"),
+        solvable=report.get("solvable"),
+        draws=report.get("draws", DRAWS),
         equivariance_error=report.get("equivariance_error"),
         jump=report.get("jump"),
         training_seconds=policy.training_record.get("seconds"),
         parameters=policy.parameter_count(),
-        warning=report["warning"],
+        warning=report.get("warning"),
     )
 
 
@@ -283,7 +283,7 @@ def _train(
 def _measured(config: RunConfig, base: ChunkPolicy, progress: bool, workers: int) -> ChunkPolicy:
     """The policy on its device, with a report on as many states as the run asks for."""
     found = base.report.get("steerability")
-    if found is None or found["states"] != config.evaluation.steerability_states:
+    if found is None or found.get("states") != config.evaluation.steerability_states:
         report = _measure(config, base, workers)
         if report.warning and progress:
             tqdm.write(f"warning: {report.warning}")

@@ -110,6 +110,6 @@ def load(path: str | Path, device: str = "cpu", trust: Sequence[str] = ()) -> Tr
         return Trained(run.policy, run.agent, config, world)
     policy = load_policy(path, device=device)
     context = AgentContext.of(policy, device)
-    known = policy.report.get("world", {})
+    known = policy.report.get("world") or {}
     world = {key: known[key] for key in ("task", "embodiment") if key in known}
     return Trained(policy, BaseAgent(context), None, {**world, "variant": "none"} if world else {})

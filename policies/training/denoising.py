@@ -13,9 +13,10 @@ from __future__ import annotations
 import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
 import torch
+from pydantic import Field
 from torch import nn
 
 from symsteer.errors import UserError
@@ -63,7 +64,7 @@ class DenoisingOptions(GradientOptions):
     """Residual blocks of the MLP."""
     zero_output: bool = False
     """Start the network's output layer at 0 instead of with random weights."""
-    diffusion_steps: int = 100
+    diffusion_steps: Annotated[int, Field(le=10_000)] = 100
     """K: noise levels in training."""
     sampling_steps: int = 2
     """DDIM steps of the sampler."""

@@ -1,8 +1,11 @@
 """Saving and loading policies: bit-equal round trip, checksums, one-sentence errors."""
 
+import copy
 import errno
+import functools
 import hashlib
 import json
+import operator
 import os
 import sys
 from pathlib import Path
@@ -13,7 +16,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from symsteer.errors import UserError
-from symsteer.policies import POLICIES
+from symsteer.policies import POLICIES, files
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Field, Layout
 from symsteer.registry import allow
@@ -168,6 +171,55 @@ def test_damaged_tensors(saved):
 def test_altered_tensors(saved):
     rewrite(saved, scale="denoiser.project.weight")
     refuse(saved, "checksum")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["denoiser.project.weight", "act_normalizer.scale"])
+def test_a_policy_that_decodes_to_nan_is_refused(trained, tmp_path, name, value):
+    policy = copy.deepcopy(trained(group="C8"))
+    policy.state_dict()[name].flatten()[0] = value
+    refuse(save_policy(policy, tmp_path), "decodes to NaN or infinity", "train it again")
+
+
+@pytest.mark.parametrize("name", POLICIES.builtin)
+def test_every_policy_is_tried_and_no_stream_of_random_numbers_moves(name, world, tmp_path):
+    policy = world.untrained(name)
+    before = torch.get_rng_state()
+    assert files._is_finite(policy)
+    assert torch.equal(torch.get_rng_state(), before)
+    loaded = load_policy(save_policy(policy, tmp_path))
+    assert torch.equal(decode(loaded, world), decode(policy, world))
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ("options horizon", "8", "horizon: Input should be a valid integer"),
+        ("options horizon", 10**9, "horizon: Input should be less than or equal to 1000"),
+        ("options diffusion_steps", 10**9, "diffusion_steps: Input should be less than or equal"),
+        ("options execute", 2.5, "execute: Input should be a valid integer"),
+        ("options width", 10**5, "ask for a larger network than the file holds"),
+        ("options depth", 10**9, "ask for a larger network than the file holds"),
+        ("options hue", 1, "there is no option 'hue'"),
+        ("obs_layout 0 multiplicity", 10**9, "obs_layout does not fit the normaliser"),
+        ("report world", 3, "report.world: Input should be a valid dictionary"),
+        ("report steerability", {"success": 2.0}, "report.steerability.success: Input should be"),
+        ("report steerability", {"states": "x"}, "report.steerability.states: Input should be"),
+        ("training_record seconds", float("nan"), "training_record.seconds: Input should be"),
+        ("report", [[[]]], "report: Input should be"),
+        ("report deep", functools.reduce(lambda x, _: [x], range(90), 1), "32 levels deep"),
+    ],
+)
+def test_a_description_of_another_form_is_refused(saved, place, value, words):
+    """Its checksum is right."""
+    with safe_open(saved, framework="pt") as file:
+        found = json.loads(file.metadata()["policy"])
+    *path, last = (int(key) if key.isdigit() else key for key in place.split())
+    functools.reduce(operator.getitem, path, found)[last] = value
+    text = json.dumps(found)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    rewrite(saved, {"policy": text, "policy_sha256": digest})
+    refuse(saved, str(saved), words)
 
 
 def test_other_layouts(saved, world):
