@@ -306,6 +306,8 @@ class KernelBestOfNAgent(Agent):
         }
         continue_stream(self.fit_generator, state["fit_generator"])
         self.decisions, self.fits = int(state["decisions"]), int(state["fits"])
+        # Of another shape, they cannot tell a value.
+        self._values(*(torch.zeros(1, x.dim) for x in (self.obs_layout, self.executed_layout)))
 
 
 def _kernel(queries: torch.Tensor, orbits: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Streams of random numbers that a checkpoint continues."""
+"""Streams of random numbers and tensors that a checkpoint continues."""
 
 from __future__ import annotations
 
@@ -18,3 +18,12 @@ def continue_stream(generator: torch.Generator, state: torch.Tensor) -> None:
     state = state.cpu()
     if state.shape == generator.get_state().shape:
         generator.set_state(state)
+    elif state.shape not in ((16,), (5056,)):  # of a GPU, of a processor
+        raise ValueError(f"the state of a generator has the shape {list(state.shape)}")
+
+
+def tensor_like(stored: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
+    """A stored tensor as ``own`` is; a copy would repeat one of another shape, so it is refused."""
+    if stored.shape != own.shape:
+        raise ValueError(f"a tensor has the shape {list(stored.shape)}, not {list(own.shape)}")
+    return stored.to(own)

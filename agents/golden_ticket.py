@@ -16,6 +16,7 @@ import torch
 
 from symsteer.agents.agent import Agent, AgentContext, AgentOptions, Budget, MakeEnv, NoiseEnv
 from symsteer.agents.episodes import Played
+from symsteer.agents.generators import tensor_like
 from symsteer.errors import UserError
 
 
@@ -92,8 +93,8 @@ class GoldenTicketAgent(Agent):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with the ticket."""
         super().load_state_dict(state)
-        self.ticket = state["ticket"].to(self.ticket)
-        self.searched = dict(state["searched"])
+        self.ticket = tensor_like(state["ticket"], self.ticket)
+        self.searched = {str(name): float(value) for name, value in state["searched"].items()}
 
 
 def play_constant(env: NoiseEnv, noise: torch.Tensor, seeds: list[int]) -> dict[str, torch.Tensor]:

@@ -8,6 +8,8 @@ from typing import Any
 
 import torch
 
+from symsteer.agents.generators import tensor_like
+
 
 class Multiplier:
     """A positive number ``exp(log)`` that grows while the gap of its constraint is negative.
@@ -37,14 +39,26 @@ class Multiplier:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self.optimizer.load_state_dict(state["optimizer"])
+        restore_adam(self.optimizer, state["optimizer"])
         with torch.no_grad():
-            self.log.copy_(state["log"])
+            self.log.copy_(tensor_like(state["log"], self.log))
 
 
 def adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
     """The Adam of all parts of the learner."""
     return torch.optim.Adam(groups, lr=lr, fused=True)
+
+
+def restore_adam(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
+    """Continue with stored moments; torch does not check that they fit the parameters."""
+    own = optimizer.state_dict()["param_groups"]
+    parameters = dict(enumerate(p for group in optimizer.param_groups for p in group["params"]))
+    for index, moments in state["state"].items():
+        for name in ("exp_avg", "exp_avg_sq"):
+            tensor_like(moments[name], parameters[index])
+        if moments.keys() != {"step", "exp_avg", "exp_avg_sq"} or not moments["step"].item() >= 1:
+            raise ValueError("an optimiser has other moments")
+    optimizer.load_state_dict({"state": state["state"], "param_groups": own})
 
 
 def descend(

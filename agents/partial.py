@@ -41,6 +41,7 @@ from symsteer.agents.equivariant import (
     equivariant_critic_layers,
     equivariant_layers,
 )
+from symsteer.agents.generators import tensor_like
 from symsteer.agents.networks import Ensemble, Weights
 from symsteer.agents.optimization import adam
 from symsteer.agents.options import SacOptions
@@ -235,7 +236,7 @@ class PartialAgent(StandardAgent):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where :meth:`state_dict` was taken."""
         super().load_state_dict(state)
-        self.sizes.copy_(state["sizes"])
+        self.sizes.copy_(tensor_like(state["sizes"], self.sizes))
 
 
 def block_weights(sizes: torch.Tensor) -> torch.Tensor:

@@ -179,10 +179,14 @@ class ReplayBuffer:
         Raises:
             UserError: if the saved transitions have other fields or shapes, or do not fit.
         """
-        rows = state["rows"]
-        size = len(next(iter(rows.values())))
+        rows, position, stride = state["rows"], state["position"], state["stride"]
+        sizes = {len(kept) for kept in rows.values()}
         found = {name: tuple(kept.shape[1:]) for name, kept in rows.items()}
-        if found != self.shapes or size > self.capacity:
+        size = max(sizes, default=0)
+        # Until the ring is full, its next row is the first free one.
+        free = range(self.capacity) if size == self.capacity else range(size, self.capacity)[:1]
+        told = position in free and stride in range(1, max(size, 1) + 1)
+        if found != self.shapes or len(sizes) != 1 or not told:
             raise UserError(
                 f"the saved replay holds {size} transitions of {found}, this buffer up to "
                 f"{self.capacity} of {self.shapes}; resume with the run's own configuration"
@@ -190,8 +194,7 @@ class ReplayBuffer:
         self._grow(size)
         for name, kept in self.storage.items():
             kept[:size] = rows[name].to(kept)
-        self.size, self.position = size, int(state["position"])
-        self.stride = int(state["stride"])
+        self.size, self.position, self.stride = size, position, stride
         continue_stream(self.generator, state["generator"])
 
     def _rows(self, name: str, count: int) -> torch.Tensor:

@@ -50,15 +50,16 @@ from symsteer.agents.agent import Agent, AgentContext, Budget, MakeEnv, Role
 from symsteer.agents.diagnostics import critic_diagnostics
 from symsteer.agents.distributions import LOG_SCALE_MAX, LOG_SCALE_MIN, SquashedGaussian
 from symsteer.agents.episodes import Played
-from symsteer.agents.generators import continue_stream
+from symsteer.agents.generators import continue_stream, tensor_like
 from symsteer.agents.networks import Ensemble, Weights, count, detached
-from symsteer.agents.optimization import Multiplier, adam, descend
+from symsteer.agents.optimization import Multiplier, adam, descend, restore_adam
 from symsteer.agents.options import NoiseSource, SacOptions
 from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Layout
 
 BANK = ("bank_noise", "bank_actions")
+MOST_OWED = 1e6
 COUNTERS = ("decisions", "owed", "distillation_owed", "updates")
 
 
@@ -557,16 +558,18 @@ class SacAgent(Agent):
         for name, network in self.networks.items():
             network.load_state_dict(state["networks"][name])
             network.changed()
-            self.optimizers[name].load_state_dict(state["optimizers"][name])
+            restore_adam(self.optimizers[name], state["optimizers"][name])
         for name, multiplier in self.multipliers.items():
             multiplier.load_state_dict(state["multipliers"][name])
         with torch.no_grad():
-            flat = _flat(self.target)
-            torch._foreach_copy_(flat, [t.to(flat[0]) for t in state["target"]])
+            for own, stored in zip(_flat(self.target), state["target"], strict=True):
+                own.copy_(tensor_like(stored, own))
         for name, generator in self._generators.items():
             continue_stream(generator, state["generators"][name])
         for name in COUNTERS:
             setattr(self, name, type(getattr(self, name))(state[name]))
+        if not 0 <= max(self.owed, self.distillation_owed) < MOST_OWED:
+            raise ValueError(f"{self.owed} and {self.distillation_owed} updates are due")
 
     def parameter_counts(self) -> dict[str, int]:
         """Numbers of trainable parameters (without target critics), and the hidden width."""

@@ -19,11 +19,12 @@ from symsteer.bench.runs.base_policy import (
     prepare_base,
     with_policy_of,
 )
-from symsteer.bench.runs.checkpoint import load_checkpoint
+from symsteer.bench.runs.checkpoint import fitting, load_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.evaluator import Evaluator, check_room
 from symsteer.bench.runs.folder import (
     CONFIG,
+    DEMONSTRATIONS,
     RECORD,
     claimed,
     discard_empty,
@@ -363,7 +364,8 @@ def _opened(
         checkpoint = load_checkpoint(folder)
         trainer = Trainer(config, folder, base, checkpoint, observers, workers, together)
         if decisions is not None:
-            trainer.agent.observe_demonstrations(decisions)
+            with fitting(folder / DEMONSTRATIONS, "delete it, and it is written again"):
+                trainer.agent.observe_demonstrations(decisions)
         try:
             yield trainer
         except BaseException as error:

@@ -15,10 +15,17 @@ from safetensors.torch import save as serialize
 
 from symsteer.agents.agent import Agent
 from symsteer.agents.replay import Transition
-from symsteer.bench.runs.checkpoint import load_checkpoint
+from symsteer.bench.runs.checkpoint import fitting, load_checkpoint
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.runs.extensions import require_extensions
-from symsteer.bench.runs.folder import CONFIG, DEMONSTRATIONS, RECORD, read_config, run_id
+from symsteer.bench.runs.folder import (
+    CHECKPOINT,
+    CONFIG,
+    DEMONSTRATIONS,
+    RECORD,
+    read_config,
+    run_id,
+)
 from symsteer.bench.runs.trainer import new_agent
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
@@ -71,7 +78,8 @@ def restored(folder: Path) -> Restored:
             "steers; restore it from where the run was made"
         )
     agent = new_agent(config, policy)
-    agent.load_state_dict(state["agent"])
+    with fitting(folder / CHECKPOINT):
+        agent.load_state_dict(state["agent"])
     return Restored(folder, config, policy, agent, state)
 
 

@@ -21,7 +21,7 @@ import torch
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import Agent, AgentContext, Budget, HasCritic
 from symsteer.agents.replay import Batch
-from symsteer.bench.runs.checkpoint import save_checkpoint
+from symsteer.bench.runs.checkpoint import fitting, save_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.evaluator import Evaluator, discount, make_env, timeouts_end
 from symsteer.bench.runs.folder import CHECKPOINT
@@ -361,9 +361,10 @@ class Trainer:
                 f"{self.folder / 'policy.safetensors'}; restore that file, or delete the run's "
                 "folder to start again"
             )
-        self.agent.load_state_dict(state["agent"])
-        if self.agent.replay is not None and state["replay"] is not None:
-            self.agent.replay.load_state_dict(state["replay"])
+        with fitting(self.folder / CHECKPOINT):
+            self.agent.load_state_dict(state["agent"])
+            if self.agent.replay is not None and state["replay"] is not None:
+                self.agent.replay.load_state_dict(state["replay"])
         for name in (
             *("env_steps", "decisions", "updates", "train_until"),
             *("next_evaluation", "fresh_starts", "final"),

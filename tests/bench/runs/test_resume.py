@@ -1,14 +1,18 @@
 """A run that is killed and continued has the same record as one that was not stopped."""
 
+import functools
 import hashlib
 import io
 import json
 import multiprocessing
+import operator
 import os
 import random
+import re
 import shutil
 import signal
 import time
+import zipfile
 
 import pytest
 import torch
@@ -26,7 +30,7 @@ from symsteer.bench.runs.run import evaluate, resume
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.runs.conftest import ensure
-from tests.bench.tiny_run import tiny_config, without_clock
+from tests.bench.tiny_run import stop, tiny_config, without_clock
 
 # Processes that have finished their imports: the kill then happens during the run.
 PROCESSES = multiprocessing.get_context("forkserver")
@@ -227,6 +231,76 @@ def test_a_damaged_or_foreign_checkpoint_is_refused_and_kept(undisturbed, begun)
     with pytest.raises(UserError, match="delete it"):
         resume(begun, progress=False)
     assert (begun / "checkpoint.pt").stat().st_size == len(whole) // 2
+
+
+@pytest.fixture(scope="module")
+def stopped(undisturbed, tmp_path_factory):
+    """The folder of a run that was stopped after its first checkpoint, with its checkpoint."""
+    out = tmp_path_factory.mktemp("stopped")
+    shutil.copytree(undisturbed.parent / "base", out / "base")
+    folder = stop(CONFIG, out, env_steps=480)
+    archive = (folder / "checkpoint.pt").read_bytes()[:-CHECKSUM_BYTES]
+    return folder, archive
+
+
+def sealed(path, content, cut=0):
+    """Write a checkpoint with the right checksum; ``cut`` bytes are missing in its first tensor."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    if cut:
+        whole, buffer = zipfile.ZipFile(buffer), io.BytesIO()
+        with zipfile.ZipFile(buffer, "w") as archive:
+            for name in whole.namelist():
+                data = whole.read(name)
+                archive.writestr(name, data[:-cut] if name.endswith("data/0") else data)
+    path.write_bytes(buffer.getvalue() + hashlib.sha256(buffer.getvalue()).digest())
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ("env_steps", -1, "env_steps: Input should be greater than or equal to 0"),
+        ("updates", 10**30, "updates: Input should be"),
+        ("final", 0, "final: Input should be a valid boolean"),
+        ("recent_episodes", {"a": ["b"]}, "recent_episodes.a.0: Input should be a valid number"),
+        ("seconds total", float("nan"), "seconds.total: Input should be a finite number"),
+        ("seconds", {}, "seconds: Dictionary should have at least 6 items"),
+        ("agent", [], "agent: Input should be a valid dictionary"),
+        ("agent", {}, "this checkpoint has agent None"),
+        ("agent owed", 1e300, "updates are due"),
+        ("agent generator", torch.zeros(3, dtype=torch.uint8), "the state of a generator has the"),
+        ("agent target", [torch.zeros(1)], "has the shape"),
+        ("agent multipliers alpha log", torch.zeros(2), "has the shape"),
+        ("agent networks critic", {}, "Missing key(s)"),
+        ("agent optimizers critic state", {0: {}}, "exp_avg"),
+        ("agent optimizers critic state 0 exp_avg", torch.zeros(1), "has the shape"),
+        ("replay position", 10**6, "the saved replay holds"),
+        ("replay stride", 0, "the saved replay holds"),
+        ("replay rows reward", torch.zeros(1).expand(10**10), "the saved replay holds"),
+        ("replay rows", {}, "the saved replay holds"),
+    ],
+)
+def test_a_checkpoint_of_another_form_is_refused(stopped, place, value, words):
+    """Its checksum is right."""
+    folder, archive = stopped
+    path, content = folder / "checkpoint.pt", torch.load(io.BytesIO(archive), weights_only=True)
+    *keys, last = (int(key) if key.isdigit() else key for key in place.split())
+    functools.reduce(operator.getitem, keys, content["state"])[last] = value
+    sealed(path, content)
+    with pytest.raises(UserError, match=re.escape(words)) as error:
+        resume(folder, progress=False)
+    assert str(path) in str(error.value)
+    assert "delete it to start the run from the beginning" in str(error.value)
+
+
+def test_a_tensor_that_is_shorter_than_it_says_is_not_read(stopped):
+    folder, archive = stopped
+    path, content = folder / "checkpoint.pt", torch.load(io.BytesIO(archive), weights_only=True)
+    sealed(path, content)
+    assert load_checkpoint(folder)
+    sealed(path, content, cut=4)
+    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
+        load_checkpoint(folder)
 
 
 def test_a_checkpoint_holds_plain_data_and_goes_without_the_replay_at_the_end(undisturbed):

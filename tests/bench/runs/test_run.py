@@ -10,8 +10,9 @@ import shutil
 import pytest
 import torch
 
+from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
-from symsteer.bench.runs import evaluator, trainer
+from symsteer.bench.runs import evaluator, run, trainer
 from symsteer.bench.runs.base_policy import prepare_base
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
@@ -398,7 +399,14 @@ def test_a_policy_without_demonstrations_cannot_be_learned_from_them(finished, t
         execute(config, tmp_path, policy=folder / "policy.safetensors", progress=False)
 
 
-def test_a_damaged_file_of_demonstrations_is_named(tmp_path):
+def test_a_damaged_file_of_demonstrations_is_named(tmp_path, finished, monkeypatch):
     (tmp_path / DEMONSTRATIONS).write_bytes(b"nothing")
     with pytest.raises(UserError, match="delete it, and it is written again"):
         stored_demonstrations(tmp_path)
+    config = tiny_config("equivariant", options={"demonstration_share": 0.25})
+    decisions = Transition(*(torch.zeros(3, 2) for _ in range(7)))
+    shutil.copytree(finished[1].parent / "base", tmp_path / "base")
+    monkeypatch.setattr(run, "demonstrated_decisions", lambda *_: decisions)
+    with pytest.raises(UserError, match="delete it, and it is written again") as error:
+        execute(config, tmp_path, progress=False)
+    assert DEMONSTRATIONS in str(error.value)
