@@ -815,8 +815,12 @@ def _tell(line: str) -> None:
 
 
 def _print_places(folder: Path) -> None:
-    """Print where the results of a finished run are."""
-    out = folder.parent
+    """Print where the results of a finished run are, and what is wrong with them."""
+    from symsteer.leaderboard.records import read_record
+
+    out, record = folder.parent, read_record(folder / "record.json")
+    if found := record.not_finite or record.nonfinite_q * "Q":
+        print(f"warning: not finite: {found}; see {folder / 'record.json'}", file=sys.stderr)
     print(f"record:      {folder / 'record.json'}")
     print(f"TensorBoard: {to_paste('tensorboard', '--logdir', out)}  then {BOARD}")
     print(f"leaderboard: {to_paste('symsteer', 'report', out, '--out', out / 'leaderboard')}")

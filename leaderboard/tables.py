@@ -292,6 +292,8 @@ def _notes(table: Table) -> list[str]:
     for row in table.rows:
         for run in row.runs:
             record = run.record
+            if lost := record.not_finite:
+                notes.append(f"{code(row.label)}, seed {run.seed}: not finite: {code(lost)}")
             if record.status == "finished":
                 continue
             done = record.evaluations[-1].env_steps if record.evaluations else 0

@@ -33,6 +33,7 @@ class Sighting:
             return "no evaluation"
         last = self.record.evaluations[-1]
         lost = ", Q not finite" if self.record.nonfinite_q else ""
+        lost += f", not finite: {found}" if (found := self.record.not_finite) else ""
         return f"success {last.success_once:4.0%} of {len(last.episodes.seed)}{lost}"
 
 

@@ -21,11 +21,15 @@ import torch
 
 import symsteer as symsteer_package
 from symsteer import bench
+from symsteer.bench import cli
 from symsteer.bench.demos import collect
+from symsteer.bench.sweep.survey import look
 from symsteer.bench.tasks import task_class
 from symsteer.cli import VERBS, _threads, main
+from symsteer.leaderboard.records import Episodes, write_record
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
+from tests.leaderboard.record_factory import make_evaluation, make_record
 
 
 def symsteer(monkeypatch, *arguments) -> int:
@@ -356,3 +360,18 @@ def run_cli(arguments, folder, **how):
 @pytest.mark.parametrize(("wanted", "threads"), [("", 1), ("3", 3), ("2,1", 2), ("0", 1), ("x", 1)])
 def test_numbers_of_threads(wanted, threads):
     assert _threads(wanted) == threads
+
+
+def test_the_end_of_a_run_and_status_say_what_was_not_finite(tmp_path, capsys):
+    last = make_evaluation([1, 0], 320)
+    columns = {**last.episodes.model_dump(by_alias=True), "return": [float("nan"), -1.0]}
+    last = last.model_copy(update={"episodes": Episodes.model_validate(columns)})
+    for evaluation, words in ((last, "return (first after 320 steps)"), (None, "")):
+        record = make_record(evaluation and [evaluation])
+        (tmp_path / "record.json").unlink(missing_ok=True)
+        write_record(record, tmp_path / "record.json")
+        cli._print_places(tmp_path)
+        place = tmp_path / "record.json"
+        expected = f"warning: not finite: {words}; see {place}\n" if words else ""
+        assert capsys.readouterr().err == expected
+        assert look(tmp_path).success.endswith(f", not finite: {words}" if words else "of 5")

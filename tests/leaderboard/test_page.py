@@ -13,7 +13,7 @@ import pytest
 
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.page import render_page
-from symsteer.leaderboard.records import RunRecord, write_record
+from symsteer.leaderboard.records import Evaluation, RunRecord, write_record
 from symsteer.leaderboard.report import generate
 from symsteer.leaderboard.study import FOLDER, PAPER, read_study
 from symsteer.leaderboard.summary import Run, summarize
@@ -416,6 +416,22 @@ def test_the_audit_changes_the_page_and_the_order_of_records_does_not(
     generate(few, again, audit(tmp_path, group="D4"))
     assert "There is no map yet" in text_of(again)
     assert not list((again / "figures").glob("map*"))
+
+
+def test_numbers_that_are_not_finite_are_told_below_their_table(tmp_path: Path) -> None:
+    """Returns of a run, at its last evaluation; Q has its own mark."""
+    records = make_cell({"base": 0.3, "standard": 0.5})
+    for record in records[-2:]:
+        last = record.evaluations[-1].model_dump(by_alias=True)
+        last["episodes"]["return"][3] = float("nan")
+        last["diagnostics"]["q_bias"] = float("inf")
+        record.evaluations[-1] = Evaluation.model_validate(last)
+    told = f"return (first after {last['env_steps']} steps)"
+    assert [record.not_finite for record in records] == [""] * (len(records) - 2) + [told] * 2
+    write(tmp_path, records)
+    generate([tmp_path / "results"], tmp_path, audit(tmp_path))
+    page = (tmp_path / "LEADERBOARD.md").read_text()
+    assert page.count(f": not finite: `{told}`") == 2
 
 
 def test_hostile_names_stay_text_in_every_section(tmp_path: Path) -> None:
