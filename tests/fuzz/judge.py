@@ -21,7 +21,7 @@ from symsteer import cli
 
 CURE = re.compile(
     r"\b(must|should|needs?|wanted|valid|did you mean|use|choose|name|give|free|restore|delete|"
-    r"remove|train|copy|collect|download|record|run|raise|lower|ask|write|put|wait|convert|start|correct|shorten|undo|mend)\b",
+    r"remove|train|copy|collect|download|record|run|raise|lower|ask|write|put|wait|convert|start|correct|shorten|undo|mend|change)\b",
     re.IGNORECASE,
 )
 """A sentence must contain one of these to say how to correct the input."""

@@ -137,8 +137,16 @@ def to_toml(data: dict[str, Any], prefix: str = "") -> str:
         elif isinstance(value, float) and not math.isfinite(value):
             lines.append(f"{name} = {value}")
         else:
-            lines.append(f"{name} = {json.dumps(value)}")
+            lines.append(f"{name} = {_inline(value)}")
     return "\n".join([*lines, *tables])
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{json.dumps(k)} = {_inline(v)}' for k, v in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_inline, value))}]"
+    return json.dumps(value)
 
 
 def suite(workshop: Workshop, number: int, folder: Path) -> Ending:

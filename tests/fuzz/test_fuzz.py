@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import shutil
 from collections import Counter
 from random import Random
 
@@ -10,6 +11,7 @@ import pytest
 
 from tests.fuzz.judge import BadEndingError
 from tests.fuzz.kinds import KINDS
+from tests.fuzz.sealed import SEALED, in_child
 
 WAYS = {
     "suite": ("suite", 10),
@@ -72,6 +74,39 @@ def test_all_damaged_inputs(kind, workshop, tmp_path, capsys):
     endings = tried(workshop, kind, range(count), tmp_path)
     with capsys.disabled():
         print(f"\n{kind}: {count} inputs, " + ", ".join(f"{n} {k}" for k, n in endings.items()))
+
+
+def tried_in_children(workshop, kind, count, folder):
+    """The same for files whose checksums are right; none takes a GiB more than the intact one."""
+    run, endings, failures = SEALED[kind], Counter(), []
+    (folder / "intact").mkdir()
+    ended, sentence, usual = in_child(lambda: run(workshop, None, folder / "intact"))
+    assert ended in ("accepted", "done"), sentence
+    for number in range(count):
+        place = folder / str(number)
+        place.mkdir()
+        random = Random(f"sealed {kind} {number}")
+        ended, sentence, peak = in_child(lambda r=random, p=place: run(workshop, r, p))
+        endings[ended] += 1
+        if ended == "failed" or peak > usual + 2**30:
+            failures.append(f"{kind} {number} ({peak - usual} bytes more): {ended} {sentence}")
+        shutil.rmtree(place)
+    assert not failures, f"{len(failures)} of {count}:\n" + "\n".join(failures)
+    return endings
+
+
+@pytest.mark.parametrize("kind", SEALED)
+def test_some_wrong_contents(kind, workshop, tmp_path):
+    tried_in_children(workshop, kind, 4, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SEALED)
+def test_three_hundred_wrong_contents(kind, workshop, tmp_path, capsys):
+    endings = tried_in_children(workshop, kind, 300, tmp_path)
+    assert endings["refused"] > 100
+    with capsys.disabled():
+        print(f"\n{kind}: 300 inputs, " + ", ".join(f"{n} {k}" for k, n in endings.items()))
 
 
 def test_there_are_a_thousand():
