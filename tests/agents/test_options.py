@@ -326,3 +326,22 @@ def test_the_page_names_every_agent_option_and_preset():
     options = [field.name for kind in kinds for field in dataclasses.fields(kind)]
     for name in {*AGENTS.builtin, *PRESETS, *options}:
         assert f"`{name}`" in PAGE, name
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("all = 1", "all: Input should be a valid dictionary"),
+        (
+            "[all]\n[[base]]\nx = 1",
+            "base: Input should be a valid dictionary",
+        ),
+        (f"[all.{'x.' * 5000}x]", "it is nested more than 32 levels deep"),
+        (f"all = {'[' * 5000}", "recursion"),
+    ],
+)
+def test_a_preset_that_is_not_made_of_tables_is_refused(tmp_path, text, words):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(UserError, match=rf"the preset {path} is not .*{words}.*; correct it"):
+        preset_options(str(path), "standard", AGENTS.get("standard").Options)
