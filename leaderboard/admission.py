@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from symsteer.errors import UserError
+from symsteer.errors import UserError, first_problem
 from symsteer.leaderboard import catalogue
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import (
@@ -40,7 +40,7 @@ from symsteer.leaderboard.records import (
 from symsteer.leaderboard.records.provenance import checkout, git
 from symsteer.leaderboard.records.repeat import KEYS
 from symsteer.leaderboard.records.schema import Q_VALUES
-from symsteer.leaderboard.records.values import Count, Sha256, first_problem
+from symsteer.leaderboard.records.values import Count, Sha256
 from symsteer.leaderboard.summary import MIN_SEEDS, Key, recipe_of, row_place, seeds_of
 from symsteer.variant import file_name, parse_variant, specs_at, variant_text
 
