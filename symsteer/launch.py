@@ -15,6 +15,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from types import FrameType
 
+SIGNALS = (_signal.SIGINT, _signal.SIGTERM)
+
 REMIND_SECONDS = 0.2
 
 PATIENCE = 3
@@ -47,8 +49,11 @@ def _remind() -> None:
     """Give the signal again and again until the program ends."""
     from time import sleep
 
-    while not _State.ended:
+    _signal.pthread_sigmask(_signal.SIG_BLOCK, SIGNALS)  # they are for the main thread
+    while True:
         sleep(REMIND_SECONDS)
+        if _State.ended:
+            return
         _State.reminded = True
         _signal.pthread_kill(_main_thread, _State.number)
 
@@ -69,7 +74,7 @@ def _is_cleaning_up() -> bool:
     return error is not None
 
 
-for _number in (_signal.SIGINT, _signal.SIGTERM):
+for _number in SIGNALS:
     # What the caller ignores stays ignored.
     if _signal.getsignal(_number) is not _signal.SIG_IGN:
         _signal.signal(_number, _receive)

@@ -22,6 +22,7 @@ from symsteer.bench.demos import load
 from symsteer.bench.runs.base_policy import demonstration_file
 from symsteer.bench.runs.config import DemonstrationConfig, RunConfig, content_key
 from symsteer.bench.runs.folder import write_json
+from symsteer.bench.sim.shards.processes import signals_wait
 from symsteer.bench.steering.evaluation import VISITED, rollout, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import held_out_seeds
@@ -91,18 +92,16 @@ def study(
         files[seed] = {config.task: demonstration_file(config, out) for config in mine}
     cells = [BaseCell(n, c, s) for c in counts for n in policies for s in range(seeds)]
     context = multiprocessing.get_context("spawn")
-    # Processes inherit the mask: Ctrl-C is for this one, which ends them.
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     pool = ProcessPool(workers, context=context)
     try:
-        jobs = [
-            pool.schedule(
-                _play_once,
-                (configs[0], cell, policies[cell.name], files[cell.seed], episodes, out),
-            )
-            for cell in cells
-        ]
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        with signals_wait(signal.SIGINT):
+            jobs = [
+                pool.schedule(
+                    _play_once,
+                    (configs[0], cell, policies[cell.name], files[cell.seed], episodes, out),
+                )
+                for cell in cells
+            ]
         parts = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
     except BaseException:
         pool.stop()

@@ -15,6 +15,7 @@ from typing import Any
 from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
+from symsteer.bench.sim.shards.processes import signals_wait
 from symsteer.bench.sweep.work import Result, one_thread
 from symsteer.files import open_log
 
@@ -45,14 +46,10 @@ class LocalPool:
     def submit(self, function: Callable[..., Result], *args: Any) -> Future:
         """Start a task; fewer than ``capacity`` may be running."""
         pool = self._idle.pop()
-        # A process inherits the signal mask. Ctrl-C is for the sweep, which ends its processes
-        # itself; it must not reach a process during its imports.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        # Ctrl-C is for the sweep, which ends its processes itself.
+        with signals_wait(signal.SIGINT, signal.SIGTERM):
             future = pool.schedule(function, args)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        self._busy[future] = pool
+            self._busy[future] = pool
         return future
 
     def result(self, future: Future) -> Result:
@@ -88,6 +85,7 @@ class LocalPool:
 
 def _begin(log: str) -> None:
     """Prepare a new process."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     one_thread()
     # Warnings of libraries and the output of a crash must not damage the display.
     with open_log(log) as file:

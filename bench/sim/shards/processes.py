@@ -17,7 +17,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import ForkServerProcess
 from typing import Any
 
@@ -55,15 +55,25 @@ def start_process(
 
 
 @contextmanager
-def _worker_settings() -> Iterator[None]:
-    """What the fork server inherits: one thread, no import from here, SIGINT blocked."""
-    before = {name: os.environ.get(name) for name in _SETTINGS}
-    os.environ.update(_SETTINGS)
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def signals_wait(*numbers: int) -> Iterator[None]:
+    """Signals wait while processes are started, and never reach these: they inherit the mask."""
+    resource_tracker.ensure_running()  # its start would unblock signals
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+@contextmanager
+def _worker_settings() -> Iterator[None]:
+    """What the fork server inherits: one thread, no import from here, SIGINT blocked."""
+    before = {name: os.environ.get(name) for name in _SETTINGS}
+    os.environ.update(_SETTINGS)
+    try:
+        with signals_wait(signal.SIGINT):
+            yield
+    finally:
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
