@@ -245,4 +245,5 @@ def test_processes_import_nothing_from_the_current_folder(strangers):
         child = start(*arguments, watch=WATCH, cwd=strangers.place)
         shown = "".join(child.communicate(timeout=300))
         assert child.returncode == 0, shown
+        assert "no picture" not in shown  # a matplotlibrc there asks for LaTeX
         check(strangers, arguments, shown)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from matplotlib import style as mpl_style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -118,6 +119,7 @@ def _millimetres(points: torch.Tensor, env: SymmetricTask) -> np.ndarray:
     return 1e3 * (points[..., :2] - centre).numpy()
 
 
+@mpl_style.context("default")  # no settings of a file in the current folder
 def draw(name: str, unbroken: Orbit, broken: Orbit) -> bytes:
     """A picture of the broken orbit over the unbroken one, PNG."""
     figure = Figure(figsize=(4, 4), layout="constrained")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib import style as mpl_style
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -301,6 +302,7 @@ def _two(value: float) -> str:
 # -------------------------------------------------------------------------- files
 
 
+@mpl_style.context("default")  # no settings of a file in the current folder
 def write_result(result: AuditResult, folder: Path) -> None:
     """Write ``audit.json``, ``map.csv`` and ``map.png``.
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib import style as mpl_style
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
@@ -114,6 +115,7 @@ def _range(values: Sequence[float], form: str) -> str:
     return low if low == high else f"{low} to {high}"
 
 
+@mpl_style.context("default")  # no settings of a file in the current folder
 def write(folder: Path, found: Found) -> None:
     """Write ``detect.json`` and ``detect.png``."""
     picture = io.BytesIO()

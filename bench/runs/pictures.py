@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import torch
+from matplotlib import style as mpl_style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -90,7 +90,8 @@ def draw_paths(rollout: Rollout, layout: Layout, title: str) -> np.ndarray:
         f"Paths: the first {drawn}, each up to its first success.\n"
         "Seen from above, about the workspace centre."
     )
-    with mpl.rc_context({"font.family": "DejaVu Sans", "font.size": 9}):
+    # "default": no settings of a file in the current folder.
+    with mpl_style.context(["default", {"font.family": "DejaVu Sans", "font.size": 9}]):
         # Almost square, because TensorBoard scales pictures to the width of a card.
         figure = Figure(figsize=(8.4, 8.4), dpi=110, layout="constrained")
         figure.suptitle(title, fontsize=11)
