@@ -25,6 +25,10 @@ PATIENCE = 3
 _main_thread = _thread.get_ident()
 
 
+class Interrupted(KeyboardInterrupt):
+    """Not KeyboardInterrupt itself: Python would kill itself at its end if one has passed exec()."""
+
+
 class _State:
     begun = ended = reminded = False
     number = count = 0
@@ -42,7 +46,7 @@ def _receive(number: int, frame: "FrameType | None") -> None:
         if _State.count == 1:
             _thread.start_new_thread(_remind, ())
     if _State.begun and not (_State.ended or _is_importing(frame) or _is_cleaning_up()):
-        raise KeyboardInterrupt
+        raise Interrupted
 
 
 def _remind() -> None:

@@ -56,6 +56,8 @@ def look(event, args):
         note(event, args[0], args[1] if len(args) > 1 else "")
     elif event == "socket.connect":
         note(event, args[1])
+    elif event == "import" and args[0].startswith("evil"):
+        note(event, args[0])
 
 if log:
     sys.addaudithook(look)
@@ -106,6 +108,10 @@ def strangers(intact, tmp_path, monkeypatch) -> types.SimpleNamespace:
     monkeypatch.setenv("CANARY", str(tmp_path / "CANARY"))
     monkeypatch.setenv("AUDIT", str(tmp_path / "audit"))
     monkeypatch.setenv("HOMES", os.pathsep.join((str(place), f"{home}/.", "/dev", TEMPORARY)))
+    watch = tmp_path / "watch"
+    watch.mkdir()
+    (watch / "sitecustomize.py").write_text(WATCH)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(str, (watch, ROOT))))
     artefacts = hostile.make(place, intact, intact.parent / "bundle.zip", secret)
     (tmp_path / "audit").touch()
     monkeypatch.chdir(place)
