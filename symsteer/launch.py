@@ -26,7 +26,7 @@ _main_thread = _thread.get_ident()
 
 
 class Interrupted(KeyboardInterrupt):
-    """Not KeyboardInterrupt itself: Python would kill itself at its end if one has passed exec()."""
+    """A KeyboardInterrupt that has passed `exec` of a text would make Python end by a signal."""
 
 
 class _State:
