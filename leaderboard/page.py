@@ -125,12 +125,7 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
     if notice := seed_notice(summary):
         parts.append(notice)
     parts += answer_section(summary, findings, overall)
-    reading = [READING.strip()]
-    if summary.has_reproductions:
-        reading.append(MADE_AGAIN.strip())
-    if summary.has_marks:
-        reading.append(SUBMITTED.strip())
-    parts += ["## Details", *folded("How to read it", reading)]
+    parts += ["## Details", *folded("How to read it", reading(summary))]
     parts += folded("Claims, effects and p-values", [CLAIMS.strip(), *claims_section(findings)])
     parts += folded("Success in every cell", [_overview(summary)])
     against = map_section(summary, findings, figures)
@@ -161,6 +156,12 @@ def render_page(summary: Summary, findings: Findings, figures: Figures, links: L
         parts += folded(title, [*names, *drawn, *blocks])
     parts += folded("Provenance", _provenance(summary, findings.audit, links))
     return "\n\n".join(parts) + "\n"
+
+
+def reading(summary: Summary) -> list[str]:
+    """How to read the page, as blocks of markdown."""
+    texts = READING, MADE_AGAIN * summary.has_reproductions, SUBMITTED * summary.has_marks
+    return [text.strip() for text in texts if text]
 
 
 def notices(study: Study) -> list[str]:
@@ -232,10 +233,13 @@ def at_a_glance(table: Table, agent: str) -> list[Row]:
 def _glance(row: Row) -> str:
     if row.success is None:
         return status(row) if row.runs else NOTHING
+    return f"{number(row.success.value)}{marks(row)}".replace(" ", SPACE)
+
+
+def marks(row: Row) -> str:
+    """Beside its success: a clear difference from the base, no reproduction, diverged Q."""
     mark = MARKS[row.difference.sign] if row.difference else ""
-    dagger = " \u2020" if any(row.diverged) else ""
-    mark += " not reproduced" * row.marked
-    return f"{number(row.success.value)}{mark}{dagger}".replace(" ", SPACE)
+    return mark + " not reproduced" * row.marked + " \u2020" * any(row.diverged)
 
 
 def spreads_section(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
@@ -266,7 +270,6 @@ def spreads_section(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
 
 
 def _share(spread: Spread) -> str:
-    """The base policies' share of the variance."""
     if spread.policies is None or spread.runs is None:
         return NOTHING
     total = spread.policies**2 + spread.runs**2 + spread.episodes**2

@@ -376,11 +376,6 @@ def stratified_bootstrap(cells: Sequence[Sequence[Sample]], resamples: int = RES
     return combined(cell_estimates(cells, mean, resamples)).interval()
 
 
-def stratified_draws(cells: Sequence[Sequence[Sample]], resamples: int = RESAMPLES) -> Array:
-    """Draws of the mean over the units of every cell: [cells, resamples]."""
-    return np.stack([cell.draws() for cell in cell_estimates(cells, mean, resamples)])
-
-
 def success_interval(runs: Sequence[Sample], resamples: int = RESAMPLES) -> Interval:
     """IQM over units of the success rate with its interval, which stays within [0, 1].
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import posixpath
 import re
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -120,11 +119,7 @@ class Documentation:
             raise UserError(f"{page} of the documentation cannot be read: restore it") from error
 
     def _rows(self, page: str) -> dict[str, dict[str, str]]:
-        return self._tables.setdefault(page, named_rows(self._text(page)))
-
-    @cached_property
-    def _tables(self) -> dict[str, dict[str, dict[str, str]]]:
-        return {}
+        return named_rows(self._text(page))
 
 
 def named_rows(text: str) -> dict[str, dict[str, str]]:
@@ -151,7 +146,6 @@ def named_rows(text: str) -> dict[str, dict[str, str]]:
 
 
 def _cells(line: str) -> list[str]:
-    """The cells of a row of a markdown table."""
     return [cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip().strip("|"))]
 
 

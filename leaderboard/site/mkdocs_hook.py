@@ -109,7 +109,8 @@ def relinked(text: str, place: str, source: str) -> str:
         anchor = f"#{parts.fragment}" if parts.fragment else ""
         found = site_address(target)
         if found is not None:
-            return f"{mark}[{label}]({_relative(found, source)}{anchor})"
+            address = posixpath.relpath(found, posixpath.dirname(source) or ".")
+            return f"{mark}[{label}]({address}{anchor})"
         if target == RESULTS:
             # One folder up from the documentation; MkDocs leaves HTML as it is.
             up = "../" * (source.count("/") + 1)
@@ -126,7 +127,3 @@ def site_address(target: str) -> str | None:
     if found := PAGES.get(target) or PICTURES.get(target):
         return found
     return target.removeprefix("docs/") if target.startswith("docs/") else None
-
-
-def _relative(target: str, source: str) -> str:
-    return posixpath.relpath(target, posixpath.dirname(source) or ".")

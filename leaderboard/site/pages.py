@@ -21,7 +21,6 @@ from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import Row, Run, Table
 from symsteer.leaderboard.tables import section, status
 from symsteer.leaderboard.text import (
-    MARKS,
     NOTHING,
     compact,
     count,
@@ -103,21 +102,14 @@ def _web(href: str) -> str | None:
     return href if href.startswith(("https://", "http://")) else None
 
 
-def _same(href: str) -> str:
-    return href
-
-
 def _matrix_row(board: Board, table: Table) -> Values:
     cells = []
     for name in board.summary.agents:
         shown = []
         for row in page.at_a_glance(table, name):
             if row.success:
-                mark = MARKS[row.difference.sign] if row.difference else ""
-                mark += " \u2020" if any(row.diverged) else ""
-                mark += " not reproduced" * row.marked
                 value, ends = interval(row.success).split("\u00a0", 1)
-                level = round(10 * row.success.value)
+                level, mark = round(10 * row.success.value), page.marks(row)
                 shown.append({"value": value, "mark": mark, "ends": ends, "level": level})
             else:
                 shown.append({"value": status(row), "mark": "", "ends": "", "level": ""})
@@ -208,13 +200,7 @@ def findings(board: Board) -> Values:
     spreads = page.spreads_section(summary, found.spreads) if found.spreads else []
     return {
         "notice": _notice(board),
-        "reading": markup.html(
-            [
-                page.READING,
-                *[page.MADE_AGAIN] * summary.has_reproductions,
-                *[page.SUBMITTED] * summary.has_marks,
-            ]
-        ),
+        "reading": markup.html(page.reading(summary)),
         "claims": markup.html([CLAIMS, *claims_section(found)]),
         "sound": markup.html([page.SOUND, sound])
         if (sound := page.soundness_table(summary))
@@ -246,7 +232,7 @@ def cell(board: Board, table: Table, before: Table | None, after: Table | None) 
         "dials": [(name, f"../{board.variant(name)}") for name in dials(key.variant)],
         "defect": f"{_defect(defect.interval)}, {defect.part}" if defect else "not audited",
         "budget": count(key.env_steps),
-        "tables": markup.html(section(table, links), _same),
+        "tables": markup.html(section(table, links), lambda href: href),
         "success": charts.success_chart(table),
         "q": charts.q_chart(table),
         "equivariance": charts.equivariance_chart(table),
@@ -290,7 +276,7 @@ def agent(board: Board, name: str) -> Values:
     rows = [(table, row) for table, row in board.rows if row.agent == name]
     usual = [row for _, row in rows if row.usual] or [row for _, row in rows]
     options = usual[0].runs[0].record.config.get("agent_options") if usual else None
-    shown = [(table, row) for table, row in rows if row.success and row in _standing(table, name)]
+    shown = [(t, row) for t, row in rows if row.success and row in page.at_a_glance(t, name)]
     return {
         "name": name,
         "role": board.summary.roles[name],
@@ -321,10 +307,6 @@ def agent(board: Board, name: str) -> Values:
         ],
         "many": len({row.label for _, row in rows}) > 1,
     }
-
-
-def _standing(table: Table, name: str) -> list[Row]:
-    return page.at_a_glance(table, name)
 
 
 def options_of(table: Mapping[str, Any]) -> list[tuple[str, str]]:
