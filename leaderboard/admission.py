@@ -41,7 +41,7 @@ from symsteer.leaderboard.records.provenance import checkout, git
 from symsteer.leaderboard.records.repeat import KEYS
 from symsteer.leaderboard.records.schema import Q_VALUES
 from symsteer.leaderboard.records.values import Count, Sha256
-from symsteer.leaderboard.summary import MIN_SEEDS, Key, recipe_of, row_place, seeds_of
+from symsteer.leaderboard.summary import MIN_SEEDS, Key, RowKey, row_key, row_place, seeds_of
 from symsteer.variant import file_name, parse_variant, specs_at, variant_text
 
 MIN_EPISODES = 100
@@ -60,9 +60,6 @@ NEEDED = (*Q_VALUES, "q_magnitude", "q_overshoot")
 
 RELEASE = re.compile(r"\d+(\.\d+)*((a|b|rc)\d+)?(\.post\d+)?")
 """Versions that a package index accepts and that are not of a development state."""
-
-RowKey = tuple[Key, str, str]
-"""Table, agent, recipe: what the runs of one row have in common."""
 
 Positive = Annotated[Count, Field(gt=0, le=10**12)]
 
@@ -205,9 +202,9 @@ def _problems(file: Path, record: RunRecord) -> Iterator[str]:
         return
     found = [("the run", rule, broken(judged)) for rule, broken in RULES.items()]
     for rule, broken in EVALUATION_RULES.items():
-        each = ((f"the evaluation at step {e.env_steps}", e) for e in record.evaluations)
-        wrong = ((where, rule, why) for where, e in each if (why := broken(judged, e)))
-        found += [first] if (first := next(wrong, None)) else []
+        whys = ((e.env_steps, broken(judged, e)) for e in record.evaluations)
+        step, why = next((one for one in whys if one[1]), (0, None))
+        found.append((f"the evaluation at step {step}", rule, why))
     for where, rule, why in found:
         if why:
             detail = "" if why is True else f" ({why})"
@@ -217,7 +214,7 @@ def _problems(file: Path, record: RunRecord) -> Iterator[str]:
 def _unknown_code(j: Judged) -> str:
     found = []
     for number, part in enumerate(j.parts, 1):
-        of = f"part {number}: " if number > 1 else ""
+        of = f"part {number}: " * (number > 1)
         if part.commit is None and not _is_released(part):
             found.append(f"{of}it names neither a commit nor a released version; use a git clone")
         if part.commit is not None and part.dirty is not False:
@@ -442,31 +439,25 @@ class _Known:
     def __init__(self) -> None:
         self._runs: dict[tuple[RowKey, str, str], tuple[Path, RunRecord]] = {}
         self._seeds: dict[RowKey, set[int]] = defaultdict(set)
-        self._committed: dict[Key, set[str]] = defaultdict(set)
-        self._committed_seeds: dict[Key, set[int]] = defaultdict(set)
-        self._references: dict[Key, set[str]] = defaultdict(set)
+        self._committed: dict[Key, list[RunRecord]] = defaultdict(list)
         self._agents: dict[tuple[Key, str], set[str]] = defaultdict(set)
         self._facts: dict[tuple[str, ...], tuple[Path, list[float]]] = {}
         self._finals: dict[tuple[str, ...], dict[Path, list[float]]] = defaultdict(dict)
 
     def add(self, file: Path, record: RunRecord, committed: bool = False) -> None:
-        row = _row(record)
+        row = row_key(record)
         self._runs.setdefault(_identity(record), (file, record))
-        if committed:
-            if record.role == "reference":
-                self._references[row[0]].add(record.settings.agent)
-            self._committed[row[0]].add(record.base_policy.content_hash)
-            self._committed_seeds[row[0]].add(record.settings.seed)
-        if record.status == "finished":
-            self._seeds[row].add(record.settings.seed)
-            policy = record.base_policy.content_hash
-            self._agents[row[0], policy].add(record.settings.agent)
-            for fact, values in _facts(record).items():
-                if values:
-                    self._facts.setdefault(fact, (file, values))
-            if record.role != "reference":
-                place, returns = _final_returns(record)
-                self._finals[place][file] = returns
+        self._committed[row[0]] += [record] * committed
+        if record.status != "finished":
+            return
+        self._seeds[row].add(record.settings.seed)
+        self._agents[row[0], record.base_policy.content_hash].add(record.settings.agent)
+        for fact, values in _facts(record).items():
+            if values:
+                self._facts.setdefault(fact, (file, values))
+        if record.role != "reference":
+            place, returns = _final_returns(record)
+            self._finals[place][file] = returns
 
     def duplicates(self, record: RunRecord) -> Iterator[str]:
         twin = self._runs.get(_identity(record))
@@ -502,22 +493,23 @@ class _Known:
                 yield f"its {fact[0]} are not those of {file}: {MEND}"
 
     def notes(self, record: RunRecord) -> Iterator[str]:
-        row = _row(record)
-        number = len(self._seeds[row])
-        if record.role == "learner" and number < MIN_SEEDS:
+        row = row_key(record)
+        if record.role == "learner" and (number := len(self._seeds[row])) < MIN_SEEDS:
             yield (
                 f"shown, not ranked: its row has {number} of the {MIN_SEEDS} finished seeds that a "
                 "ranking needs"
             )
-        usual, seed = self._committed_seeds[row[0]], record.settings.seed
+        committed, seed = self._committed[row[0]], record.settings.seed
+        usual = sorted({other.settings.seed for other in committed})
         if usual and seed not in usual:
             yield (
                 f"its seed {seed} is none of those of the committed runs of its table "
-                f"({', '.join(map(str, sorted(usual)))}): agents are compared on equal seeds"
+                f"({', '.join(map(str, usual))}): agents are compared on equal seeds"
             )
-        policy, committed = record.base_policy.content_hash, self._committed[row[0]]
-        if committed and policy not in committed:
-            lacking = self._references[row[0]] - self._agents[row[0], policy]
+        policy = record.base_policy.content_hash
+        if committed and all(other.base_policy.content_hash != policy for other in committed):
+            references = {r.settings.agent for r in committed if r.role == "reference"}
+            lacking = references - self._agents[row[0], policy]
             names = sorted(lacking, key=lambda name: row_place(name, "reference"))
             wanted = f"; submit {', '.join(names)} on it as well" if names else ""
             yield (
@@ -534,11 +526,7 @@ class _Known:
 
 def _identity(record: RunRecord) -> tuple[RowKey, str, str]:
     """What two runs may not share. A base policy trained elsewhere is another one."""
-    return _row(record), seeds_of(record.config), record.base_policy.content_hash
-
-
-def _row(record: RunRecord) -> RowKey:
-    return Key.of(record), record.settings.agent, recipe_of(record.config)
+    return row_key(record), seeds_of(record.config), record.base_policy.content_hash
 
 
 def _facts(record: RunRecord) -> dict[tuple[str, ...], list[float]]:
@@ -588,12 +576,8 @@ def _texts(data: Any) -> Iterator[str]:
     """Every text in plain data, keys included."""
     if isinstance(data, str):
         yield data
-    elif isinstance(data, dict):
-        for key, value in data.items():
-            yield key
-            yield from _texts(value)
-    elif isinstance(data, list):
-        for value in data:
+    elif isinstance(data, dict | list):
+        for value in [*data, *data.values()] if isinstance(data, dict) else data:
             yield from _texts(value)
 
 

@@ -497,22 +497,21 @@ def load_runs(
             listed reproduction. None: nothing is known, and all are trusted.
     """
     known = read_reproductions(reproductions) if reproductions else {}
-    vouched = listed if listed is not None or not known else all_listed()
+    vouched = all_listed() if listed is None else listed
     runs = []
     for file in record_files(paths):
-        digest = file_hash(file) if known or listed is not None else ""
-        runs.append(
-            Run(file, read_record(file), known.get(digest), listed is None or digest in listed)
-        )
+        record, digest = read_record(file), file_hash(file)
+        runs.append(Run(file, record, known.get(digest), listed is None or digest in listed))
         if reproductions and digest in known:
             path = reproductions / f"{digest}.json"
-            check_reproduction(path, file, file_hash(path) in (vouched or ()), listed is None)
+            counts = file_hash(path) in vouched, listed is None
+            check_reproduction(known[digest], path, file, *counts)
     confirmed = {
-        _row_of(run)
+        row_key(run.record)
         for run in runs
         if not run.trusted and run.reproduction and run.reproduction.verdict != "different"
     }
-    runs = [run if run.trusted else replace(run, trusted=_row_of(run) in confirmed) for run in runs]
+    runs = [replace(r, trusted=r.trusted or row_key(r.record) in confirmed) for r in runs]
     used = {run.reproduction.record.sha256 for run in runs if run.reproduction}
     present = {run.record.run_id for run in runs}
     for digest in sorted(known.keys() - used):
@@ -524,8 +523,12 @@ def load_runs(
     return runs
 
 
-def _row_of(run: Run) -> tuple[Key, str, str]:
-    return Key.of(run.record), run.agent, recipe_of(run.record.config)
+RowKey = tuple[Key, str, str]
+"""Table, agent, recipe: what the runs of one row have in common."""
+
+
+def row_key(record: RunRecord) -> RowKey:
+    return Key.of(record), record.settings.agent, recipe_of(record.config)
 
 
 def recipe_of(config: Mapping[str, Any]) -> str:
@@ -580,7 +583,7 @@ def grouped(
     grid = grid_of(trusted) if grid is None else grid
     tables: dict[Key, dict[Group, list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in chosen:
-        _, agent, recipe = _row_of(run)
+        _, agent, recipe = row_key(run.record)
         tables[Key.of(run.record, grid)][agent, recipe, not run.trusted].append(run)
     # An agent has one role: that of its newest trusted run.
     by_age = sorted(chosen, key=lambda run: (run.trusted, run.record.started, run.record.run_id))
@@ -648,7 +651,7 @@ def _one_per_cell(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
     cells: dict[tuple[Any, ...], list[Run]] = defaultdict(list)
     for run in runs:
         seeds = seeds_of(run.record.config)
-        cells[*_row_of(run), seeds, run.policy, not run.trusted].append(run)
+        cells[*row_key(run.record), seeds, run.policy, not run.trusted].append(run)
     chosen, set_aside = [], []
     for cell in sorted(cells):
         candidates = sorted(

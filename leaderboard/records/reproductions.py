@@ -55,6 +55,8 @@ PARTS: tuple[Part, ...] = get_args(Part)
 REPEATED = ".record.json"
 """What the name of the repeated record ends with, beside the file of a reproduction."""
 
+OF_EVALUATIONS: tuple[Part, ...] = ("episodes", "diagnostics")
+
 IGNORED = {"base_policy": {"training_seconds"}}
 
 
@@ -140,14 +142,7 @@ def compare_records(record: RunRecord, again: RunRecord) -> tuple[list[Differenc
 
     What the record does not have, such as a diagnostic that is newer, is not compared.
     """
-    differences = [
-        _difference(part, [(None, leaf) for leaf in _leaves(*blocks)])
-        for part, blocks in _blocks(record, again).items()
-    ]
-    differences += [
-        _difference(part, list(_over_evaluations(part, record, again)))
-        for part in ("episodes", "diagnostics")
-    ]
+    differences = [_difference(part, list(_values(part, record, again))) for part in PARTS]
     mine, theirs = (_final(one).success_once for one in (record, again))
     trials = len(_final(record).episodes.seed)
     low, high = newcombe((theirs * trials, trials), (mine * trials, trials))
@@ -227,11 +222,14 @@ def read_reproductions(folder: Path) -> dict[str, Reproduction]:
     return found
 
 
-def check_reproduction(path: Path, record: Path, vouched: bool, alone: bool) -> None:
+def check_reproduction(
+    found: Reproduction, path: Path, record: Path, vouched: bool, alone: bool
+) -> None:
     """Compute a reproduction again from its record and the repeated one, which lies beside it.
 
     Args:
-        path: of the reproduction.
+        found: the reproduction.
+        path: of its file.
         record: of the record that it names.
         vouched: whether a maintainers' list has it: then it may be without the repeated record.
         alone: whether one that no list has counts as well.
@@ -239,7 +237,7 @@ def check_reproduction(path: Path, record: Path, vouched: bool, alone: bool) -> 
     Raises:
         UserError: if the records give another one, or it does not count.
     """
-    again, found = path.with_suffix(REPEATED), Reproduction.model_validate_json(path.read_bytes())
+    again = path.with_suffix(REPEATED)
     if not vouched and not alone:
         raise UserError(
             f"{path} does not count, because the list of the study, which maintainers keep, lacks "
@@ -271,16 +269,14 @@ def _wanted(found: Reproduction, record: Path, again: Path) -> Reproduction:
     _, success, area = compare_records(one, one)
     success = found.success.model_copy(update={"recorded": success.recorded})
     area = found.area.model_copy(update={"recorded": area.recorded})
-    verdict = _verdict(found.differences, success)
-    known = {"verdict": verdict, "record": _original(record, one)}
+    known = {"verdict": _verdict(found.differences, success), "record": _original(record, one)}
     return found.model_copy(update=known | {"success": success, "area": area})
 
 
 def _rounded(reproduction: Reproduction) -> Any:
     """Plain data without the last digits, which differ between versions of libraries."""
-    return json.loads(
-        dump_reproduction(reproduction), parse_float=lambda text: f"{float(text):.9f}"
-    )
+    text = dump_reproduction(reproduction)
+    return json.loads(text, parse_float=lambda number: f"{float(number):.9f}")
 
 
 def _verdict(differences: Sequence[Difference], success: Success) -> Verdict:
@@ -295,31 +291,21 @@ def _final(record: RunRecord) -> Evaluation:
     return record.final
 
 
-def _blocks(record: RunRecord, again: RunRecord) -> dict[Part, tuple[Any, Any]]:
-    """The blocks outside of evaluations, of both records."""
-    keys: dict[Part, str] = {
-        "seeds": "seeds",
-        "parameters": "parameters",
-        "base policy": "base_policy",
-        "feasible Q": "feasible_q",
-        "budget": "budget",
-    }
-    wanted = set(keys.values())
-    mine = record.model_dump(include=wanted, exclude=IGNORED, exclude_none=True)
-    theirs = again.model_dump(include=wanted, exclude=IGNORED)
-    return {part: (mine.get(key), theirs.get(key)) for part, key in keys.items()}
-
-
 Leaf = tuple[str, Any, Any]
 """Name of a value, the recorded one and the repeated one."""
 
 _MISSING = object()
 
 
-def _over_evaluations(
-    part: Part, record: RunRecord, again: RunRecord
-) -> Iterator[tuple[int | None, Leaf]]:
-    """Every value of the evaluations, with the step of its evaluation."""
+def _values(part: Part, record: RunRecord, again: RunRecord) -> Iterator[tuple[int | None, Leaf]]:
+    """Every value of a part, with the step of its evaluation if it has one."""
+    if part not in OF_EVALUATIONS:
+        key = part.lower().replace(" ", "_")
+        mine = record.model_dump(include={key}, exclude=IGNORED, exclude_none=True)
+        theirs = again.model_dump(include={key}, exclude=IGNORED)
+        for leaf in _leaves(mine.get(key), theirs.get(key)):
+            yield None, leaf
+        return
     repeated = [_measured(evaluation, part) for evaluation in again.evaluations]
     for index, evaluation in enumerate(record.evaluations):
         mine = _measured(evaluation, part)
