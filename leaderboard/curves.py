@@ -30,22 +30,19 @@ class Curve:
 def success_curve(row: Row) -> Curve:
     """The IQM of success over the finished runs of a row, where all of them were evaluated."""
     points = _common(row.finished)
-    bands = [
-        success_interval(
-            [
-                Sample.pooled(episode_success(run.curve[step]).items(), run.policy)
-                for run, step in zip(row.finished, point, strict=True)
-            ],
-            BAND_RESAMPLES,
-        )
+    cells = [
+        [
+            Sample.pooled(episode_success(run.curve[step]).items(), run.policy)
+            for run, step in zip(row.finished, point, strict=True)
+        ]
         for point in points
     ]
-    return Curve(
-        _places(points),
-        [band.value for band in bands],
-        [band.low for band in bands],
-        [band.high for band in bands],
-    )
+    return _with_bands(_places(points), cells)
+
+
+def _with_bands(steps: list[float], cells: Sequence[Sequence[Sample]]) -> Curve:
+    bands = [success_interval(runs, BAND_RESAMPLES) for runs in cells]
+    return Curve(steps, [b.value for b in bands], [b.low for b in bands], [b.high for b in bands])
 
 
 def direction_curve(row: Row) -> Curve | None:
@@ -73,13 +70,7 @@ def direction_curve(row: Row) -> Curve | None:
     shown = [(k * 360 / SECTORS, runs) for k, runs in turned if runs]
     if not shown:
         return None
-    bands = [success_interval(runs, BAND_RESAMPLES) for _, runs in shown]
-    return Curve(
-        [degrees for degrees, _ in shown],
-        [band.value for band in bands],
-        [band.low for band in bands],
-        [band.high for band in bands],
-    )
+    return _with_bands([degrees for degrees, _ in shown], [runs for _, runs in shown])
 
 
 def series(run: Run, name: str) -> tuple[list[int], list[float]]:

@@ -70,6 +70,8 @@ PARTS = {
 """Colours of the map: which part of a decision the defect is of."""
 FIT = "#444444"
 
+MEASURE_NAMES = {"auc": "area under the curve", "success": "final success"}
+
 COLUMNS = 3
 TITLE_WIDTH = 36
 """Characters of a panel's title."""
@@ -165,19 +167,20 @@ def learning_curves(tables: Sequence[Table]) -> Figure:
         for row in table.rows:
             if not row.runs:
                 continue
-            style = style_of(row.agent)
-            color, marker, line = style
-            _draw_success(ax, row, style, table.key.env_steps, len(table.learners) < MANY)
-            handles.setdefault(
-                plain(row.label),
-                Line2D([], [], color=color, marker=marker, linestyle=line, markersize=5),
-            )
+            _draw_success(ax, row, table.key.env_steps, len(table.learners) < MANY)
+            handles.setdefault(plain(row.label), _entry(row.agent, markersize=5))
     _legend(figure, handles)
     return figure
 
 
-def _draw_success(ax: Axes, row: Row, style: Style, budget: int, band: bool) -> None:
-    color, marker, line = style
+def _entry(agent: str, **more: Any) -> Line2D:
+    """An agent in the legend."""
+    color, marker, line = style_of(agent)
+    return Line2D([], [], color=color, marker=marker, linestyle=line, **more)
+
+
+def _draw_success(ax: Axes, row: Row, budget: int, band: bool) -> None:
+    color, marker, line = style_of(row.agent)
     for run in row.runs:
         values = [evaluation.success_once for evaluation in run.curve.values()]
         if run.finished and (row.is_reference or not 1 < len(row.finished) < MIN_SEEDS):
@@ -236,27 +239,16 @@ def q_values(tables: Sequence[Table]) -> Figure:
                 if run.record.nonfinite_q:
                     ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7)
             places, means = mean_series(runs, "q_mean")
-            every = max(1, len(places) // MAX_MARKERS)
-            style: dict[str, Any] = {
-                "color": color,
-                "marker": marker,
-                "markersize": 4,
-                "markevery": every,
-            }
+            style: dict[str, Any] = {"color": color, "marker": marker, "markersize": 4}
+            style["markevery"] = max(1, len(places) // MAX_MARKERS)
             ax.plot(places, means, linestyle=line, linewidth=1.7, **style)
             returns = mean_series(runs, "return_mean")
             ax.plot(*returns, linestyle="none", markerfacecolor="white", **style)
             extremes += returns[1]
-            handles.setdefault(
-                plain(row.label),
-                Line2D([], [], color=color, marker=marker, linestyle=line, markersize=5),
-            )
+            handles.setdefault(plain(row.label), _entry(row.agent, markersize=5))
             if returns[1]:
-                hollow: dict[str, Any] = {
-                    "marker": "o",
-                    "markerfacecolor": "white",
-                    "linestyle": "none",
-                }
+                hollow: dict[str, Any] = {"marker": "o", "markerfacecolor": "white"}
+                hollow["linestyle"] = "none"
                 explained["fresh return"] = Line2D([], [], color="#555555", markersize=5, **hollow)
         if table.feasible:
             _feasible_band(ax, *table.feasible, extremes)
@@ -312,12 +304,11 @@ def advantage_map(found: DefectMap, embodiment: str) -> Figure:
     tasks = sorted({point.table.key.task for point in points})
     markers = {task: PLACE_MARKERS[i % len(PLACE_MARKERS)] for i, task in enumerate(tasks)}
     right = 1.04 * max(point.defect.interval.high for point in points)
-    names = {"auc": "area under the curve", "success": "final success"}
     for axes, row in zip(grid, panels, strict=True):
         for ax, panel in zip(axes, row, strict=True):
             ax.set_xlim(-0.02 * right, right)
             _draw_panel(ax, panel, markers)
-            ax.set_title(f"{panel.agent}, {names[panel.measure]}")
+            ax.set_title(f"{panel.agent}, {MEASURE_NAMES[panel.measure]}")
         axes[0].set_ylabel(f"advantage over {STANDARD}")
     for ax in grid[-1]:
         ax.set_xlabel(f"audited defect of a decision, {plain(embodiment, 26)}")
@@ -382,7 +373,6 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
     kinds = list(defects)
     agents = list(dict.fromkeys(gain.agent for gain in found))
     figure = Figure(figsize=(9.0, 0.9 + 0.28 * len(kinds)), layout="constrained")
-    names = {"auc": "area under the curve", "success": "final success"}
     axes = figure.subplots(1, len(MEASURES), sharey=True)
     for ax, measure in zip(axes, MEASURES, strict=True):
         ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
@@ -401,16 +391,12 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
                 markerfacecolor=color if gain.enough else "white",
                 elinewidth=1.2,
             )
-        ax.set_title(f"advantage over {STANDARD}: {names[measure]}")
+        ax.set_title(f"advantage over {STANDARD}: {MEASURE_NAMES[measure]}")
         ax.grid(axis="y", visible=False)
     labels = [_with_defects(kind, own) for kind, own in defects.items()]
     axes[0].set_yticks(range(len(kinds)), labels)
     axes[0].set_ylim(len(kinds) - 0.5, -0.5)
-    handles: dict[str, Line2D | Patch] = {}
-    for agent in agents:
-        color, marker, line = style_of(agent)
-        handles[plain(agent, 26)] = Line2D([], [], color=color, marker=marker, linestyle=line)
-    _legend(figure, handles)
+    _legend(figure, {plain(agent, 26): _entry(agent) for agent in agents})
     return figure
 
 

@@ -7,6 +7,7 @@ import re
 import stat
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import REPEATED
@@ -101,18 +102,19 @@ def _mode(path: Path) -> int:
     except FileNotFoundError as error:
         raise UserError(f"{path} does not exist: name a record or a folder with records") from error
     except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}; name another path") from error
+        _refuse(error)
+
+
+def _refuse(error: OSError) -> NoReturn:
+    raise UserError(
+        f"{error.filename} cannot be read: {error.strerror}; make it readable or leave it out"
+    ) from error
 
 
 def _in_folder(folder: Path) -> list[Path]:
-    def refuse(error: OSError) -> None:
-        raise UserError(
-            f"{error.filename} cannot be read: {error.strerror}; make it readable or leave it out"
-        ) from error
-
     files = sorted(
         Path(parent, name)
-        for parent, _, names in os.walk(folder, onerror=refuse)
+        for parent, _, names in os.walk(folder, onerror=_refuse)
         for name in names
         if name.endswith(".json") and not name.endswith(REPEATED)
     )
@@ -130,6 +132,4 @@ def _begins_like_a_record(file: Path) -> bool:
         with open(file, "rb") as opened:
             return _BEGINNING.match(opened.read(128)) is not None
     except OSError as error:
-        raise UserError(
-            f"{file} cannot be read: {error.strerror}; make it readable or leave it out"
-        ) from error
+        _refuse(error)

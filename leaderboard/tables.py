@@ -190,12 +190,9 @@ def _episodes(row: Row, links: Links) -> str:
 
 
 def status(row: Row) -> str:
-    parts = []
-    for status in ("finished", "running", "interrupted", "failed"):
-        if number_of := sum(run.record.status == status for run in row.runs):
-            parts.append(f"{number_of} {status}")
-    if row.missing:
-        parts.append(f"{row.missing} missing")
+    found = [run.record.status for run in row.runs] + ["missing"] * row.missing
+    order = ("finished", "running", "interrupted", "failed", "missing")
+    parts = [f"{found.count(status)} {status}" for status in order if status in found]
     made_again = row.reproductions
     parts += [f"{made_again[v]} {REPRODUCED[v]}" for v in VERDICTS if made_again[v]]
     return ", ".join(parts).replace(" ", SPACE).replace(f",{SPACE}", ", ")
@@ -205,24 +202,20 @@ def _against_best(table: Table) -> list[str]:
     best = table.best_reference
     if best is None or best.success is None:
         return []
-    against = [
-        f"{code(row.label)} {difference(row.against_best)}"
-        for row in sorted(table.learners, key=_place)
-        if row.against_best
-    ]
     text = f"Best reference: {code(best.label)}, {number(best.success.value)}."
-    return [text + (f" Against it: {'; '.join(against)}." if against else "")]
+    against = _of_learners(table, "against_best")
+    return [text + (f" Against it: {against}." if against else "")]
 
 
 def _plateau(table: Table) -> list[str]:
-    rises = [
-        f"{code(row.label)} {difference(row.rise)}"
-        for row in sorted(table.learners, key=_place)
-        if row.rise
-    ]
-    if not rises:
-        return []
-    return [f"From the fourth to the last fifth of the budget: {'; '.join(rises)}."]
+    rises = _of_learners(table, "rise")
+    return [f"From the fourth to the last fifth of the budget: {rises}."] if rises else []
+
+
+def _of_learners(table: Table, name: str) -> str:
+    """An interval of each learner that has it, by rank."""
+    rows = [row for row in sorted(table.learners, key=_place) if getattr(row, name)]
+    return "; ".join(f"{code(row.label)} {difference(getattr(row, name))}" for row in rows)
 
 
 def _diagnostics(table: Table) -> list[str]:
@@ -276,13 +269,11 @@ def _parameters(row: Row) -> str:
     sizes = {
         (p.actor, p.critic, p.width) for run in row.runs if (p := run.record.parameters).total > 0
     }
-    if not sizes:
-        return NOTHING
-    texts = []
-    for actor, critic, width in sorted(sizes, key=str):
-        text = f"{count(actor)}, {count(critic)}" + (f"<br>({width})" if width else "")
-        texts.append(text.replace(" ", SPACE))
-    return "; ".join(texts)
+    texts = [
+        (f"{count(actor)}, {count(critic)}" + f"<br>({width})" * bool(width)).replace(" ", SPACE)
+        for actor, critic, width in sorted(sizes, key=str)
+    ]
+    return "; ".join(texts) or NOTHING
 
 
 def _notes(table: Table) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Any
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons
 from symsteer.leaderboard.curves import direction_curve, mean_series, series, success_curve
 from symsteer.leaderboard.defects import DefectMap, Panel
-from symsteer.leaderboard.figures import style_of
+from symsteer.leaderboard.figures import MEASURE_NAMES, style_of
 from symsteer.leaderboard.paper import BASE, STANDARD
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.statistics import Interval
@@ -291,7 +291,7 @@ def map_chart(panels: Sequence[Panel], names: Mapping[Any, str]) -> Chart:
                 shape |= {"low": plain(low for low, _ in ends)}
                 one["lines"].append(shape | {"high": plain(high for _, high in ends)})
         found.append(one)
-    measure = "area under the curve" if panels[0].measure == "auc" else "final success"
+    measure = MEASURE_NAMES[panels[0].measure]
     x = {"title": "audited defect of a decision", "from_zero": True}
     y = {"title": f"advantage over {STANDARD}", "zero": True}
     return {"kind": "points", "x": x, "y": y, "series": found, "measure": measure}
