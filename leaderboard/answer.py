@@ -6,14 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from symsteer.leaderboard.defects import (
-    MEASURES,
-    Audit,
-    advantage,
-    defect_of,
-    dial_of,
-    parts_of,
-)
+from symsteer.leaderboard.defects import MEASURES, Audit, advantage, defect_of, dial_of, parts_of
 from symsteer.leaderboard.paper import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.statistics import Interval, cell_estimates, combined, crossed_bootstrap
 from symsteer.leaderboard.summary import (

@@ -105,11 +105,7 @@ def _check_names(study: Study, summary: Summary, audit: Audit) -> None:
     for claim in study.claims:
         named: list[tuple[str, tuple[str, ...]]] = [("agent", claim.agents)]
         for cells in (claim.cells, claim.minus or Cells()):
-            named += [
-                ("task", cells.task or ()),
-                ("embodiment", cells.embodiment or ()),
-                ("variant", cells.variant or ()),
-            ]
+            named += [(k, getattr(cells, k) or ()) for k in ("task", "embodiment", "variant")]
         for kind, names in named:
             for name in names:
                 # What has a schedule is known by what it is at the end of a run.

@@ -61,12 +61,7 @@ FEASIBLE, FEASIBLE_EDGE, FEASIBLE_TEXT = "#DDE7D0", "#7A9A50", "#4F6B2A"
 PLACE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*")
 """Markers of the map, one for each task."""
 
-PARTS = {
-    "tool": "#0072B2",
-    "object": "#D55E00",
-    "cost": "#CC79A7",
-    "observation": "#009E73",
-}
+PARTS = {"tool": "#0072B2", "object": "#D55E00", "cost": "#CC79A7", "observation": "#009E73"}
 """Colours of the map: which part of a decision the defect is of."""
 FIT = "#444444"
 
@@ -471,7 +466,6 @@ def improvement_chart(found: Comparisons) -> Figure:
 def _side_by_side(
     groups: Sequence[str], cells: Mapping[str, int], height: float
 ) -> tuple[Figure, list[Axes]]:
-    """One panel for each group of cells."""
     figure = Figure(figsize=(9.0 if len(groups) > 1 else 5.6, height), layout="constrained")
     axes = list(figure.subplots(1, len(groups), squeeze=False, sharey=True).flat)
     for ax, group in zip(axes, groups, strict=True):

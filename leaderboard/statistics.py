@@ -363,9 +363,7 @@ def combined(cells: Sequence[Estimate], weights: Sequence[float] | None = None) 
 
 
 def crossed_bootstrap(
-    runs: Sequence[Sample],
-    statistic: Callable[..., Array] = mean,
-    resamples: int = RESAMPLES,
+    runs: Sequence[Sample], statistic: Callable[..., Array] = mean, resamples: int = RESAMPLES
 ) -> Interval:
     """`statistic` over the units of one cell with its 95 % interval (`cell_estimates`)."""
     return cell_estimates([runs], statistic, resamples)[0].interval()

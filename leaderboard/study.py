@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from symsteer.errors import UserError
 from symsteer.files import read_toml
-from symsteer.leaderboard.records.provenance import committed_hash, git_hash
+from symsteer.leaderboard.records.provenance import is_committed
 from symsteer.names import unknown
 
 PAPER = "paper"
@@ -158,8 +158,11 @@ def read_study(name_or_path: str) -> Study:
             )
         own = {"notice": file.notice, "details": file.details, "declared": file.declared}
         file = declaring.model_copy(update=own)
-    if file.declared:
-        _check_commit(source, file.declared)
+    if file.declared and is_committed(source, file.declared) is False:
+        raise UserError(
+            f"{source} is not as the commit {file.declared} has it, so this commit has not "
+            "declared these claims; name the one that has, or restore the file"
+        )
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
     texts = file.notice.strip(), file.details.strip(), file.declared
     return Study(*texts, file.claim, file.statement, source.name, digest, read_list(path))
@@ -193,16 +196,6 @@ def _read(name_or_path: str) -> tuple[_File, Path]:
         return _File.model_validate(data), path
     except ValidationError as error:
         raise UserError(f"{path.name}: {_problem(error)}; correct it there") from error
-
-
-def _check_commit(source: Path, commit: str) -> None:
-    """Compare a file that declares claims with what a commit has in its place."""
-    known, then = committed_hash(source, commit)
-    if known and then != git_hash(source.read_bytes()):
-        raise UserError(
-            f"{source} is not as the commit {commit} has it, so this commit has not declared these "
-            "claims; name the one that has, or restore the file"
-        )
 
 
 def _problem(error: ValidationError) -> str:

@@ -403,9 +403,7 @@ class Table:
     def feasible(self) -> tuple[float, float] | None:
         """The widest feasible Q bounds of the runs, entropy allowance included."""
         bounds = [found for run in self.counted if (found := run.feasible)]
-        if not bounds:
-            return None
-        return min(low for low, _ in bounds), max(high for _, high in bounds)
+        return (min(low for low, _ in bounds), max(h for _, h in bounds)) if bounds else None
 
     @property
     def is_ranked(self) -> bool:
@@ -432,17 +430,13 @@ class Summary:
 
     @property
     def _trusted_tables(self) -> list[Table]:
-        """Those with a trusted run."""
         return [table for table in self.tables if any(row.runs for row in table.trusted)]
 
     @cached_property
     def _demonstrations(self) -> dict[tuple[str, ...], int]:
         """The largest number of demonstrations of each place."""
-        most: dict[tuple[str, ...], int] = {}
-        for table in self._trusted_tables:
-            key = table.key
-            most[key.place] = max(key.demonstrations, most.get(key.place, 0))
-        return most
+        # Of equal places the last one counts.
+        return dict(sorted((t.key.place, t.key.demonstrations) for t in self._trusted_tables))
 
     def has_few_demonstrations(self, key: Key) -> bool:
         """Whether other tables of the same place have more."""
@@ -480,9 +474,7 @@ class Summary:
 
 
 def load_runs(
-    paths: Iterable[Path],
-    reproductions: Path | None = None,
-    listed: Collection[str] | None = None,
+    paths: Iterable[Path], reproductions: Path | None = None, listed: Collection[str] | None = None
 ) -> list[Run]:
     """Read the records that `paths` name: files, run folders, folders of either.
 
@@ -687,7 +679,6 @@ def _table(
 
 
 def _complete(table: Table) -> None:
-    """Compute every number of a table."""
     rows = table.trusted
     for row in table.rows:
         _fill(row)

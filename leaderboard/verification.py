@@ -37,9 +37,7 @@ def differences(files: Mapping[str, bytes], stale: list[str], out: Path) -> list
     for name, wanted in sorted(files.items()):
         path = out / name
         try:
-            with open(path, "rb") as file:
-                # One byte more than wanted tells a longer file, however large it is.
-                found = file.read(len(wanted) + 1)
+            found = path.read_bytes()
         except FileNotFoundError:
             lines.append(f"{path}: missing")
         except OSError as error:

@@ -146,12 +146,8 @@ def _seconds(pairs: Sequence[RunPair]) -> tuple[float, float]:
 def _success(pair: RunPair) -> Paired:
     """Success in the final evaluation; paired runs have the same held-out episodes there."""
     a, b = pair.a.final_success, pair.b.final_success
-    policy = pair.a.policy
-    return Paired(
-        Sample.pooled(a.items(), policy),
-        Sample.pooled(b.items(), policy),
-        Sample.pooled(paired_differences(b, a).items(), policy),
-    )
+    values = a, b, paired_differences(b, a)
+    return Paired(*(Sample.pooled(one.items(), pair.a.policy) for one in values))
 
 
 def _area(pair: RunPair) -> Paired | None:
@@ -159,10 +155,8 @@ def _area(pair: RunPair) -> Paired | None:
     if pair.a.is_reference or pair.b.is_reference:
         return None
     difference = area_difference(pair.b, pair.a, pair.a.record.settings.env_steps)
-    if difference is None:
-        return None
     a, b = (Sample.constant(run.area, run.policy) for run in (pair.a, pair.b))
-    return Paired(a, b, difference)
+    return Paired(a, b, difference) if difference else None
 
 
 def _bias(pair: RunPair) -> Paired | None:
@@ -170,12 +164,8 @@ def _bias(pair: RunPair) -> Paired | None:
     a, b = pair.a.last("q_bias"), pair.b.last("q_bias")
     if a is None or b is None:
         return None
-    policy = pair.a.policy
-    return Paired(
-        Sample.constant(abs(a), policy),
-        Sample.constant(abs(b), policy),
-        Sample.constant(abs(b) - abs(a), policy),
-    )
+    values = abs(a), abs(b), abs(b) - abs(a)
+    return Paired(*(Sample.constant(one, pair.a.policy) for one in values))
 
 
 MEASURES: dict[Measure, Callable[[RunPair], Paired | None]] = {

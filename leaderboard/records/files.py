@@ -69,10 +69,7 @@ def read_record(path: Path | str) -> RunRecord:
         ) from error
     try:
         data = json.loads(
-            text,
-            parse_constant=_refuse,
-            parse_float=_finite,
-            object_pairs_hook=_unique_keys,
+            text, parse_constant=_refuse, parse_float=_finite, object_pairs_hook=_unique_keys
         )
     except (ValueError, RecursionError) as error:
         problem = error.msg if isinstance(error, json.JSONDecodeError) else str(error)

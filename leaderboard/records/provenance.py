@@ -25,7 +25,6 @@ CODE = ("agents", "bench", "leaderboard", "policies", "symsteer")
 PACKAGES = ("torch", "mani-skill", "sapien", "escnn", "gymnasium", "numpy")
 """Packages whose versions a record names, where they are installed."""
 
-
 NUMBERED = {"family": "cpu family", "model": "model"}
 """What a processor's kind is numbered by: a name such as "AMD EPYC" may stand for many."""
 
@@ -146,8 +145,8 @@ def git(folder: Path, *arguments: str, **variables: str) -> str | None:
     return result.stdout.strip()
 
 
-def committed_hash(file: Path, commit: str) -> tuple[bool, str | None]:
-    """Whether the repository around a file can be asked, and git's hash of the file in a commit.
+def is_committed(file: Path, commit: str) -> bool | None:
+    """Whether a commit has a file as it is; None if the repository around it cannot be asked.
 
     The repository may be anyone's: git reads its objects from an empty repository of ours, so that
     none of its configuration is in force.
@@ -155,7 +154,7 @@ def committed_hash(file: Path, commit: str) -> tuple[bool, str | None]:
     file = file.resolve()
     top = next((folder for folder in file.parents if (folder / ".git").exists()), file)
     if not (top / ".git/objects").is_dir() or (top / ".git/shallow").exists():
-        return False, None
+        return None
     with tempfile.TemporaryDirectory() as name:
         empty = Path(name)
         for part in ("objects", "refs"):
@@ -163,14 +162,10 @@ def committed_hash(file: Path, commit: str) -> tuple[bool, str | None]:
         (empty / "HEAD").write_text("ref: refs/heads/none\n")
         places = {"GIT_DIR": name, "GIT_ALTERNATE_OBJECT_DIRECTORIES": str(top / ".git/objects")}
         if git(empty, "version") is None:
-            return False, None
-        place = f"{commit}:{file.relative_to(top).as_posix()}"
-        return True, git(empty, "rev-parse", "--verify", "--quiet", place, **places)
-
-
-def git_hash(data: bytes) -> str:
-    """The hash that git gives to a file's content."""
-    return hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+            return None
+        place, data = f"{commit}:{file.relative_to(top).as_posix()}", file.read_bytes()
+        own = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+        return own == git(empty, "rev-parse", "--verify", "--quiet", place, **places)
 
 
 @functools.cache

@@ -179,14 +179,9 @@ class Episodes(Measured):
 
     @model_validator(mode="after")
     def _columns_agree(self) -> Self:
-        columns = (
-            self.success_once,
-            self.success_at_end,
-            self.return_,
-            self.episode_len,
-            self.seed if self.direction is None else self.direction,
-        )
-        if not self.seed or any(len(column) != len(self.seed) for column in columns):
+        columns = self.success_once, self.success_at_end, self.return_, self.episode_len
+        direction = self.seed if self.direction is None else self.direction
+        if not self.seed or {len(c) for c in (*columns, direction)} != {len(self.seed)}:
             raise ValueError("the columns must be equally long and not empty")
         if len(set(self.seed)) != len(self.seed):
             raise ValueError("an evaluation seed occurs twice")
@@ -332,18 +327,13 @@ class RunRecord(Block):
     @property
     def has_critic(self) -> bool:
         """Whether any evaluation measured a Q-value."""
-        return any(
-            name in evaluation.diagnostics for evaluation in self.evaluations for name in Q_VALUES
-        )
+        return any(name in e.diagnostics for e in self.evaluations for name in Q_VALUES)
 
     @property
     def nonfinite_q(self) -> bool:
         """Whether a Q-value of any evaluation was not finite (`Q_VALUES`; a bias may be)."""
-        return any(
-            f"diagnostics/{name}" in evaluation.nonfinite
-            for evaluation in self.evaluations
-            for name in Q_VALUES
-        )
+        flags = [f"diagnostics/{name}" for name in Q_VALUES]
+        return any(flag in e.nonfinite for e in self.evaluations for flag in flags)
 
     @property
     def not_finite(self) -> str:
@@ -363,10 +353,8 @@ class RunRecord(Block):
             return None
         trained = [evaluation for evaluation in self.evaluations if evaluation.updates > 0]
         last = trained[-1] if trained else None
-        middle = None
-        if last is not None and len(trained) > 1:
-            half = last.env_steps / 2
-            middle = min(trained[:-1], key=lambda evaluation: abs(evaluation.env_steps - half))
+        half = last.env_steps / 2 if last else 0
+        middle = min(trained[:-1], key=lambda e: abs(e.env_steps - half), default=None)
 
         def at(evaluation: Evaluation | None, name: str) -> float | None:
             return evaluation.diagnostics.get(name) if evaluation else None
@@ -374,11 +362,8 @@ class RunRecord(Block):
         def largest(name: str) -> float | None:
             return max((v for e in trained if (v := at(e, name)) is not None), default=None)
 
-        magnitude, ends, was = (
-            largest("q_magnitude"),
-            at(last, "q_abs_max"),
-            at(middle, "q_abs_max"),
-        )
+        magnitude = largest("q_magnitude")
+        ends, was = at(last, "q_abs_max"), at(middle, "q_abs_max")
         growth = ends / was if ends is not None and was else None
         outside, before = at(last, "q_overshoot") or 0.0, at(middle, "q_overshoot") or 0.0
         grew = growth is not None and growth >= MAX_GROWTH

@@ -20,14 +20,7 @@ from symsteer.leaderboard.site.clips import shared_media
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.summary import Row, Run, Table
 from symsteer.leaderboard.tables import section, status
-from symsteer.leaderboard.text import (
-    NOTHING,
-    compact,
-    count,
-    difference,
-    interval,
-    number,
-)
+from symsteer.leaderboard.text import NOTHING, compact, count, difference, interval, number
 
 Values = dict[str, Any]
 

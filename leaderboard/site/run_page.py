@@ -11,7 +11,7 @@ from symsteer.leaderboard.site.board import Board, dials
 from symsteer.leaderboard.site.clips import media
 from symsteer.leaderboard.site.pages import options_of
 from symsteer.leaderboard.summary import Run
-from symsteer.leaderboard.text import NOTHING, compact, count, number
+from symsteer.leaderboard.text import compact, count, number
 
 
 def run_values(board: Board, run: Run) -> dict[str, Any]:
@@ -113,21 +113,7 @@ def _evaluation(evaluation: Evaluation) -> list[str]:
 def _episodes(evaluation: Evaluation) -> list[list[str]]:
     """Rows of the table of the last evaluation's episodes."""
     columns = evaluation.episodes
-    rows = zip(
-        columns.seed,
-        columns.success_once,
-        columns.success_at_end,
-        columns.return_,
-        columns.episode_len,
-        strict=True,
-    )
-    return [
-        [
-            str(seed),
-            "yes" if once else "no",
-            "yes" if end else "no",
-            NOTHING if ret is None else number(ret, 1),
-            str(length),
-        ]
-        for seed, once, end, ret, length in rows
-    ]
+    flags = zip(columns.success_once, columns.success_at_end, strict=True)
+    successes = [["yes" if flag else "no" for flag in both] for both in flags]
+    numbers = zip(columns.seed, successes, columns.return_, columns.episode_len, strict=True)
+    return [[str(seed), *both, number(ret, 1), str(length)] for seed, both, ret, length in numbers]
