@@ -119,17 +119,9 @@ def paper_page(findings: Findings) -> str:
     """What became of the paper's statements, as a page; empty if the study names none."""
     if not findings.study.statements:
         return ""
-    return (
-        "\n\n".join(
-            [
-                PAPER_TITLE.strip(),
-                "All claims and results are on the [leaderboard](LEADERBOARD.md).",
-                "## Statements",
-                *paper_section(findings),
-            ]
-        )
-        + "\n"
-    )
+    link = "All claims and results are on the [leaderboard](LEADERBOARD.md)."
+    parts = [PAPER_TITLE.strip(), link, "## Statements", *paper_section(findings)]
+    return "\n\n".join(parts) + "\n"
 
 
 def paper_section(findings: Findings) -> list[str]:

@@ -199,18 +199,12 @@ def audit_commands(keys: Sequence[Key]) -> list[str]:
     Names that no task or variant could have are left out: text from a record must not become part
     of a command that a reader copies.
     """
-    wanted: dict[tuple[str, str, str], list[str]] = {}
+    wanted: dict[tuple[str, str, str], dict[str, None]] = {}
     for key in sorted(keys):
         words = (key.task, key.embodiment, key.variant, key.group)
         constant = all(spec.is_constant for spec in parts_of(key.variant) or ())
-        if (
-            key.group
-            and constant
-            and all(re.fullmatch(r"[A-Za-z0-9][\w.:+-]*", w, re.ASCII) for w in words)
-        ):
-            variants = wanted.setdefault((key.task, key.embodiment, key.group), [])
-            if key.variant not in variants:
-                variants.append(key.variant)
+        if constant and all(re.fullmatch(r"[A-Za-z0-9][\w.:+-]*", w, re.ASCII) for w in words):
+            wanted.setdefault((key.task, key.embodiment, key.group), {})[key.variant] = None
     return [
         to_paste(
             *("symsteer", "audit", "--task", task, "--embodiment", embodiment, "--group", group),
@@ -374,10 +368,8 @@ class DefectMap:
 
     def agents(self, embodiment: str) -> list[str]:
         """Those of `USING_SYMMETRY` that have points."""
-        with_points = {
-            a for (e, a, _), panel in self.panels.items() if e == embodiment and panel.points
-        }
-        return [agent for agent in USING_SYMMETRY if agent in with_points]
+        agents = {a for (e, a, _), panel in self.panels.items() if e == embodiment and panel.points}
+        return [agent for agent in USING_SYMMETRY if agent in agents]
 
     def panel(self, embodiment: str, agent: str, measure: str) -> Panel:
         """A panel, without points if there are none."""

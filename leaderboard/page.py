@@ -180,13 +180,12 @@ def _effects_table(found: Sequence[MainEffect]) -> str:
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for one in found:
         change = f"{code(one.option)} {code(one.levels[0])} to {code(one.levels[1])}"
-        counts = f"{one.runs}, {one.policies}"
         own = rows.setdefault((code(one.agent), change), {})
         mark = MARKS[one.effect.sign] if one.policies >= MIN_SEEDS else ""
         difference = stacked(one.effect, sign=True, marks=mark)
         means = f"{number(one.means[0])} to {number(one.means[1])}".replace(" ", SPACE)
         own[one.measure] = f"{means}<br>{difference}"
-        own["counts"] = counts
+        own["counts"] = f"{one.runs}, {one.policies}"
     names = [*EFFECT_MEASURES, "counts"]
     header = ["Agent", "Change", "Success", "Largest \\|Q\\|", "Diverged", "Runs, policies"]
     body = [[*place, *(own.get(name, NOTHING) for name in names)] for place, own in rows.items()]
@@ -212,10 +211,8 @@ def _overview(summary: Summary) -> str:
     header = ["Task", *(code(agent) for agent in summary.agents)]
     rows = []
     for table in summary.tables:
-        cells = []
-        for agent in summary.agents:
-            shown = at_a_glance(table, agent)
-            cells.append("<br>".join(_glance(row) for row in shown) or NOTHING)
+        shown = (at_a_glance(table, agent) for agent in summary.agents)
+        cells = ("<br>".join(map(_glance, own)) or NOTHING for own in shown)
         rows.append([cell_name(table, summary), *cells])
     return grid(header, rows, left=1)
 

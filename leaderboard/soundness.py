@@ -59,20 +59,15 @@ class Soundness:
 def soundness(row: Row, table: Table) -> Soundness:
     """The measures of a learner's row."""
     base = table.row_of(BASE)
-    falls = [
-        fall
-        for run in row.finished
-        if (fall := _fall(run, base.finished if base else [])) is not None
-    ]
+    references = base.finished if base else []
+    falls = [fall for run in row.finished if (fall := _fall(run, references)) is not None]
     biases = [(abs(bias), run) for run in row.finished if (bias := run.last("q_bias")) is not None]
     shares = [
         bias / (feasible.high - feasible.low)
         for bias, run in biases
         if (feasible := run.record.feasible_q)
     ]
-    correlations = [
-        value for run in row.finished if (value := run.last("q_correlation")) is not None
-    ]
+    correlations = [v for run in row.finished if (v := run.last("q_correlation")) is not None]
     return Soundness(
         _median(falls),
         max(falls, default=None),

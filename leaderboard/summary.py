@@ -688,9 +688,8 @@ def _complete(table: Table) -> None:
         if base and row.agent != BASE:
             _against_base(row, base)
         if table.threshold is not None and not row.is_reference:
-            row.threshold_steps = [
-                steps_to_threshold(*_points(run), table.threshold) for run in row.finished
-            ]
+            points = map(_points, row.finished)
+            row.threshold_steps = [steps_to_threshold(*own, table.threshold) for own in points]
     references = [row for row in rows if row.is_reference and row.success]
     table.best_reference = max(
         references, key=lambda row: row.success.value if row.success else 0.0, default=None
@@ -764,14 +763,10 @@ def _fill(row: Row) -> None:
     if not row.finished:
         return
     row.success = success_interval([success_sample(run) for run in row.finished])
-    row.last = success_interval(
-        [Sample.pooled(run.final_success.items(), run.policy) for run in row.finished]
-    )
-    rises = [
-        Sample.pooled(run.rise.items(), run.policy)
-        for run in row.finished
-        if run.rise and not row.is_reference
-    ]
+    finals = [Sample.pooled(run.final_success.items(), run.policy) for run in row.finished]
+    row.last = success_interval(finals)
+    rising = [run for run in row.finished if run.rise and not row.is_reference]
+    rises = [Sample.pooled(run.rise.items(), run.policy) for run in rising]
     row.rise = crossed_bootstrap(rises) if rises else None
     if row.search_steps is None:
         row.area = float(np.mean([run.area for run in row.finished]))
@@ -799,12 +794,8 @@ def _against_base(row: Row, base: Row) -> None:
     dips = []
     for run in row.finished:
         reference = reference_success(run, base.finished)
-        below = [
-            float(np.mean(list(differences.values())))
-            for evaluation in run.curve.values()
-            if (differences := paired_differences(episode_success(evaluation), reference))
-        ]
-        if below:
+        found = (paired_differences(episode_success(e), reference) for e in run.curve.values())
+        if below := [float(np.mean(list(values.values()))) for values in found if values]:
             dips.append(deepest_dip(below))
     row.dip = min(dips, default=None)
 
@@ -857,12 +848,9 @@ def area_pairs(first: Row, second: Row, budget: int) -> dict[Pair, Sample]:
 
     Over the evaluations that both runs have (`aligned`), on the episodes that both have there.
     """
-    pairs = {}
-    for run in first.finished:
-        partner = _partner(run, second)
-        if partner and (sample := area_difference(run, partner, budget)):
-            pairs[run.pair] = sample
-    return pairs
+    twins = [(run, twin) for run in first.finished if (twin := _partner(run, second))]
+    found = {run.pair: area_difference(run, twin, budget) for run, twin in twins}
+    return {pair: sample for pair, sample in found.items() if sample}
 
 
 def area_difference(run: Run, partner: Run, budget: int) -> Sample | None:

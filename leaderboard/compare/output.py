@@ -157,7 +157,6 @@ def _side(letter: str, side: Side) -> str:
 
 
 def _code(run: Run) -> str:
-    """The commit of a run, short."""
     dirty = " with changes" if run.record.provenance.dirty else ""
     return (code_of(run)[:8] or "unknown") + dirty
 

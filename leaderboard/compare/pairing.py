@@ -123,20 +123,15 @@ def pair_runs(a: Side, b: Side) -> Pairing:
             cells.append(Cell(key, "" if usual else row.label, tuple(pairs)))
     if not cells:
         raise _without_pairs(a, b, identities)
-    alone = [
-        (
-            *(
-                Leftover(run, _why(run, other.runs, identities, "BA"[index]))
-                for run in side.runs
-                if run.path not in paired
-            ),
-            *side.leftovers,
-        )
-        for index, (side, other) in enumerate(((a, b), (b, a)))
-    ]
+
+    def alone(side: Side, other: Side, name: str) -> tuple[Leftover, ...]:
+        rest = [run for run in side.runs if run.path not in paired]
+        reasons = (_why(run, other.runs, identities, name) for run in rest)
+        return *map(Leftover, rest, reasons), *side.leftovers
+
     return Pairing(
         tuple(cells),
-        (alone[0], alone[1]),
+        (alone(a, b, "B"), alone(b, a, "A")),
         (_only(known[0], known[1]), _only(known[1], known[0])),
         tuple(sorted({text for cell in cells for pair in cell.pairs for text in _changes(pair)})),
     )

@@ -40,18 +40,14 @@ def repeat_command(config: Mapping[str, Any]) -> str | None:
         and for texts that no option has, because a reader may copy the command into a shell.
     """
     tables = config.get("agent_options"), config.get("policy")
-    if not all(isinstance(table, Mapping) for table in tables):
+    own = {key: value for key, value in config.items() if key not in DERIVED}
+    if not own.keys() <= KEYS or not all(isinstance(table, Mapping) for table in tables):
         return None
     words = ["symsteer", "run"]
-    own = {key: value for key, value in config.items() if key not in DERIVED}
-    if not own.keys() <= KEYS:
-        return None
     for key, value in flat(own).items():
         name = key.replace("agent_options.", "agent.", 1)
-        if not OPTION.fullmatch(name):
-            return None
         option = option_words(name, value)
-        if not all(VALUE.fullmatch(word) for word in option[1:]):
+        if not OPTION.fullmatch(name) or not all(VALUE.fullmatch(word) for word in option[1:]):
             return None
         words += option
     files = config.get("files")

@@ -107,8 +107,10 @@ def relinked(text: str, place: str, source: str) -> str:
             return match[0]
         target = posixpath.normpath(posixpath.join(posixpath.dirname(place), parts.path))
         anchor = f"#{parts.fragment}" if parts.fragment else ""
-        found = site_address(target)
-        if found is not None:
+        found = PAGES.get(target) or PICTURES.get(target)
+        if not found and target.startswith("docs/"):
+            found = target.removeprefix("docs/")
+        if found:
             address = posixpath.relpath(found, posixpath.dirname(source) or ".")
             return f"{mark}[{label}]({address}{anchor})"
         if target == RESULTS:
@@ -120,10 +122,3 @@ def relinked(text: str, place: str, source: str) -> str:
         return label if label.startswith("`") else f"{label} (`{target}`)"
 
     return LINK.sub(replace, text)
-
-
-def site_address(target: str) -> str | None:
-    """The documentation's file that stands for a file of the repository; None if none does."""
-    if found := PAGES.get(target) or PICTURES.get(target):
-        return found
-    return target.removeprefix("docs/") if target.startswith("docs/") else None
