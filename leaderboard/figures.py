@@ -197,16 +197,9 @@ def _draw_success(ax: Axes, row: Row, budget: int, band: bool) -> None:
         return
     if band:
         ax.fill_between(curve.steps, curve.low, curve.high, color=color, alpha=0.14, linewidth=0)
-    ax.plot(
-        curve.steps,
-        curve.values,
-        color=color,
-        linestyle=line,
-        marker=marker,
-        markersize=4,
-        markevery=max(1, len(curve.steps) // MAX_MARKERS),
-        linewidth=1.7,
-    )
+    marks: dict[str, Any] = {"marker": marker, "markersize": 4}
+    marks["markevery"] = max(1, len(curve.steps) // MAX_MARKERS)
+    ax.plot(curve.steps, curve.values, color=color, linestyle=line, linewidth=1.7, **marks)
 
 
 def q_values(tables: Sequence[Table]) -> Figure:
@@ -266,16 +259,9 @@ def _feasible_band(ax: Axes, low: float, high: float, values: Sequence[float]) -
         return
     if values and bottom - low > 2 * (top - bottom):
         # The lower bound is so far away that showing it would flatten the curves.
-        ax.text(
-            0.98,
-            0.02,
-            f"feasible down to {low:.4g}",
-            transform=ax.transAxes,
-            ha="right",
-            va="bottom",
-            color=FEASIBLE_TEXT,
-            fontsize=8,
-        )
+        corner: dict[str, Any] = {"transform": ax.transAxes, "ha": "right", "va": "bottom"}
+        text = f"feasible down to {low:.4g}"
+        ax.text(0.98, 0.02, text, color=FEASIBLE_TEXT, fontsize=8, **corner)
         margin = 0.18 * (top - bottom)
     else:
         bottom = min(bottom, low)
@@ -326,18 +312,10 @@ def _draw_panel(ax: Axes, panel: Panel, markers: Mapping[str, str]) -> None:
     for point in panel.points:
         defect, gain = point.defect.interval, point.advantage
         color = PARTS[point.defect.part]
-        ax.errorbar(
-            defect.value,
-            gain.value,
-            xerr=_arms(defect),
-            yerr=_arms(gain),
-            color=color,
-            elinewidth=0.8,
-            alpha=0.85,
-            marker=markers[point.table.key.task],
-            markersize=6,
-            markerfacecolor=color if point.counts else "white",
-        )
+        look: dict[str, Any] = {"color": color, "elinewidth": 0.8, "alpha": 0.85, "markersize": 6}
+        look["marker"] = markers[point.table.key.task]
+        look["markerfacecolor"] = color if point.counts else "white"
+        ax.errorbar(defect.value, gain.value, xerr=_arms(defect), yerr=_arms(gain), **look)
     if not panel.points:
         ax.text(0.5, 0.5, "no paired runs", transform=ax.transAxes, ha="center", color="#777777")
 
@@ -376,16 +354,10 @@ def answer_chart(found: Sequence[Gain]) -> Figure:
                 continue
             color, marker, _ = style_of(gain.agent)
             shift = agents.index(gain.agent) - (len(agents) - 1) / 2
-            ax.errorbar(
-                gain.effect.value,
-                kinds.index(gain.kind) + 0.24 * shift,
-                xerr=_arms(gain.effect),
-                color=color,
-                marker=marker,
-                markersize=5,
-                markerfacecolor=color if gain.enough else "white",
-                elinewidth=1.2,
-            )
+            height = kinds.index(gain.kind) + 0.24 * shift
+            look: dict[str, Any] = {"color": color, "elinewidth": 1.2, "markersize": 5}
+            look |= {"marker": marker, "markerfacecolor": color if gain.enough else "white"}
+            ax.errorbar(gain.effect.value, height, xerr=_arms(gain.effect), **look)
         ax.set_title(f"advantage over {STANDARD}: {MEASURE_NAMES[measure]}")
         ax.grid(axis="y", visible=False)
     labels = [_with_defects(kind, own) for kind, own in defects.items()]

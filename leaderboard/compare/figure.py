@@ -81,14 +81,8 @@ def _draw_change(ax: Axes, height: int, change: Change) -> None:
     found = change.difference
     color, marker, _ = LOOKS[found.sign if change.counts else 0]
     ax.plot([found.low, found.high], [height] * 2, color=color, linewidth=1.8)
-    ax.plot(
-        found.value,
-        height,
-        marker,
-        color=color,
-        markersize=6.5,
-        markerfacecolor=color if change.counts else "white",
-    )
+    face = color if change.counts else "white"
+    ax.plot(found.value, height, marker, color=color, markersize=6.5, markerfacecolor=face)
 
 
 def _legend(changes: Changes) -> list[Line2D]:

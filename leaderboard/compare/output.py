@@ -286,15 +286,8 @@ def _aligned(rows: Sequence[Sequence[str]], sides: str) -> str:
     folded = []
     for row in rows:
         indent = row[0][: len(row[0]) - len(row[0].lstrip())]
-        folded.append(
-            textwrap.wrap(
-                row[0].strip(),
-                NAME_WIDTH,
-                initial_indent=indent,
-                subsequent_indent=f"{indent}  ",
-                break_on_hyphens=False,
-            )
-        )
+        how: dict[str, Any] = {"initial_indent": indent, "subsequent_indent": f"{indent}  "}
+        folded.append(textwrap.wrap(row[0].strip(), NAME_WIDTH, break_on_hyphens=False, **how))
     widths = [max(len(line) for lines in folded for line in lines)]
     widths += [max(len(row[column]) for row in rows) for column in range(1, len(sides))]
     lines = []

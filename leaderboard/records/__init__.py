@@ -30,7 +30,6 @@ from symsteer.leaderboard.records.schema import (
     MAX_GROWTH,
     MAX_OVERSHOOT,
     ROLES,
-    SCHEMA_VERSION,
     BasePolicy,
     Budget,
     Divergence,
@@ -40,7 +39,6 @@ from symsteer.leaderboard.records.schema import (
     Parameters,
     Role,
     RunRecord,
-    RunSettings,
     WallClock,
 )
 from symsteer.leaderboard.records.values import canonical_json, config_hash, flat, portable
@@ -55,7 +53,6 @@ __all__ = [
     "REPEATED",
     "REPRODUCED",
     "ROLES",
-    "SCHEMA_VERSION",
     "VERDICTS",
     "BasePolicy",
     "Budget",
@@ -69,7 +66,6 @@ __all__ = [
     "Reproduction",
     "Role",
     "RunRecord",
-    "RunSettings",
     "WallClock",
     "canonical_json",
     "check_reproduction",
