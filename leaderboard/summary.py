@@ -435,7 +435,7 @@ class Summary:
     @cached_property
     def _demonstrations(self) -> dict[tuple[str, ...], int]:
         """The largest number of demonstrations of each place."""
-        # Of equal places the last one counts.
+        # Of each place the largest comes last, and counts.
         return dict(sorted((t.key.place, t.key.demonstrations) for t in self._trusted_tables))
 
     def has_few_demonstrations(self, key: Key) -> bool:
@@ -489,7 +489,7 @@ def load_runs(
             listed reproduction. None: nothing is known, and all are trusted.
     """
     known = read_reproductions(reproductions) if reproductions else {}
-    vouched = all_listed() if listed is None else listed
+    vouched = all_listed() if listed is None and known else listed or ()
     runs = []
     for file in record_files(paths):
         record, digest = read_record(file), file_hash(file)

@@ -107,10 +107,8 @@ def relinked(text: str, place: str, source: str) -> str:
             return match[0]
         target = posixpath.normpath(posixpath.join(posixpath.dirname(place), parts.path))
         anchor = f"#{parts.fragment}" if parts.fragment else ""
-        found = PAGES.get(target) or PICTURES.get(target)
-        if not found and target.startswith("docs/"):
-            found = target.removeprefix("docs/")
-        if found:
+        own = target.removeprefix("docs/") if target.startswith("docs/") else ""
+        if found := PAGES.get(target) or PICTURES.get(target) or own:
             address = posixpath.relpath(found, posixpath.dirname(source) or ".")
             return f"{mark}[{label}]({address}{anchor})"
         if target == RESULTS:
