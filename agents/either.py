@@ -10,7 +10,7 @@ from torch import nn
 from symsteer.agents.equivariant import equivariant_actor_layers, equivariant_critic_layers
 from symsteer.agents.options import SacOptions
 from symsteer.agents.standard import StandardAgent
-from symsteer.names import unknown
+from symsteer.names import check
 from symsteer.policies.geometry import Layout
 
 Layers = Literal["plain", "equivariant"]
@@ -25,8 +25,7 @@ class EitherOptions(SacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.layers not in get_args(Layers):
-            raise unknown("layers", self.layers, get_args(Layers))
+        check("layers", [self.layers], get_args(Layers))
 
 
 class EitherAgent(StandardAgent):

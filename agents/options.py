@@ -11,7 +11,7 @@ from symsteer.agents.agent import AgentOptions
 from symsteer.agents.distributions import LOG_SCALE_MAX, LOG_SCALE_MIN
 from symsteer.agents.networks import Activation
 from symsteer.errors import UserError
-from symsteer.names import unknown
+from symsteer.names import check
 from symsteer.policies.geometry import Group
 
 Critic = Literal["noise", "aliased", "sampler"]
@@ -112,8 +112,7 @@ class SacOptions(AgentOptions):
             ("warmup_noise", NoiseSource),
             ("activation", Activation),
         ):
-            if getattr(self, name) not in get_args(choices):
-                raise unknown(name, getattr(self, name), get_args(choices))
+            check(name, [getattr(self, name)], get_args(choices))
         self._require(
             "be positive",
             lambda value: value > 0,

@@ -49,7 +49,7 @@ from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent, plain_layers
 from symsteer.errors import UserError
-from symsteer.names import unknown
+from symsteer.names import check
 from symsteer.policies.geometry import Field, Group, Layout
 
 Gate = Literal["hard", "soft"]
@@ -72,8 +72,7 @@ class PartialOptions(SacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.gate not in get_args(Gate):
-            raise unknown("gate", self.gate, get_args(Gate))
+        check("gate", [self.gate], get_args(Gate))
         self._require("not be negative", lambda value: value >= 0, "fence")
         if self.critic == "noise":
             raise UserError(

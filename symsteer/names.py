@@ -16,6 +16,14 @@ def nearest(name: str, valid: Iterable[str]) -> str | None:
     return next(iter(difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)), None)
 
 
+def check(kind: str, names: Iterable[str], valid: Iterable[str], where: str = "") -> None:
+    """Raise the error of :func:`unknown` for the first of the names that is not valid."""
+    valid = list(valid)
+    for name in names:
+        if name not in valid:
+            raise unknown(kind, name, valid, where)
+
+
 def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> UserError:
     """The error for a name that does not exist.
 

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from symsteer.errors import UserError, first_problem
 from symsteer.files import read_toml
-from symsteer.names import unknown
+from symsteer.names import check
 
 T = TypeVar("T", bound=Any)
 
@@ -41,9 +41,7 @@ def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
         raise UserError(f"{problem}; correct it") from error
     valid = [field.name for field in dataclasses.fields(options)]
     own = tables.get(agent, {})
-    for key in own:
-        if key not in valid:
-            raise unknown(f"option of {agent}", key, valid, path.name)
+    check(f"option of {agent}", own, valid, path.name)
     return {key: value for key, value in tables.get("all", {}).items() if key in valid} | own
 
 

@@ -7,7 +7,7 @@ import functools
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,7 +19,7 @@ from symsteer.bench.tasks import TASKS, task_name
 from symsteer.bench.variants import VARIANTS
 from symsteer.bench.variants.levels import with_numbers
 from symsteer.errors import UserError
-from symsteer.names import unknown
+from symsteer.names import check
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import PolicyOptions
 from symsteer.variant import VariantSpec, parse_variant, variant_text
@@ -220,18 +220,6 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
         raise UserError(f"{where}{error}") from error
 
 
-def check_keys(data: Iterable[str], valid: Iterable[str], source: str, prefix: str = "") -> None:
-    """Check that all keys are valid.
-
-    Raises:
-        UserError: if one is not; the message has the nearest valid key.
-    """
-    valid = sorted(valid)
-    for key in data:
-        if key not in valid:
-            raise unknown("key", prefix + key, [prefix + name for name in valid], source)
-
-
 def content_key(*parts: Any) -> str:
     """Twelve hexadecimal digits that change with any of the JSON-able parts."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
@@ -289,7 +277,7 @@ def _merge(defaults: dict[str, Any], data: Mapping[str, Any]) -> dict[str, Any]:
 def _check_nested_keys(
     data: Mapping[str, Any], defaults: dict[str, Any], source: str, prefix: str
 ) -> None:
-    check_keys(data, defaults, source, prefix)
+    check("key", [prefix + key for key in data], [prefix + key for key in sorted(defaults)], source)
     for key, value in data.items():
         if isinstance(defaults[key], dict):
             if not isinstance(value, dict):

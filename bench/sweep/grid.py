@@ -19,7 +19,7 @@ from typing import Any
 
 from symsteer.errors import UserError
 from symsteer.files import read_toml
-from symsteer.names import unknown
+from symsteer.names import check
 from symsteer.variant import with_strength
 
 SUITES = Path(__file__).parent.parent / "suites"
@@ -92,10 +92,7 @@ def suite_data(data: dict[str, Any], path: Path) -> SuiteData:
         UserError: if the content is not a suite.
     """
     source = path.name
-    valid = ("description", "grid", "run")
-    for key in data:
-        if key not in valid:
-            raise unknown("key", key, valid, source)
+    check("key", data, ("description", "grid", "run"), source)
     shared, description = data.get("run", {}), data.get("description", "")
     if not isinstance(shared, dict):
         raise UserError(f"{source}: run must be a table, [run]")

@@ -17,7 +17,7 @@ from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.sweep.grid import SuiteData, read_suite, split_key
 from symsteer.errors import UserError
-from symsteer.names import unknown
+from symsteer.names import check
 from symsteer.policies import POLICIES
 from symsteer.registry import Registry
 
@@ -126,13 +126,12 @@ class _Options:
     def _check(self, path: list[str], names: list[str]) -> None:
         """Refuse an ``[option]``, or ``[name, option]``, that none of the named agents has."""
         *owner, option = path
-        if owner and owner[0] not in names:
-            raise unknown(self.kind, owner[0], names, f"{self.source}, {self.kind}.{owner[0]}")
+        check(self.kind, owner, names, f"{self.source}, {self.kind}.{''.join(owner)}")
         names = owner or names
         valid = dict.fromkeys(field for name in names for field in _fields(self.classes[name]))
-        if option not in (*valid, *self.reserved):
+        if option not in self.reserved:
             where = f"{self.source} ({self.kind} {', '.join(names)})"
-            raise unknown(f"{self.kind} option", option, valid, where)
+            check(f"{self.kind} option", [option], valid, where)
 
 
 def _fields(options: Any) -> list[str]:

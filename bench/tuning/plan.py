@@ -30,7 +30,7 @@ from symsteer.bench.sweep.suite import suite_of
 from symsteer.bench.tuning import FOLDER
 from symsteer.errors import UserError, first_problem
 from symsteer.files import read_toml
-from symsteer.names import unknown
+from symsteer.names import check
 
 LATER = ("description", "trials", "further", "exchange", "batch", "singles")
 """What may change after the first trial."""
@@ -163,9 +163,7 @@ def read_plan(name_or_path: str) -> TuningPlan:
     """
     data, path = read_toml(name_or_path, "tuning plan", FOLDER)
     source = path.name
-    for key in data:
-        if key not in _File.model_fields:
-            raise unknown("key", key, set(_File.model_fields) - {"options"}, source)
+    check("key", data, _File.model_fields.keys() - {"options"}, source)
     try:
         file = _File.model_validate(data)
     except ValidationError as error:
@@ -175,9 +173,7 @@ def read_plan(name_or_path: str) -> TuningPlan:
         names = dict.fromkeys(name for agent in agents for name in _option_names(agent))
     except UserError as error:
         raise UserError(f"{source}: agents: {error}") from error
-    for key in data["space"]:
-        if key not in names and key not in agents:
-            raise unknown("option or agent", key, [*names, *agents], f"{source}, space")
+    check("option or agent", data["space"], [*names, *agents], f"{source}, space")
     for where, table in (("space", file.space), ("run.agent", file.options)):
         for agent in agents:
             if not isinstance(table.get(agent, {}), dict):
@@ -193,12 +189,9 @@ def read_plan(name_or_path: str) -> TuningPlan:
     )
     shared = {name for space in plan.spaces.values() for name in space}
     tables = [("start", data.get("start", {})), *(("further", f) for f in data.get("further", ()))]
-    for key, name in ((key, name) for key, table in tables for name in table):
-        if name not in shared:
-            raise unknown("tuned option", name, sorted(shared), f"{source}, {key}")
-    for agent in plan.singles:
-        if agent not in plan.spaces:
-            raise unknown("agent", agent, plan.agents, f"{source}, singles")
+    for key, table in tables:
+        check("tuned option", table, sorted(shared), f"{source}, {key}")
+    check("agent", plan.singles, plan.agents, f"{source}, singles")
     for agent in plan.agents:
         plan.cells(agent, plan.start(agent), "confirm")
         for name, value in (item for options in plan.further(agent) for item in options.items()):
@@ -221,9 +214,7 @@ def _space(agent: str, data: Mapping[str, Any], agents: Sequence[str], source: s
     tables = data["space"]
     fields = _option_names(agent)
     own = tables.get(agent, {})
-    for name in own:
-        if name not in fields:
-            raise unknown(f"option of {agent}", name, fields, f"{source}, space")
+    check(f"option of {agent}", own, fields, f"{source}, space")
     shared = {key: value for key, value in tables.items() if key not in agents and key in fields}
     space: dict[str, Range | Choices] = {}
     for name, value in {**shared, **own}.items():

@@ -21,7 +21,7 @@ from typing import Literal, get_args
 import torch
 
 from symsteer.errors import UserError
-from symsteer.names import unknown
+from symsteer.names import check
 
 Process = Literal["diffusion", "flow"]
 Prediction = Literal["sample", "epsilon", "velocity"]
@@ -66,10 +66,8 @@ class Diffusion:
     ):
         if not 2 <= steps <= MOST_STEPS:
             raise UserError(f"diffusion needs 2 to {MOST_STEPS} noise levels, not {steps}")
-        if prediction not in get_args(Prediction):
-            raise unknown("prediction", prediction, get_args(Prediction))
-        if process not in get_args(Process):
-            raise unknown("process", process, get_args(Process))
+        check("prediction", [prediction], get_args(Prediction))
+        check("process", [process], get_args(Process))
         if (prediction, process) in (("epsilon", "flow"), ("velocity", "diffusion")):
             own = "epsilon" if process == "diffusion" else "velocity"
             raise UserError(f"{process} predicts sample or {own}, not {prediction}; choose one")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from symsteer.errors import UserError
-from symsteer.names import unknown
+from symsteer.names import check
 from symsteer.policies.geometry import Field, Layout
 
 
@@ -32,8 +32,7 @@ class Frame:
         if not name:
             return
         vectors = {field.name: field for field in planar_vectors(obs_layout)}
-        if name not in vectors:
-            raise unknown("planar vector", name, vectors, "frame of a base policy")
+        check("planar vector", [name], vectors, "frame of a base policy")
         field = vectors[name]
         self.slice = obs_layout.slice(name)
         self.layout = Layout(
