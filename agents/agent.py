@@ -118,15 +118,12 @@ class NoiseEnv(Protocol):
 
     def training_seeds(self, start: int, count: int) -> list[int]:
         """Seeds of ``count`` training episodes, for the ``start``-th fresh start."""
-        ...
 
     def reset(self, seeds: list[int]) -> torch.Tensor:
         """Start episodes; observations ``[N, obs_dim]``."""
-        ...
 
     def step(self, noise: torch.Tensor) -> Any:
         """Play noise ``[N, Tp, Da]``; a transition with ``episodes``, those that ended."""
-        ...
 
 
 MakeEnv = Callable[[bool], NoiseEnv]
@@ -269,6 +266,13 @@ class Agent:
             dtype=self.dtype,
         )
 
+    def _new_replay(self, capacity: int, **more: tuple[int, ...]) -> ReplayBuffer:
+        """An empty buffer of the agent's transitions, and of further fields with their shapes."""
+        obs, act = (self.obs_layout.dim,), self.act_layout.dim
+        shapes = {"obs": obs, "noise": (self.rows, act), "actions": (self.context.execute, act)}
+        shapes |= {"reward": (), "next_obs": obs, "terminal": (), "truncated": (), **more}
+        return ReplayBuffer(capacity, shapes, self.device, self.context.seed, self.dtype)
+
     def _new_generator(self, stream: int = 0) -> torch.Generator:
         """A generator from the agent's seed; other streams draw other numbers."""
         # Seeds of runs are below 2^32.
@@ -282,8 +286,6 @@ class HasCritic(Protocol):
 
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """A draw from the stochastic policy ``[B, Tp, Da]`` and its log-probability ``[B]``."""
-        ...
 
     def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Every critic's value in the environment's reward units, ``[critics, B]``."""
-        ...

@@ -93,21 +93,7 @@ class KernelBestOfNAgent(Agent):
         super().__init__(context, options)
         self.group = Group.parse(self.options.group)
         self.executed_layout = self.act_layout.repeat(context.execute)
-        self.replay = ReplayBuffer(
-            self.options.points,
-            {
-                "obs": (self.obs_layout.dim,),
-                "noise": (self.rows, self.act_layout.dim),
-                "actions": (context.execute, self.act_layout.dim),
-                "reward": (),
-                "next_obs": (self.obs_layout.dim,),
-                "terminal": (),
-                "truncated": (),
-            },
-            self.device,
-            context.seed,
-            self.dtype,
-        )
+        self.replay = self._new_replay(self.options.points)
         self.fit_generator = self._new_generator(1)
         self.decisions = self.fits = 0
         nothing = torch.zeros(0, device=self.device, dtype=self.dtype)

@@ -33,7 +33,6 @@ class HasValues(Protocol):
 
     def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Every critic's value in reward units, ``[critics, B]``."""
-        ...
 
 
 class HasPolicy(HasValues, Protocol):
@@ -41,11 +40,9 @@ class HasPolicy(HasValues, Protocol):
 
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Noise ``[B, Tp, Da]``."""
-        ...
 
     def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
         """Noise of the base policy ``[count, Tp, Da]``."""
-        ...
 
 
 SYMMETRY_STATES = 64
@@ -123,13 +120,7 @@ def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -
     Args:
         obs: ``[B, obs_dim]``.
     """
-    return equivariance_error(
-        agent.mode,
-        (obs,),
-        (agent.obs_layout,),
-        agent.act_layout,
-        group,
-    )
+    return equivariance_error(agent.mode, (obs,), (agent.obs_layout,), agent.act_layout, group)
 
 
 @torch.no_grad()

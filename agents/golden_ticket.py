@@ -42,9 +42,8 @@ class GoldenTicketAgent(Agent):
 
     def __init__(self, context: AgentContext, options: GoldenTicketOptions | None = None):
         super().__init__(context, options)
-        self.ticket = torch.zeros(
-            self.rows, self.act_layout.dim, device=self.device, dtype=self.dtype
-        )
+        shape = (self.rows, self.act_layout.dim)
+        self.ticket = torch.zeros(shape, device=self.device, dtype=self.dtype)
         self.searched: dict[str, float | None] = {}
 
     @classmethod

@@ -29,7 +29,6 @@ class DenseLayer(Protocol):
 
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Weight ``[out, in]`` and bias ``[out]``."""
-        ...
 
 
 class Dense(nn.Linear):

@@ -614,21 +614,11 @@ class SacAgent(Agent):
         states = dict.fromkeys(("obs", "next_obs"), self.obs_layout)
         return {**states, **dict.fromkeys(("noise", "actions", *BANK), self.act_layout)}
 
-    def _new_replay(self, capacity: int) -> ReplayBuffer:
-        obs, act = (self.obs_layout.dim,), self.act_layout.dim
-        chunk, executed = (self.rows, act), (self.context.execute, act)
-        shapes: dict[str, tuple[int, ...]] = {
-            "obs": obs,
-            "noise": chunk,
-            "actions": executed,
-            "reward": (),
-            "next_obs": obs,
-            "terminal": (),
-            "truncated": (),
-        }
+    def _new_replay(self, capacity: int, **more: tuple[int, ...]) -> ReplayBuffer:
         if self.keeps_bank and (size := self.options.noise_bank):
-            shapes |= {"bank_noise": (size, *chunk), "bank_actions": (size, *executed)}
-        return ReplayBuffer(capacity, shapes, self.device, self.context.seed, self.dtype)
+            rows = self.rows, self.context.execute
+            more |= {k: (size, n, self.act_layout.dim) for k, n in zip(BANK, rows, strict=True)}
+        return super()._new_replay(capacity, **more)
 
     def _features(self, obs: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():

@@ -74,10 +74,8 @@ class Team:
         scalars = self.core.learn(stacked)
         found = []
         for index, (member, batch) in enumerate(zip(self.members, turned, strict=True)):
-            member.updates, member.distillation_owed = (
-                self.core.updates,
-                self.core.distillation_owed,
-            )
+            member.updates = self.core.updates
+            member.distillation_owed = self.core.distillation_owed
             own = {name: value[index] for name, value in scalars.items()}
             found.append(own | member.after_update(batch))
         return found
@@ -157,11 +155,8 @@ class StackedEnsemble(Ensemble):
     def __init__(self, ensembles: Sequence[Ensemble]):
         nn.Module.__init__(self)
         first = ensembles[0]
-        self.width, self.layer_norm, self.activation = (
-            first.width,
-            first.layer_norm,
-            first.activation,
-        )
+        self.width, self.layer_norm = first.width, first.layer_norm
+        self.activation = first.activation
         self._expanded: Weights | None = None
         self._ensembles = list(ensembles)
         self._stacked: list[tuple[_DenseOf, dict[str, torch.Tensor]]] = []
