@@ -28,14 +28,8 @@ READABLE = ("1", "2", "3")
 FILE_NAME = "policy.safetensors"
 
 DAMAGE = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    RuntimeError,
-    StopIteration,
-    TypeError,
-    UserError,
-    ValueError,
+    *(ArithmeticError, AttributeError, LookupError, RuntimeError, SafetensorError),
+    *(StopIteration, TypeError, UserError, ValueError),
 )
 """What a description or tensors of the wrong form raise while something is built from them."""
 

@@ -17,7 +17,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
@@ -211,22 +211,13 @@ class Layout:
     @classmethod
     def join(cls, **layouts: Layout) -> Layout:
         """The layout of several concatenated vectors."""
-        return cls(
-            [
-                Field(f"{prefix}.{f.name}", f.frequency, f.multiplicity, f.odd)
-                for prefix, layout in layouts.items()
-                for f in layout.fields
-            ]
-        )
+        parts = ((prefix, f) for prefix, layout in layouts.items() for f in layout.fields)
+        return cls([replace(f, name=f"{prefix}.{f.name}") for prefix, f in parts])
 
     def repeat(self, count: int) -> Layout:
         """The layout of ``count`` concatenated vectors."""
         return Layout(
-            [
-                Field(f"{f.name}[{i}]", f.frequency, f.multiplicity, f.odd)
-                for i in range(count)
-                for f in self.fields
-            ]
+            [replace(f, name=f"{f.name}[{i}]") for i in range(count) for f in self.fields]
         )
 
     def matrix(
@@ -298,15 +289,7 @@ class Layout:
 
     def to_json(self) -> list[dict[str, Any]]:
         """Plain data for JSON; :meth:`from_json` reads it."""
-        return [
-            {
-                "name": f.name,
-                "frequency": f.frequency,
-                "multiplicity": f.multiplicity,
-                "odd": f.odd,
-            }
-            for f in self.fields
-        ]
+        return [asdict(field) for field in self.fields]
 
     @classmethod
     def from_json(cls, data: Sequence[Mapping[str, Any]]) -> Layout:
@@ -381,11 +364,8 @@ class Group:
         return cls(int(match[2]), match[1] == "D")
 
     def __str__(self) -> str:
-        return (
-            "SO2"
-            if self.rotations == 0
-            else f"{'D' if self.reflections else 'C'}{self.order_of_rotations}"
-        )
+        kind = "D" if self.reflections else "C"
+        return f"{kind}{self.rotations}" if self.rotations else "SO2"
 
     @property
     def order_of_rotations(self) -> int:

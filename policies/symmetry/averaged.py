@@ -19,9 +19,9 @@ from torch import nn
 
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
-from symsteer.policies.symmetry.lifted import lifted_denoiser
+from symsteer.policies.symmetry.lifted import EquivariantOptions, lifted_denoiser
 from symsteer.policies.symmetry.unconstrained import TRIVIAL, matched_size
-from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
+from symsteer.policies.training.denoising import DiffusionPolicy
 
 
 class AveragedDenoiser(Denoiser):
@@ -73,17 +73,11 @@ class AveragedDenoiser(Denoiser):
 
 
 @dataclass(frozen=True)
-class AveragedOptions(DenoisingOptions):
+class AveragedOptions(EquivariantOptions):
     """Options of the frame-averaged diffusion policy."""
 
-    group: str = "C8"
-    """The finite symmetry group: C_n or D_n."""
     match_parameters: bool = True
     """Widen the network inside until it has as many parameters as the lifted one."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _ = Group.parse(self.group).order
 
     def resolved(self, obs_layout: Layout, act_layout: Layout) -> Self:
         """Options with the size filled in."""

@@ -12,6 +12,7 @@ in the middle. With the trivial group C1 there is one slice: an ordinary diffusi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -160,7 +161,7 @@ def lifted_denoiser(
     obs_layout: Layout,
     act_layout: Layout,
     group: Group,
-    kind: type[LiftedDenoiser] = LiftedDenoiser,
+    kind: Callable[..., LiftedDenoiser] = LiftedDenoiser,
 ) -> LiftedDenoiser:
     """The network that the options describe, over ``group``."""
     return kind(

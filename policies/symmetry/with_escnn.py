@@ -8,6 +8,7 @@ observation (:meth:`EscnnDiffusionPolicy.make_encoder`).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -17,7 +18,7 @@ from torch.nn import functional
 
 from symsteer.policies.geometry import Field, Group, Layout, escnn_modules
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift, Project, RegularLinear
-from symsteer.policies.symmetry.lifted import EquivariantOptions, LiftedDenoiser
+from symsteer.policies.symmetry.lifted import EquivariantOptions, LiftedDenoiser, lifted_denoiser
 from symsteer.policies.training.denoising import DiffusionPolicy
 
 if TYPE_CHECKING:
@@ -155,21 +156,13 @@ class EscnnDiffusionPolicy(DiffusionPolicy):
     Options = EscnnOptions
     options: EscnnOptions
 
-    def make_denoiser(self) -> EscnnDenoiser:
+    def make_denoiser(self) -> LiftedDenoiser:
         """The lifted network over the options' group, with :meth:`make_encoder`."""
         options, group = self.options, Group.parse(self.options.group)
         seen = self.obs_layout.field_type(group)
-        return EscnnDenoiser(
-            self.obs_layout,
-            self.chunk_layout,
-            options.horizon,
-            group,
-            options.network,
-            options.channels,
-            options.width,
-            options.depth,
-            encoder=self.make_encoder(seen, regular_fields(seen, options.channels)),
-        )
+        encoder = self.make_encoder(seen, regular_fields(seen, options.channels))
+        kind = functools.partial(EscnnDenoiser, encoder=encoder)
+        return lifted_denoiser(options, self.obs_layout, self.chunk_layout, group, kind)
 
     def make_encoder(self, seen: FieldType, embedding: FieldType) -> EquivariantModule | None:
         """An escnn module from normalised observations to regular fields; a subclass may say which.

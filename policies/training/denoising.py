@@ -20,7 +20,7 @@ from pydantic import Field
 from torch import nn
 
 from symsteer.errors import UserError
-from symsteer.names import unknown
+from symsteer.names import check
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.normalizer import Normalizer
@@ -33,16 +33,8 @@ from symsteer.policies.training.orbit import orbit_targets
 Network = Literal["mlp", "unet"]
 
 DECODE_FIELDS = (
-    "group",
-    "network",
-    "channels",
-    "width",
-    "depth",
-    "horizon",
-    "execute",
-    "diffusion_steps",
-    "sampling_steps",
-    "prediction",
+    *("group", "network", "channels", "width", "depth", "horizon", "execute"),
+    *("diffusion_steps", "sampling_steps", "prediction"),
 )
 """Options that a trained policy's behaviour depends on."""
 
@@ -88,8 +80,7 @@ class DenoisingOptions(GradientOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_positive("channels", "width", "depth")
-        if self.network not in get_args(Network):
-            raise unknown("network", self.network, get_args(Network))
+        check("network", [self.network], get_args(Network))
         if self.network == "unet" and self.horizon % 2:
             raise UserError(
                 f"the unet halves the chunk; choose an even horizon, not {self.horizon}"
