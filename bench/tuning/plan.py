@@ -163,7 +163,7 @@ def read_plan(name_or_path: str) -> TuningPlan:
     """
     data, path = read_toml(name_or_path, "tuning plan", FOLDER)
     source = path.name
-    check("key", data, _File.model_fields.keys() - {"options"}, source)
+    check("key", data, sorted(_File.model_fields.keys() - {"options"}), source)
     try:
         file = _File.model_validate(data)
     except ValidationError as error:

@@ -195,27 +195,14 @@ def from_json(data: Mapping[str, Any]) -> tuple[list[TrialResult], list[Chosen]]
     Raises:
         UserError: if the data are not those of a search.
     """
-
-    def scores(each: Sequence[Mapping[str, Any]]) -> list[Score]:
-        return [Score(**score) for score in each]
-
     try:
-        trials = [TrialResult(**{**t, "scores": scores(t["scores"])}) for t in data["trials"]]
-        chosen = [
-            Chosen(
-                **{
-                    **c,
-                    **{k: {n: scores(s) for n, s in c[k].items()} for k in ("singles", "fresh")},
-                }
-            )
-            for c in data["chosen"]
-        ]
-    except (KeyError, TypeError) as error:
+        trials = TypeAdapter(list[TrialResult]).validate_python(data["trials"])
+        return trials, TypeAdapter(list[Chosen]).validate_python(data["chosen"])
+    except (LookupError, TypeError, ValueError) as error:
         raise UserError(
-            f"these are not the trials of a search ({error}); name the file PLAN.json that "
-            "`symsteer tune` wrote"
+            f"these are not the trials of a search ({first_problem(error)}); name the file "
+            "PLAN.json that `symsteer tune` wrote"
         ) from None
-    return trials, chosen
 
 
 def to_text(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
