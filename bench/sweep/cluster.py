@@ -129,16 +129,14 @@ def _connect(address: str) -> Any:
 
 def _wait_for_answer(address: str) -> None:
     """Fail after a few seconds if no Ray head answers; Ray itself would wait for minutes."""
-    channel = grpc.insecure_channel(address)
-    try:
-        grpc.channel_ready_future(channel).result(timeout=CONNECT_SECONDS)
-    except grpc.FutureTimeoutError as error:
-        raise UserError(
-            f"no Ray cluster answers at {address}; start one with `ray start --head`, or check "
-            "the address"
-        ) from error
-    finally:
-        channel.close()
+    with grpc.insecure_channel(address) as channel:
+        try:
+            grpc.channel_ready_future(channel).result(timeout=CONNECT_SECONDS)
+        except grpc.FutureTimeoutError as error:
+            raise UserError(
+                f"no Ray cluster answers at {address}; start one with `ray start --head`, or check "
+                "the address"
+            ) from error
 
 
 def _check_shared(ray: Any, out: Path) -> None:

@@ -18,7 +18,7 @@ from rich.text import Text
 from symsteer.bench.runs.folder import read_progress
 from symsteer.bench.sweep.estimate import Estimate, duration, share_done, steps_done
 from symsteer.bench.sweep.plan import Plan, PlannedRun, short_labels
-from symsteer.bench.sweep.schedule import Outcome, Task
+from symsteer.bench.sweep.schedule import Outcome, Task, Watcher
 from symsteer.bench.sweep.survey import look
 from symsteer.bench.sweep.work import Result
 
@@ -32,7 +32,7 @@ SKEW = timedelta(seconds=5)
 """Largest difference between the clocks of two machines."""
 
 
-class Display(contextlib.AbstractContextManager):
+class Display(contextlib.AbstractContextManager, Watcher):
     """Prints one line for each run that ends, for logs and pipes.
 
     Args:
@@ -61,12 +61,6 @@ class Display(contextlib.AbstractContextManager):
     def __exit__(self, *details: object) -> None:
         pass
 
-    def started(self, task: Task) -> None:
-        """A task began."""
-
-    def retried(self, task: Task, result: Result) -> None:
-        """A task failed and will be tried again."""
-
     def ended(self, outcome: Outcome) -> None:
         """A run has ended."""
         self.waiting.pop(outcome.run, None)
@@ -79,9 +73,6 @@ class Display(contextlib.AbstractContextManager):
         count = f"[{self.counts.total():{len(str(self.total))}d}/{self.total}]"
         width = max(len(label) for label in self.labels.values())
         self.write(outcome.status, f"{count} {self.labels[outcome.run]:{width}s}  {detail}")
-
-    def refresh(self, running: list[Task]) -> None:
-        """Half a second has passed, or a task has ended."""
 
     def write(self, status: str, text: str) -> None:
         """Print one line."""
@@ -115,11 +106,9 @@ class LiveDisplay(Display):
         self.live.stop()
 
     def started(self, task: Task) -> None:
-        """A task began."""
         self.begun[task] = time.monotonic(), datetime.now(UTC)
 
     def retried(self, task: Task, result: Result) -> None:
-        """A task failed and will be tried again."""
         run = task.team[0] if task.team else None
         self.write("again", f"{self._label(task, run)}: {result.reason}")
 

@@ -103,16 +103,11 @@ def suite_data(data: dict[str, Any], path: Path) -> SuiteData:
     grids = grids if isinstance(grids, list) else [grids]
     if not all(isinstance(grid, dict) for grid in grids):
         raise UserError(f"{source}: grid must be a table, [grid], or several, each [[grid]]")
-    return SuiteData(
-        path.stem,
-        source,
-        description,
-        shared,
-        tuple(
-            Grid(tuple(grid), tuple(_merge(shared, cell, source) for cell in _cells(grid, source)))
-            for grid in grids
-        ),
+    found = (
+        Grid(tuple(grid), tuple(_merge(shared, cell, source) for cell in _cells(grid, source)))
+        for grid in grids
     )
+    return SuiteData(path.stem, source, description, shared, tuple(found))
 
 
 def split_key(key: str) -> list[str]:

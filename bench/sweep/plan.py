@@ -184,14 +184,8 @@ def write_manifest(plan: Plan, workers: int, failures: Mapping[str, str]) -> Non
     Raises:
         UserError: if it cannot be written.
     """
-    manifest = Manifest(
-        plan.name,
-        plan.description,
-        workers,
-        datetime.now(UTC).isoformat(timespec="seconds"),
-        tuple(plan.runs),
-        dict(failures),
-    )
+    now, runs = datetime.now(UTC).isoformat(timespec="seconds"), tuple(plan.runs)
+    manifest = Manifest(plan.name, plan.description, workers, now, runs, dict(failures))
     write_json(manifest_path(plan.out, plan.name), asdict(manifest))
 
 

@@ -58,8 +58,8 @@ class Outcome:
     trace: str = ""
 
 
-class Watcher(Protocol):
-    """Is called at the events of a sweep."""
+class Watcher:
+    """Is called at the events of a sweep; a method may do nothing."""
 
     def started(self, task: Task) -> None:
         """A task began."""
