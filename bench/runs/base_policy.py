@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 from collections.abc import Mapping
@@ -27,6 +28,9 @@ from symsteer.policies.files import load_policy, policy_path, save_policy
 
 STEERABILITY_ENVS = 128
 """Parallel environments of the steerability report; fewer if it has fewer episodes."""
+
+MEASURED = ("episodes", "action_std", "solvable", "equivariance_error", "jump", "warning")
+"""Of the steerability report, in the record under the same names."""
 
 
 def prepare_base(
@@ -57,17 +61,22 @@ def prepare_base(
     layouts = (task.observation_layout, task.action_layout)
     if policy is not None:
         return _measured(config, load_policy(policy, *layouts), progress, workers)
-    demos = {}
+    paths = {}
     for name in config.policy_tasks:
+        own = demonstrations if name == config.task else None
         one = dataclasses.replace(config, task=name)
-        path = demonstrations if name == config.task else None
-        path = path or demonstration_file(one, out, progress)
-        demos[name] = load(path, name, config.embodiment, config.demonstrations.count)
+        paths[name] = own or demonstration_file(one, out, progress)
+    demos = _loaded(config, paths)
     folder = _policy_folder(config, out, demos)
     if not policy_path(folder).is_file():
         for name, base in _train(config, demos, progress).items():
             one = dataclasses.replace(config, task=name)
-            base.report["world"] = _world(one)
+            base.report["world"] = {
+                "task": one.task,
+                "embodiment": one.embodiment,
+                "demonstrations": dataclasses.asdict(one.demonstrations),
+                "policy_seed": one.policy_seed,
+            }
             save_policy(base, _policy_folder(one, out, demos))
     base = load_policy(folder, *layouts)
     new = "steerability" not in base.report
@@ -120,28 +129,15 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
     return told
 
 
-def _world(config: RunConfig) -> dict[str, Any]:
-    """Task and demonstrations of a policy's training, for its file."""
-    return {
-        "task": config.task,
-        "embodiment": config.embodiment,
-        "demonstrations": dataclasses.asdict(config.demonstrations),
-        "policy_seed": config.policy_seed,
-    }
-
-
 def find_base(config: RunConfig, out: Path) -> Path | None:
     """The folder of a run's trained base policy; None if it has not been trained yet."""
-    demos = {}
-    for name in config.policy_tasks:
-        path = demonstration_path(dataclasses.replace(config, task=name), out)
-        if not path.is_file():
-            return None
-        try:
-            demos[name] = load(path, name, config.embodiment, config.demonstrations.count)
-        except UserError:  # the run that trains the policy reports what is wrong with the file
-            return None
-    folder = _policy_folder(config, out, demos)
+    paths = _demonstration_paths(config, out)
+    if not all(path.is_file() for path in paths.values()):
+        return None
+    try:
+        folder = _policy_folder(config, out, _loaded(config, paths))
+    except UserError:  # the run that trains the policy reports what is wrong with a file
+        return None
     return folder if policy_path(folder).is_file() else None
 
 
@@ -159,10 +155,7 @@ def take_base(config: RunConfig, content_hash: str, runs: Path, out: Path) -> No
     Raises:
         UserError: if the policy or the demonstrations are not there.
     """
-    demos = {}
-    for name in config.policy_tasks:
-        one = dataclasses.replace(config, task=name)
-        demos[name] = demonstration_path(one, runs)
+    demos = _demonstration_paths(config, runs)
     folders = (runs / "base").glob(f"{config.task}-{config.embodiment}-*")
     same = [
         folder
@@ -175,11 +168,9 @@ def take_base(config: RunConfig, content_hash: str, runs: Path, out: Path) -> No
             "demonstrations; name a folder of runs that has, or leave --base-from out to make them "
             "anew"
         )
-    count = config.demonstrations.count
-    loaded = {name: load(path, name, config.embodiment, count) for name, path in demos.items()}
     pairs = [file for path in demos.values() for file in (path, path.with_suffix(".json"))]
     files = {out / "base" / file.name: file.read_bytes() for file in pairs}
-    place = _policy_folder(config, out, loaded)
+    place = _policy_folder(config, out, _loaded(config, demos))
     write_together(files | {place / file.name: file.read_bytes() for file in same[0].iterdir()})
 
 
@@ -203,15 +194,8 @@ def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> P
         def advance(done: int, total: int) -> None:
             bar.update(done - bar.n)
 
-        return collect(
-            config.task,
-            config.embodiment,
-            wanted.count,
-            wanted.mode,
-            wanted.seed,
-            path,
-            progress=advance,
-        )
+        how = (wanted.count, wanted.mode, wanted.seed, path)
+        return collect(config.task, config.embodiment, *how, progress=advance)
 
 
 def demonstrated_decisions(
@@ -231,21 +215,29 @@ def demonstrated_decisions(
 def describe_base(policy: ChunkPolicy) -> BasePolicy:
     """The record's block on a base policy."""
     report = policy.report.get("steerability") or {}
+    measured: dict[str, Any] = {key: report.get(key) for key in MEASURED}
     return BasePolicy(
         name=policy.name,
         group=str(policy.group),
         content_hash=policy.content_hash(),
         base_success=report.get("success"),
-        episodes=report.get("episodes"),
-        action_std=report.get("action_std"),
-        solvable=report.get("solvable"),
         draws=report.get("draws", DRAWS),
-        equivariance_error=report.get("equivariance_error"),
-        jump=report.get("jump"),
         training_seconds=policy.training_record.get("seconds"),
         parameters=policy.parameter_count(),
-        warning=report.get("warning"),
+        **measured,
     )
+
+
+def _demonstration_paths(config: RunConfig, out: Path) -> dict[str, Path]:
+    return {
+        name: demonstration_path(dataclasses.replace(config, task=name), out)
+        for name in config.policy_tasks
+    }
+
+
+def _loaded(config: RunConfig, paths: Mapping[str, Path]) -> dict[str, Demonstrations]:
+    count = config.demonstrations.count
+    return {name: load(path, name, config.embodiment, count) for name, path in paths.items()}
 
 
 def _policy_folder(config: RunConfig, out: Path, demos: Mapping[str, Demonstrations]) -> Path:
@@ -292,7 +284,8 @@ def _measured(config: RunConfig, base: ChunkPolicy, progress: bool, workers: int
 
 
 def _measure(config: RunConfig, policy: ChunkPolicy, workers: int) -> Steerability:
-    num_envs = min(STEERABILITY_ENVS, DRAWS * config.evaluation.steerability_states)
+    states = config.evaluation.steerability_states
+    num_envs = min(STEERABILITY_ENVS, DRAWS * states)
     env = make(
         config.task,
         num_envs=num_envs,
@@ -301,13 +294,8 @@ def _measure(config: RunConfig, policy: ChunkPolicy, workers: int) -> Steerabili
         workers=min(workers, num_envs),
     )
     latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
-    try:
-        with torch.no_grad():
-            return steerability(
-                latent, policy, config.policy_seed, config.evaluation.steerability_states
-            )
-    finally:
-        latent.close()
+    with contextlib.closing(latent), torch.no_grad():
+        return steerability(latent, policy, config.policy_seed, states)
 
 
 def origin(demonstrations: Path | None, policy: Path | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import multiprocessing
 import signal
 import statistics
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,23 +92,17 @@ def study(
         files[seed] = {config.task: demonstration_file(config, out) for config in mine}
     cells = [BaseCell(n, c, s) for c in counts for n in policies for s in range(seeds)]
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPool(workers, context=context)
-    try:
-        with signals_wait(signal.SIGINT):
-            jobs = [
-                pool.schedule(
-                    _play_once,
-                    (configs[0], cell, policies[cell.name], files[cell.seed], episodes, out),
-                )
-                for cell in cells
-            ]
-        parts = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
-    except BaseException:
-        pool.stop()
-        raise
-    finally:
-        pool.close()
-        pool.join()
+    with ProcessPool(workers, context=context) as pool:
+        try:
+            jobs = []
+            with signals_wait(signal.SIGINT):
+                for cell in cells:
+                    args = (configs[0], cell, policies[cell.name], files[cell.seed], episodes, out)
+                    jobs.append(pool.schedule(_play_once, args))
+            parts = [job.result() for job in tqdm(jobs, desc="base policies", disable=None)]
+        except BaseException:
+            pool.stop()
+            raise
     return [row for rows in parts for row in rows]
 
 
@@ -155,11 +149,8 @@ def unbroken(
 ) -> Generator[LatentNoiseEnv, None, None]:
     """The unbroken task of a run, for at most ``episodes`` held-out episodes at a time."""
     env = make(config.task, num_envs=min(EVALUATION_ENVS, episodes), embodiment=config.embodiment)
-    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
-    try:
+    with closing(LatentNoiseEnv(env, policy, ignore_terminations=True)) as latent:
         yield latent
-    finally:
-        latent.close()
 
 
 def visited_states(played: Rollout) -> torch.Tensor:

@@ -190,9 +190,7 @@ def _paths(run: Restored, variants: Sequence[VariantSpec], episodes: int) -> np.
     config = run.config
     feasible = feasible_return(config, run.agent, run.policy)
     evaluator = Evaluator(config, run.policy, run.agent, feasible, variants)
-    try:
+    with contextlib.closing(evaluator):
         played = evaluator.play(episodes)
-    finally:
-        evaluator.close()
     title = f"{config.agent} on {config.task} ({variant_text(variants)}), seed {config.seed}"
     return draw_paths(played, run.policy.obs_layout, title)

@@ -6,6 +6,7 @@ One episode is simulated again for them.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 from collections.abc import Sequence
@@ -255,7 +256,7 @@ def filmed(
         human_render_camera_configs=CAMERA,
     )
     # Not through the latent-noise environment: it starts a new episode before the last frame.
-    try:
+    with contextlib.closing(env):
         obs, _ = env.reset(seed=[seed])
         frames = [_frame(env)]
         steps, done, info = 0, False, {}
@@ -271,8 +272,6 @@ def filmed(
                 if done:
                     break
         return Filmed(frames, steps, bool(info["success"]))
-    finally:
-        env.close()
 
 
 def _frame(env: Any) -> np.ndarray:
