@@ -119,4 +119,4 @@ def fitting(path: Path, cure: str = CURE) -> Iterator[None]:
             yield
     except DAMAGE as error:
         reason = " ".join(first_problem(error).split())[:300]
-        raise UserError(f"{path} does not fit its run ({reason}); {cure}") from error
+        raise UserError(f"{path} is damaged or does not fit its run ({reason}); {cure}") from error

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from safetensors import SafetensorError
 from safetensors.torch import load as deserialize
 from safetensors.torch import save as serialize
 
 from symsteer.agents.replay import Batch, ReplayBuffer
+from symsteer.bench.runs.checkpoint import fitting
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
 
@@ -34,10 +34,8 @@ def stored_replay(folder: Path) -> Batch:
             f"the run {folder.name} did not keep its decisions; run it with --keep-replay, which "
             f"writes {REPLAY} at the end"
         )
-    try:
+    with fitting(path, "restore it, or repeat the run"):
         found = Batch(deserialize(path.read_bytes()))
-    except SafetensorError as error:
-        raise UserError(f"{path} is damaged ({error}); restore it, or repeat the run") from error
-    if missing := [name for name in FIELDS if name not in found]:
-        raise UserError(f"{path} lacks {', '.join(missing)}; restore it, or repeat the run")
+        if missing := [name for name in FIELDS if name not in found]:
+            raise ValueError(f"it lacks {', '.join(missing)}")
     return found

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from symsteer.agents import AGENTS
-from symsteer.agents.replay import Transition
 from symsteer.bench.runs.base_policy import (
     demonstrated_decisions,
     origin,
@@ -34,6 +33,7 @@ from symsteer.bench.runs.folder import (
 )
 from symsteer.bench.runs.observers import ProgressFile, observers_of
 from symsteer.bench.runs.stored import (
+    RENEW,
     named,
     restored,
     store_demonstrations,
@@ -47,7 +47,6 @@ from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import build, evaluation_variants, read
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, read_record
-from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import save_policy
 from symsteer.terminal import to_paste
 from symsteer.variant import specs_at, variant_text
@@ -133,56 +132,31 @@ def execute(
         UserError: if the input is wrong, the run is finished already, or another process is
             working on it (``RunBusyError``).
     """
+    with opened(config, out, demonstrations, policy, progress, workers, tracking) as trainer:
+        trainer.play()
+    return trainer.folder
+
+
+@contextlib.contextmanager
+def opened(
+    config: RunConfig,
+    out: Path,
+    demonstrations: Path | None = None,
+    policy: Path | None = None,
+    progress: bool = True,
+    workers: int = 1,
+    tracking: Tracking | None = None,
+    together: int = 1,
+) -> Iterator[Trainer]:
+    """The trainer of one of ``together`` runs in a process; see :func:`execute`."""
     if policy is not None:
         if demonstrations is not None:
             raise UserError("a base policy of yours needs no demonstrations; leave one of them out")
         config = with_policy_of(config, policy)
     check_all(config, workers)
     files = origin(demonstrations, policy)
-
-    def prepare() -> ChunkPolicy:
-        return prepare_base(config, out, demonstrations, policy, progress, workers)
-
-    def demonstrated() -> Transition:
-        if policy is not None:
-            raise UserError(
-                f"the agent {config.agent!r} learns from demonstrations, which a base policy of "
-                "yours does not have; set agent.demonstration_share to 0 or name no base policy"
-            )
-        return demonstrated_decisions(config, out, demonstrations, progress)
-
-    folder = out / run_id(config, files)
-    with _opened(
-        config, folder, files, prepare, demonstrated, progress, workers, tracking
-    ) as trainer:
-        trainer.play()
-    return folder
-
-
-@contextlib.contextmanager
-def opened(
-    config: RunConfig, out: Path, together: int, tracking: Tracking | None = None
-) -> Iterator[Trainer]:
-    """The trainer of a run that shares this process with others; see :func:`execute`.
-
-    Args:
-        config: what to run.
-        out: folder of the runs.
-        together: number of runs in this process.
-        tracking: a service that shows the run.
-    """
-    check_all(config, workers=1)
-
-    def prepare() -> ChunkPolicy:
-        return prepare_base(config, out, progress=False)
-
-    def demonstrated() -> Transition:
-        return demonstrated_decisions(config, out, None, progress=False)
-
-    folder = out / run_id(config, {})
-    with _opened(
-        config, folder, {}, prepare, demonstrated, False, tracking=tracking, together=together
-    ) as trainer:
+    how = (demonstrations, policy, progress, workers, tracking, together)
+    with _opened(config, out / run_id(config, files), files, *how) as trainer:
         yield trainer
 
 
@@ -203,25 +177,7 @@ def resume(
     config, files = stored_config(folder)
     check_device(config, f"the run {folder.name}")
     check_all(config, workers)
-
-    def check_own() -> None:
-        if files:
-            raise UserError(
-                f"the run {folder.name} began from files of yours and was stopped before it had "
-                "its base policy; start it again with `symsteer run` and the same options"
-            )
-
-    def prepare() -> ChunkPolicy:
-        check_own()
-        return prepare_base(config, folder.parent, None, None, progress, workers)
-
-    def demonstrated() -> Transition:
-        check_own()
-        return demonstrated_decisions(config, folder.parent, None, progress)
-
-    with _opened(
-        config, folder, files, prepare, demonstrated, progress, workers, tracking
-    ) as trainer:
+    with _opened(config, folder, files, None, None, progress, workers, tracking) as trainer:
         trainer.play()
     return folder
 
@@ -281,11 +237,9 @@ def evaluate(
     feasible = feasible_return(config, run.agent, run.policy)
     evaluator = Evaluator(config, run.policy, run.agent, feasible, variants, workers)
     begin = time.perf_counter()
-    try:
+    with contextlib.closing(evaluator):
         columns = evaluator.play(count).episodes
         diagnostics = evaluator.diagnose(config.evaluation.final_diagnostic_episodes)
-    finally:
-        evaluator.close()
     evaluation = Evaluation(
         **{key: run.state[key] for key in ("env_steps", "decisions", "updates", "final")},
         wall_clock=time.perf_counter() - begin,
@@ -330,32 +284,49 @@ def _opened(
     config: RunConfig,
     folder: Path,
     files: dict[str, Any],
-    prepare: Callable[[], ChunkPolicy],
-    demonstrated: Callable[[], Transition],
+    demonstrations: Path | None,
+    policy: Path | None,
     progress: bool,
-    workers: int = 1,
-    tracking: Tracking | None = None,
+    workers: int,
+    tracking: Tracking | None,
     together: int = 1,
 ) -> Iterator[Trainer]:
     """The trainer of a run that this process alone works on; it is told of errors."""
+    out = folder.parent
     resolved = {
         **config.to_json(),
         "evaluation_variant": variant_text(evaluation_variants(config.variants)),
         "files": files,
     }
+
+    def check_files() -> None:
+        if files and demonstrations is None and policy is None:
+            raise UserError(
+                f"the run {folder.name} began from files of yours and was stopped before it had "
+                "its base policy; start it again with `symsteer run` and the same options"
+            )
+
     with claimed(folder):
         try:
             write_json(folder / CONFIG, resolved)
             base = stored_policy(folder, config)
             if base is None:
+                check_files()
                 ProgressFile(folder, config.env_steps).write("base policy", 0)
-                base = prepare()
+                base = prepare_base(config, out, demonstrations, policy, progress, workers)
                 save_policy(base, folder)
             decisions = None
             if AGENTS.get(config.agent).wants_demonstrations(config.agent_options):
                 decisions = stored_demonstrations(folder)
                 if decisions is None:
-                    decisions = demonstrated()
+                    check_files()
+                    if policy is not None:
+                        raise UserError(
+                            f"the agent {config.agent!r} learns from demonstrations, which a base "
+                            "policy of yours does not have; set agent.demonstration_share to 0 or "
+                            "name no base policy"
+                        )
+                    decisions = demonstrated_decisions(config, out, demonstrations, progress)
                     store_demonstrations(decisions, folder)
         except BaseException:
             discard_empty(folder)
@@ -364,7 +335,7 @@ def _opened(
         checkpoint = load_checkpoint(folder)
         trainer = Trainer(config, folder, base, checkpoint, observers, workers, together)
         if decisions is not None:
-            with fitting(folder / DEMONSTRATIONS, "delete it, and it is written again"):
+            with fitting(folder / DEMONSTRATIONS, RENEW):
                 trainer.agent.observe_demonstrations(decisions)
         try:
             yield trainer

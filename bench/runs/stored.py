@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load as deserialize
 from safetensors.torch import save as serialize
 
@@ -33,6 +32,9 @@ from symsteer.files import write_atomically
 from symsteer.leaderboard.records import DERIVED, flat
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path
+
+RENEW = "delete it, and it is written again"
+"""What helps against a damaged file of demonstrations."""
 
 
 @dataclass(frozen=True)
@@ -159,9 +161,5 @@ def stored_demonstrations(folder: Path) -> Transition | None:
     path = folder / DEMONSTRATIONS
     if not path.is_file():
         return None
-    try:
+    with fitting(path, RENEW):
         return Transition(**deserialize(path.read_bytes()))
-    except (SafetensorError, TypeError) as error:
-        raise UserError(
-            f"{path} is damaged ({error}); delete it, and it is written again"
-        ) from error

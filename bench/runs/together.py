@@ -61,7 +61,9 @@ def execute_together(
                 continue
             stack = everything.enter_context(contextlib.ExitStack())
             try:
-                trainer = stack.enter_context(opened(config, out, len(configs), tracking))
+                trainer = stack.enter_context(
+                    opened(config, out, progress=False, tracking=tracking, together=len(configs))
+                )
             except Exception as error:
                 errors[index] = error
                 continue
