@@ -224,14 +224,11 @@ class Progress(Observer):
             )
 
     def finished(self, run: Trainer) -> None:
-        self._close()
-
-    def failed(self, run: Trainer, error: BaseException) -> None:
-        self._close()
-
-    def _close(self) -> None:
         if self.bar is not None:
             self.bar.close()
+
+    def failed(self, run: Trainer, error: BaseException) -> None:
+        self.finished(run)
 
 
 class ProgressFile:

@@ -104,14 +104,7 @@ class RunLog:
             self.writer.add_image(tag, picture, step, dataformats="HWC")
 
     def film(self, tag: str, frames: Sequence[np.ndarray], rate: float, step: int) -> None:
-        """Write an animated picture.
-
-        Args:
-            tag: of the film.
-            frames: ``[height, width, 3]`` uint8.
-            rate: frames per second.
-            step: of the run.
-        """
+        """Write ``frames``, each ``[height, width, 3]`` uint8, as a film, ``rate`` per second."""
         height, width, _ = frames[0].shape
         image = Summary.Image(
             height=height, width=width, colorspace=3, encoded_image_string=to_gif(frames, rate)

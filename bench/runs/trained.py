@@ -101,13 +101,8 @@ def load(path: str | Path, device: str = "cpu", trust: Sequence[str] = ()) -> Tr
     path = Path(path)
     if (path / CONFIG).is_file() or (path.is_dir() and not (path / "policy.safetensors").is_file()):
         run = restored(path)
-        config = run.config
-        world = {
-            "task": config.task,
-            "embodiment": config.embodiment,
-            "variant": config.variant,
-        }
-        return Trained(run.policy, run.agent, config, world)
+        world = {key: getattr(run.config, key) for key in ("task", "embodiment", "variant")}
+        return Trained(run.policy, run.agent, run.config, world)
     policy = load_policy(path, device=device)
     context = AgentContext.of(policy, device)
     known = policy.report.get("world") or {}

@@ -34,6 +34,12 @@ from symsteer.leaderboard.records import Episodes, Evaluation
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.variant import VariantSpec, specs_at
 
+COUNTERS = (
+    *("env_steps", "decisions", "updates", "train_until"),
+    *("next_evaluation", "fresh_starts", "final"),
+)
+"""Numbers of a run that a checkpoint keeps."""
+
 Updates: TypeAlias = Generator[Batch, Mapping[str, torch.Tensor] | None, None]
 """A run that hands out every batch that is due, and is sent the scalars of the update."""
 
@@ -221,11 +227,8 @@ class Trainer:
         self.evaluator.enter(evaluation_variants(self.config.variants, share))
         columns = self.evaluator.play(wanted.final_episodes if final else wanted.episodes).episodes
         played = time.perf_counter()
-        diagnostics = dict(
-            self.evaluator.diagnose(
-                wanted.final_diagnostic_episodes if final else wanted.diagnostic_episodes
-            )
-        )
+        long = wanted.final_diagnostic_episodes if final else wanted.diagnostic_episodes
+        diagnostics = dict(self.evaluator.diagnose(long))
         if final:
             diagnostics |= self.evaluator.compare(wanted.final_episodes)
         self.evaluate_seconds += played - begin
@@ -321,16 +324,8 @@ class Trainer:
             self._checkpoint()
 
     def _make_env(self, ignore_terminations: bool) -> LatentNoiseEnv:
-        config = self.config
-        env = make_env(
-            config,
-            self.base,
-            self.agent,
-            config.num_envs,
-            self.world,
-            ignore_terminations,
-            self.workers,
-        )
+        how = (self.config.num_envs, self.world, ignore_terminations, self.workers)
+        env = make_env(self.config, self.base, self.agent, *how)
         env.clock = self.clock
         return env
 
@@ -341,13 +336,7 @@ class Trainer:
             "base_policy": self.base.content_hash(),
             "agent": self.agent.state_dict(),
             "replay": replay.state_dict() if replay else None,
-            "env_steps": self.env_steps,
-            "decisions": self.decisions,
-            "updates": self.updates,
-            "train_until": self.train_until,
-            "next_evaluation": self.next_evaluation,
-            "fresh_starts": self.fresh_starts,
-            "final": self.final,
+            **{name: getattr(self, name) for name in COUNTERS},
         }
         for observer in self.observers:
             state |= observer.saving(self)
@@ -365,10 +354,7 @@ class Trainer:
             self.agent.load_state_dict(state["agent"])
             if self.agent.replay is not None and state["replay"] is not None:
                 self.agent.replay.load_state_dict(state["replay"])
-        for name in (
-            *("env_steps", "decisions", "updates", "train_until"),
-            *("next_evaluation", "fresh_starts", "final"),
-        ):
+        for name in COUNTERS:
             setattr(self, name, state[name])
         self.share = self.env_steps / self.config.env_steps
         seconds = state["seconds"]
