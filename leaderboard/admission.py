@@ -33,6 +33,7 @@ from symsteer.leaderboard.records import (
     Provenance,
     RunRecord,
     canonical_json,
+    file_hash,
     flat,
     portable,
     read_record,
@@ -41,11 +42,12 @@ from symsteer.leaderboard.records.provenance import checkout, git
 from symsteer.leaderboard.records.repeat import KEYS
 from symsteer.leaderboard.records.schema import Q_VALUES
 from symsteer.leaderboard.records.values import Count, Sha256
+from symsteer.leaderboard.study import all_listed
 from symsteer.leaderboard.summary import MIN_SEEDS, Key, RowKey, row_key, row_place, seeds_of
 from symsteer.variant import file_name, parse_variant, specs_at, variant_text
 
 MIN_EPISODES = 100
-"""Held-out episodes of an admissible record's final evaluation."""
+"""Held-out episodes of a submitted record's final evaluation."""
 
 SURPRISE, COPIED = 64, 0.9
 """Final returns that take so many bits to guess are copied, if another run has more of them."""
@@ -99,8 +101,9 @@ class Judged:
     episode. `step`: environment steps of a decision. `cost`: the most that a step may cost.
     """
 
-    def __init__(self, file: Path, record: RunRecord):
+    def __init__(self, file: Path, record: RunRecord, least: int):
         self.file, self.record, self.settings = file, record, record.settings
+        self.least = least
         # Version 0.1 called the agent's options `sac`.
         options = "agent_options" if "agent_options" in record.config else "sac"
         if strange := record.config.keys() - KEYS - {*DERIVED, options}:
@@ -165,7 +168,7 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
         for file in record_files([committed]):
             if file not in files:
                 known.add(file, read_record(file), committed=True)
-    verdicts, records = [], {}
+    verdicts, records, own = [], {}, all_listed()
     for file in files:
         verdicts.append(verdict := Verdict(file))
         try:
@@ -173,7 +176,7 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
         except UserError as error:
             verdict.problems.append(str(error))
             continue
-        problems = *_problems(file, record), *known.duplicates(record)
+        problems = *_problems(file, record, file_hash(file) in own), *known.duplicates(record)
         verdict.problems += [*problems, *known.contradictions(record)]
         known.add(file, record)
     for verdict in verdicts:
@@ -182,8 +185,8 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
     return verdicts
 
 
-def _problems(file: Path, record: RunRecord) -> Iterator[str]:
-    """What breaks the rules that look at one record alone."""
+def _problems(file: Path, record: RunRecord, own: bool) -> Iterator[str]:
+    """What breaks the rules that look at one record alone, a study's `own` or a submitted one."""
     if file.name != f"{record.run_id}.json":
         yield f"the file must be named after its run: rename it to {record.run_id}.json"
     if record.status != "finished":
@@ -193,7 +196,7 @@ def _problems(file: Path, record: RunRecord) -> Iterator[str]:
         )
         return
     try:
-        judged = Judged(file, record)
+        judged = Judged(file, record, 0 if own else MIN_EPISODES)
     except (ValidationError, ValueError, UserError) as error:
         yield (
             f"its configuration is none of `symsteer run` ({first_problem(error)}): take the "
@@ -330,7 +333,7 @@ def _clock(j: Judged) -> bool:
 
 def _number(j: Judged, e: Evaluation) -> str | None:
     number, wanted = len(e.episodes.seed), j.config.final_episodes if e.final else j.config.episodes
-    return f"{number} of them" if number != wanted or number < MIN_EPISODES * e.final else None
+    return f"{number} of them" if number != wanted or number < j.least * e.final else None
 
 
 def _counts(j: Judged, e: Evaluation) -> bool:

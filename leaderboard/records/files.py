@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +59,9 @@ def read_record(path: Path | str) -> RunRecord:
     """Read and validate the record at `path`; raises UserError with one sentence if it is bad."""
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise UserError(f"{path} is larger than {MAX_BYTES >> 20} MiB: not a run record")
+        about = path.stat()
+        if about.st_size > MAX_BYTES or stat.S_ISFIFO(about.st_mode):
+            raise UserError(f"{path} is a pipe or larger than {MAX_BYTES >> 20} MiB: not a record")
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
