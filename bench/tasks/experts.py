@@ -40,6 +40,19 @@ class Intent:
     gripper: torch.Tensor
     """+1 open, -1 closed, ``[N]``."""
 
+    @classmethod
+    def to(cls, move: torch.Tensor, gripper: float, yaw: torch.Tensor | None = None) -> Intent:
+        """Move by ``move [N, 3]`` with the same fingers everywhere; by default without a turn."""
+        still = torch.zeros_like(move[:, 0])
+        return cls(move, still if yaw is None else yaw, torch.full_like(still, gripper))
+
+    @classmethod
+    def to_let_go(cls, free: torch.Tensor) -> Intent:
+        """Open the fingers, and rise by 3 cm where they are ``free [N]`` of the object."""
+        up = torch.zeros(len(free), 3, device=free.device)
+        up[:, 2] = torch.where(free, 0.03, 0.0)
+        return cls.to(up, OPEN)
+
 
 class Expert:
     """Solves a task from its privileged state.

@@ -40,17 +40,17 @@ def twofold_yaw(q: torch.Tensor) -> torch.Tensor:
 def grasp_yaw(tcp_q: torch.Tensor, cube_q: torch.Tensor) -> dict[str, torch.Tensor]:
     """Cosine and sine ``[N, 1]`` of four times the yaw from the fingers to the cube's faces."""
     axis = quaternion_to_matrix(tcp_q)[:, :2, 0]
-    gripper, cube = _fourth_power(axis[:, 0], axis[:, 1]), fourfold_yaw(cube_q)
-    cosine = (gripper * cube).sum(dim=1, keepdim=True)
-    sine = gripper[:, :1] * cube[:, 1:] - gripper[:, 1:] * cube[:, :1]
-    return {"grasp_yaw_cos": cosine, "grasp_yaw_sin": sine}
+    return _yaw_between(_fourth_power(axis[:, 0], axis[:, 1]), fourfold_yaw(cube_q))
 
 
 def bar_grasp_yaw(tcp_q: torch.Tensor, bar_q: torch.Tensor) -> dict[str, torch.Tensor]:
     """Cosine and sine ``[N, 1]`` of twice the yaw from the fingers to a bar (its body x axis)."""
-    gripper, bar = twofold_yaw(tcp_q), twofold_yaw(bar_q)
-    cosine = (gripper * bar).sum(dim=1, keepdim=True)
-    sine = gripper[:, :1] * bar[:, 1:] - gripper[:, 1:] * bar[:, :1]
+    return _yaw_between(twofold_yaw(tcp_q), twofold_yaw(bar_q))
+
+
+def _yaw_between(gripper: torch.Tensor, thing: torch.Tensor) -> dict[str, torch.Tensor]:
+    cosine = (gripper * thing).sum(dim=1, keepdim=True)
+    sine = gripper[:, :1] * thing[:, 1:] - gripper[:, 1:] * thing[:, :1]
     return {"grasp_yaw_cos": cosine, "grasp_yaw_sin": sine}
 
 

@@ -23,6 +23,7 @@ from symsteer.bench.tasks.experts import (
     yaw_along,
 )
 from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose, twofold_yaw
+from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -46,15 +47,12 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
     task_id = "LiftPegUpright-v1"
     max_episode_steps = 50
     task_fields = (
-        Field("peg_xy", 1),
-        Field("peg_z", 0),
+        *vector_fields("peg"),
         Field("peg_line", 2),
         Field("peg_lean", 1),
         Field("peg_rise", 0),
-        Field("tcp_to_peg_xy", 1),
-        Field("tcp_to_peg_z", 0),
-        Field("grasp_yaw_cos", 0),
-        Field("grasp_yaw_sin", 0, odd=True),
+        *vector_fields("tcp_to_peg"),
+        *GRASP_YAW,
     )
     spawn_radius = 0.1
     spawn_extent = 0.223
@@ -87,15 +85,12 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         tcp = self.seen(self.agent.tcp_pose, "tool")
         peg = self.seen(self.peg.pose, "object")
         axis = quaternion_to_matrix(peg.q)[:, :, 0]
-        to_peg = peg.p - tcp.p
         return {
-            "peg_xy": peg.p[:, :2],
-            "peg_z": peg.p[:, 2:],
+            **in_parts(peg=peg.p),
             "peg_line": twofold_yaw(peg.q),
             "peg_lean": axis[:, 2:] * axis[:, :2],
             "peg_rise": axis[:, 2:] ** 2,
-            "tcp_to_peg_xy": to_peg[:, :2],
-            "tcp_to_peg_z": to_peg[:, 2:],
+            **in_parts(tcp_to_peg=peg.p - tcp.p),
             **bar_grasp_yaw(tcp.q, peg.q),
         }
 
@@ -129,16 +124,9 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         step = (radius * tilt).clamp(0.0, 0.05)
         # Height of the peg's lowest corner, by which a lifted peg goes down again.
         foot = peg.p[:, 2] - self.peg_half_length * rise - self.peg_half_width * flat
-        raise_end = Intent(
-            move=torch.cat(
-                [-(step * rise)[:, None] * bearing, (step * flat - foot)[:, None]], dim=1
-            ),
-            yaw=torch.zeros_like(yaw),
-            gripper=torch.full_like(yaw, self._loose),
-        )
-        up = torch.zeros_like(peg.p)
-        up[:, 2] = torch.where(finger_width(self) > 0.06, 0.03, 0.0)
-        release = Intent(move=up, yaw=torch.zeros_like(yaw), gripper=torch.full_like(yaw, OPEN))
+        arc = torch.cat([-(step * rise)[:, None] * bearing, (step * flat - foot)[:, None]], dim=1)
+        raise_end = Intent.to(arc, self._loose)
+        release = Intent.to_let_go(finger_width(self) > 0.06)
         stands = (tilt < 0.06) & (foot.abs() < 0.004)
         return choose(stands, release, choose(held, raise_end, approach))
 

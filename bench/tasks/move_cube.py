@@ -12,6 +12,7 @@ from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, HOVER, Intent, funnel
 from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, goal_disc_pose
+from symsteer.bench.tasks.fields import in_parts, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -25,11 +26,9 @@ class MoveCube(SymmetricTask):
     """
 
     task_fields: ClassVar[tuple[Field, ...]] = (
-        Field("cube_xy", 1),
-        Field("cube_z", 0),
+        *vector_fields("cube"),
         Field("cube_yaw", 4),
-        Field("tcp_to_cube_xy", 1),
-        Field("tcp_to_cube_z", 0),
+        *vector_fields("tcp_to_cube"),
         Field("goal_xy", 1),
         Field("cube_to_goal_xy", 1),
         Field("tcp_to_goal_xy", 1),
@@ -64,13 +63,10 @@ class MoveCube(SymmetricTask):
         tcp = self.seen(self.agent.tcp_pose, "tool").p
         cube = self.seen(self.obj.pose, "object")
         goal = self.seen(self.goal_region.pose, "goal").p[:, :2]
-        to_cube = cube.p - tcp
         return {
-            "cube_xy": cube.p[:, :2],
-            "cube_z": cube.p[:, 2:],
+            **in_parts(cube=cube.p),
             "cube_yaw": fourfold_yaw(cube.q),
-            "tcp_to_cube_xy": to_cube[:, :2],
-            "tcp_to_cube_z": to_cube[:, 2:],
+            **in_parts(tcp_to_cube=cube.p - tcp),
             "goal_xy": goal,
             "cube_to_goal_xy": goal - cube.p[:, :2],
             "tcp_to_goal_xy": goal - tcp[:, :2],
@@ -102,14 +98,6 @@ class MoveCube(SymmetricTask):
         low = tcp[:, 2] < cube[:, 2] + 0.015
         pushing = behind & low
         push = 0.03 * ahead - 1.0 * across[:, None] * side
-        return Intent(
-            move=torch.cat(
-                [
-                    torch.where(pushing[:, None], push, start),
-                    torch.where(pushing, height, height + lift)[:, None],
-                ],
-                dim=1,
-            ),
-            yaw=torch.zeros_like(along),
-            gripper=torch.full_like(along, CLOSED),
-        )
+        level = torch.where(pushing[:, None], push, start)
+        rise = torch.where(pushing, height, height + lift)
+        return Intent.to(torch.cat([level, rise[:, None]], dim=1), CLOSED)

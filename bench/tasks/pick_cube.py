@@ -12,6 +12,7 @@ from mani_skill.utils.structs import Actor, Pose
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, funnel, grasp
 from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
+from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -28,17 +29,11 @@ class PickCube(SymmetricTask, PickCubeEnv):
     task_id = "PickCube-v1"
     max_episode_steps = 50
     task_fields: ClassVar[tuple[Field, ...]] = (
-        Field("cube_xy", 1),
-        Field("cube_z", 0),
+        *vector_fields("cube"),
         Field("cube_yaw", 4),
-        Field("tcp_to_cube_xy", 1),
-        Field("tcp_to_cube_z", 0),
-        Field("grasp_yaw_cos", 0),
-        Field("grasp_yaw_sin", 0, odd=True),
-        Field("goal_xy", 1),
-        Field("goal_z", 0),
-        Field("cube_to_goal_xy", 1),
-        Field("cube_to_goal_z", 0),
+        *vector_fields("tcp_to_cube"),
+        *GRASP_YAW,
+        *vector_fields("goal", "cube_to_goal"),
     )
     spawn_radius = 0.1
     spawn_extent: ClassVar[float] = 0.13
@@ -65,18 +60,12 @@ class PickCube(SymmetricTask, PickCubeEnv):
         tcp = self.seen(self.agent.tcp_pose, "tool")
         cube = self.seen(self.cube.pose, "object")
         goal = self.seen(self.goal_site.pose, "goal").p
-        to_cube, to_goal = cube.p - tcp.p, goal - cube.p
         return {
-            "cube_xy": cube.p[:, :2],
-            "cube_z": cube.p[:, 2:],
+            **in_parts(cube=cube.p),
             "cube_yaw": fourfold_yaw(cube.q),
-            "tcp_to_cube_xy": to_cube[:, :2],
-            "tcp_to_cube_z": to_cube[:, 2:],
+            **in_parts(tcp_to_cube=cube.p - tcp.p),
             **grasp_yaw(tcp.q, cube.q),
-            "goal_xy": goal[:, :2],
-            "goal_z": goal[:, 2:],
-            "cube_to_goal_xy": to_goal[:, :2],
-            "cube_to_goal_z": to_goal[:, 2:],
+            **in_parts(goal=goal, cube_to_goal=goal - cube.p),
         }
 
     def intent(self, offset: torch.Tensor) -> Intent:
@@ -86,9 +75,5 @@ class PickCube(SymmetricTask, PickCubeEnv):
         to_goal = self.goal_site.pose.p - cube.p
         far = to_goal[:, :2].norm(dim=1)
         rise = funnel(far, 0.02, 0.5, 0.03)
-        carry = Intent(
-            move=torch.cat([to_goal[:, :2], to_goal[:, 2:] + rise[:, None]], dim=1),
-            yaw=torch.zeros_like(approach.yaw),
-            gripper=torch.full_like(approach.gripper, CLOSED),
-        )
-        return choose(held, carry, approach)
+        move = torch.cat([to_goal[:, :2], to_goal[:, 2:] + rise[:, None]], dim=1)
+        return choose(held, Intent.to(move, CLOSED), approach)

@@ -10,16 +10,9 @@ from mani_skill.envs.tasks.tabletop.place_sphere import PlaceSphereEnv
 from mani_skill.utils.structs import Actor
 
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.experts import (
-    CLOSED,
-    OPEN,
-    Intent,
-    choose,
-    finger_width,
-    funnel,
-    grasp_at,
-)
+from symsteer.bench.tasks.experts import CLOSED, Intent, choose, finger_width, funnel, grasp_at
 from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw
+from symsteer.bench.tasks.fields import in_parts, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -40,14 +33,10 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
     task_id = "PlaceSphere-v1"
     max_episode_steps = 50
     task_fields = (
-        Field("sphere_xy", 1),
-        Field("sphere_z", 0),
-        Field("tcp_to_sphere_xy", 1),
-        Field("tcp_to_sphere_z", 0),
+        *vector_fields("sphere", "tcp_to_sphere"),
         Field("bin_xy", 1),
         Field("bin_yaw", 4),
-        Field("sphere_to_bin_xy", 1),
-        Field("sphere_to_bin_z", 0),
+        *vector_fields("sphere_to_bin"),
     )
     spawn_radius = 0.07
     distance_range = (0.11, 0.18)
@@ -74,16 +63,11 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
         tcp = self.seen(self.agent.tcp_pose, "tool").p
         sphere = self.seen(self.obj.pose, "object").p
         bin_pose = self.seen(self.bin.pose, "goal")
-        to_sphere, to_bin = sphere - tcp, bin_pose.p - sphere
         return {
-            "sphere_xy": sphere[:, :2],
-            "sphere_z": sphere[:, 2:],
-            "tcp_to_sphere_xy": to_sphere[:, :2],
-            "tcp_to_sphere_z": to_sphere[:, 2:],
+            **in_parts(sphere=sphere, tcp_to_sphere=sphere - tcp),
             "bin_xy": bin_pose.p[:, :2],
             "bin_yaw": fourfold_yaw(bin_pose.q),
-            "sphere_to_bin_xy": to_bin[:, :2],
-            "sphere_to_bin_z": to_bin[:, 2:],
+            **in_parts(sphere_to_bin=bin_pose.p - sphere),
         }
 
     def intent(self, offset: torch.Tensor) -> Intent:
@@ -105,16 +89,10 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
         # Slowly at the end: a sphere that is let go in motion spins in the bin for seconds.
         move = torch.cat([place[:, :2], (drop.maximum(lowest) + rise)[:, None]], dim=1)
         last = move.norm(dim=1, keepdim=True) < 0.04
-        carry = Intent(
-            move=torch.where(last, 0.6 * move, move),
-            yaw=any_yaw,
-            gripper=torch.full_like(any_yaw, CLOSED),
-        )
+        carry = Intent.to(torch.where(last, 0.6 * move, move), CLOSED)
         opening = finger_width(self)
         # Once the fingers let go, the sphere may settle where the walls leave it.
         near = torch.where(opening > 0.045, 0.008, 0.006)
         placed = (aside < near) & (drop > -0.013)
-        up = torch.zeros_like(place)
-        up[:, 2] = torch.where(placed & (opening > 0.06), 0.03, 0.0)
-        release = Intent(move=up, yaw=any_yaw, gripper=torch.full_like(any_yaw, OPEN))
+        release = Intent.to_let_go(placed & (opening > 0.06))
         return choose(placed, release, choose(held, carry, approach))

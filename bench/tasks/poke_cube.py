@@ -21,6 +21,7 @@ from symsteer.bench.tasks.features import (
     goal_disc_pose,
     twofold_yaw,
 )
+from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -51,15 +52,11 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
     task_id = "PokeCube-v1"
     max_episode_steps = 60
     task_fields = (
-        Field("peg_xy", 1),
-        Field("peg_z", 0),
+        *vector_fields("peg"),
         Field("peg_yaw", 2),
-        Field("tcp_to_peg_xy", 1),
-        Field("tcp_to_peg_z", 0),
-        Field("grasp_yaw_cos", 0),
-        Field("grasp_yaw_sin", 0, odd=True),
-        Field("cube_xy", 1),
-        Field("cube_z", 0),
+        *vector_fields("tcp_to_peg"),
+        *GRASP_YAW,
+        *vector_fields("cube"),
         Field("cube_yaw", 4),
         Field("peg_end_to_cube_xy", 1),
         Field("goal_xy", 1),
@@ -111,17 +108,14 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         tcp = self.seen(self.agent.tcp_pose, "tool")
         peg, cube = self.seen(self.peg.pose, "object"), self.seen(self.cube.pose, "object")
         goal = self.seen(self.goal_region.pose, "goal").p
-        to_peg, peg_to_cube = peg.p - tcp.p, cube.p - peg.p
+        peg_to_cube = cube.p - peg.p
         end = self._half_peg(quaternion_to_matrix(peg.q)[:, :, 0], peg_to_cube)
         return {
-            "peg_xy": peg.p[:, :2],
-            "peg_z": peg.p[:, 2:],
+            **in_parts(peg=peg.p),
             "peg_yaw": twofold_yaw(peg.q),
-            "tcp_to_peg_xy": to_peg[:, :2],
-            "tcp_to_peg_z": to_peg[:, 2:],
+            **in_parts(tcp_to_peg=peg.p - tcp.p),
             **bar_grasp_yaw(tcp.q, peg.q),
-            "cube_xy": cube.p[:, :2],
-            "cube_z": cube.p[:, 2:],
+            **in_parts(cube=cube.p),
             "cube_yaw": fourfold_yaw(cube.q),
             "peg_end_to_cube_xy": (peg_to_cube - end)[:, :2],
             "goal_xy": goal[:, :2],
@@ -172,12 +166,7 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         retreat = -(self.cube_half_size + 0.015) - back - along
         move = torch.where(lined_up, forward, retreat)[:, None] * ahead - across[:, None] * side
         lift = self.peg_half_width + 0.005 - peg.p[:, 2:]
-        poke = Intent(
-            move=torch.cat([move, lift], dim=1),
-            yaw=-turn,
-            gripper=torch.full_like(turn, CLOSED),
-        )
-        still = torch.zeros_like(turn)
+        poke = Intent.to(torch.cat([move, lift], dim=1), CLOSED, -turn)
         # Let go: a hand that squeezes a peg is not quite at rest.
-        stand = Intent(move=torch.zeros_like(tcp), yaw=still, gripper=torch.full_like(turn, OPEN))
+        stand = Intent.to(torch.zeros_like(tcp), OPEN)
         return choose(distance < 0.045, stand, choose(held, poke, approach))

@@ -14,6 +14,7 @@ from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matr
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, grasp_at, yaw_along
 from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose
+from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
 from symsteer.policies.geometry import Field, Layout
 
 HORIZONTAL = Layout([Field("xy", 1)])
@@ -43,13 +44,10 @@ class PushT(SymmetricTask, PushTEnv):
     max_episode_steps = 100
     mirrored_across_yz = frozenset({"Tee", "goal_Tee"})
     task_fields = (
-        Field("tee_xy", 1),
-        Field("tee_z", 0),
+        *vector_fields("tee"),
         Field("tee_stem", 1),
-        Field("tcp_to_tee_xy", 1),
-        Field("tcp_to_tee_z", 0),
-        Field("grasp_yaw_cos", 0),
-        Field("grasp_yaw_sin", 0, odd=True),
+        *vector_fields("tcp_to_tee"),
+        *GRASP_YAW,
         Field("goal_xy", 1),
         Field("goal_stem", 1),
         Field("tee_to_goal_xy", 1),
@@ -131,13 +129,11 @@ class PushT(SymmetricTask, PushTEnv):
         tcp = self.seen(self.agent.tcp_pose, "tool")
         tee = self.seen(self.tee.pose, "object")
         goal = self.seen(self.goal_tee.pose, "goal")
-        to_tee, stem, goal_stem = tee.p - tcp.p, _stem(tee.q), _stem(goal.q)
+        stem, goal_stem = _stem(tee.q), _stem(goal.q)
         return {
-            "tee_xy": tee.p[:, :2],
-            "tee_z": tee.p[:, 2:],
+            **in_parts(tee=tee.p),
             "tee_stem": stem,
-            "tcp_to_tee_xy": to_tee[:, :2],
-            "tcp_to_tee_z": to_tee[:, 2:],
+            **in_parts(tcp_to_tee=tee.p - tcp.p),
             **bar_grasp_yaw(tcp.q, tee.q),
             "goal_xy": goal.p[:, :2],
             "goal_stem": goal_stem,
@@ -166,8 +162,7 @@ class PushT(SymmetricTask, PushTEnv):
         # Keep the block on the table, and the finger tips, 9 mm below the tool, above it.
         height = self.half_thickness - tee.p[:, 2:] + (self.lowest_grip - tcp[:, 2:]).clamp_min(0.0)
         move = torch.cat([self.body.drag_gain * (fit + turned - tcp[:, :2]), height], dim=1)
-        drag = Intent(move=move, yaw=turn, gripper=torch.full_like(turn, CLOSED))
-        return choose(held, drag, approach)
+        return choose(held, Intent.to(move, CLOSED, turn), approach)
 
 
 def _stem(q: torch.Tensor) -> torch.Tensor:

@@ -10,8 +10,9 @@ from mani_skill.envs.tasks.tabletop.stack_cube import StackCubeEnv
 from mani_skill.utils.structs import Actor
 
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.experts import CLOSED, OPEN, Intent, choose, finger_width, funnel, grasp
+from symsteer.bench.tasks.experts import CLOSED, Intent, choose, finger_width, funnel, grasp
 from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
+from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -28,18 +29,13 @@ class StackCube(SymmetricTask, StackCubeEnv):
     task_id = "StackCube-v1"
     max_episode_steps = 60
     task_fields = (
-        Field("cube_a_xy", 1),
-        Field("cube_a_z", 0),
+        *vector_fields("cube_a"),
         Field("cube_a_yaw", 4),
-        Field("cube_b_xy", 1),
-        Field("cube_b_z", 0),
+        *vector_fields("cube_b"),
         Field("cube_b_yaw", 4),
-        Field("tcp_to_a_xy", 1),
-        Field("tcp_to_a_z", 0),
-        Field("grasp_yaw_cos", 0),
-        Field("grasp_yaw_sin", 0, odd=True),
-        Field("a_to_b_xy", 1),
-        Field("a_to_b_z", 0),
+        *vector_fields("tcp_to_a"),
+        *GRASP_YAW,
+        *vector_fields("a_to_b"),
     )
     spawn_radius = 0.07
     spawn_extent: ClassVar[float] = 0.18
@@ -64,19 +60,14 @@ class StackCube(SymmetricTask, StackCubeEnv):
     def _observe_task(self) -> dict[str, torch.Tensor]:
         tcp = self.seen(self.agent.tcp_pose, "tool")
         a, b = self.seen(self.cubeA.pose, "object"), self.seen(self.cubeB.pose, "object")
-        to_a, a_to_b = a.p - tcp.p, b.p - a.p
         return {
-            "cube_a_xy": a.p[:, :2],
-            "cube_a_z": a.p[:, 2:],
+            **in_parts(cube_a=a.p),
             "cube_a_yaw": fourfold_yaw(a.q),
-            "cube_b_xy": b.p[:, :2],
-            "cube_b_z": b.p[:, 2:],
+            **in_parts(cube_b=b.p),
             "cube_b_yaw": fourfold_yaw(b.q),
-            "tcp_to_a_xy": to_a[:, :2],
-            "tcp_to_a_z": to_a[:, 2:],
+            **in_parts(tcp_to_a=a.p - tcp.p),
             **grasp_yaw(tcp.q, a.q),
-            "a_to_b_xy": a_to_b[:, :2],
-            "a_to_b_z": a_to_b[:, 2:],
+            **in_parts(a_to_b=b.p - a.p),
         }
 
     def intent(self, offset: torch.Tensor) -> Intent:
@@ -87,18 +78,7 @@ class StackCube(SymmetricTask, StackCubeEnv):
         top = torch.cat([top[:, :2], top[:, 2:] + 2 * self.cube_half_size[2]], dim=1)
         aside = top[:, :2].norm(dim=1)
         rise = funnel(aside, 0.006, 3.0, 0.05)
-        carry = Intent(
-            move=torch.cat([top[:, :2], top[:, 2:] + rise[:, None]], dim=1),
-            yaw=torch.zeros_like(approach.yaw),
-            gripper=torch.full_like(approach.gripper, CLOSED),
-        )
+        carry = Intent.to(torch.cat([top[:, :2], top[:, 2:] + rise[:, None]], dim=1), CLOSED)
         placed = (aside < 0.012) & (top[:, 2].abs() < 0.004)
-        free = placed & (finger_width(self) > 0.06)
-        up = torch.zeros_like(top)
-        up[:, 2] = torch.where(free, 0.03, 0.0)
-        release = Intent(
-            move=up,
-            yaw=torch.zeros_like(approach.yaw),
-            gripper=torch.full_like(approach.gripper, OPEN),
-        )
+        release = Intent.to_let_go(placed & (finger_width(self) > 0.06))
         return choose(placed, release, choose(held, carry, approach))

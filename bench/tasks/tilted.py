@@ -26,6 +26,7 @@ from symsteer.bench.sim.rotations import (
 )
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.features import grasp_yaw
+from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
 from symsteer.bench.tasks.pick_cube import PickCube
 from symsteer.bench.tasks.push_cube import PushCube
 from symsteer.bench.variants.base import STREAM
@@ -72,16 +73,10 @@ class Tilted(SymmetricTask):
     """
 
     gripper_fields: ClassVar[tuple[Field, ...]] = (
-        Field("normal_xy", 1),
-        Field("normal_z", 0),
-        Field("tcp_xy", 1),
-        Field("tcp_z", 0),
-        Field("tcp_x_axis_xy", 1),
-        Field("tcp_x_axis_z", 0),
+        *vector_fields("normal", "tcp", "tcp_x_axis"),
         Field("tcp_y_axis_xy", 1, odd=True),
         Field("tcp_y_axis_z", 0, odd=True),
-        Field("tcp_z_axis_xy", 1),
-        Field("tcp_z_axis_z", 0),
+        *vector_fields("tcp_z_axis"),
         Field("gripper_width", 0),
     )
 
@@ -107,15 +102,9 @@ class Tilted(SymmetricTask):
     def _observe_gripper(
         self, position: torch.Tensor, axes: torch.Tensor, width: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        vectors = {
-            "normal": torch.tensor([0.0, 0.0, 1.0], device=self.device).expand_as(position),
-            "tcp": position,
-            **{f"tcp_{name}_axis": axes[:, :, i] for i, name in enumerate("xyz")},
-        }
-        fields = {}
-        for name, vector in vectors.items():
-            fields[f"{name}_xy"], fields[f"{name}_z"] = vector[:, :2], vector[:, 2:]
-        return {**fields, "gripper_width": width}
+        normal = torch.tensor([0.0, 0.0, 1.0], device=self.device).expand_as(position)
+        turned = {f"tcp_{name}_axis": axes[:, :, i] for i, name in enumerate("xyz")}
+        return {**in_parts(normal=normal, tcp=position, **turned), "gripper_width": width}
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         flat = super()._observe_task()
@@ -193,11 +182,7 @@ class TiltedPushCube(Tilted, PushCube):
 
     task_id = "TiltedPushCube-v1"
     # In place of the cube's yaw.
-    task_fields: ClassVar[tuple[Field, ...]] = (
-        *in_space(PushCube.task_fields),
-        Field("grasp_yaw_cos", 0),
-        Field("grasp_yaw_sin", 0, odd=True),
-    )
+    task_fields: ClassVar[tuple[Field, ...]] = (*in_space(PushCube.task_fields), *GRASP_YAW)
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         tool, cube = self.seen(self.agent.tcp_pose, "tool"), self.seen(self.obj.pose, "object")
