@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -221,11 +222,7 @@ def summary(result: AuditResult) -> dict[str, Any]:
     row: dict[str, Any] = {name: get(result) for name, get in PLAIN.items()}
     for name, get in ESTIMATES.items():
         estimate = get(result)
-        row[name] = (
-            None
-            if estimate is None
-            else [_short(v) for v in (estimate.value, estimate.low, estimate.high)]
-        )
+        row[name] = estimate and [_short(v) for v in astuple(estimate)]
     return row
 
 
@@ -309,15 +306,13 @@ def write_result(result: AuditResult, folder: Path) -> None:
     Raises:
         UserError: the folder cannot be written.
     """
-    rows: list[list[object]] = [["body", "x_mm", "y_mm", "copies", "mm"]]
-    rows += [[b.body, b.x_mm, b.y_mm, b.copies, float(f"{b.mm:.4g}")] for b in result.map]
+    head = ["body", "x_mm", "y_mm", "copies", "mm"]
+    rows = [[b.body, b.x_mm, b.y_mm, b.copies, float(f"{b.mm:.4g}")] for b in result.map]
     picture = io.BytesIO()
     map_figure(result).savefig(picture, format="png", dpi=110, metadata={"Software": None})
     write_together(
         {
-            folder / "map.csv": csv_text(
-                [["body", "x_mm", "y_mm", "copies", "mm"], *rows]
-            ).encode(),
+            folder / "map.csv": csv_text([head, *rows]).encode(),
             folder / "map.png": picture.getvalue(),
             # Last: a folder with this file is complete, and is not measured again.
             folder / "audit.json": (json.dumps(result.to_json(), indent=1) + "\n").encode(),

@@ -80,7 +80,10 @@ def test_one_audit(monkeypatch, capsys, tmp_path):
     assert data["base_policy"] == policy.content_hash()[:12]
     assert {"expert", "policy"} <= {row["subset"] for row in data["dynamics"]}
     assert (tmp_path / "out" / "map.png").read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "out" / "map.csv").read_text().startswith("body,x_mm,y_mm,copies,mm\n")
+    head, *rows = (tmp_path / "out" / "map.csv").read_text().splitlines()
+    assert head == "body,x_mm,y_mm,copies,mm"
+    assert rows
+    assert all(row.startswith(("tool,", "object,")) for row in rows)
 
 
 def test_a_table_of_audits(monkeypatch, capsys, tmp_path):
