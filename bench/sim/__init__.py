@@ -18,13 +18,7 @@ if TYPE_CHECKING:
     from symsteer.bench.sim.headless import prepare_headless, rendering_works
     from symsteer.bench.sim.parallel import create
 
-__all__ = [
-    "BatchedCpuMixin",
-    "create",
-    "make_env_class",
-    "prepare_headless",
-    "rendering_works",
-]
+__all__ = ["BatchedCpuMixin", "create", "make_env_class", "prepare_headless", "rendering_works"]
 
 _HOME = {
     "BatchedCpuMixin": "environment",

@@ -263,10 +263,8 @@ def _check_rendering() -> Check:
 
 
 def _check_tensorboard() -> Check:
-    try:
-        found = version("tensorboard")
-    except PackageNotFoundError:
-        return Check("TensorBoard", False, "missing", "pip install tensorboard", required=True)
+    if (found := _installed("tensorboard")) == "missing":
+        return Check("TensorBoard", False, found, "pip install tensorboard", required=True)
     return Check("TensorBoard", True, f"{found}: tensorboard --logdir runs", required=True)
 
 

@@ -7,7 +7,8 @@ pair. A pair's impulse acts on its first body; a body's impulse is what all othe
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,16 +19,34 @@ import torch
 _Entries = list[tuple[int, int]]
 
 
-class Impulses:
-    """Result of a query: float32 [n, 3], with the ``.torch()`` of SAPIEN's CudaArray."""
+class Buffer:
+    """An array that numpy and torch share, with the ``.torch()`` of SAPIEN's CudaArray.
 
-    def __init__(self, n: int) -> None:
-        self.array = np.zeros((n, 3), dtype=np.float32)
-        self._tensor = torch.from_numpy(self.array)
+    Args:
+        array: the shared array.
+        fill: called before each ``.torch()``; for buffers that are filled on demand.
+    """
+
+    def __init__(self, array: np.ndarray, fill: Callable[[], None] | None = None) -> None:
+        self.array = array
+        self._tensor = torch.from_numpy(array)
+        self._fill = fill
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+        return self.array.shape
 
     def torch(self) -> torch.Tensor:
-        """The impulses as a tensor; shares memory with the array."""
+        """The array as a tensor; both share memory."""
+        if self._fill is not None:
+            self._fill()
         return self._tensor
+
+
+def _impulses(n: int) -> Buffer:
+    """The result of a query, ``[n, 3]``."""
+    return Buffer(np.zeros((n, 3), dtype=np.float32))
 
 
 class PairImpulseQuery:
@@ -37,7 +56,7 @@ class PairImpulseQuery:
     """First of its rows among those of all queries."""
 
     def __init__(self, body_pairs: Sequence[tuple[Any, Any]]) -> None:
-        self.cuda_impulses = Impulses(len(body_pairs))
+        self.cuda_impulses = _impulses(len(body_pairs))
         self._entries: dict[tuple[Any, Any], _Entries] = defaultdict(list)
         for row, (first, second) in enumerate(body_pairs):
             self._entries[first, second].append((row, 1))
@@ -55,7 +74,7 @@ class BodyImpulseQuery:
     """First of its rows among those of all queries."""
 
     def __init__(self, bodies: Sequence[Any]) -> None:
-        self.cuda_impulses = Impulses(len(bodies))
+        self.cuda_impulses = _impulses(len(bodies))
         self._rows: dict[Any, list[int]] = defaultdict(list)
         for row, body in enumerate(bodies):
             self._rows[body].append(row)
@@ -69,18 +88,13 @@ class BodyImpulseQuery:
 Query = TypeVar("Query", PairImpulseQuery, BodyImpulseQuery)
 
 
+@dataclass
 class _Found:
     """The contact points of one scene that enter a result: impulse, row and sign."""
 
-    def __init__(self) -> None:
-        self.impulses: list[np.ndarray] = []
-        self.rows: list[int] = []
-        self.signs: list[int] = []
-
-    def clear(self) -> None:
-        self.impulses.clear()
-        self.rows.clear()
-        self.signs.clear()
+    impulses: list[np.ndarray] = field(default_factory=list)
+    rows: list[int] = field(default_factory=list)
+    signs: list[int] = field(default_factory=list)
 
 
 class ContactReader:
@@ -112,7 +126,7 @@ class ContactReader:
     def forget(self, scene: int) -> None:
         """Drop the contacts of a scene whose state was set, until its next substep."""
         self._forgotten.add(scene)
-        self._found[scene].clear()
+        self._found[scene] = _Found()
         self._must_sum = True
 
     def answer(self, query: PairImpulseQuery | BodyImpulseQuery) -> None:
@@ -124,8 +138,7 @@ class ContactReader:
 
     def _read(self) -> None:
         for scene, system in enumerate(self._systems):
-            found = self._found[scene]
-            found.clear()
+            found = self._found[scene] = _Found()
             if scene in self._forgotten:
                 continue
             for contact in system.get_contacts():

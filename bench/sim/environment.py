@@ -88,7 +88,6 @@ class BatchedCpuMixin(Unique, BaseEnv):
     def __init__(
         self,
         *args: Any,
-        num_envs: int = 1,
         obs_mode: str | None = None,
         render_mode: str | None = None,
         sim_backend: str = "auto",
@@ -110,7 +109,6 @@ class BatchedCpuMixin(Unique, BaseEnv):
         self._camera_device = rendering.find_device(render_backend) if cameras else None
         super().__init__(
             *args,
-            num_envs=num_envs,
             obs_mode=obs_mode,
             render_mode=render_mode,
             sim_backend="physx_cpu",
@@ -245,7 +243,6 @@ class CudaMixin(Unique, BaseEnv):
     def __init__(
         self,
         *args: Any,
-        num_envs: int = 1,
         sim_backend: str = "auto",
         render_backend: str | None = None,
         render_mode: str | None = None,
@@ -262,7 +259,6 @@ class CudaMixin(Unique, BaseEnv):
             render_backend = "gpu" if _needs_cameras(self, render_mode, obs_mode) else "none"
         super().__init__(
             *args,
-            num_envs=num_envs,
             sim_backend=sim_backend,
             render_backend=render_backend,
             render_mode=render_mode,

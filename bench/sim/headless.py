@@ -106,12 +106,9 @@ def _install_stand_ins() -> None:
     def add_nothing(self: Any, *args: Any, **kwargs: Any) -> Any:
         return self
 
-    sapien.render.RenderMaterial = InertMaterial
-    sapien.render.RenderTexture2D = InertTexture
-    urdf_loader.RenderMaterial = InertMaterial
-    urdf_loader.RenderTexture2D = InertTexture
-    mjcf_loader.RenderMaterial = InertMaterial
-    mjcf_loader.RenderTexture2D = InertTexture
+    modules: tuple[Any, ...] = (sapien.render, urdf_loader, mjcf_loader)
+    for module in modules:
+        module.RenderMaterial, module.RenderTexture2D = InertMaterial, InertTexture
     for name in _VISUAL_METHODS:
         setattr(sapien.ActorBuilder, name, add_nothing)
     ActorBuilder.add_plane_repeated_visual = add_nothing

@@ -27,45 +27,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partialmethod
 from typing import Any
 
 import numpy as np
 import sapien
 import sapien.physx as physx
-import torch
 
-from symsteer.bench.sim.contacts import BodyImpulseQuery, ContactReader, PairImpulseQuery
+from symsteer.bench.sim.contacts import BodyImpulseQuery, Buffer, ContactReader, PairImpulseQuery
 
 _POSE = slice(0, 7)
 _VELOCITY = slice(7, 13)
 
 # Where `pack` puts a body's 13 numbers: quaternion first, then position, then velocities.
 _PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
-
-
-class Buffer:
-    """A float32 array that numpy and torch share, with the ``.torch()`` of SAPIEN's CudaArray.
-
-    Args:
-        array: the shared array.
-        fill: called before each ``.torch()``; for buffers that are filled on demand.
-    """
-
-    def __init__(self, array: np.ndarray, fill: Callable[[], None] | None = None) -> None:
-        self.array = array
-        self._tensor = torch.from_numpy(array)
-        self._fill = fill
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the array."""
-        return self.array.shape
-
-    def torch(self) -> torch.Tensor:
-        """The array as a tensor; both share memory."""
-        if self._fill is not None:
-            self._fill()
-        return self._tensor
 
 
 class BatchedPhysx:
@@ -385,24 +360,14 @@ class BatchedPhysx:
         self._body_buffer[self._n_rigid :, _VELOCITY] = self._body_state[self._n_rigid :, _VELOCITY]
 
     def _fetch_joints(self, name: str) -> None:
+        """Fetch joint positions or velocities, or their drive targets."""
         self._refresh()
         self._joint_buffer[name][:] = self._joint_state[name]
 
-    def gpu_fetch_articulation_qpos(self) -> None:
-        """Fetch joint positions."""
-        self._fetch_joints("qpos")
-
-    def gpu_fetch_articulation_qvel(self) -> None:
-        """Fetch joint velocities."""
-        self._fetch_joints("qvel")
-
-    def gpu_fetch_articulation_target_qpos(self) -> None:
-        """Fetch drive targets."""
-        self._fetch_joints("target_qpos")
-
-    def gpu_fetch_articulation_target_qvel(self) -> None:
-        """Fetch drive velocity targets."""
-        self._fetch_joints("target_qvel")
+    gpu_fetch_articulation_qpos = partialmethod(_fetch_joints, "qpos")
+    gpu_fetch_articulation_qvel = partialmethod(_fetch_joints, "qvel")
+    gpu_fetch_articulation_target_qpos = partialmethod(_fetch_joints, "target_qpos")
+    gpu_fetch_articulation_target_qvel = partialmethod(_fetch_joints, "target_qvel")
 
     def gpu_fetch_articulation_qacc(self) -> None:
         """Do nothing: joint accelerations are read on demand, see `_read_qacc`."""
@@ -489,6 +454,7 @@ class BatchedPhysx:
         self._body_state[roots, _VELOCITY] = buffer[roots, _VELOCITY]
 
     def _apply_joints(self, name: str, moved: bool) -> None:
+        """Apply joint positions, velocities, or forces, which act until others are applied."""
         self.finish_substeps()
         buffer, state = self._joint_buffer[name], self._joint_state[name]
         for row in self._changed(buffer, state):
@@ -496,17 +462,9 @@ class BatchedPhysx:
             self._touch(self._articulation_scene[row], moved)
         state[:] = buffer
 
-    def gpu_apply_articulation_qpos(self) -> None:
-        """Apply joint positions."""
-        self._apply_joints("qpos", moved=True)
-
-    def gpu_apply_articulation_qvel(self) -> None:
-        """Apply joint velocities."""
-        self._apply_joints("qvel", moved=False)
-
-    def gpu_apply_articulation_qf(self) -> None:
-        """Apply joint forces, which act until others are applied."""
-        self._apply_joints("qf", moved=False)
+    gpu_apply_articulation_qpos = partialmethod(_apply_joints, "qpos", moved=True)
+    gpu_apply_articulation_qvel = partialmethod(_apply_joints, "qvel", moved=False)
+    gpu_apply_articulation_qf = partialmethod(_apply_joints, "qf", moved=False)
 
     def _apply_targets(
         self, name: str, calls: list[list[Callable[[float], None]]], refresh_driven: bool

@@ -14,6 +14,7 @@ import sapien.render
 import torch
 from mani_skill.utils import common
 
+from symsteer.bench.sim.contacts import Buffer
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.sim.physx import BatchedPhysx
 from symsteer.errors import UserError
@@ -45,17 +46,6 @@ def find_device(name: str | None = None) -> sapien.Device:
         ) from error
 
 
-class Pictures:
-    """Pictures of all scenes [N, height, width, channels], with CudaArray's ``.torch()``."""
-
-    def __init__(self, pictures: torch.Tensor) -> None:
-        self._pictures = pictures
-
-    def torch(self) -> torch.Tensor:
-        """The pictures, on the CPU."""
-        return self._pictures
-
-
 class CameraGroup:
     """The same camera in every scene."""
 
@@ -67,10 +57,10 @@ class CameraGroup:
         for camera in self._cameras:
             camera.take_picture()
 
-    def get_picture_cuda(self, name: str) -> Pictures:
-        """A texture of the last pictures, for instance "Color"."""
+    def get_picture_cuda(self, name: str) -> Buffer:
+        """A texture of the last pictures, e.g. "Color", ``[N, height, width, channels]``."""
         pictures = [common.to_tensor(camera.get_picture(name)) for camera in self._cameras]
-        return Pictures(torch.stack(pictures))
+        return Buffer(torch.stack(pictures).numpy())
 
 
 class RenderGroup:

@@ -20,21 +20,6 @@ from mani_skill.utils.geometry.rotation_conversions import (
     quaternion_raw_multiply as quaternion_multiply,
 )
 
-__all__ = [
-    "euler_rates_matrix",
-    "euler_to_matrix",
-    "matrix_to_euler_facing_down",
-    "planar_matrix",
-    "quaternion_multiply",
-    "quaternion_to_matrix",
-    "rotation_vector_to_matrix",
-    "transform_angular",
-    "transform_quaternion",
-    "unwrap",
-    "wrap",
-    "yaw_quaternion",
-]
-
 
 def quaternion_to_matrix(q: torch.Tensor) -> torch.Tensor:
     """Rotation matrices ``[..., 3, 3]`` of unit quaternions ``[..., 4]``."""

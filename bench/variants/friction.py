@@ -56,10 +56,7 @@ class Frictions:
         """Write the coefficients that have changed since they were last written."""
         for surface in self.surfaces:
             parts = [variant.friction(surface.body) for variant in self.variants]
-            added = torch.zeros_like(surface.written)
-            for part in parts:
-                if part is not None:
-                    added = added + part
+            added = sum((p for p in parts if p is not None), torch.zeros_like(surface.written))
             for row in (added != surface.written).nonzero().flatten().tolist():
                 extra = float(added[row])
                 for material, static, dynamic in surface.materials[row]:
