@@ -117,7 +117,7 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
         return Manifest.model_validate_json(text)
     except ValidationError as error:
         raise UserError(
-            f"the {MANIFEST} of {path} is wrong ({first_problem(error)}); copy it again"
+            f"the {MANIFEST} of {path} is wrong in {first_problem(error)}; copy it again"
         ) from error
 
 
