@@ -33,8 +33,9 @@ from symsteer.bench.audit.result import (
     FieldDefect,
     check_group,
 )
-from symsteer.bench.audit.states import Visited, join_trees, visit
+from symsteer.bench.audit.states import Visited, visit
 from symsteer.bench.sim.rotations import quaternion_to_matrix
+from symsteer.bench.sim.trees import join_trees
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.features import is_direction
@@ -52,29 +53,15 @@ def visit_all(
     reference: SymmetricTask, settings: AuditSettings, policy: ChunkPolicy | None
 ) -> Visited:
     """Sample the states of all visitors of ``settings``, in the unbroken task."""
-    return join_trees(
-        [
-            visit(
-                reference,
-                visitor,
-                settings.count,
-                settings.chunk,
-                settings.seed,
-                policy if visitor == "policy" else None,
-            )
-            for visitor in settings.visitors
-        ]
-    )
+    numbers = settings.count, settings.chunk, settings.seed
+    actors = {"expert": None, "policy": policy}
+    return join_trees([visit(reference, v, *numbers, actors[v]) for v in settings.visitors])
 
 
 def reference_task(settings: AuditSettings) -> SymmetricTask:
     """Make the unbroken task, with one environment for each state of a visitor, at most 64."""
-    return make(
-        settings.task,
-        num_envs=min(settings.count, 64),
-        embodiment=settings.embodiment,
-        sim=settings.sim,
-    )
+    count = min(settings.count, 64)
+    return make(settings.task, num_envs=count, embodiment=settings.embodiment, sim=settings.sim)
 
 
 def audit(

@@ -17,18 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from symsteer.bench.audit.states import (
-    Element,
-    Turner,
-    Visited,
-    join_trees,
-    map_trees,
-    rows_of,
-    seen_from,
-    task_state,
-)
+from symsteer.bench.audit.states import Element, Turner, Visited, seen_from, task_state
 from symsteer.bench.sim.environment import Simulator
 from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
+from symsteer.bench.sim.trees import join_trees, map_trees, rows_of
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.variants.base import overriding
@@ -165,10 +157,8 @@ class Experiment:
         plan = torch.cat([layout.transform(actions, *g) for g in elements] + [actions])
 
         # New scenes, so that all copies have the same history.
-        if not self.fresh:
-            env.reset(seed=[self.seed] * env.num_envs, options={"reconfigure": True})
-        else:
-            env.reset(seed=[self.seed] * env.num_envs)
+        options = {} if self.fresh else {"reconfigure": True}
+        env.reset(seed=[self.seed] * env.num_envs, options=options)
         self.fresh = False
         scenes = join_trees([*starts, floor])
         self._put(scenes)
@@ -265,9 +255,7 @@ class Experiment:
         moved = self.env.agent.tcp_pose.p - before
         cost = torch.zeros(self.env.num_envs, device=self.env.device)
         for variant in overriding(self.env.variants, "extra_cost"):
-            extra = variant.extra_cost(moved)
-            if extra is not None:
-                cost = cost + extra
+            cost = cost + variant.extra_cost(moved)
         return torch.where(info["success"], torch.zeros_like(cost), cost)
 
     def _reward_function(
@@ -367,8 +355,7 @@ class Experiment:
             seeds = np.asarray(rng.integers(2**31, size=self.env.num_envs)).tolist()
             self.env.reset(seed=seeds)
             state = task_state(self.env)
-            bodies = ("actors", "articulations")
-            state |= {k: {n: state[k][n] for n in known[k]} for k in bodies}
+            state |= {k: {n: state[k][n] for n in known[k]} for k in ("actors", "articulations")}
             state.pop("controller", None)
             found.append(self._observe_unbroken(seen_from(state, self.centre)))
         return torch.cat(found)[:count].double()

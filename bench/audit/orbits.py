@@ -17,8 +17,8 @@ from matplotlib import style as mpl_style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from symsteer.bench.audit.states import join_trees, rows_of
 from symsteer.bench.pages import CHECKOUT
+from symsteer.bench.sim.trees import join_trees, rows_of
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert

@@ -14,8 +14,9 @@ from typing import Literal
 import numpy as np
 import torch
 
-from symsteer.bench.audit.states import MOVED, map_trees
+from symsteer.bench.audit.states import MOVED
 from symsteer.bench.sim.rotations import planar_matrix
+from symsteer.bench.sim.trees import map_trees
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
@@ -155,7 +156,8 @@ def _rollout(
     if policy is not None:
         choose = _policy_actions(env, policy, start, count, elements)
     elif kind == "expert":
-        choose = _turned(env, _expert_actions(env, count), elements)
+        expert = Expert(env)
+        choose = _turned(env, lambda step: expert.act()[:count], elements)
     else:
         choose = _turned(env, _noise(env, start, count, steps), elements)
     tcp, objects, success = [_tcp(env)], [_objects(env)], []
@@ -238,11 +240,6 @@ def _policy_actions(
         return chunk[:, step % policy.execute]
 
     return choose
-
-
-def _expert_actions(env: SymmetricTask, count: int) -> Callable[[int], torch.Tensor]:
-    expert = Expert(env)
-    return lambda step: expert.act()[:count]
 
 
 def _noise(env: SymmetricTask, start: int, count: int, steps: int) -> Callable[[int], torch.Tensor]:

@@ -7,8 +7,7 @@ simulation state: bodies, robot, controller targets.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +15,7 @@ import torch
 
 from symsteer.bench.audit.arm import ArmTurner
 from symsteer.bench.sim.rotations import planar_matrix
+from symsteer.bench.sim.trees import join_trees, map_trees, rows_of
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
 from symsteer.policies.contract import ChunkPolicy
@@ -78,11 +78,7 @@ def visit(
 
 
 def _visit_batch(
-    env: SymmetricTask,
-    visitor: Visitor,
-    steps: int,
-    seeds: list[int],
-    policy: ChunkPolicy | None,
+    env: SymmetricTask, visitor: Visitor, steps: int, seeds: list[int], policy: ChunkPolicy | None
 ) -> Visited:
     rng = np.random.default_rng([*seeds, visitor == "policy"])
     episodes = np.asarray(rng.integers(2**31, size=env.num_envs)).tolist()
@@ -213,25 +209,3 @@ def _shift(state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
     moved = state.clone()
     moved[:, :2] += offset
     return moved
-
-
-def map_trees(function: Callable[..., torch.Tensor], *trees: Any) -> Any:
-    """Apply a function to the corresponding tensors of trees (dictionaries and dataclasses)."""
-    first = trees[0]
-    if isinstance(first, dict):
-        return {key: map_trees(function, *(tree[key] for tree in trees)) for key in first}
-    if is_dataclass(first) and not isinstance(first, type):
-        names = [f.name for f in fields(first)]
-        parts = {n: map_trees(function, *(getattr(tree, n) for tree in trees)) for n in names}
-        return type(first)(**parts)
-    return function(*trees)
-
-
-def join_trees(trees: Sequence[Any]) -> Any:
-    """Concatenate trees of ``[S_i, ...]``."""
-    return map_trees(lambda *tensors: torch.cat(tensors), *trees)
-
-
-def rows_of(tree: Any, rows: torch.Tensor) -> Any:
-    """Some rows of a tree of ``[S, ...]``."""
-    return map_trees(lambda tensor: tensor[rows], tree)

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from symsteer.bench.demos.files import opened
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.film import write_video
+from symsteer.bench.sim.trees import map_trees, rows_of
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.picture import CAMERA
 
@@ -76,7 +77,8 @@ def _frames(
             for episode, length in enumerate(lengths):
                 states = _arrays(file[f"traj_{episode}/env_states"])
                 for step in range(length):
-                    env.set_state_dict(_row(states, step))
+                    row = rows_of(states, slice(step, step + 1))
+                    env.set_state_dict(map_trees(torch.from_numpy, row))
                     yield episode, env.render()[0].cpu().numpy()[..., :3]
     finally:
         env.close()
@@ -86,14 +88,4 @@ def _arrays(group: h5py.Group) -> dict[str, Any]:
     return {
         key: _arrays(value) if isinstance(value, h5py.Group) else np.asarray(value)
         for key, value in group.items()
-    }
-
-
-def _row(states: dict[str, Any], step: int) -> dict[str, Any]:
-    """The state of one environment at one step."""
-    return {
-        key: _row(value, step)
-        if isinstance(value, dict)
-        else torch.from_numpy(value[step : step + 1])
-        for key, value in states.items()
     }

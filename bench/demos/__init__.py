@@ -8,13 +8,4 @@ from symsteer.bench.demos.collect import CLEAN, DIVERSE, MODES, Diversity, colle
 from symsteer.bench.demos.files import FORMAT
 from symsteer.bench.demos.load import Demonstrations, load
 
-__all__ = [
-    "CLEAN",
-    "DIVERSE",
-    "FORMAT",
-    "MODES",
-    "Demonstrations",
-    "Diversity",
-    "collect",
-    "load",
-]
+__all__ = ["CLEAN", "DIVERSE", "FORMAT", "MODES", "Demonstrations", "Diversity", "collect", "load"]

@@ -18,6 +18,7 @@ import torch
 
 from symsteer.bench.demos.files import write
 from symsteer.bench.sim.environment import Simulator
+from symsteer.bench.sim.trees import map_trees
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
@@ -165,7 +166,7 @@ def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[Atte
             obs=np.stack([o[i] for o in observations[: end + 1]]),
             actions=np.stack([a[i] for a in actions[:end]]),
             rewards=np.stack([r[i] for r in rewards[:end]]),
-            states=_stack_row(states[: end + 1], i),
+            states=map_trees(lambda *x, i=i: np.stack([s[i] for s in x]), *states[: end + 1]),
         )
         for i, end in enumerate(length)
         if end > 0
@@ -204,16 +205,4 @@ def _disturbances(
 
 def _numpy(tree: Any) -> Any:
     """A copy on the host: the simulation reuses its buffers."""
-    if isinstance(tree, dict):
-        return {key: _numpy(value) for key, value in tree.items()}
-    return tree.detach().cpu().numpy().copy()
-
-
-def _stack_row(states: list[dict[str, Any]], row: int) -> dict[str, Any]:
-    """States of environment ``row`` over time, ``[T + 1, ...]`` arrays."""
-    return {
-        key: _stack_row([state[key] for state in states], row)
-        if isinstance(value, dict)
-        else np.stack([state[key][row] for state in states])
-        for key, value in states[0].items()
-    }
+    return map_trees(lambda tensor: tensor.detach().cpu().numpy().copy(), tree)

@@ -15,6 +15,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, field_validator
 
 from symsteer.bench.demos.files import SEAL, checksum, opened
+from symsteer.bench.sim.trees import map_trees, rows_of
 from symsteer.bench.tasks import check_embodiment, make, task_class, task_name
 from symsteer.bench.tasks.embodiments import BODIES
 from symsteer.errors import UserError, first_problem
@@ -216,11 +217,8 @@ def _read_group(path: Path, file: h5py.File, record: dict[str, Any], own: bool) 
     else:
         read["states"] = {
             kind: {key: np.asarray(value, np.float32) for key, value in group[path_].items()}
-            for kind, path_ in (
-                ("actors", "env_states/actors"),
-                ("articulations", "env_states/articulations"),
-            )
-            if path_ in group
+            for kind in ("actors", "articulations")
+            if (path_ := f"env_states/{kind}") in group
         }
     return read
 
@@ -264,12 +262,7 @@ def _rebuild_observations(
         for start in range(0, total, _REBUILD_BATCH):
             # The last batch is filled up with the last state.
             index = np.arange(start, start + _REBUILD_BATCH).clip(max=total - 1)
-            env.set_state_dict(
-                {
-                    kind: {key: torch.from_numpy(value[index]) for key, value in tree.items()}
-                    for kind, tree in states.items()
-                }
-            )
+            env.set_state_dict(map_trees(torch.from_numpy, rows_of(states, index)))
             rows.append(env.get_obs().cpu().numpy()[: total - start].copy())
         group["obs"] = np.concatenate(rows)
     env.close()

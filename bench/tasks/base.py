@@ -27,6 +27,7 @@ from symsteer.bench.sim.rotations import (
     transform_angular,
     transform_quaternion,
 )
+from symsteer.bench.sim.trees import rows_of
 from symsteer.bench.tasks.embodiments import BODIES, Embodiment
 from symsteer.bench.tasks.experts import Intent
 from symsteer.bench.tasks.floating import ACTION_LAYOUT
@@ -89,11 +90,15 @@ class SymmetricTask(GymEnv):
     """Whether a decision follows the next observation. If not, a task that needs cameras may report
     what it saw last, but for episodes at their time limit."""
     observation_layout: ClassVar[Layout]
+    _gripper_layout: ClassVar[Layout]
+    _task_layout: ClassVar[Layout]
     _main_seed: list[int]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "task_fields" in cls.__dict__:
+            cls._gripper_layout = Layout(cls.gripper_fields)
+            cls._task_layout = Layout(cls.task_fields)
             cls.observation_layout = Layout([*cls.gripper_fields, *cls.task_fields])
 
     def __init__(
@@ -207,10 +212,6 @@ class SymmetricTask(GymEnv):
             "gripper_width": width,
         }
 
-    @functools.cached_property
-    def _gripper_layout(self) -> Layout:
-        return Layout(self.gripper_fields)
-
     def seen(self, pose: Pose, role: Role) -> Pose:
         """A true pose as the observation reports it: variants of perception distort it.
 
@@ -227,10 +228,6 @@ class SymmetricTask(GymEnv):
         expected = [field.name for field in self.task_fields]
         assert list(fields) == expected, f"fields {list(fields)} are not the layout's {expected}"
         return self._reported(fields, self._task_layout)
-
-    @functools.cached_property
-    def _task_layout(self) -> Layout:
-        return Layout(self.task_fields)
 
     def _reported(self, fields: dict[str, torch.Tensor], layout: Layout) -> dict[str, torch.Tensor]:
         """The fields as variants of observation report them."""
@@ -338,10 +335,7 @@ class SymmetricTask(GymEnv):
     @functools.cached_property
     def _broken(self) -> torch.Tensor:
         """Environments in which some variant has a strength above zero, ``[N]`` bool."""
-        broken = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        for variant in self.variants:
-            broken = broken | variant.active
-        return broken
+        return torch.stack([variant.active for variant in self.variants]).any(dim=0)
 
     # ------------------------------------------------------------------ resets
 
@@ -385,7 +379,7 @@ class SymmetricTask(GymEnv):
             self._reset_rows = None
         if kept and partial is not None:
             fresh = self.agent.get_controller_state()
-            _copy_rows(fresh, kept, partial)
+            _write_rows(kept, rows_of(fresh, partial), partial)
             self.agent.set_controller_state(kept)
         return obs, info
 
@@ -448,7 +442,7 @@ class SymmetricTask(GymEnv):
         if env_idx is not None:
             # ManiSkill writes rows in the order of the environments.
             env_idx, order = torch.as_tensor(env_idx, dtype=torch.long, device=self.device).sort()
-            state = _rows(state, order)
+            state = rows_of(state, order)
         super().set_state_dict(
             {key: state[key] for key in ("actors", "articulations") if key in state}, env_idx
         )
@@ -457,12 +451,11 @@ class SymmetricTask(GymEnv):
         else:
             targets = self.agent.get_controller_state()
             if targets and "controller" in state:
-                _copy_rows_from_subset(targets, state["controller"], env_idx)
+                _write_rows(targets, state["controller"], env_idx)
             elif targets:
                 self.agent.set_controller_state({})
-                _copy_rows_from_subset(
-                    targets, _rows(self.agent.get_controller_state(), env_idx), env_idx
-                )
+                present = self.agent.get_controller_state()
+                _write_rows(targets, rows_of(present, env_idx), env_idx)
             if targets:
                 self.agent.set_controller_state(targets)
 
@@ -561,24 +554,11 @@ def _expand(seed: list[int], count: int) -> list[int]:
     return seed + np.random.RandomState(seed[0]).randint(2**31, size=count - 1).tolist()
 
 
-def _rows(tree: Any, index: torch.Tensor) -> Any:
-    return {k: _rows(v, index) for k, v in tree.items()} if isinstance(tree, dict) else tree[index]
-
-
-def _copy_rows(source: Any, target: Any, rows: torch.Tensor) -> None:
-    """Copy ``rows`` of every tensor of ``source`` into ``target``."""
-    for key, value in target.items():
-        if isinstance(value, dict):
-            _copy_rows(source[key], value, rows)
-        else:
-            value[rows] = source[key][rows]
-
-
-def _copy_rows_from_subset(target: Any, source: Any, rows: torch.Tensor) -> None:
+def _write_rows(target: Any, source: Any, rows: torch.Tensor) -> None:
     """Write ``source``, whose tensors have one row per entry of ``rows``, into those rows."""
     for key, value in target.items():
         if isinstance(value, dict):
-            _copy_rows_from_subset(value, source[key], rows)
+            _write_rows(value, source[key], rows)
         else:
             value[rows] = torch.as_tensor(source[key], device=value.device, dtype=value.dtype)
 

@@ -175,11 +175,8 @@ class Floating(Embodiment):
         )
 
     def transform_controller(self, state: dict, angle: float, reflect: bool) -> dict:
-        target = state["root"]["target_qpos"]
-        return {
-            **state,
-            "root": {"target_qpos": self._transform_root_joints(target, angle, reflect)},
-        }
+        turned = self._transform_root_joints(state["root"]["target_qpos"], angle, reflect)
+        return {**state, "root": {"target_qpos": turned}}
 
     def shift_robot(self, state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
         moved = state.clone()

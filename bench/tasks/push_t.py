@@ -10,10 +10,10 @@ import torch
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.utils.structs import Actor, Pose
 
-from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
+from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, grasp_at, yaw_along
-from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose
+from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose, goal_disc_pose
 from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
 from symsteer.policies.geometry import Field, Layout
 
@@ -80,10 +80,8 @@ class PushT(SymmetricTask, PushTEnv):
         xy, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
         self.tee.set_pose(flat_pose(xy, self.half_thickness, yaw, self.device))
         xy, yaw = disc(u[:, 3:5], self.goal_spawn_radius), yaw + self.max_turn * (2 * u[:, 5] - 1)
-        goal = flat_pose(xy, 1e-3, yaw, self.device)
-        self.goal_tee.set_pose(goal)
-        flat = goal.q.new_tensor([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]).expand_as(goal.q)
-        self.ee_goal_pos.set_pose(Pose.create_from_pq(goal.p, quaternion_multiply(goal.q, flat)))
+        self.goal_tee.set_pose(flat_pose(xy, 1e-3, yaw, self.device))
+        self.ee_goal_pos.set_pose(goal_disc_pose(xy, yaw, self.device))
 
     @property
     def manipulated(self) -> Actor:

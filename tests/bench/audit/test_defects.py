@@ -18,7 +18,7 @@ from symsteer.bench.audit.report import (
     to_markdown,
 )
 from symsteer.bench.audit.result import VERSION, AuditResult, AuditSettings
-from symsteer.bench.audit.states import map_trees
+from symsteer.bench.sim.trees import map_trees
 from symsteer.bench.variants import VARIANTS
 from tests.bench.state_tasks import STATE_TASKS
 

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from symsteer.bench.audit.result import check_group
-from symsteer.bench.audit.states import Turner, map_trees, visit
+from symsteer.bench.audit.states import Turner, visit
 from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
+from symsteer.bench.sim.trees import map_trees
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
