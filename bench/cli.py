@@ -6,9 +6,10 @@ imported inside the functions, so that help, ``list`` and ``doctor`` do not wait
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -21,6 +22,12 @@ from symsteer.terminal import BOARD, complain, folded, printable, to_paste
 
 if TYPE_CHECKING:
     from symsteer.registry import Registry
+
+Trust = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(help="Code of other authors that files name, as module:Class; it is executed."),
+]
+"""The option with which a user consents to code that files name."""
 
 
 def run(arguments: list[str]) -> int:
@@ -52,7 +59,7 @@ def resume(
     workers: int = 1,
     track: Literal["wandb"] | None = None,
     quiet: bool = False,
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Continue a run that was stopped, from its last checkpoint.
 
@@ -63,7 +70,6 @@ def resume(
         workers: Processes that share the simulation; they change nothing in the record but times.
         track: Show the run in Weights & Biases, too; it continues there as well.
         quiet: No progress bars.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(*trust)
     from symsteer.bench.runs.run import resume
@@ -83,7 +89,7 @@ def reproduce(
     into: Path | None = None,
     workers: int = 1,
     quiet: bool = False,
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Make a run again from its record, and say what agrees (docs/runner.md).
 
@@ -103,7 +109,6 @@ def reproduce(
             reproduction.json, the new record, and the line for the list of the study.
         workers: Processes that share the simulation.
         quiet: No progress bars.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(*trust)
     from symsteer.bench.runs.reproduce import reproduce, text
@@ -120,7 +125,7 @@ def evaluate(
     episodes: int | None = None,
     workers: int = 1,
     json: bool = False,
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Play held-out episodes with the last checkpoint of a run, in its own variant or another.
 
@@ -132,7 +137,6 @@ def evaluate(
         episodes: Number of held-out episodes; default: as many as the record's final ones.
         workers: Processes that share the simulation.
         json: Print only JSON, with every episode and diagnostic.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(variant, *trust)
     from json import dumps
@@ -168,7 +172,7 @@ def film(
     variant: str | None = None,
     episodes: int = 3,
     out: Path | None = None,
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Film held-out episodes with the last checkpoints of runs.
 
@@ -181,7 +185,6 @@ def film(
         episodes: Number of held-out episodes.
         out: The film, .mp4 or .gif; default: an .mp4 in the run's folder, for several runs beside
             the first one.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(variant, *trust)
     from symsteer.bench.runs.film import film
@@ -204,7 +207,7 @@ def sweep(
     together: int = 1,
     track: Literal["wandb"] | None = None,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Run all runs of a suite; the same command continues a sweep that was stopped.
 
@@ -220,7 +223,6 @@ def sweep(
             differ in seeds and variants alone.
         track: Show the runs in Weights & Biases, too, in a group with the name of the suite.
         dry_run: Only show which runs are left and how long they may take.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(*trust)
     from dataclasses import replace
@@ -260,7 +262,7 @@ def tune(
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
     together: int = 1,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Search for the best settings of agents, with the same number of trials for each.
 
@@ -274,20 +276,13 @@ def tune(
         together: Runs of a trial that share a process and are trained as one, which is faster, if
             they differ in seeds and variants alone.
         dry_run: Only show what would be tried.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(*trust)
     from symsteer.bench.tuning.plan import read_plan
 
     found = read_plan(plan)
-    try:
+    with _extra("tune", "optuna", "tuning needs Optuna"):
         from symsteer.bench.tuning.command import Tuner, preview
-    except ModuleNotFoundError as error:
-        if error.name != "optuna":
-            raise
-        raise UserError(
-            'tuning needs Optuna; install it with: pip install "symsteer[tune]"'
-        ) from error
     if dry_run:
         print(preview(found))
         return 0
@@ -450,7 +445,7 @@ def export(
     policy: str | None = None,
     runs: Path = Path("runs"),
     videos: Literal["auto", "on", "off"] = "auto",
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Write a base policy and its demonstrations to one file, or demonstrations for LeRobot.
 
@@ -471,7 +466,6 @@ def export(
         policy: Base policy (default edp); `symsteer list` names them.
         runs: Folder of runs; demonstrations and policies of settings are kept in RUNS/base.
         videos: Whether a LeRobot dataset has a video; auto: where a Vulkan driver works.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(task, policy, *trust)
     from symsteer.bench.bundles.bundle import check_path, write_bundle
@@ -494,7 +488,9 @@ def export(
         check_path(out)
         wanted = contents
     else:
-        write_dataset = _lerobot(out)
+        with _extra("lerobot", "pyarrow", "a LeRobot dataset needs pyarrow"):
+            from symsteer.bench.bundles.lerobot import check_folder, write_dataset
+        check_folder(out)
         wanted = "demonstrations"
     prepare_folder(out.parent)
     if run is not None:
@@ -518,24 +514,8 @@ def export(
     return 0
 
 
-def _lerobot(out: Path) -> Callable[..., str]:
-    """The function that writes datasets, once its package and its folder are as it needs them."""
-    try:
-        from symsteer.bench.bundles.lerobot import check_folder, write_dataset
-    except ModuleNotFoundError as error:
-        if error.name != "pyarrow":
-            raise
-        raise UserError(
-            'a LeRobot dataset needs pyarrow; install it with: pip install "symsteer[lerobot]"'
-        ) from error
-    check_folder(out)
-    return write_dataset
-
-
 def fetch_bundle(
-    file: Annotated[Path, tyro.conf.arg(metavar="FILE")],
-    /,
-    out: Path = Path("runs/base"),
+    file: Annotated[Path, tyro.conf.arg(metavar="FILE")], /, out: Path = Path("runs/base")
 ) -> int:
     """Check a bundle and unpack it to where runs find its demonstrations and base policy.
 
@@ -585,7 +565,7 @@ def audit(
     json: bool = False,
     rollouts: int = 0,
     actions: Literal["expert", "random", "policy"] = "expert",
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Measure how broken the symmetry of a task is, in simulation (docs/audit.md).
 
@@ -613,7 +593,6 @@ def audit(
         rollouts: If above 0: compare this many whole episodes of the floating gripper with their
             turned copies instead.
         actions: Who acts in these episodes.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(*task, *variant, *trust)
     from json import dumps
@@ -662,7 +641,7 @@ def detect(
     seed: int = 0,
     out: Path | None = None,
     json: bool = False,
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Score detectors of broken symmetry on the decisions of runs (docs/detect.md).
 
@@ -679,7 +658,6 @@ def detect(
         out: Folder for detect.json and detect.png; of several runs, each has its own folder there,
             beside summary.json and summary.md.
         json: Print only JSON.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(*detector, *trust)
     from json import dumps
@@ -807,6 +785,18 @@ def doctor(quiet: bool = False) -> int:
         if not check.ok and check.cure:
             print(f"{'':26s} -> {check.cure}")
     return 0 if all(check.ok or not check.required for check in checks) else 1
+
+
+@contextlib.contextmanager
+def _extra(extra: str, package: str, problem: str) -> Iterator[None]:
+    """Name the extra to install if a package that is imported inside is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        cure = f'install it with: pip install "symsteer[{extra}]"'
+        raise UserError(f"{problem}; {cure}") from error
 
 
 def _tell(line: str) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from symsteer.bench.cli import Trust
 from symsteer.errors import UserError
 from symsteer.registry import allow
 from symsteer.terminal import printable
@@ -34,7 +35,7 @@ def advise(
     states: int = 32,
     runs: Path = Path("runs"),
     json: Path | None = None,
-    trust: tuple[str, ...] = (),
+    trust: Trust = (),
 ) -> int:
     """Say which agent to take in a world, and how sure that is (docs/advise.md).
 
@@ -53,7 +54,6 @@ def advise(
         states: States of the expert and of the base policy, each, of an audit that is measured.
         runs: Folder of the runs; base policies of an audit that is measured are kept in RUNS/base.
         json: Write everything into this file, too.
-        trust: Code of other authors that files name, as module:Class; it is executed.
     """
     allow(task, variant, *trust)
     if [task, audit, detection].count(None) != 2:
