@@ -26,7 +26,7 @@ from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.paper import ROW_ORDER
-from symsteer.leaderboard.records import BasePolicy, RunRecord, read_record
+from symsteer.leaderboard.records import RunRecord, read_record
 from symsteer.leaderboard.statistics import (
     Interval,
     Sample,
@@ -134,9 +134,9 @@ def gain(runs: Sequence[RunRecord], others: Sequence[RunRecord]) -> Interval | N
         task, seed = run.settings.task, run.settings.seed
         rival = rivals.get((task, seed))
         if rival and rival.final and run.final:
+            both = (rival.final.episodes, run.final.episodes)
             theirs, own = (
-                dict(zip(found.seed, map(float, found.success_once), strict=True))
-                for found in (rival.final.episodes, run.final.episodes)
+                dict(zip(found.seed, map(float, found.success_once), strict=True)) for found in both
             )
             pairs = ((episode, own[episode] - theirs[episode]) for episode in own)
             cells[task].append(Sample.pooled(pairs, f"{task} {seed}"))
@@ -271,12 +271,10 @@ def properties(base: Sequence[RunRecord], count: int = STEERED) -> str:
     """Size, symmetry and steerability of each policy, over tasks and trainings."""
     rows = []
     for name, found in _trained(base, count).items():
-        policies = [record.base_policy for record in found]
-        sizes = _known(policies, "parameters")
-        row = [name, str(len(found)), f"{statistics.median(sizes):,.0f}" if sizes else "-"]
-        row.append(_seconds(found))
+        row = [name, str(len(found)), _median(found, "parameters")]
+        row.append(_median(found, "training_seconds"))
         for measure, form in MEASURES.items():
-            row.append(_range([form.format(value) for value in _known(policies, measure)]))
+            row.append(_range([form.format(value) for value in _known(found, measure)]))
         rows.append(row)
     head = ["policy", "trainings", "parameters", "training, s"]
     head += ["equivariance error", "jump", "spread", "solvable"]
@@ -314,17 +312,17 @@ def pairs(records: Sequence[RunRecord]) -> str:
     for name, other in PAIRS:
         if name in cells and other in cells:
             own, theirs = cells[name], cells[other]
-            row = [name, _seconds(own["base"]), other, _seconds(theirs["base"])]
+            first, second = (_median(runs["base"], "training_seconds") for runs in (own, theirs))
+            row = [name, first, other, second]
             gained = [gain(own.get(agent, ()), theirs.get(agent, ())) for agent in agents]
             rows.append([*row, *map(difference, gained)])
     head = ["policy", "training, s", "minus", "training, s", *(f"`{agent}`" for agent in agents)]
     return table(head, rows) if rows else ""
 
 
-def _seconds(found: Sequence[RunRecord]) -> str:
-    """Median of the trainings' seconds."""
-    seconds = _known([record.base_policy for record in found], "training_seconds")
-    return f"{statistics.median(seconds):,.0f}" if seconds else "-"
+def _median(found: Sequence[RunRecord], measure: str) -> str:
+    values = _known(found, measure)
+    return f"{statistics.median(values):,.0f}" if values else "-"
 
 
 def _trained(base: Sequence[RunRecord], count: int = STEERED) -> Mapping[str, list[RunRecord]]:
@@ -346,9 +344,8 @@ def steered(records: Sequence[RunRecord]) -> str:
     for (name, task), found in cells.items():
         if len(found) < 2:
             continue
-        shared = set.intersection(
-            *({run.base_policy.content_hash for run in runs} for runs in found.values())
-        )
+        hashes = [{run.base_policy.content_hash for run in runs} for runs in found.values()]
+        shared = set.intersection(*hashes)
         row = [name, task.removesuffix("-v1"), str(len(shared))]
         for agent in agents:
             runs = [r for r in found.get(agent, ()) if r.base_policy.content_hash in shared]
@@ -430,8 +427,8 @@ def _interval(found: Interval) -> str:
     return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
 
 
-def _known(policies: Sequence[BasePolicy], measure: str) -> list[float]:
-    return sorted(v for policy in policies if (v := getattr(policy, measure)) is not None)
+def _known(found: Sequence[RunRecord], measure: str) -> list[float]:
+    return sorted(v for run in found if (v := getattr(run.base_policy, measure)) is not None)
 
 
 def _range(values: Sequence[str]) -> str:
@@ -440,12 +437,8 @@ def _range(values: Sequence[str]) -> str:
 
 def finished(folder: Path) -> dict[str, Path]:
     """Paths of the finished runs' records below a folder, by run."""
-    found = {}
-    for path in sorted(folder.glob("*/record.json")):
-        record = read_record(path)
-        if record.status == "finished":
-            found[record.run_id] = path
-    return found
+    records = {path: read_record(path) for path in sorted(folder.glob("*/record.json"))}
+    return {run.run_id: path for path, run in records.items() if run.status == "finished"}
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:

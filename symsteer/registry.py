@@ -141,12 +141,9 @@ class Registry(Generic[T]):
         Raises:
             UserError: if there is no such name, or two distributions offer it.
         """
-        if name in self.builtin:
+        if name in self:
             self._refuse_twins(name)
-            return self.builtin[name]
-        if name in self._entry_points():
-            self._refuse_twins(name)
-            return self._entry_points()[name][0].value
+            return self.builtin.get(name) or self._entry_points()[name][0].value
         if TARGET.fullmatch(name):
             return name
         raise unknown(self.kind, name, self.names())
@@ -227,8 +224,8 @@ class Registry(Generic[T]):
         self.get(name)
         target = self.target(name)
         package = target.partition(":")[0].partition(".")[0]
-        found = [points[0].dist for n, points in self._entry_points().items() if n == name]
-        distribution = found[0] if found else _distribution_of(package)
+        points = self._entry_points().get(name)
+        distribution = points[0].dist if points else _distribution_of(package)
         return Extension(
             self.kind,
             name,

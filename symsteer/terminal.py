@@ -21,7 +21,6 @@ BOARD = "http://localhost:6006/#custom_scalars&_smoothingWeight=0"
 LONGEST_LINE = 900
 """Characters of an error message; the middle of a longer one is left out."""
 
-
 NARROWEST = 20
 """Columns; in a terminal of fewer the help would never end."""
 

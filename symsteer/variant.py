@@ -46,12 +46,13 @@ class VariantSpec:
     rise: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not all(isinstance(value, Real) and 0 <= value <= 1 for value in self._strengths):
+        strengths: tuple[float, ...] = _as_tuple(self.strength)
+        if not all(isinstance(value, Real) and 0 <= value <= 1 for value in strengths):
             raise UserError(
                 f"the strength of variant {self.name!r} must lie in [0, 1], one number or one per "
                 f"environment; it is {self.strength}"
             )
-        if self.low is not None and not 0 <= self.low < self._strengths[0]:
+        if self.low is not None and not 0 <= self.low < strengths[0]:
             raise UserError(
                 f"the strengths of variant {self.name!r} must be a range such as 0.2..0.8 within "
                 f"[0, 1]; they are {self.low:g}..{self.strength}"
@@ -61,10 +62,6 @@ class VariantSpec:
                 f"variant {self.name!r} must begin within the budget, at a share in (0, 1], and "
                 f"reach its strength by its end, e.g. {self.name}:1@0.5 or {self.name}:1@0.25..0.75"
             )
-
-    @property
-    def _strengths(self) -> tuple[float, ...]:
-        return _as_tuple(self.strength)
 
     @property
     def changes_nothing(self) -> bool:

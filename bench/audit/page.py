@@ -59,14 +59,9 @@ def _overview(rows: Sequence[dict[str, Any]]) -> str:
     """Range of each component over the tasks, one row for each embodiment and variant."""
     head = ["variant", "tasks", "decision", "tool", "object", "cost", "observed", "resets"]
     lines = ["| " + " | ".join(head) + " |", "|---|" + "--:|" * (len(head) - 1)]
-    for embodiment, group, variant in dict.fromkeys(
-        (r["embodiment"], r["group"], r["variant"]) for r in rows
-    ):
-        own = [
-            r
-            for r in rows
-            if (r["embodiment"], r["group"], r["variant"]) == (embodiment, group, variant)
-        ]
+    for place in dict.fromkeys((r["embodiment"], r["group"], r["variant"]) for r in rows):
+        own = [r for r in rows if (r["embodiment"], r["group"], r["variant"]) == place]
+        embodiment, group, variant = place
         name = "unbroken" if variant == "none" else f"`{variant}`"
         if (embodiment, group) != ("floating", "C8"):
             name = f"{embodiment}, {group}, {name}"

@@ -52,7 +52,8 @@ def text(result: AuditResult) -> str:
                 continue
             name = body if subset == "all" else f"{body}, where it moves"
             lines.append(f"{name:26s} {_relative(defect)}")
-            lines.append(f"{'':26s} {_millimetres(defect)}, {_number(defect.degrees, 2)} degrees")
+            mm = f"{_number(defect.mm, 2)} of {defect.displacement_mm:.1f} mm"
+            lines.append(f"{'':26s} {mm}, {_number(defect.degrees, 2)} degrees")
     floors = [result.defect(b) for b in ("tool", "object")]  # type: ignore[arg-type]
     lines.append(
         f"{'floor (rounding alone)':26s} "
@@ -146,10 +147,6 @@ def _largest(result: AuditResult) -> str | None:
 def _relative(defect: Defect) -> str:
     directions = {"horizontal": defect.horizontal, "vertical": defect.vertical}
     return ", ".join(f"{k} {_percent(v) if v else 'at rest'}" for k, v in directions.items())
-
-
-def _millimetres(defect: Defect) -> str:
-    return f"{_number(defect.mm, 2)} of {defect.displacement_mm:.1f} mm"
 
 
 def _short_percent(value: float) -> str:

@@ -191,11 +191,7 @@ class AuditResult:
     seconds: float = 0.0
     version: int = field(default=VERSION)
 
-    def defect(
-        self,
-        body: Literal["tool", "object"],
-        subset: str = "all",
-    ) -> Defect | None:
+    def defect(self, body: Literal["tool", "object"], subset: str = "all") -> Defect | None:
         """An entry of ``dynamics``, or None if the subset has too few states."""
         rows = (d for d in self.dynamics if (d.body, d.subset) == (body, subset))
         return next(rows, None)

@@ -126,15 +126,7 @@ def _write_tables(
     pixels: Sequence[np.ndarray] | None,
     out: Path,
 ) -> None:
-    """The frames, and all that LeRobot wants to know about them.
-
-    Args:
-        config: task and embodiment.
-        columns: all frames.
-        lengths: frames of each episode.
-        pixels: of each episode, for statistics; None without a video.
-        out: folder of the dataset.
-    """
+    """The frames, and all that LeRobot wants to know about them; ``pixels`` for statistics."""
     described = _features(config, columns, pixels is not None)
     instruction = TASKS.summary(config.task)
     ends = np.cumsum(lengths).tolist()

@@ -8,11 +8,7 @@ from typing import Any
 import torch
 from scipy.stats import binomtest
 
-from symsteer.bench.runs.base_study import (
-    held_out_episodes,
-    unbroken,
-    visited_states,
-)
+from symsteer.bench.runs.base_study import held_out_episodes, unbroken, visited_states
 from symsteer.bench.runs.config import RunConfig
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group

@@ -88,10 +88,8 @@ def _line(*cells: str) -> str:
 def summary_text(rows: Sequence[dict[str, Any]]) -> str:
     """Tables of several runs, in markdown; one for each world."""
     parts = []
-    for world in dict.fromkeys(
-        (r["task"], r["embodiment"], r["variant"], r["group"]) for r in rows
-    ):
-        own = [r for r in rows if (r["task"], r["embodiment"], r["variant"], r["group"]) == world]
+    for world in dict.fromkeys(tuple(row[name] for name in WORLD) for row in rows):
+        own = [row for row in rows if tuple(row[name] for name in WORLD) == world]
         task, embodiment, variant, group = world
         decisions, broken = own[0]["decisions"], own[0]["broken"]
         parts.append(

@@ -136,15 +136,8 @@ def detect(
             f"there is no {policy_path(folder)}; restore it from where the run was made"
         )
     policy = policy.to("cpu")
-    settings = AuditSettings(
-        config.task,
-        config.embodiment,
-        config.variant,
-        group,
-        count=count,
-        chunk=policy.execute,
-        seed=seed,
-    )
+    world = config.task, config.embodiment, config.variant, group
+    settings = AuditSettings(*world, count=count, chunk=policy.execute, seed=seed)
     truth = measure_truth(settings, policy)
     report(f"truth: {int(truth.broken.sum())} of {int(truth.reached.sum())} copies are broken")
     context = AgentContext.of(policy, seed=seed)
@@ -214,11 +207,5 @@ def _detection(
             return None
         return Measure.of(value, np.array([statistic(chosen) for chosen in draws]))
 
-    return Detection(
-        detector,
-        score,
-        measured(of_orbits),
-        measured(of_copies),
-        measured(correlation),
-        scores,
-    )
+    measures = (measured(of_orbits), measured(of_copies), measured(correlation))
+    return Detection(detector, score, *measures, scores)
