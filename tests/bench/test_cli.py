@@ -251,6 +251,7 @@ def test_commands_can_be_pasted(monkeypatch, capsys, tmp_path):
     assert symsteer(monkeypatch, "status", out) == 0
     *_, command = capsys.readouterr().out.partition("start some: ")
     assert shlex.split(command) == ["symsteer", "sweep", "SUITE", "--out", str(out)]
+    write_record(make_record(), out / "run" / "record.json")
     bench.cli._print_places(out / "run")
     board, page = capsys.readouterr().out.splitlines()[1:]
     assert shlex.split(board)[1:4] == ["tensorboard", "--logdir", str(out)]

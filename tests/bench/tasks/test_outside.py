@@ -7,8 +7,11 @@ from symsteer.bench.demos import collect, load
 from symsteer.bench.tasks import TASKS, gym_id, make, task_class
 from symsteer.bench.tasks.registration import register
 from symsteer.errors import UserError
+from symsteer.registry import allow
 
 TARGET = "tests.bench.tasks.lab:NearPick"
+
+allow(TARGET)
 
 
 def test_a_class_is_named_by_its_module():

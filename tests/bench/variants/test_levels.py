@@ -7,6 +7,7 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.tasks import make
 from symsteer.bench.variants.levels import LEVELS, points_of, strength, table, with_numbers
 from symsteer.errors import UserError
+from symsteer.registry import allow
 
 PLACE = ("PushCube-v1", "floating")
 
@@ -92,6 +93,7 @@ def test_runs_audits_and_environments_take_levels():
     ],
 )
 def test_levels_that_do_not_exist(task, embodiment, variant, words):
+    allow(task)
     with pytest.raises(UserError, match=words):
         RunConfig(task=task, embodiment=embodiment, variant=variant)
 
