@@ -8,6 +8,7 @@ lost. Then it is given again, until the program ends; also if it was lost in a d
 # Built in: an import that takes time could be interrupted before there is a handler.
 import _signal
 import _thread
+import atexit
 import os
 import sys
 
@@ -78,6 +79,13 @@ def _is_cleaning_up() -> bool:
     return error is not None
 
 
+def _ignore_signals() -> None:
+    for number in SIGNALS:
+        _signal.signal(number, _signal.SIG_IGN)
+
+
+# The first to be registered is the last that is called: all is done then.
+atexit.register(_ignore_signals)
 for _number in SIGNALS:
     # What the caller ignores stays ignored.
     if _signal.getsignal(_number) is not _signal.SIG_IGN:

@@ -319,9 +319,11 @@ def _load(target: str, what: str) -> Any:
         raise
     # Importing a file can raise any exception.
     except Exception as error:
+        missing = isinstance(error, ModuleNotFoundError)
+        cure = "install it, or name its folder in PYTHONPATH" if missing else "correct or remove it"
         raise UserError(
             f"{what} cannot be imported from {module_name} ({type(error).__name__}: "
-            f"{error}{_line(error, module_name)}); correct or remove it"
+            f"{error}{_line(error, module_name)}); {cure}"
         ) from error
     if not hasattr(module, attribute):
         raise UserError(f"{what} cannot be found: {module_name} has no {attribute}; check the name")

@@ -341,6 +341,13 @@ def _opened(
             yield trainer
         except BaseException as error:
             trainer.stop(error)
-            how = ("--workers", workers) if workers > 1 else ()
+            names = (
+                config.agent,
+                config.policy_name,
+                config.task,
+                *(v.name for v in config.variants),
+            )
+            typed = [name for name in names if ":" in name]
+            how = ("--workers", workers) * (workers > 1) + ("--trust", *typed) * bool(typed)
             error.add_note(f"continue the run with: {to_paste('symsteer', 'resume', folder, *how)}")
             raise
