@@ -8,7 +8,6 @@ lost. Then it is given again, until the program ends; also if it was lost in a d
 # Built in: an import that takes time could be interrupted before there is a handler.
 import _signal
 import _thread
-import atexit
 import os
 import sys
 
@@ -84,8 +83,6 @@ def _ignore_signals() -> None:
         _signal.signal(number, _signal.SIG_IGN)
 
 
-# The first to be registered is the last that is called: all is done then.
-atexit.register(_ignore_signals)
 for _number in SIGNALS:
     # What the caller ignores stays ignored.
     if _signal.getsignal(_number) is not _signal.SIG_IGN:
@@ -98,6 +95,10 @@ def main() -> int:
     Returns:
         The exit code: that of :func:`symsteer.cli.main`; 130 after Ctrl-C, 143 after SIGTERM.
     """
+    import atexit
+
+    # The first to be registered is the last that is called: all is done then.
+    atexit.register(_ignore_signals)
     # Processes that Python starts for this one do not look into the current folder either.
     os.environ["PYTHONSAFEPATH"] = "1"
     report = sys.unraisablehook
