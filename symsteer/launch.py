@@ -15,7 +15,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from types import FrameType
 
-SIGNALS = (_signal.SIGINT, _signal.SIGTERM)
+SIGNALS = {_signal.SIGINT: "interrupted", _signal.SIGTERM: "terminated"}
+"""What is said of each."""
 
 REMIND_SECONDS = 0.2
 
@@ -41,7 +42,8 @@ def _receive(number: int, frame: "FrameType | None") -> None:
     else:
         _State.number, _State.count = number, _State.count + 1
         if _State.ended or _State.count >= PATIENCE:
-            os.write(2, b"interrupted\n" * (_State.count == 1))
+            if not _State.ended or _State.count == 1:
+                os.write(2, f"{SIGNALS[number]}\n".encode())
             os._exit(128 + number)
         if _State.count == 1:
             _thread.start_new_thread(_remind, ())
@@ -121,5 +123,4 @@ def main() -> int:
         return code
     from symsteer.terminal import complain
 
-    word = "interrupted" if _State.number == _signal.SIGINT else "terminated"
-    return complain(interruption, word, 128 + _State.number)
+    return complain(interruption, SIGNALS[_State.number], 128 + _State.number)
