@@ -90,11 +90,11 @@ def test_a_signal_ends_the_program_with_one_sentence(program, tmp_path, index):
 
 
 @pytest.mark.slow
-def test_200_signals_lose_nothing(program, tmp_path):
-    """Spread over the program's life; each tenth time it goes on, and its record is as ever."""
-    for index in range(200):
+def test_signals_at_any_time_lose_nothing(program, tmp_path):
+    """A hundred over the life of each program; each tenth time it goes on, with its own record."""
+    for index in range(100):
         place = tmp_path / str(index)
-        if interrupted(program, place, index, 200) and index % 10 == 5:
+        if interrupted(program, place, index, 100) and index % 10 == 5:
             child = start(*program[0], watch="", cwd=place)
             child.communicate(timeout=300)
             whole = program[3]
