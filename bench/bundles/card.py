@@ -132,6 +132,6 @@ def _measured_table(measured: Measured) -> str:
         "spread of the actions over the noise": (
             f"{found['action_std']:.2f} of the demonstrations' standard deviation"
         ),
-        **({"warning": found["warning"]} if found["warning"] else {}),
+        **({"warning": found["warning"]} if found.get("warning") else {}),
     }
     return "\n".join(["| | |", "| :-- | :-- |", *(f"| {k} | {v} |" for k, v in rows.items())])

@@ -10,6 +10,7 @@ from scipy.stats import binomtest
 
 from symsteer.bench.runs.base_study import held_out_episodes, unbroken, visited_states
 from symsteer.bench.runs.config import RunConfig
+from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
 from symsteer.policies.steerability import decode_error
@@ -51,7 +52,16 @@ def measure(config: RunConfig, policy: ChunkPolicy) -> Measured:
         config: task, embodiment, seed of the noise and number of episodes
             (``evaluation.final_episodes``).
         policy: the base policy, on the CPU.
+
+    Raises:
+        UserError: if a part of the policy's steerability report is missing.
     """
+    report = policy.report.get("steerability") or {}
+    if None in map(report.get, ("solvable", "states", "draws", "action_std")):
+        raise UserError(
+            "the file of the base policy lacks a part of its steerability report, which the card "
+            "shows; export it from the run that made it"
+        )
     seed, episodes = config.policy_seed, config.evaluation.final_episodes
     with unbroken(config, policy, episodes) as env:
         played = held_out_episodes(env, policy, seed, episodes)
@@ -65,5 +75,5 @@ def measure(config: RunConfig, policy: ChunkPolicy) -> Measured:
         episodes=episodes,
         group=str(group),
         equivariance_error=decode_error(policy, visited_states(played), group, seed),
-        steerability=policy.report["steerability"],
+        steerability=report,
     )

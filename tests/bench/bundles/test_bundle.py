@@ -162,9 +162,13 @@ def test_flags_and_lists_of_the_command_are_as_they_are_typed():
 
 def test_a_policy_without_symmetry_has_a_large_error(tmp_path):
     config = tiny_config(policy_name="plain")
-    plain = measure(config, prepare_base(config, tmp_path, progress=False))
+    policy = prepare_base(config, tmp_path, progress=False)
+    plain = measure(config, policy)
     assert plain.group == "C8"
     assert plain.equivariance_error > 1e-2
+    del policy.report["steerability"]["solvable"]
+    with pytest.raises(UserError, match="lacks a part of its steerability report"):
+        measure(config, policy)
 
 
 def test_parts_alone(run, tmp_path):
