@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -46,11 +47,23 @@ class LocalPool:
     def submit(self, function: Callable[..., Result], *args: Any) -> Future:
         """Start a task; fewer than ``capacity`` may be running."""
         pool = self._idle.pop()
-        # Ctrl-C is for the sweep, which ends its processes itself.
-        with signals_wait(signal.SIGINT, signal.SIGTERM):
+        # Ctrl-C is for the sweep, which ends its processes itself. One that is ended while it starts
+        # complains, and not on the terminal.
+        with signals_wait(signal.SIGINT, signal.SIGTERM), self._complaints_in_log():
             future = pool.schedule(function, args)
             self._busy[future] = pool
         return future
+
+    @contextlib.contextmanager
+    def _complaints_in_log(self) -> Iterator[None]:
+        terminal = os.dup(2)
+        try:
+            with open_log(self._log) as file:
+                os.dup2(file.fileno(), 2)
+            yield
+        finally:
+            os.dup2(terminal, 2)
+            os.close(terminal)
 
     def result(self, future: Future) -> Result:
         """The result of a task; a process that died is replaced."""
