@@ -47,8 +47,8 @@ class LocalPool:
     def submit(self, function: Callable[..., Result], *args: Any) -> Future:
         """Start a task; fewer than ``capacity`` may be running."""
         pool = self._idle.pop()
-        # Ctrl-C is for the sweep, which ends its processes itself. One that is ended while it starts
-        # complains, and not on the terminal.
+        # Ctrl-C is for the sweep, which ends its processes itself. A process that is ended while it
+        # starts complains, but not on the terminal.
         with signals_wait(signal.SIGINT, signal.SIGTERM), self._complaints_in_log():
             future = pool.schedule(function, args)
             self._busy[future] = pool
