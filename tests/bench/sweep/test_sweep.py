@@ -167,8 +167,8 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
     shutil.copytree(undisturbed.parent / "base", out / "base")
     # A test suite that runs in the background has its children ignore interrupts.
     program = (
-        "import signal, sys; from symsteer.cli import main; "
-        "signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from symsteer.launch import main; "
         f"sys.argv = ['symsteer', 'sweep', {path!r}, '--out', {str(out)!r}, '--workers', '1']; "
         "sys.exit(main())"
     )
