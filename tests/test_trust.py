@@ -107,7 +107,7 @@ def strangers(intact, tmp_path, monkeypatch) -> types.SimpleNamespace:
     monkeypatch.setenv("HOME", str(home))
     monkeypatch.setenv("CANARY", str(tmp_path / "CANARY"))
     monkeypatch.setenv("AUDIT", str(tmp_path / "audit"))
-    monkeypatch.setenv("HOMES", os.pathsep.join((str(place), f"{home}/.", "/dev", TEMPORARY)))
+    monkeypatch.setenv("HOMES", os.pathsep.join((f"{tempfile.gettempdir()}/", "/dev")))
     watch = tmp_path / "watch"
     watch.mkdir()
     (watch / "sitecustomize.py").write_text(WATCH)

@@ -12,6 +12,7 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from symsteer.policies import POLICIES
 from symsteer.policies.files import policy_path
+from symsteer.registry import allow
 from tests.bench.tiny_run import POLICY, tiny_config
 from tests.marks import slow_except
 
@@ -82,6 +83,7 @@ def test_tasks_that_cannot_be_joined_are_refused():
     with pytest.raises(UserError, match=r"'PushCub-v1'.*did you mean 'PushCube-v1'"):
         check(config("PickCube-v1", ("PushCub-v1",)))
     other = "tests.bench.tasks.lab:OtherActions"
+    allow(other)
     with pytest.raises(UserError, match=f"the actions of {other} have another layout than those"):
         check(config("PickCube-v1", (other,)))
 
