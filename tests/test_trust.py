@@ -111,6 +111,9 @@ def strangers(intact, tmp_path, monkeypatch) -> types.SimpleNamespace:
     watch = tmp_path / "watch"
     watch.mkdir()
     (watch / "sitecustomize.py").write_text(WATCH)
+    # It can be imported: consent alone keeps it from being executed.
+    (watch / "evilmod.py").write_text(hostile.CODE.format("evilmod") + "class Evil: pass\n")
+    monkeypatch.syspath_prepend(watch)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(map(str, (watch, ROOT))))
     artefacts = hostile.make(place, intact, intact.parent / "bundle.zip", secret)
     (tmp_path / "audit").touch()
