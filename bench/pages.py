@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from symsteer.errors import UserError
@@ -29,12 +28,6 @@ def with_tables(page: str, tables: str, name: str) -> str:
             f"{name} lacks the marks {BEGIN.strip()} and {END.strip()}; restore the page"
         )
     return f"{before}{BEGIN}\n{tables.strip()}\n\n{END}{after}"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A markdown table; the first column holds names, the others numbers."""
-    lines = [head, [":--", *("--:" for _ in head[1:])], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def check_checkout(page: Path) -> None:

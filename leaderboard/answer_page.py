@@ -17,12 +17,12 @@ from symsteer.leaderboard.text import (
     difference,
     ends,
     folded,
-    grid,
     image,
     interval,
     share,
     without_empty,
 )
+from symsteer.tables import markdown
 
 ANSWER = f"""\
 Advantage over `{STANDARD}` by what breaks the symmetry, with 95 % intervals. In brackets: the
@@ -71,7 +71,7 @@ def _glance(summary: Summary) -> str:
     for name, tallies in rivals.items():
         columns[name] = [_counts(tallies.get(agent)) for agent in diverged]
     columns["Q diverged"] = [share(sum(flags), len(flags)) for flags in diverged.values()]
-    return grid(*without_empty(columns), left=1)
+    return markdown(*without_empty(columns), left=1)
 
 
 def _diverged(summary: Summary) -> dict[str, list[bool]]:
@@ -114,7 +114,7 @@ def _gains_table(found: Sequence[Gain]) -> str:
         for kind, own in texts.items()
     ]
     header = [f"{code(agent)}: AUC,<br>success" for agent in agents]
-    return grid(["World", "Defect", "Cells", *header], rows, left=1)
+    return markdown(["World", "Defect", "Cells", *header], rows, left=1)
 
 
 def _verdicts(findings: Findings) -> str:

@@ -10,7 +10,8 @@ from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.power import POWER, needed
 from symsteer.leaderboard.study import Claim
 from symsteer.leaderboard.summary import MIN_SEEDS
-from symsteer.leaderboard.text import NOTHING, SPACE, code, compact, grid, number, stacked
+from symsteer.leaderboard.text import NOTHING, SPACE, code, compact, number, stacked
+from symsteer.tables import markdown
 
 CLAIMS = f"""\
 Effects are differences of two agents, paired by base policy and seed (success and its area by
@@ -81,7 +82,7 @@ def claims_section(findings: Findings) -> list[str]:
             "Cells, pairs, policies",
             "Verdict",
         ]
-        parts.append(grid(header, rows, left=2))
+        parts.append(markdown(header, rows, left=2))
     if untested:
         lines = [f"- {reason}: {'; '.join(names)}" for reason, names in untested.items()]
         parts.append("Not tested:\n\n" + "\n".join(lines))
@@ -129,7 +130,7 @@ def paper_section(findings: Findings) -> list[str]:
     tests = Counter(o.claim.family for o in findings.claims if not o.reason)
     own = statements(findings)
     overall = [[text, standing(found)] for text, found in own.items()]
-    parts = [PAPER.strip(), grid(["The paper says", "These runs say"], overall, left=2)]
+    parts = [PAPER.strip(), markdown(["The paper says", "These runs say"], overall, left=2)]
     header = ["Claim", "Effect", "Size, 95 % interval", "p", "Verdict", "What it would take"]
     for text, found in own.items():
         rows = [
@@ -143,7 +144,7 @@ def paper_section(findings: Findings) -> list[str]:
             ]
             for outcome in found
         ]
-        parts += [f"### {text}", grid(header, rows, left=2)]
+        parts += [f"### {text}", markdown(header, rows, left=2)]
     return parts
 
 

@@ -16,12 +16,12 @@ from symsteer.leaderboard.text import (
     SPACE,
     code,
     difference,
-    grid,
     image,
     number,
     share,
     stacked,
 )
+from symsteer.tables import markdown
 
 Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
 """By place, (task, embodiment), (embodiment,) or (), then by kind: description and address."""
@@ -112,7 +112,7 @@ def _left_out(tested: Sequence[LeaveOut]) -> str:
         "Inside",
         "Error",
     ]
-    return grid(header, rows, left=3)
+    return markdown(header, rows, left=3)
 
 
 def _best_left_out(tested: LeaveOut) -> str:
@@ -156,7 +156,7 @@ def _slopes(panels: Sequence[Panel]) -> str:
         "Advantage ends at a defect of",
         "Undecided because",
     ]
-    return grid(header, rows, left=3)
+    return markdown(header, rows, left=3)
 
 
 def _fit(fit: Fit) -> list[str]:
@@ -198,5 +198,5 @@ def _numbers(summary: Summary, panels: Sequence[Panel]) -> str:
         rows.append([cell_name(cell.table, summary), size, resets, *row])
     header = ["Cell", "Audited defect, of", "Resets"]
     header += [f"{code(agent)}: AUC,<br>success" for agent in by_agent]
-    table = grid([*header, "Runs"], rows, left=1)
+    table = markdown([*header, "Runs"], rows, left=1)
     return f"<details>\n<summary>The map's numbers</summary>\n\n{table}\n\n</details>"

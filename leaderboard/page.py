@@ -26,13 +26,13 @@ from symsteer.leaderboard.text import (
     code,
     compact,
     folded,
-    grid,
     image,
     interval,
     number,
     stacked,
     without_empty,
 )
+from symsteer.tables import markdown
 
 READING = f"""\
 Each agent steers a frozen diffusion policy by choosing the noise that it starts from. References
@@ -189,7 +189,7 @@ def _effects_table(found: Sequence[MainEffect]) -> str:
     names = [*EFFECT_MEASURES, "counts"]
     header = ["Agent", "Change", "Success", "Largest \\|Q\\|", "Diverged", "Runs, policies"]
     body = [[*place, *(own.get(name, NOTHING) for name in names)] for place, own in rows.items()]
-    return grid(header, body, left=2)
+    return markdown(header, body, left=2)
 
 
 def seed_notice(summary: Summary) -> str:
@@ -214,7 +214,7 @@ def _overview(summary: Summary) -> str:
         shown = (at_a_glance(table, agent) for agent in summary.agents)
         cells = ("<br>".join(map(_glance, own)) or NOTHING for own in shown)
         rows.append([cell_name(table, summary), *cells])
-    return grid(header, rows, left=1)
+    return markdown(header, rows, left=1)
 
 
 def at_a_glance(table: Table, agent: str) -> list[Row]:
@@ -263,7 +263,7 @@ def spreads_section(summary: Summary, found: Mapping[str, Spread]) -> list[str]:
     }
     header, body = without_empty(columns)
     rows = [[code(agent), *texts] for agent, texts in zip(found, body, strict=True)]
-    return [*parts, grid(["Agent", *header], rows, left=1)]
+    return [*parts, markdown(["Agent", *header], rows, left=1)]
 
 
 def _share(spread: Spread) -> str:
@@ -294,7 +294,7 @@ def soundness_table(summary: Summary) -> str:
                 ]
             )
     header = ["Task", "Agent", "Runs", "Fall", "Correlation", "Bias (reward)", "Verdict"]
-    return grid(header, rows, left=2) if rows else ""
+    return markdown(header, rows, left=2) if rows else ""
 
 
 def comparisons_section(found: Comparisons, figures: Mapping[str, tuple[str, str]]) -> list[str]:
@@ -316,7 +316,7 @@ def comparisons_section(found: Comparisons, figures: Mapping[str, tuple[str, str
             for (first, second), texts in pairs.items()
         ]
         header = ["P(X > Y)", *(f"{group} (cells; runs of X, of Y)" for group in groups)]
-        parts.append(grid(header, rows, left=1))
+        parts.append(markdown(header, rows, left=1))
     return parts
 
 

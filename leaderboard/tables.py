@@ -19,12 +19,12 @@ from symsteer.leaderboard.text import (
     compact,
     count,
     difference,
-    grid,
     number,
     share,
     stacked,
     without_empty,
 )
+from symsteer.tables import markdown
 
 Links = Mapping[Path, str | None]
 """Address of each record relative to the page, None to show none."""
@@ -104,7 +104,7 @@ def section(table: Table, links: Links) -> list[str]:
             *([status(row)] if shows_status else []),
         ]
         rows.append([_rank(row, table), *cells] if table.is_ranked else cells)
-    parts.append(grid(header, rows, left=2 if table.is_ranked else 1))
+    parts.append(markdown(header, rows, left=2 if table.is_ranked else 1))
     if absent := [code(row.agent) for row in table.rows if not row.runs]:
         parts.append(f"Not run here: {', '.join(absent)}.")
     parts += [*_against_best(table), *_plateau(table), *_diagnostics(table)]
@@ -243,7 +243,7 @@ def _diagnostics(table: Table) -> list[str]:
     }
     header, body = without_empty(columns)
     body = [[code(row.label), *texts] for row, texts in zip(rows, body, strict=True)]
-    return ["Q-values, symmetry and cost:", grid(["Agent", *header], body, left=1)]
+    return ["Q-values, symmetry and cost:", markdown(["Agent", *header], body, left=1)]
 
 
 def _pair(first: float | None, second: float | None) -> str:

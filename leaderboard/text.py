@@ -117,12 +117,6 @@ def without_empty(columns: Mapping[str, Sequence[str]]) -> tuple[list[str], list
     return list(shown), [list(row) for row in zip(*shown.values(), strict=True)]
 
 
-def grid(header: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    """A markdown table; the first `left` columns are left-aligned, the others right-aligned."""
-    rule = [":--" if index < left else "--:" for index in range(len(header))]
-    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows))
-
-
 def folded(title: str, blocks: Sequence[str]) -> list[str]:
     """Blocks of markdown that a reader opens; the title is our own."""
     return [f"<details>\n<summary>{title}</summary>", *blocks, "</details>"]

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from scipy.stats import spearmanr
 
-from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
+from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.paper import ROW_ORDER
@@ -36,6 +36,7 @@ from symsteer.leaderboard.statistics import (
 )
 from symsteer.leaderboard.text import difference, number
 from symsteer.policies import POLICIES
+from symsteer.tables import markdown
 from symsteer.terminal import complain
 
 PAGE = CHECKOUT / "docs" / "base-policies.md"
@@ -217,7 +218,7 @@ def demonstrations(base: Sequence[RunRecord], task: str) -> str:
         [name, *(_interval(success(found[n])) if n in found else "-" for n in counts)]
         for name, found in cells.items()
     ]
-    return table(["policy", *map(str, counts)], rows)
+    return markdown(["policy", *map(str, counts)], rows)
 
 
 def gains(base: Sequence[RunRecord], rival: str = DEFAULT) -> str:
@@ -248,7 +249,7 @@ def _against(rival: str, cells: Cells[Column], columns: Mapping[Column, str]) ->
         if name != rival:
             gained = [gain(own.get(c, ()), rivals.get(c, ())) for c in columns]
             rows.append([name, *map(difference, gained)])
-    return table(["policy", *columns.values()], rows) if rows and rivals else ""
+    return markdown(["policy", *columns.values()], rows) if rows and rivals else ""
 
 
 def starts(base: Sequence[RunRecord]) -> str:
@@ -260,7 +261,7 @@ def starts(base: Sequence[RunRecord]) -> str:
         for name, rival in STARTS
         if {name, rival} <= cells.keys()
     ]
-    return table(["policy", *map(str, counts)], rows) if rows else ""
+    return markdown(["policy", *map(str, counts)], rows) if rows else ""
 
 
 def _count(record: RunRecord) -> int:
@@ -278,7 +279,7 @@ def properties(base: Sequence[RunRecord], count: int = STEERED) -> str:
         rows.append(row)
     head = ["policy", "trainings", "parameters", "training, s"]
     head += ["equivariance error", "jump", "spread", "solvable"]
-    return table(head, rows) if rows else ""
+    return markdown(head, rows) if rows else ""
 
 
 def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str:
@@ -300,7 +301,7 @@ def costs(base: Sequence[RunRecord], decode: Sequence[Mapping[str, Any]]) -> str
         row.append("" if name == DEFAULT else difference(gained))
         rows.append(row)
     head = ["policy", "decode, ms", "its products", *(task.removesuffix("-v1") for task in tasks)]
-    return table([*head, f"against {DEFAULT}"], rows) if rows else ""
+    return markdown([*head, f"against {DEFAULT}"], rows) if rows else ""
 
 
 def pairs(records: Sequence[RunRecord]) -> str:
@@ -317,7 +318,7 @@ def pairs(records: Sequence[RunRecord]) -> str:
             gained = [gain(own.get(agent, ()), theirs.get(agent, ())) for agent in agents]
             rows.append([*row, *map(difference, gained)])
     head = ["policy", "training, s", "minus", "training, s", *(f"`{agent}`" for agent in agents)]
-    return table(head, rows) if rows else ""
+    return markdown(head, rows) if rows else ""
 
 
 def _median(found: Sequence[RunRecord], measure: str) -> str:
@@ -351,7 +352,9 @@ def steered(records: Sequence[RunRecord]) -> str:
             runs = [r for r in found.get(agent, ()) if r.base_policy.content_hash in shared]
             row.append(_interval(success(runs)) if runs else "-")
         rows.append(row)
-    return table(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""
+    return (
+        markdown(["policy", "task", "trainings", *(f"`{a}`" for a in agents)], rows) if rows else ""
+    )
 
 
 FORETELL: Mapping[str, Callable[[RunRecord], float | None]] = {
@@ -381,7 +384,7 @@ def foretold(records: Sequence[RunRecord]) -> str:
                 cells.append(number(spearmanr(values, success).statistic) if varies else "-")
             name = f"`{agent}`, {task.removesuffix('-v1')} ({len(both)})"
             rows.append([name, *cells])
-    return table(["agent, task (trainings)", *FORETELL], rows) if base and rows else ""
+    return markdown(["agent, task (trainings)", *FORETELL], rows) if base and rows else ""
 
 
 def _agents(records: Sequence[RunRecord]) -> list[str]:
@@ -401,7 +404,7 @@ def orbit_gains(base: Sequence[RunRecord]) -> str:
             others = cells.get(rival, [])
             row = [rival, _interval(success(found)), _interval(success(others)) if others else "-"]
             rows.append([*row, difference(gain(found, others))])
-    return table(["policy", "with", "without", "difference"], rows) if rows else ""
+    return markdown(["policy", "with", "without", "difference"], rows) if rows else ""
 
 
 def variances(gradient: Sequence[Mapping[str, Any]]) -> str:
@@ -416,7 +419,7 @@ def variances(gradient: Sequence[Mapping[str, Any]]) -> str:
         for (policy, deviation), cell in cells.items()
     ]
     head = [f"`steps` {step:,}" for step in steps]
-    return table(["policy", "observation noise", *head], rows) if rows else ""
+    return markdown(["policy", "observation noise", *head], rows) if rows else ""
 
 
 def _spread(values: Sequence[float]) -> str:

@@ -17,7 +17,7 @@ from typing import Any, get_args
 import numpy as np
 from scipy.stats import ttest_1samp
 
-from symsteer.bench.pages import CHECKOUT, check_checkout, table, with_tables
+from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.bench.tuning.trials import (
     START,
     Chosen,
@@ -29,6 +29,7 @@ from symsteer.bench.tuning.trials import (
 )
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.tables import markdown
 from symsteer.terminal import complain
 
 PAGE = CHECKOUT / "docs" / "tuning.md"
@@ -83,7 +84,7 @@ def effort(trials: Sequence[TrialResult]) -> str:
         lost = str(known.count(False)) if known else "-"
         rows.append([f"`{agent}`", *map(str, counts), str(len(scores)), lost, f"{hours:.1f}"])
     head = ["agent", "trials", "complete", "given up", "failed", "runs", "Q not finite"]
-    return table([*head, "hours of one core"], rows)
+    return markdown([*head, "hours of one core"], rows)
 
 
 def choices(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
@@ -100,7 +101,7 @@ def choices(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
     rows = [[f"`{name}`", *(cell(choice, name) for choice in chosen)] for name in names]
     rows.append(["mean rank", *(f"{choice.rank:.1f}" for choice in chosen)])
     rows.append(["of the start", *(f"{choice.start_rank:.1f}" for choice in chosen)])
-    return table(["option", *(f"`{choice.agent}`" for choice in chosen)], rows) if chosen else ""
+    return markdown(["option", *(f"`{choice.agent}`" for choice in chosen)], rows) if chosen else ""
 
 
 def comparison(chosen: Sequence[Chosen]) -> str:
@@ -126,7 +127,7 @@ def comparison(chosen: Sequence[Chosen]) -> str:
                 )
         rows.append(row)
     head = ["agent", "start", "one option", "chosen", "chosen for each task"]
-    return table(head, rows) if rows else ""
+    return markdown(head, rows) if rows else ""
 
 
 def _difference(gaps: Mapping[Score, float]) -> str:
@@ -157,7 +158,7 @@ def singles(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
         texts = ", ".join(f"{name}: {area:.3f}" for name, area in each.items())
         rows.append([f"`{choice.agent}`", f"{own[START]:.3f}", f"{own[choice.trial]:.3f}", texts])
     head = ["agent", "start", "chosen", "start with one option of the choice"]
-    return table(head, rows) if rows else ""
+    return markdown(head, rows) if rows else ""
 
 
 def response(trials: Sequence[TrialResult], probe: int) -> str:
@@ -188,7 +189,7 @@ def response(trials: Sequence[TrialResult], probe: int) -> str:
                 ]
                 row.append(f"{np.mean(inside):.0f} ({len(inside)})" if inside else "-")
             rows.append(row)
-    return table(["option", *(f"`{agent}`" for agent in standings), "all"], rows)
+    return markdown(["option", *(f"`{agent}`" for agent in standings), "all"], rows)
 
 
 def _groups(values: Sequence[Any]) -> list[tuple[str, Any, Any]]:
