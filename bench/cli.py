@@ -692,79 +692,31 @@ def detect(
 
 def throughput(
     task: str = "PickCube-v1",
-    num_envs: tuple[int, ...] = (1, 4, 16, 64, 256),
-    repeats: int = 5,
-    seconds: float = 0.7,
-    cores: int = 0,
-    memory: bool = False,
-    learner: bool = False,
-    decode: bool = False,
-    run: bool = False,
-    runs: Path = Path("runs"),
-    device: Literal["cpu", "cuda"] = "cpu",
+    agent: str = "standard",
+    num_envs: tuple[int, ...] = (4, 16, 64),
+    workers: tuple[int, ...] = (1,),
+    seconds: float = 10.0,
     json: bool = False,
 ) -> int:
-    """Compare the speed of simulation with stock ManiSkill and with PhysX alone, in minutes.
+    """Measure how fast this machine steers: steps per second of a run, and where its time goes.
+
+    Other programs disturb the measurement, so close them first.
 
     Args:
-        task: Task; `symsteer list` names them. ManiSkill's stock class and controller are used.
+        task: Task; `symsteer list` names them.
+        agent: Agent; it has its default options.
         num_envs: Numbers of environments.
-        repeats: Measurements of each backend.
-        seconds: Minimum length of a measurement.
-        cores: Processes in the measurement on all cores; 0: one per core.
-        memory: Only measure how memory grows over 10,000 steps with resets.
-        learner: Only measure the CPU time of an update of each learner.
-        decode: Only measure the CPU time in which each base policy decodes.
-        run: Only measure the CPU time of whole runs with the default settings, alone and in teams
-            of five, two agents; about an hour for each repeat.
-        runs: Folder that keeps the base policy of these runs.
-        device: With cuda, --learner and --decode measure wall-clock time on the processor and on
-            the GPU, in turns.
+        workers: Numbers of processes that share the simulation.
+        seconds: Length of each measurement.
         json: Print only JSON.
     """
-    allow(task)
-    from symsteer.bench import throughput as speed
+    allow(task, agent)
+    from json import dumps
 
-    if device == "cuda":
-        import torch
+    from symsteer.bench.throughput import measure, table
 
-        if not learner and not decode:
-            raise UserError("--device cuda is for --learner and --decode; name one of them")
-        if not torch.cuda.is_available():
-            raise UserError(
-                "--device cuda was asked for, but torch finds no CUDA device here; leave it out "
-                "(`symsteer doctor` says what is missing)"
-            )
-    devices = ("cpu",) if device == "cpu" else ("cpu", "cuda")
-    if learner or decode or run:
-        part: Any
-        if learner:
-            from symsteer.bench import learner_throughput as part
-
-            rows = part.measure(task, 20, repeats, _tell, devices=devices)
-        elif decode:
-            from symsteer.bench import decode_throughput as part
-
-            rows = part.measure(task, 10, repeats, _tell, devices=devices)
-        else:
-            from symsteer.bench import run_throughput as part
-            from symsteer.bench.runs.config import RunConfig
-
-            configs = [RunConfig(task=task, agent=agent) for agent in ("standard", "equivariant")]
-            rows = part.measure(configs, repeats, runs, _tell)
-        print(speed.dump({"rows": rows}) if json else part.table(rows))
-        return 0
-    if memory:
-        growth = speed.memory_growth(task, report=_tell)
-        print(
-            speed.dump(growth)
-            if json
-            else f"memory grew by {growth['growth_kib']:.0f} KiB from step {growth['steps'][1]} to "
-            f"{growth['steps'][-1]} of {growth['num_envs']} environments"
-        )
-        return 0
-    data = speed.measure(task, num_envs, repeats, seconds, cores or None, _tell)
-    print(speed.dump(data) if json else speed.table(data))
+    rows = measure(task, agent, num_envs, workers, seconds, _tell)
+    print(dumps({"rows": rows}, indent=2) if json else table(rows))
     return 0
 
 

@@ -82,7 +82,7 @@ def map_section(summary: Summary, findings: Findings, figures: Figures) -> list[
             measured = ", ".join(code(command, 1000) for command in commands)
             text += (
                 f" To measure them: {measured}; then "
-                "`python -m symsteer.bench.audit.page leaderboard/results/audit/summary.json "
+                "`python -m tools.pages.audit leaderboard/results/audit/summary.json "
                 "runs/audit/summary.json`."
             )
         parts.append(text)

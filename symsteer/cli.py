@@ -88,7 +88,7 @@ VERBS = {
     "detect": Verb(f"{BENCH}:detect", "Score detectors of broken symmetry on a run's decisions."),
     "advise": Verb("symsteer.advise:advise", "Say which agent to take in a world, and how sure."),
     "new": Verb("symsteer.agents.new:new", "Write a new agent and its tests.", computes=False),
-    "throughput": Verb(f"{BENCH}:throughput", "Measure the speed of the simulation."),
+    "throughput": Verb(f"{BENCH}:throughput", "Measure how fast this machine steers."),
     "doctor": Verb(f"{BENCH}:doctor", "Show what this machine can do.", computes=False),
 }
 

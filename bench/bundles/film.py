@@ -14,9 +14,9 @@ from tqdm import tqdm
 from symsteer.bench.demos.files import opened
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.film import write_video
+from symsteer.bench.runs.pictures import CAMERA
 from symsteer.bench.sim.trees import map_trees, rows_of
 from symsteer.bench.tasks import make
-from symsteer.bench.tasks.picture import CAMERA
 
 PIXELS = 128
 """Width and height of the pictures."""

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from mani_skill.utils.sapien_utils import look_at
 from matplotlib import style as mpl_style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -28,7 +29,6 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.steering.directions import directions, positions
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make
-from symsteer.bench.tasks.picture import CAMERA, SIZE
 from symsteer.bench.variants import evaluation_variants
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Field, Layout
@@ -44,6 +44,17 @@ SECTORS = 12
 
 FRAMES = 6
 """Frames of an episode, in two rows; a GIF has its colours from as many."""
+
+SIZE = 320
+"""Width and height of a rendered frame, pixels."""
+
+CAMERA = {
+    "pose": look_at([0.5, 0.65, 0.55], [0.0, 0.0, 0.08]),
+    "fov": 0.8,
+    "width": SIZE,
+    "height": SIZE,
+}
+"""The camera of rendered frames."""
 
 FRAMES_PER_SECOND = 20
 """ManiSkill's control frequency: films with a frame for each control step run in real time."""

@@ -88,16 +88,6 @@ def test_cuda_where_there_is_none(option, monkeypatch, capsys, tmp_path):
     assert "no CUDA device" in sentence(capsys)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-@pytest.mark.parametrize(
-    ("part", "words"),
-    [((), "--device cuda is for --learner and --decode"), (("--decode",), "no CUDA device")],
-)
-def test_a_gpu_is_timed_where_there_is_one(part, words, monkeypatch, capsys):
-    assert symsteer(monkeypatch, "throughput", "--device", "cuda", *part) == 2
-    assert words in sentence(capsys)
-
-
 def test_demonstrations_of_another_task(demos, monkeypatch, capsys, tmp_path):
     arguments = ("run", "--quiet", "--task", "PushCube-v1", "--demos", demos, "--out", tmp_path)
     assert symsteer(monkeypatch, *arguments) == 2

@@ -92,11 +92,11 @@ audit --resume
 audit --out file
 audit --seed 99999999999999999999
 throughput --task Nothing
-throughput --repeats 0
+throughput --agent nobody
 throughput --num-envs -4
 throughput --num-envs 99999999
 throughput --seconds nan
-throughput --cores 100000
+throughput --workers 100000
 demos
 demos folder.h5
 demos folder

@@ -6,7 +6,6 @@ import sys
 import pytest
 import torch
 
-from symsteer.bench.audit import page
 from symsteer.bench.audit.study import variant_texts
 from symsteer.bench.tasks import task_class
 from symsteer.bench.variants import VARIANTS
@@ -125,43 +124,3 @@ def test_variant_texts():
     assert variant_texts(["action_gain"], [0.0]) == ["none"]
     with pytest.raises(UserError):
         variant_texts(["none"], [0.5])
-
-
-def test_the_page_says_what_the_data_say():
-    """`python -m symsteer.bench.audit.page` writes it."""
-    rows = page.read_summary(page.SUMMARY)
-    text = page.PAGE.read_text()
-    assert text == page.generate(text, rows)
-    for task in {row["task"] for row in rows}:
-        text = page.task_page(task).read_text()
-        assert text == page.generate_task(text, task, rows)
-    assert page.SUMMARY.stat().st_size < 300_000
-
-
-def test_the_page_is_written_in_a_checkout_only(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(page, "PAGE", tmp_path / "docs" / "audit.md")
-    assert page.main([]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert "in a checkout" in lines[0]
-
-
-@pytest.mark.parametrize("row", [{}, {"version": 1}, {"version": 99}])
-def test_a_summary_of_another_version(row, capsys, tmp_path):
-    path = tmp_path / "summary.json"
-    path.write_text(json.dumps([row]))
-    assert page.main([str(path)]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert f"version {row.get('version', 1)}" in lines[0]
-    for text in ("[3]", "{", "3"):
-        path.write_text(text)
-        assert page.main([str(path)]) == 2
-        assert "cannot read the summary" in capsys.readouterr().err
-
-
-def test_a_page_without_marks():
-    with pytest.raises(UserError, match="marks"):
-        page.generate("no marks", [])
-    with pytest.raises(UserError, match="mark"):
-        page.generate_task("no marks", "PickCube-v1", [])

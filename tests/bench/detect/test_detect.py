@@ -13,11 +13,9 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from symsteer.bench.audit.result import AuditSettings
-from symsteer.bench.detect.page import main as write_page
 from symsteer.bench.detect.report import interval
 from symsteer.bench.detect.study import Measure, _detection, auroc, mean_of_runs
 from symsteer.bench.detect.truth import Truth, measure_truth
-from symsteer.bench.pages import BEGIN, END
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.stored import stored_config, stored_policy
@@ -109,15 +107,6 @@ def test_several_runs_give_means_over_those_in_the_same_world(run, tmp_path, mon
     assert first["correlation"]["runs"] == 2
     assert "### PushCube-v1, floating, `obstacle:1`, C4" in printed.out
     assert (out / "summary.md").read_text().strip() in printed.out
-    page = tmp_path / "detect.md"
-    page.write_text(f"before\n{BEGIN}old\n{END}after\n")
-    monkeypatch.setattr("symsteer.bench.detect.page.PAGE", page)
-    monkeypatch.setattr("symsteer.bench.detect.page.SUMMARY", tmp_path / "kept.json")
-    assert write_page([str(out / "summary.json")]) == 0
-    assert (out / "summary.md").read_text() in page.read_text()
-    assert "old" not in page.read_text()
-    assert write_page([]) == 0
-    assert write_page([str(out / "summary.md")]) == 2
 
 
 def test_the_mean_of_runs_has_the_spread_of_runs_and_of_their_data():

@@ -1,6 +1,5 @@
 import pytest
 
-from symsteer.bench.audit.page import SUMMARY, read_summary
 from symsteer.bench.audit.result import AuditSettings
 from symsteer.bench.audit.study import grid
 from symsteer.bench.runs.config import RunConfig
@@ -8,6 +7,7 @@ from symsteer.bench.tasks import make
 from symsteer.bench.variants.levels import LEVELS, points_of, strength, table, with_numbers
 from symsteer.errors import UserError
 from symsteer.registry import allow
+from tools.pages.audit import SUMMARY, read_summary
 
 PLACE = ("PushCube-v1", "floating")
 

@@ -15,8 +15,8 @@ from symsteer.bench.variants import VARIANTS
 from symsteer.errors import UserError
 from symsteer.leaderboard.site import docs
 from symsteer.leaderboard.site.docs import CONFIG, Documentation, build_documentation, named_rows
-from symsteer.leaderboard.site.mkdocs_hook import PAGES, relinked
 from tests.leaderboard.site.pages import dead_links, read_pages
+from tools.mkdocs_hook import PAGES, relinked
 
 ROOT = CONFIG.parent
 

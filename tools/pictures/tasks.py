@@ -1,8 +1,8 @@
 """Pictures of the tasks, with both embodiments, for the documentation.
 
-- ``python -m symsteer.bench.tasks.picture docs/tasks.png``: all tasks in one picture, but for
+- ``python -m tools.pictures.tasks docs/tasks.png``: all tasks in one picture, but for
   those on a tilted table and those that cameras see, whose scenes are the same.
-- ``python -m symsteer.bench.tasks.picture docs/tasks/pull-cube.png PullCube-v1``: one task.
+- ``python -m tools.pictures.tasks docs/tasks/pull-cube.png PullCube-v1``: one task.
 - ``... docs/tasks/seen-push-cube.png SeenPushCube-v1``: what the cameras see, and the cloud.
 
 Needs a Vulkan driver; ``symsteer doctor`` says whether there is one.
@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import sapien
-from mani_skill.utils.sapien_utils import look_at
 from PIL import Image, ImageDraw
 
 from symsteer.bench.caption import captioned
+from symsteer.bench.runs.pictures import CAMERA, SIZE
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
 from symsteer.bench.tasks.clouds import CAMERAS, PIXELS
 from symsteer.bench.tasks.experts import Expert
@@ -27,13 +27,6 @@ from symsteer.errors import UserError
 from symsteer.files import staged
 from symsteer.terminal import complain
 
-SIZE = 320
-CAMERA = {
-    "pose": look_at([0.5, 0.65, 0.55], [0.0, 0.0, 0.08]),
-    "fov": 0.8,
-    "width": SIZE,
-    "height": SIZE,
-}
 TASKS_PER_ROW = 4
 COLOURS = 128
 VIEW = 192
@@ -128,7 +121,7 @@ def contact_sheet() -> np.ndarray:
 def main() -> int:
     """Write the picture to the path given on the command line."""
     if len(sys.argv) not in (2, 3):
-        print("usage: python -m symsteer.bench.tasks.picture FILE.png [TASK]", file=sys.stderr)
+        print("usage: python -m tools.pictures.tasks FILE.png [TASK]", file=sys.stderr)
         return 2
     try:
         if len(sys.argv) == 2:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from symsteer.errors import UserError
 
-CHECKOUT = Path(__file__).resolve().parents[1]
+CHECKOUT = Path(__file__).resolve().parents[2]
 BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
 
 

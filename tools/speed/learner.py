@@ -1,8 +1,7 @@
 """Time of an update of each learner, side by side with what bounds it.
 
 The base policy has the default size and is untrained, transitions are random: neither changes the
-cost. The agent `best-of-n-kernel` has fits in place of updates: its time is that of a fit, divided
-by the updates that the plain agent makes in as many decisions.
+cost.
 """
 
 from __future__ import annotations
@@ -17,15 +16,13 @@ from typing import Any
 import torch
 
 from symsteer.agents import AGENTS
-from symsteer.agents.agent import Agent, AgentContext
-from symsteer.agents.best_of_n_kernel import KernelBestOfNAgent
+from symsteer.agents.agent import AgentContext
 from symsteer.agents.options import SacOptions, critics_of
 from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
-from symsteer.bench.tasks import task_class
-from symsteer.bench.timing import clock_of, in_turns, products_of, time_on
-from symsteer.policies import POLICIES
+from symsteer.bench.throughput import new_agent, new_policy
+from tools.speed.timing import clock_of, in_turns, products_of, time_on
 
 DECISIONS = 512
 """Random decisions in the replay."""
@@ -40,7 +37,7 @@ class Contender:
 
     Attributes:
         device: of its tensors.
-        what: the update, its matrix products alone, or a fit.
+        what: the update, or its matrix products alone.
         critic: of a learner.
         members: learners that are updated at once.
         batch_size: transitions in an update of one learner; 0 without batches.
@@ -135,8 +132,6 @@ def _contenders(task: str, agents: Sequence[str], device: str) -> list[Contender
     found = []
     for name in agents:
         agent_class = AGENTS.get(name)
-        if agent_class is KernelBestOfNAgent:
-            found.append(_kernel(task, name, device))
         if not issubclass(agent_class, SacAgent):
             continue
         for critic in critics_of(agent_class.Options):
@@ -152,7 +147,7 @@ def _contenders(task: str, agents: Sequence[str], device: str) -> list[Contender
                 team = Team([_learner(task, name, critic, seed, device) for seed in seeds])
                 run = functools.partial(_update_team, team)
                 found.append(Contender(device, name, "update", critic, count, *sizes, run, count))
-    context = _context(task, 0, device)
+    context = AgentContext.of(new_policy(task).to(device), device)
     if importlib.util.find_spec("stable_baselines3"):
         size = _standard_options().batch_size
         train = _sb3(context)
@@ -160,32 +155,11 @@ def _contenders(task: str, agents: Sequence[str], device: str) -> list[Contender
     return found
 
 
-def _context(task: str, seed: int, device: str) -> AgentContext:
-    kind, policy = task_class(task), POLICIES.get("edp")
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        base = policy(policy.Options(), kind.observation_layout, kind.action_layout)
-    return AgentContext.of(base.to(device), device, seed)
-
-
-def _agent(task: str, name: str, seed: int, device: str, **options: Any) -> Agent:
-    agent_class = AGENTS.get(name)
-    return agent_class(_context(task, seed, device), agent_class.Options(**options))
-
-
 def _learner(task: str, name: str, critic: str, seed: int, device: str) -> SacAgent:
-    agent = _agent(task, name, seed, device, critic=critic)
+    agent = new_agent(task, name, device, seed, critic=critic)
     assert isinstance(agent, SacAgent)
     agent.observe(_decisions(agent.context, agent.rows, DECISIONS))
     return agent
-
-
-def _kernel(task: str, name: str, device: str) -> Contender:
-    agent = _agent(task, name, 0, device)
-    assert isinstance(agent, KernelBestOfNAgent)
-    agent.observe(_decisions(agent.context, agent.rows, agent.options.points))
-    updates = agent.options.refit * _standard_options().utd
-    return Contender(device, name, "fit, per update", "", 1, 0, 0, agent.fit, updates)
 
 
 def _standard_options() -> SacOptions:

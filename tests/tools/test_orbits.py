@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from symsteer.bench.audit.orbits import Orbit, draw, orbit
 from symsteer.policies.geometry import Group
+from tools.pictures.orbits import Orbit, draw, orbit
 
 
 @pytest.fixture(scope="module")

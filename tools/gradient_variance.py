@@ -1,6 +1,6 @@
 """Variance of the training gradient with orbit targets, beside that with the pairs' own targets.
 
-python -m symsteer.bench.gradient_variance > leaderboard/results/base-policies/gradient.json
+python -m tools.gradient_variance > leaderboard/results/base-policies/gradient.json
 
 A policy is trained with the pairs' own targets. Its gradient is then taken on the same batches,
 noise levels and noise with both kinds of targets, before and after training. The rows go to

@@ -1,12 +1,12 @@
 """Writes the tables of docs/base-policies.md from the committed records of the suite `policies`.
 
-python -m symsteer.policies_page                # from the committed records
-python -m symsteer.policies_page RUNS           # copies the finished records first
-python -m symsteer.policies_page --decode FILE  # replaces the times of decoding first
+python -m tools.pages.base_policies                # from the committed records
+python -m tools.pages.base_policies RUNS           # copies the finished records first
+python -m tools.pages.base_policies --decode FILE  # replaces the times of decoding first
 
-Records are in leaderboard/results/policies. FILE holds what `symsteer throughput --decode --json`
+Records are in leaderboard/results/policies. FILE holds what `python -m tools.speed decode --json`
 prints. leaderboard/results/base-policies/gradient.json holds what `python -m
-symsteer.bench.gradient_variance` prints.
+tools.gradient_variance` prints.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from typing import Any, TypeVar
 
 from scipy.stats import spearmanr
 
-from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.paper import ROW_ORDER
@@ -38,6 +37,7 @@ from symsteer.leaderboard.text import difference, number
 from symsteer.policies import POLICIES
 from symsteer.tables import markdown
 from symsteer.terminal import complain
+from tools.pages.marks import CHECKOUT, check_checkout, with_tables
 
 PAGE = CHECKOUT / "docs" / "base-policies.md"
 RESULTS = CHECKOUT / "leaderboard" / "results"
@@ -153,8 +153,8 @@ def render(
 
     Args:
         records: finished runs of the suite.
-        decode: rows of `symsteer throughput --decode`.
-        gradient: rows of `python -m symsteer.bench.gradient_variance`.
+        decode: rows of `python -m tools.speed decode`.
+        gradient: rows of `python -m tools.gradient_variance`.
     """
     records = sorted(records, key=_place)
     tilted = [record for record in records if record.settings.task.startswith(TILTED)]
@@ -452,7 +452,7 @@ def main(arguments: Sequence[str]) -> int:
     """Write docs/base-policies.md; returns the exit code."""
     parser = argparse.ArgumentParser(description="Write the tables of docs/base-policies.md.")
     parser.add_argument("runs", nargs="?", type=Path, help="runs whose records are copied")
-    parser.add_argument("--decode", type=Path, help="output of symsteer throughput --decode --json")
+    parser.add_argument("--decode", type=Path, help="output of python -m tools.speed decode --json")
     given = parser.parse_args(arguments)
     files: dict[Path, bytes] = {}
     try:
@@ -471,8 +471,8 @@ def main(arguments: Sequence[str]) -> int:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(
                 f"{DECODE} or {GRADIENT} cannot be read ({error}); write them again with "
-                "`symsteer throughput --decode --json` and `python -m "
-                "symsteer.bench.gradient_variance`"
+                "`python -m tools.speed decode --json` and `python -m "
+                "tools.gradient_variance`"
             ) from None
         text = with_tables(PAGE.read_text(), tables, "docs/base-policies.md")
         write_together({PAGE: text.encode()})

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 log = logging.getLogger("mkdocs.hooks.symsteer")
 """MkDocs counts what it says: with `strict`, a warning is an error."""
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 
-SHARED = Path(__file__).resolve().parent / "static"
+SHARED = ROOT / "leaderboard" / "site" / "static"
 """Scripts and styles that the documentation has in common with the results."""
 
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md"}

@@ -15,12 +15,12 @@ from typing import Any
 
 import torch
 
-from symsteer.bench.tasks import task_class
-from symsteer.bench.timing import clock_of, in_turns, products_of, time_on
+from symsteer.bench.throughput import new_policy
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.networks.denoiser import parameter_count
+from tools.speed.timing import clock_of, in_turns, products_of, time_on
 
 CHUNKS = (64, 192)
 """Chunks that are decoded at once: those of 64 environments, those of a batch of an update."""
@@ -68,7 +68,7 @@ def measure(
     timed += [(name, options) for name, options in VARIATIONS if name in policies]
     for device, (name, options) in itertools.product(devices, timed):
         try:
-            policy = _policy(task, name, options).to(device)
+            policy = new_policy(task, name, **options).to(device)
         except UserError as error:
             report(f"without {name}: {error}")
             continue
@@ -114,15 +114,6 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             f"{row['products'] / row['median']:5.0%}"
         )
     return "\n".join(lines)
-
-
-def _policy(task: str, name: str, options: Mapping[str, Any]) -> ChunkPolicy:
-    kind, policy = task_class(task), POLICIES.get(name)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        found = policy(policy.Options(**options), kind.observation_layout, kind.action_layout)
-    found.freeze()
-    return found
 
 
 def _inputs(policy: ChunkPolicy, chunks: int) -> tuple[torch.Tensor, torch.Tensor]:

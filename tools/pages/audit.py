@@ -1,7 +1,7 @@
 """Writes the tables of docs/audit.md, docs/variants.md and the tasks' pages from the summary.
 
-python -m symsteer.bench.audit.page                     # from the committed summary
-python -m symsteer.bench.audit.page OUT/summary.json    # replaces the committed summary first
+python -m tools.pages.audit                     # from the committed summary
+python -m tools.pages.audit OUT/summary.json    # replaces the committed summary first
 
 The committed summary is leaderboard/results/audit/summary.json.
 """
@@ -24,11 +24,11 @@ from symsteer.bench.audit.report import (
     to_markdown,
 )
 from symsteer.bench.audit.result import VERSION, old_version
-from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.bench.variants.levels import table
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.terminal import complain
+from tools.pages.marks import CHECKOUT, check_checkout, with_tables
 
 PAGE = CHECKOUT / "docs" / "audit.md"
 VARIANTS_PAGE = CHECKOUT / "docs" / "variants.md"

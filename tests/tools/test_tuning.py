@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import json
-
-import pytest
-
-from symsteer.bench.pages import BEGIN, END
-from symsteer.bench.tuning import page
-from symsteer.bench.tuning.trials import Chosen, Score, TrialResult, to_json
+from symsteer.bench.tuning.trials import Chosen, Score, TrialResult
+from tools.pages import tuning as page
 
 
 def scores(*areas):
@@ -91,37 +86,3 @@ def test_the_response_is_the_share_of_other_trials_that_are_beaten():
     assert found["`critics` 2"] == "| `critics` 2 | 50 (5) | 50 (5) |"
     thirds = [line for name, line in found.items() if name.startswith("`lr`")]
     assert [line.split(" | ")[1] for line in thirds] == ["56 (2)", "50 (2)", "38 (1)"]
-
-
-def test_the_page_is_written_between_its_marks(tmp_path, monkeypatch, capsys):
-    text, committed = tmp_path / "tuning.md", tmp_path / "results"
-    text.write_text(f"before\n{BEGIN}old\n{END}after\n")
-    monkeypatch.setattr(page, "PAGE", text)
-    monkeypatch.setattr(page, "TRIALS", committed)
-    for name in ("zoo", "core"):
-        source = tmp_path / f"{name}.json"
-        source.write_text(json.dumps({"data": {"probe": 1}, **to_json(TRIALS, CHOSEN)}))
-        assert page.main([str(source)]) == 0
-        assert (committed / source.name).read_text() == source.read_text()
-        # Stands beside the trials, and is not a plan's.
-        (committed / f"{name}-scores.json").write_text("{}")
-    written = text.read_text()
-    assert written.startswith(f"before\n{BEGIN}\n### `core`: what was tried\n")
-    assert written.endswith(f"{END}after\n")
-    assert written.count("### `zoo`: what was tried\n") == 1
-    assert "old" not in written
-    assert page.main([]) == 0
-    assert text.read_text() == written
-
-
-@pytest.mark.parametrize(
-    ("content", "message"), [("{}", "not the trials"), ("x", "cannot be read")]
-)
-def test_other_files_are_refused(tmp_path, monkeypatch, capsys, content, message):
-    path = tmp_path / "other.json"
-    path.write_text(content)
-    monkeypatch.setattr(page, "PAGE", tmp_path / "tuning.md")
-    monkeypatch.setattr(page, "TRIALS", tmp_path)
-    (tmp_path / "tuning.md").write_text(f"{BEGIN}{END}")
-    assert page.main([str(path)]) == 2
-    assert message in capsys.readouterr().err

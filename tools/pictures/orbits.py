@@ -1,6 +1,6 @@
 """Draws what each variant does to turned copies of one episode.
 
-python -m symsteer.bench.audit.orbits    # writes docs/variants/*.png
+python -m tools.pictures.orbits    # writes docs/variants/*.png
 
 Eight copies of a PushCube episode start turned by multiples of 45 degrees and execute the scripted
 expert's actions, turned alike. In the unbroken world their paths are a star.
@@ -17,7 +17,6 @@ from matplotlib import style as mpl_style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from symsteer.bench.pages import CHECKOUT
 from symsteer.bench.sim.trees import join_trees, rows_of
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
@@ -25,6 +24,7 @@ from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.variants import VARIANTS
 from symsteer.files import write_together
 from symsteer.policies.geometry import Group
+from tools.pages.marks import CHECKOUT
 
 FOLDER = CHECKOUT / "docs" / "variants"
 TASK = "PushCube-v1"

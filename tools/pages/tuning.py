@@ -1,7 +1,7 @@
 """Writes the tables of docs/tuning.md from the committed trials.
 
-python -m symsteer.bench.tuning.page                            # from the committed trials
-python -m symsteer.bench.tuning.page RUNS/tuning/PLAN.json      # adds or replaces those of a plan
+python -m tools.pages.tuning                            # from the committed trials
+python -m tools.pages.tuning RUNS/tuning/PLAN.json      # adds or replaces those of a plan
 
 The committed trials are leaderboard/results/tuning/PLAN.json.
 """
@@ -17,7 +17,6 @@ from typing import Any, get_args
 import numpy as np
 from scipy.stats import ttest_1samp
 
-from symsteer.bench.pages import CHECKOUT, check_checkout, with_tables
 from symsteer.bench.tuning.trials import (
     START,
     Chosen,
@@ -31,6 +30,7 @@ from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.tables import markdown
 from symsteer.terminal import complain
+from tools.pages.marks import CHECKOUT, check_checkout, with_tables
 
 PAGE = CHECKOUT / "docs" / "tuning.md"
 TRIALS = CHECKOUT / "leaderboard" / "results" / "tuning"

@@ -1,0 +1,44 @@
+"""The committed pages hold the tables that the committed results give."""
+
+from __future__ import annotations
+
+import pytest
+
+from symsteer.files import write_together
+from tools.pages import audit, base_policies, tuning
+from tools.pages.marks import BEGIN, END, with_tables
+
+TOOLS = (audit, base_policies, tuning)
+
+
+@pytest.fixture
+def written(monkeypatch):
+    """What a tool writes, by path, in place of writing it."""
+    files = {}
+    for tool in TOOLS:
+        monkeypatch.setattr(tool, "write_together", files.update)
+    return files
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_the_committed_pages_are_what_the_results_give(tool, written, capsys):
+    assert tool.main([]) == 0
+    assert written
+    for path, content in written.items():
+        assert path.read_bytes() == content, f"{path.name} is old: run python -m {tool.__name__}"
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+@pytest.mark.parametrize("content", ["{", "[3]", '{"rows": [{}]}'])
+def test_files_that_are_no_results(tool, content, tmp_path, written, capsys):
+    path = tmp_path / "other.json"
+    write_together({path: content.encode()})
+    assert tool.main([str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert not written
+
+
+def test_tables_are_written_between_the_marks():
+    page = f"before\n{BEGIN}old\n{END}after\n"
+    assert with_tables(page, "new", "page.md") == f"before\n{BEGIN}\nnew\n\n{END}after\n"
