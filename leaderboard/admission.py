@@ -37,6 +37,7 @@ from symsteer.leaderboard.records import (
     flat,
     portable,
     read_record,
+    with_retired,
 )
 from symsteer.leaderboard.records.provenance import checkout, git
 from symsteer.leaderboard.records.repeat import KEYS
@@ -536,8 +537,9 @@ def _facts(record: RunRecord) -> dict[tuple[str, ...], list[float]]:
     """Numbers of a finished record that others with the same settings must have as well."""
     s, base, sizes = record.settings, record.base_policy, record.parameters
     place = s.task, s.embodiment
-    options = record.config.get("agent_options", record.config.get("sac"))
-    settings = canonical_json([options, record.config.get("policy")])
+    config = with_retired(record.config)
+    options = config.get("agent_options", config.get("sac"))
+    settings = canonical_json([options, config.get("policy")])
     directions = record.final.episodes.direction if record.final else None
     world = str(record.config.get("evaluation_variant"))
     networks: list[float] = [sizes.actor, sizes.critic, sizes.width or 0]

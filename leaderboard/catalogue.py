@@ -31,11 +31,15 @@ POLICIES = (
 
 REFERENCES = ("base", "zero", "golden-ticket")
 
+RETIRED_AGENTS: dict[str, Role] = {"approximate": "learner", "best-of-n-kernel": "learner"}
+"""Agents that only committed records still have; `approximate` is that of version 0.1."""
+
 AGENTS: dict[str, Role] = {
     **dict.fromkeys(REFERENCES, "reference"),
     **dict.fromkeys(("standard", "standard-matched", "augmented", "equivariant"), "learner"),
     **dict.fromkeys(("residual-pathway", "relaxed", "projected", "constrained"), "learner"),
     **dict.fromkeys(("partial", "ensemble", "displaced", "residual", "best-of-n"), "learner"),
-    **{"best-of-n-kernel": "learner", "approximate": "learner", "wrong-group": "control"},
+    **{"wrong-group": "control"},
+    **RETIRED_AGENTS,
 }
-"""The role of each agent; `approximate` is that of version 0.1."""
+"""The role of each agent."""

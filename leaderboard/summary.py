@@ -30,6 +30,7 @@ from symsteer.leaderboard.records import (
     flat,
     read_record,
     read_reproductions,
+    with_retired,
 )
 from symsteer.leaderboard.records.curves import area_under_curve
 from symsteer.leaderboard.records.reproductions import Verdict
@@ -535,7 +536,7 @@ def recipe_of(config: Mapping[str, Any]) -> str:
             }
         return [strip(item) for item in value] if isinstance(value, list) else value
 
-    return config_hash(strip(config))
+    return config_hash(strip(with_retired(config)))
 
 
 def seeds_of(config: Mapping[str, Any]) -> str:
@@ -749,7 +750,7 @@ def setting_texts(config: Mapping[str, Any]) -> dict[str, str]:
     """All settings but those of the machine as texts, keys of nested tables joined by dots."""
     return {
         key: value if isinstance(value, str) else json.dumps(value)
-        for key, value in flat(config).items()
+        for key, value in flat(with_retired(config)).items()
         if not MACHINE.intersection(key.split("."))
     }
 

@@ -19,6 +19,7 @@ from symsteer.bench.tasks import TASKS, task_name
 from symsteer.bench.variants import VARIANTS
 from symsteer.bench.variants.levels import with_numbers
 from symsteer.errors import UserError
+from symsteer.leaderboard.records import without_retired
 from symsteer.names import check
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import PolicyOptions
@@ -206,6 +207,7 @@ def build_config(data: Mapping[str, Any], source: str) -> RunConfig:
             raise UserError(f"{source}: {key} must be a text in quotes, not {name!r}")
     try:
         defaults, plain = _defaults(agent, policy_name)
+        tables["agent_options"] = without_retired(tables["agent_options"], plain["agent_options"])
         _check_nested_keys({**data, **tables}, plain, source, "")
         chosen = {
             key: _validated(type(getattr(defaults, key)), {**plain[key], **table}, key)

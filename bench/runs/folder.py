@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,15 +32,18 @@ class RunBusyError(UserError):
     """Another process is working on the run."""
 
 
-def run_id(config: RunConfig, origin: dict[str, Any]) -> str:
+def run_id(
+    config: RunConfig, origin: dict[str, Any], stored: Mapping[str, Any] | None = None
+) -> str:
     """A readable name that is unique for the configuration.
 
     Args:
         config: the run's configuration.
         origin: content hashes of demonstrations or a policy that came from files.
+        stored: the configuration as plain data, of a run that may have options that are no more.
     """
     variant, agent, task = map(file_name, (config.variant, config.agent, config.task))
-    key = content_key(config.to_json(), origin)
+    key = content_key(stored or config.to_json(), origin)
     return f"{task}-{config.embodiment}-{variant}-{agent}-s{config.seed}-{key}"
 
 

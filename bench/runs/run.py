@@ -28,6 +28,7 @@ from symsteer.bench.runs.folder import (
     claimed,
     discard_empty,
     is_finished,
+    read_config,
     run_id,
     write_json,
 )
@@ -298,6 +299,8 @@ def _opened(
         "evaluation_variant": variant_text(evaluation_variants(config.variants)),
         "files": files,
     }
+    if run_id(config, files) != folder.name:  # it was begun with options that are no more
+        resolved = read_config(folder)
 
     def check_files() -> None:
         if files and demonstrations is None and policy is None:

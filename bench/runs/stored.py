@@ -104,7 +104,8 @@ def stored_config(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
             f"the run {folder.name} was begun by an older version, without {', '.join(newer)}; "
             "use that version for it, or start it again with `symsteer run`"
         )
-    if not isinstance(files, dict) or run_id(config, files) != folder.name:
+    own = {key: value for key, value in data.items() if key not in DERIVED}
+    if not isinstance(files, dict) or run_id(config, files, own) != folder.name:
         raise UserError(
             f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or the "
             "folder renamed; undo that"

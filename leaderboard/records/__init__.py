@@ -25,6 +25,7 @@ from symsteer.leaderboard.records.reproductions import (
     read_reproductions,
     reproduction_of,
 )
+from symsteer.leaderboard.records.retired import with_retired, without_retired
 from symsteer.leaderboard.records.schema import (
     HELD_OUT_SEED,
     MAX_GROWTH,
@@ -80,5 +81,7 @@ __all__ = [
     "read_reproductions",
     "repeat_command",
     "reproduction_of",
+    "with_retired",
+    "without_retired",
     "write_record",
 ]

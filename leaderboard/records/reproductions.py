@@ -20,6 +20,7 @@ from symsteer.errors import UserError, first_problem
 from symsteer.leaderboard.records.curves import area_under_curve
 from symsteer.leaderboard.records.files import read_record
 from symsteer.leaderboard.records.provenance import Provenance
+from symsteer.leaderboard.records.retired import with_retired
 from symsteer.leaderboard.records.schema import Evaluation, RunRecord
 from symsteer.leaderboard.records.shares import newcombe
 from symsteer.leaderboard.records.values import (
@@ -263,7 +264,7 @@ def _wanted(found: Reproduction, record: Path, again: Path) -> Reproduction:
     """What the two records say; without the repeated one, what it must say of the record."""
     one = read_record(record)
     if again.is_file():
-        if not flat(one.config).items() <= flat(read_record(again).config).items():
+        if not flat(one.config).items() <= flat(with_retired(read_record(again).config)).items():
             raise ValueError("another run")
         return reproduction_of(record, again, found.conditions)
     _, success, area = compare_records(one, one)

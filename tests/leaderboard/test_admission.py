@@ -454,13 +454,12 @@ def test_a_configuration_that_nothing_runs(
 
 
 def test_names_and_limits_are_those_of_the_registries() -> None:
-    """`approximate` is the one agent of version 0.1 that is no more."""
     limits = {name: task_class(name).max_episode_steps for name in TASKS.builtin}
     assert limits == catalogue.TASKS
     assert sorted(EMBODIMENTS) == sorted(catalogue.EMBODIMENTS)
     assert set(POLICIES.builtin) == set(catalogue.POLICIES)
     roles = {name: AGENTS.get(name).role for name in AGENTS.builtin}
-    assert roles | {"approximate": "learner"} == catalogue.AGENTS
+    assert roles | catalogue.RETIRED_AGENTS == catalogue.AGENTS
     classes = {name: VARIANTS.get(name) for name in VARIANTS.builtin}
     costs = {name: found(VariantSpec(name, 1.0)).highest_cost for name, found in classes.items()}
     assert costs == catalogue.VARIANTS

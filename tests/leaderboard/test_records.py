@@ -24,8 +24,11 @@ from symsteer.leaderboard.records import (
     dump_record,
     portable,
     read_record,
+    with_retired,
+    without_retired,
     write_record,
 )
+from symsteer.leaderboard.records.retired import RETIRED
 from tests.leaderboard.record_factory import START, make_config, make_evaluation, make_record
 
 REPOSITORY = Path(__file__).parents[2]
@@ -551,3 +554,15 @@ def test_random_damage_gives_a_record_error_or_a_valid_record(tmp_path: Path) ->
         except UserError:
             refused += 1
     assert refused > 300
+
+
+def test_of_an_option_that_is_no_more_one_value_means_the_same() -> None:
+    old = make_config(agent_options={"target_entropy": 0.5, **RETIRED})
+    new = make_config(agent_options={"target_entropy": 0.5})
+    assert with_retired(new) == with_retired(old) == old
+    assert with_retired(make_config(agent_options={"candidates": 64}))["agent_options"] == {
+        "candidates": 64
+    }
+    options = {**old["agent_options"], "n_step": 3}
+    assert without_retired(options, ["target_entropy"]) == {"target_entropy": 0.5, "n_step": 3}
+    assert without_retired(old["agent_options"], ["subset"]) == {"target_entropy": 0.5, "subset": 2}

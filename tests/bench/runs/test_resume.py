@@ -24,11 +24,13 @@ from symsteer.bench.runs.folder import (
     claimed,
     is_finished,
     read_progress,
+    run_id,
     state_of,
 )
 from symsteer.bench.runs.run import evaluate, resume
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import read_record
+from symsteer.leaderboard.records import DERIVED, read_record
+from symsteer.leaderboard.records.retired import RETIRED
 from tests.bench.runs.conftest import ensure
 from tests.bench.tiny_run import stop, tiny_config, without_clock
 
@@ -202,6 +204,19 @@ def test_a_run_of_a_version_with_fewer_options_is_named(begun):
     (begun / "config.json").write_text(json.dumps(config))
     with pytest.raises(UserError, match=r"older version, without policy\.zero_output; use that"):
         resume(begun, progress=False)
+
+
+def test_a_run_with_an_option_that_is_no_more_goes_on(begun, monkeypatch):
+    monkeypatch.setitem(RETIRED, "momentum", 0.0)
+    data = json.loads((begun / "config.json").read_text())
+    data["agent_options"]["momentum"] = 0.0
+    own = {key: value for key, value in data.items() if key not in DERIVED}
+    folder = begun.with_name(run_id(CONFIG, {}, own))
+    begun.rename(folder)
+    (folder / "config.json").write_text(json.dumps(data))
+    resume(folder, progress=False)
+    assert read_record(folder / "record.json").config == data
+    assert evaluate(folder).recorded
 
 
 def test_what_cannot_be_continued(undisturbed, begun, tmp_path):

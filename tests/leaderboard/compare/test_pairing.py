@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.records.retired import RETIRED
 from tests.leaderboard.compare.runs import at_commit, paired, runs_of, save
 from tests.leaderboard.record_factory import make_evaluation, make_record
 
@@ -137,6 +138,22 @@ def test_a_setting_that_one_side_does_not_know_does_not_count(tmp_path: Path):
     found = paired(a, b)
     assert len(found.pairs) == 6
     assert found.one_sided == (("old",), ("agent_options.new",))
+
+
+def test_an_option_that_is_no_more_has_its_one_value(tmp_path: Path):
+    options = {"target_entropy": 0.5, "lr": 0.1}
+    agents = ("standard", "equivariant")
+
+    def side(name: str, **more: object) -> Path:
+        runs = [r for a in agents for r in runs_of(*CURVES, agent=a, agent_options=options | more)]
+        return save(tmp_path / name, runs)
+
+    old, new, other = side("old", **RETIRED), side("new"), side("other", n_step=3)
+    found = paired(old, new)
+    assert len(found.pairs) == 6
+    assert (found.one_sided, found.changed) == (((), ()), ())
+    with pytest.raises(UserError, match=r"differ in agent_options|differ in n_step \(1, 3\)"):
+        paired(old, other)
 
 
 def test_a_run_has_one_partner(tmp_path: Path):
