@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from symsteer.errors import UserError
-from symsteer.files import prepare_folder, write_atomically
+from symsteer.files import prepare_folder
 from symsteer.registry import allow
 from symsteer.terminal import BOARD, complain, folded, printable, to_paste
 
@@ -321,9 +321,8 @@ def status(
 
 
 def list_names() -> int:
-    """Name the tasks, embodiments, variants, agents, policies, detectors, suites and plans."""
+    """Name the tasks, embodiments, variants, agents, policies, suites and plans."""
     from symsteer.agents import AGENTS
-    from symsteer.agents.detectors import DETECTORS
     from symsteer.bench.sweep.grid import read_suite, suite_names
     from symsteer.bench.tasks import EMBODIMENTS, TASKS
     from symsteer.bench.tuning import plan_summaries
@@ -343,7 +342,6 @@ def list_names() -> int:
         "suites (symsteer sweep SUITE)",
         ((suite.name, f"{suite.description} ({len(suite.runs)} runs)") for suite in suites),
     )
-    _print_names("detectors of broken symmetry (symsteer detect RUN)", _summaries(DETECTORS))
     _print_names("tuning plans (symsteer tune PLAN)", plan_summaries().items())
     return 0
 
@@ -629,64 +627,6 @@ def audit(
         print(text(found[0]))
     if out is not None and not json:
         print(f"wrote {out}")
-    return 0
-
-
-def detect(
-    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]")],
-    /,
-    detector: tuple[str, ...] = (),
-    count: int = 64,
-    group: str = "C8",
-    seed: int = 0,
-    out: Path | None = None,
-    json: bool = False,
-    trust: Trust = (),
-) -> int:
-    """Score detectors of broken symmetry on the decisions of runs (docs/detect.md).
-
-    The runs are in a broken world, with keep_replay. Several runs give a table with the means over
-    those in the same world.
-
-    Args:
-        runs: Folders of runs.
-        detector: Detectors; default: all. `symsteer list` names them.
-        count: States of the scripted expert and of the base policy, each; all their turned copies
-            are simulated.
-        group: Symmetry group.
-        seed: Seed of states, detectors and intervals.
-        out: Folder for detect.json and detect.png; of several runs, each has its own folder there,
-            beside summary.json and summary.md.
-        json: Print only JSON.
-    """
-    allow(*detector, *trust)
-    from json import dumps
-
-    from symsteer.agents.detectors import DETECTORS
-    from symsteer.bench.detect import report
-    from symsteer.bench.detect.study import detect
-    from symsteer.bench.runs.folder import write_json
-
-    if not runs:
-        raise UserError("name the folder of a run, e.g. symsteer detect runs/PushCube-v1-...")
-
-    if out is not None:
-        prepare_folder(out)
-    found = []
-    for run in runs:
-        if len(runs) > 1:
-            _tell(str(run))
-        found.append(detect(run, detector or tuple(DETECTORS), count, group, seed, _tell))
-        if out is not None:
-            report.write(out if len(runs) == 1 else out / run.resolve().name, found[-1])
-    rows = report.summary(found)
-    shown = report.text(found[0]) if len(runs) == 1 else report.summary_text(rows)
-    if out is not None and len(runs) > 1:
-        write_json(out / "summary.json", rows)
-        write_atomically(out / "summary.md", f"{shown}\n".encode())
-    print(dumps(report.to_json(found[0]) if len(runs) == 1 else rows) if json else f"\n{shown}")
-    if out is not None and not json:
-        print(f"\nwrote {out}")
     return 0
 
 

@@ -18,11 +18,6 @@ if TYPE_CHECKING:
     from symsteer.leaderboard.advice import Advice, Choice, Expected, LeaveOut, World
     from symsteer.leaderboard.defects import Audit
 
-DETECTION = (
-    "A detection has no defect: its AUROC and its share of broken copies are no numbers of the "
-    "map's axis. The world that it names was placed by its audit; nothing else of it was used."
-)
-
 
 def advise(
     task: str | None = None,
@@ -30,7 +25,6 @@ def advise(
     variant: str = "none",
     group: str = "C8",
     audit: Path | None = None,
-    detection: Path | None = None,
     records: tuple[Path, ...] = (),
     states: int = 32,
     runs: Path = Path("runs"),
@@ -39,8 +33,8 @@ def advise(
 ) -> int:
     """Say which agent to take in a world, and how sure that is (docs/advise.md).
 
-    The world is named by --task, or by a file of `symsteer audit` or `symsteer detect`. What the
-    committed audit does not have is measured first.
+    The world is named by --task, or by a file of `symsteer audit`. What the committed audit does
+    not have is measured first.
 
     Args:
         task: Task; `symsteer list` names them.
@@ -48,7 +42,6 @@ def advise(
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none.
         group: Group of the base policy.
         audit: What `symsteer audit --out` wrote, the folder or its audit.json or summary.json.
-        detection: What `symsteer detect --out` wrote, the folder or its detect.json.
         records: Folders of runs or records, each a study of its own; default: the committed
             records.
         states: States of the expert and of the base policy, each, of an audit that is measured.
@@ -56,8 +49,8 @@ def advise(
         json: Write everything into this file, too.
     """
     allow(task, variant, *trust)
-    if [task, audit, detection].count(None) != 2:
-        raise UserError("name one world: with --task and --variant, with --audit or --detection")
+    if (task is None) == (audit is None):
+        raise UserError("name one world: with --task and --variant, or with --audit")
     from symsteer.leaderboard.advice import advise, leave_tasks_out
     from symsteer.leaderboard.defects import read_audit
     from symsteer.leaderboard.paths import REPRODUCTIONS, STUDY, chosen_records
@@ -70,8 +63,6 @@ def advise(
     if audit is not None:
         worlds = [(world, f"measured, {audit}") for world in _audited(audit)]
     else:
-        if detection is not None:
-            task, embodiment, variant, group = _detected(detection)
         settings = _named(task or "", embodiment, variant, group, states)
     # Of the committed records, submitted ones that nobody has made again give no advice.
     listed = None if records else read_list(FOLDER / f"{STUDY}.toml")
@@ -86,7 +77,6 @@ def advise(
     number = sum(len(summary.runs) for summary in summaries)
     blocks = [_text(found, source) for found, (_, source) in zip(advices, worlds, strict=True)]
     blocks += [_test_text(test) for test in tests]
-    blocks += [DETECTION] if detection is not None else []
     studies = f"{len(folders)} studies" if len(folders) > 1 else "one study"
     print(printable("\n\n".join([f"From {number} runs of {studies}.", *blocks])))
     if json is not None:
@@ -165,25 +155,6 @@ def _worlds(data: bytes, path: Path) -> Iterator[World]:
 
     for place, defect in parse_audit(data, path).items():
         yield World(*place, defect)
-
-
-def _detected(path: Path) -> tuple[str, str, str, str]:
-    """Task, embodiment, variant and group of a detection."""
-    path = path / "detect.json" if path.is_dir() else path
-    try:
-        settings = encoding.loads(path.read_bytes())["settings"]
-        words = [settings[key] for key in ("task", "embodiment", "variant", "group")]
-        if not all(isinstance(word, str) for word in words):
-            raise TypeError("names must be texts")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}; name another file") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise UserError(
-            f"{path} is no detection of one run: name the detect.json that `symsteer detect --out` "
-            "wrote"
-        ) from error
-    task, embodiment, variant, group = words
-    return task, embodiment, variant, group
 
 
 # What the terminal shows.

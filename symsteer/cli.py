@@ -75,7 +75,7 @@ VERBS = {
     ),
     "list": Verb(
         f"{BENCH}:list_names",
-        "Name the tasks, embodiments, variants, agents, policies, detectors, suites and plans.",
+        "Name the tasks, embodiments, variants, agents, policies, suites and plans.",
         computes=False,
     ),
     "demos": Verb(f"{BENCH}:demos", "Write demonstrations of the scripted expert."),
@@ -85,7 +85,6 @@ VERBS = {
         f"{BENCH}:fetch_bundle", "Check such a file and unpack it.", computes=False
     ),
     "audit": Verb(f"{BENCH}:audit", "Measure how broken the symmetry of a task is."),
-    "detect": Verb(f"{BENCH}:detect", "Score detectors of broken symmetry on a run's decisions."),
     "advise": Verb("symsteer.advise:advise", "Say which agent to take in a world, and how sure."),
     "new": Verb("symsteer.agents.new:new", "Write a new agent and its tests.", computes=False),
     "throughput": Verb(f"{BENCH}:throughput", "Measure how fast this machine steers."),

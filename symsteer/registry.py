@@ -1,12 +1,11 @@
-"""One registry for agents, policies, variants, tasks and detectors, open to other packages.
+"""One registry for agents, policies, variants and tasks, open to other packages.
 
 A name stands for a class. It comes from one of three places:
 
 - SymSteer's own table: ``symsteer.agents.AGENTS``, ``symsteer.policies.POLICIES``,
-  ``symsteer.bench.variants.VARIANTS``, ``symsteer.bench.tasks.TASKS``,
-  ``symsteer.agents.detectors.DETECTORS``;
+  ``symsteer.bench.variants.VARIANTS``, ``symsteer.bench.tasks.TASKS``;
 - an entry point of an installed distribution, in the group ``symsteer.agents``,
-  ``symsteer.policies``, ``symsteer.variants``, ``symsteer.tasks`` or ``symsteer.detectors``;
+  ``symsteer.policies``, ``symsteer.variants`` or ``symsteer.tasks``;
 - ``package.module:Class``, to try a class that is not installed. Importing it executes its code, so
   it needs consent (:func:`allow`): what a user types has it, what a file names does not.
 

@@ -131,7 +131,6 @@ def make(place: Path, run: Path, bundle: Path, secret: Path) -> list[Path]:
     demos = _demonstrations(place, run.parent / "base", secret)
     _bundle(place / "bundle.zip", bundle, policy)
     settings = {"task": EVIL, "embodiment": "floating", "variant": f"{EVIL}:0.5", "group": "C8"}
-    (place / "detect.json").write_text(json.dumps({"settings": settings}))
     (place / "audit").mkdir()
     (place / "audit" / "audit.json").write_text(json.dumps({"settings": settings}))
     for folder in (place / "audit" / "summary.json", place / "summary.json"):
@@ -145,7 +144,7 @@ def make(place: Path, run: Path, bundle: Path, secret: Path) -> list[Path]:
         *(place / "study.toml", place / "bare.git" / "study.toml", place / "plan.toml"),
         *sorted(folder for folder in runs.iterdir() if folder.name != "sweeps"),
         *(folder / "record.json" for folder in sorted(runs.glob("*=*"))),
-        *(policy, place / "world", *demos, place / "bundle.zip", place / "detect.json"),
+        *(policy, place / "world", *demos, place / "bundle.zip"),
         *(place / "audit", place / "summary.json", runs, place),
     ]
 

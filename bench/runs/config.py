@@ -98,7 +98,7 @@ class RunConfig:
     environments begin new episodes in fresh scenes, because a checkpoint cannot contain the
     contacts that PhysX remembers."""
     keep_replay: bool = False
-    """Write all decisions to `replay.safetensors` at the end; `symsteer detect` needs them."""
+    """Write all decisions to `replay.safetensors` at the end, to learn from them."""
     sim: Literal["cpu", "cuda"] = "cpu"
     """Device of the simulation."""
     device: Literal["cpu", "cuda"] = "cpu"

@@ -1,4 +1,4 @@
-"""`symsteer advise`: worlds by name, from an audit and from a detection; mistakes."""
+"""`symsteer advise`: worlds by name and from an audit; mistakes."""
 
 from __future__ import annotations
 
@@ -85,20 +85,6 @@ def test_the_file_of_one_audit(advise, tmp_path, monkeypatch, capsys):
         assert "PushCube-v1, floating, wind:0.3, C8" in shown.out
 
 
-def test_a_detection_names_its_world_alone(advise, tmp_path):
-    settings = {
-        "task": "PushT-v1",
-        "embodiment": "floating",
-        "variant": "action_gain:0.25",
-        "group": "C8",
-    }
-    (tmp_path / "detect.json").write_text(json.dumps({"settings": settings, "broken": 3}))
-    code, shown = advise("--detection", tmp_path)
-    assert code == 0
-    assert "PushT-v1, floating, action_gain:0.25, C8" in shown.out
-    assert "A detection has no defect" in shown.out
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -112,13 +98,10 @@ def test_a_detection_names_its_world_alone(advise, tmp_path):
         (("--task", "PushT-v1", "--variant", "wind:0.33", "--states", "1"), "at least 8"),
         (("--audit", "nowhere"), "cannot read nowhere"),
         (("--audit", "."), "holds no audit"),
-        (("--detection", "."), "cannot read detect.json"),
-        (("--detection", "detect-me.json"), "no detection of one run"),
     ],
 )
 def test_mistakes(advise, tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "detect-me.json").write_text("[1]")
     code, shown = advise(*arguments)
     assert (code, shown.out) == (2, "")
     assert words in shown.err

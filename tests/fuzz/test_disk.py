@@ -366,7 +366,6 @@ def test_read_only_folders(undisturbed, workshop, read_only, tmp_path):
         ("film", finished, "--episodes", 1),
         ("export", finished, "--out", runs / "a.zip"),
         ("export", finished, "--format", "lerobot", "--out", runs / "set"),
-        ("detect", finished, "--out", runs / "detect"),
         ("site", finished, "--no-docs", "--out", runs / "site"),
         ("new", "agent", "mine", "--out", runs),
     ):

@@ -77,8 +77,6 @@ advise --audit nowhere
 advise --audit folder
 advise --audit file
 advise --audit x.json
-advise --detection folder
-advise --detection x.json
 advise --task PickCube-v1 --records nowhere
 advise --task PickCube-v1 --records folder
 audit --task Nothing

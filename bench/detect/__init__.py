@@ -1,1 +1,0 @@
-"""Detectors of broken symmetry, scored against the audit."""
