@@ -103,13 +103,12 @@ def compare(
         raise UserError(f"--picture is {picture}; its name must end with .png or .svg")
     from json import dumps
 
-    from symsteer.leaderboard.compare.changes import find_changes
     from symsteer.leaderboard.compare.output import to_data, to_text
     from symsteer.leaderboard.compare.pairing import pair_runs
     from symsteer.leaderboard.compare.sides import read_sides
 
     first, second = read_sides(a, b, runs)
-    changes = find_changes(pair_runs(first, second), margin)
+    changes = pair_runs(first, second, margin)
     if picture is not None:
         from symsteer.files import write_atomically
         from symsteer.leaderboard.compare import figure

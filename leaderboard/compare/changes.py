@@ -1,4 +1,4 @@
-"""What changed from A to B, in each cell and over all of them, and the verdict.
+"""Pairs of runs, what changed from A to B in each cell and over all of them, and the verdict.
 
 All differences are B minus A, within pairs of runs and on the same episodes; intervals and the
 number of pairs that a verdict needs are those of the leaderboard (docs/metrics.md).
@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from symsteer.leaderboard.compare.pairing import Cell, Pairing, RunPair
+from symsteer.leaderboard.compare.sides import Leftover
 from symsteer.leaderboard.statistics import (
     Interval,
     Sample,
@@ -20,7 +21,7 @@ from symsteer.leaderboard.statistics import (
     stratified_bootstrap,
     units_of,
 )
-from symsteer.leaderboard.summary import MIN_SEEDS, area_difference
+from symsteer.leaderboard.summary import MIN_SEEDS, Key, Run, area_difference
 
 Measure = Literal["success", "auc", "q_bias"]
 Verdict = Literal["identical", "none", "worse", "better", "not worse"]
@@ -28,14 +29,8 @@ Verdict = Literal["identical", "none", "worse", "better", "not worse"]
 DECISIVE: tuple[Measure, ...] = ("success", "auc")
 """The measures that the verdict follows from."""
 
-
-@dataclass(frozen=True)
-class Paired:
-    """A measure of two paired runs: A's value, B's value, and B minus A."""
-
-    a: Sample
-    b: Sample
-    difference: Sample
+Samples = tuple[Sample, Sample, Sample]
+"""A measure of two paired runs: A's value, B's value, and B minus A."""
 
 
 @dataclass(frozen=True)
@@ -51,31 +46,107 @@ class Change:
 
 
 @dataclass(frozen=True)
-class CellChanges:
-    """A cell, the measures that it has, and seconds of a run of A and of B."""
+class RunPair:
+    a: Run
+    b: Run
 
-    cell: Cell
-    measures: dict[Measure, Change]
-    seconds: tuple[float, float]
+    @property
+    def same_episodes(self) -> bool:
+        """Whether all episodes of all evaluations agree bit for bit."""
+        mine, theirs = self.a.record.evaluations, self.b.record.evaluations
+        return [e.episodes for e in mine] == [e.episodes for e in theirs]
+
+    @property
+    def same_diagnostics(self) -> bool:
+        """Whether all diagnostics of all evaluations agree bit for bit."""
+        mine, theirs = (
+            [(e.diagnostics, e.nonfinite) for e in run.record.evaluations]
+            for run in (self.a, self.b)
+        )
+        return mine == theirs
+
+
+@dataclass(frozen=True)
+class PairedCell:
+    """The pairs of one cell and agent.
+
+    Attributes:
+        key: the cell.
+        label: agent and settings of A; empty where they are the same in all cells.
+        pairs: at least one.
+    """
+
+    key: Key
+    label: str
+    pairs: tuple[RunPair, ...]
+
+    @property
+    def is_identical(self) -> bool:
+        return all(pair.same_episodes for pair in self.pairs)
+
+    @cached_property
+    def samples(self) -> dict[Measure, list[Samples]]:
+        """Of each measure the pairs that have it."""
+        return {
+            name: [values for pair in self.pairs if (values := measure(pair.a, pair.b))]
+            for name, measure in MEASURES.items()
+        }
+
+    @cached_property
+    def measures(self) -> dict[Measure, Change]:
+        """What the measures that it has changed by."""
+        return {name: _change([samples]) for name, samples in self.samples.items() if samples}
+
+    @property
+    def seconds(self) -> tuple[float, float]:
+        """Of a run of A and of B."""
+        return _seconds(self.pairs)
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Everything that the comparison says.
+    """Everything that a comparison says.
 
     Attributes:
-        pairing: the pairs.
-        cells: in the order of the pairing.
-        overall: the mean over the cells that have enough pairs; over all if none has.
-        seconds: of a run of A and of B, mean over all pairs.
+        cells: at least one.
+        alone: runs of A, and runs of B, that are in no pair.
+        one_sided: settings that only the records of A have, and those that only B's have; they do
+            not count.
+        changed: options of the agent that differ within pairs, as texts.
         margin: how much worse B may be.
     """
 
-    pairing: Pairing
-    cells: tuple[CellChanges, ...]
-    overall: dict[Measure, Change]
-    seconds: tuple[float, float]
+    cells: tuple[PairedCell, ...]
+    alone: tuple[tuple[Leftover, ...], tuple[Leftover, ...]]
+    one_sided: tuple[tuple[str, ...], tuple[str, ...]]
+    changed: tuple[str, ...]
     margin: float
+
+    @property
+    def pairs(self) -> list[RunPair]:
+        return [pair for cell in self.cells for pair in cell.pairs]
+
+    @property
+    def seconds(self) -> tuple[float, float]:
+        """Of a run of A and of B, mean over all pairs."""
+        return _seconds(self.pairs)
+
+    @cached_property
+    def overall(self) -> dict[Measure, Change]:
+        """The mean over the cells that have enough pairs; over all if none has."""
+        overall = {}
+        for name in MEASURES:
+            having = [cell.samples[name] for cell in self.cells if cell.samples[name]]
+            enough = [samples for samples in having if len(samples) >= MIN_SEEDS]
+            if having:
+                overall[name] = _change(enough or having)
+        return overall
+
+    @property
+    def decisive(self) -> dict[Measure, Interval]:
+        """The differences that the verdict follows from."""
+        changes = {name: self.overall[name] for name in DECISIVE if name in self.overall}
+        return {name: change.difference for name, change in changes.items() if change.counts}
 
     @property
     def verdict(self) -> Verdict:
@@ -83,58 +154,30 @@ class Changes:
 
         `identical`: all episodes of all pairs agree. `none`: no cell has enough pairs.
         """
-        if all(cell.is_identical for cell in self.pairing.cells):
+        if all(cell.is_identical for cell in self.cells):
             return "identical"
-        found = [
-            change.difference
-            for name in DECISIVE
-            if (change := self.overall.get(name)) and change.counts
-        ]
-        if not found:
+        if not self.decisive:
             return "none"
-        if any(interval.high < -self.margin for interval in found):
+        if any(interval.high < -self.margin for interval in self.decisive.values()):
             return "worse"
-        signs = {interval.sign for interval in found}
+        signs = {interval.sign for interval in self.decisive.values()}
         return "better" if 1 in signs and -1 not in signs else "not worse"
 
 
-def find_changes(pairing: Pairing, margin: float = 0.0) -> Changes:
-    """Compute every number of a comparison."""
-    samples: dict[Measure, list[list[Paired]]] = {
-        name: [[found for pair in cell.pairs if (found := measure(pair))] for cell in pairing.cells]
-        for name, measure in MEASURES.items()
-    }
-    cells = [
-        CellChanges(
-            cell,
-            {name: _change([found[index]]) for name, found in samples.items() if found[index]},
-            _seconds(cell.pairs),
-        )
-        for index, cell in enumerate(pairing.cells)
-    ]
-    overall = {}
-    for name, by_cell in samples.items():
-        having = [found for found in by_cell if found]
-        enough = [found for found in having if len(found) >= MIN_SEEDS]
-        if having:
-            overall[name] = _change(enough or having)
-    return Changes(pairing, tuple(cells), overall, _seconds(pairing.pairs), margin)
+def _change(cells: Sequence[Sequence[Samples]]) -> Change:
+    """The mean over cells of the mean over base policies."""
 
+    def level(index: int) -> float:
+        units = [units_of([samples[index] for samples in pairs]).values() for pairs in cells]
+        return float(np.mean([np.mean([unit.value for unit in values]) for values in units]))
 
-def _change(cells: Sequence[Sequence[Paired]]) -> Change:
     return Change(
-        _level([[pair.a for pair in pairs] for pairs in cells]),
-        _level([[pair.b for pair in pairs] for pairs in cells]),
-        stratified_bootstrap([[pair.difference for pair in pairs] for pairs in cells]),
-        sum(map(len, cells)),
-        min(map(len, cells)) >= MIN_SEEDS,
+        a=level(0),
+        b=level(1),
+        difference=stratified_bootstrap([[samples[2] for samples in pairs] for pairs in cells]),
+        pairs=sum(map(len, cells)),
+        counts=min(map(len, cells)) >= MIN_SEEDS,
     )
-
-
-def _level(cells: Sequence[Sequence[Sample]]) -> float:
-    """Mean over cells of the mean over base policies."""
-    units = [[unit.value for unit in units_of(runs).values()] for runs in cells]
-    return float(np.mean([np.mean(values) for values in units]))
 
 
 def _seconds(pairs: Sequence[RunPair]) -> tuple[float, float]:
@@ -143,32 +186,37 @@ def _seconds(pairs: Sequence[RunPair]) -> tuple[float, float]:
     return float(a), float(b)
 
 
-def _success(pair: RunPair) -> Paired:
+def _success(a: Run, b: Run) -> Samples:
     """Success in the final evaluation; paired runs have the same held-out episodes there."""
-    a, b = pair.a.final_success, pair.b.final_success
-    values = a, b, paired_differences(b, a)
-    return Paired(*(Sample.pooled(one.items(), pair.a.policy) for one in values))
+    one, two = a.final_success, b.final_success
+    first, second, difference = (
+        Sample.pooled(values.items(), a.policy)
+        for values in (one, two, paired_differences(two, one))
+    )
+    return first, second, difference
 
 
-def _area(pair: RunPair) -> Paired | None:
+def _area(a: Run, b: Run) -> Samples | None:
     """Area under the success curve, of runs that have one: references are evaluated once."""
-    if pair.a.is_reference or pair.b.is_reference:
+    if a.is_reference or b.is_reference:
         return None
-    difference = area_difference(pair.b, pair.a, pair.a.record.settings.env_steps)
-    a, b = (Sample.constant(run.area, run.policy) for run in (pair.a, pair.b))
-    return Paired(a, b, difference) if difference else None
+    difference = area_difference(b, a, a.record.settings.env_steps)
+    first, second = (Sample.constant(run.area, run.policy) for run in (a, b))
+    return (first, second, difference) if difference else None
 
 
-def _bias(pair: RunPair) -> Paired | None:
+def _bias(a: Run, b: Run) -> Samples | None:
     """Size of the bias of Q at the end, where both runs have measured it."""
-    a, b = pair.a.last("q_bias"), pair.b.last("q_bias")
-    if a is None or b is None:
+    one, two = a.last("q_bias"), b.last("q_bias")
+    if one is None or two is None:
         return None
-    values = abs(a), abs(b), abs(b) - abs(a)
-    return Paired(*(Sample.constant(one, pair.a.policy) for one in values))
+    first, second, difference = (
+        Sample.constant(value, a.policy) for value in (abs(one), abs(two), abs(two) - abs(one))
+    )
+    return first, second, difference
 
 
-MEASURES: dict[Measure, Callable[[RunPair], Paired | None]] = {
+MEASURES: dict[Measure, Callable[[Run, Run], Samples | None]] = {
     "success": _success,
     "auc": _area,
     "q_bias": _bias,

@@ -43,7 +43,7 @@ def picture(a: Side, b: Side, changes: Changes, path: Path) -> bytes:
 def draw(a: Side, b: Side, changes: Changes) -> Figure:
     """Panels for success and AUC: cells from top to bottom, the mean over them below a line."""
     measures = [name for name in DECISIVE if name in changes.overall]
-    names = cell_names([found.cell for found in changes.cells])
+    names = cell_names(changes.cells)
     labels = [plain(" ".join(name), 60) for name in names]
     rows = [found.measures for found in changes.cells]
     if len(rows) > 1:

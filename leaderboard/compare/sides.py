@@ -76,10 +76,42 @@ def read_sides(a: str, b: str, place: Path) -> tuple[Side, Side]:
     return first, second
 
 
+def code_of(run: Run) -> str:
+    """The commit with which a run began; of an installed package, the hash of its code."""
+    provenance = run.record.provenance
+    return provenance.commit or provenance.sha256 or ""
+
+
 def _side(name: str, place: Path, load: Callable[[], list[Run]]) -> Side:
+    """A side; of an agent's runs alone no grid of options can be seen."""
+    kind, runs, grid = _meant(name, place, load)
+    tables, older = grouped(runs, grid)
+    leftovers = [Leftover(run, "a newer record of the same run") for run in older]
+    rows = []
+    for table in tables:
+        for row in table.rows:
+            if kind == "agent" and row is not table.row_of(name):
+                leftovers += [Leftover(run, f"other settings: {row.label}") for run in row.runs]
+                continue
+            unfinished = [run for run in row.runs if not run.finished]
+            leftovers += [Leftover(r, f"not finished: {r.record.status}") for r in unfinished]
+            if row.finished:
+                rows.append((table.key, row))
+    if not rows:
+        raise UserError(
+            f"{name} has no finished run among {len(runs)} records; finish one, for example with "
+            "`symsteer resume`"
+        )
+    place = Path(name) if kind in ("folder", "file") else place
+    return Side(name, kind, place, tuple(rows), tuple(leftovers))
+
+
+def _meant(
+    name: str, place: Path, load: Callable[[], list[Run]]
+) -> tuple[Kind, list[Run], Sequence[str] | None]:
+    """How a name is read, the runs that it means, and the options of their grid if known."""
     if os.path.exists(name):
-        path = Path(name)
-        return _built(name, "folder" if path.is_dir() else "file", path, load_runs([path]))
+        return "folder" if os.path.isdir(name) else "file", load_runs([Path(name)]), None
     if not place.exists():
         raise UserError(
             f"{name!r} is no file or folder, and there is no folder {place} with records of an "
@@ -88,8 +120,7 @@ def _side(name: str, place: Path, load: Callable[[], list[Run]]) -> Side:
     pool = load()
     agents = sorted({run.agent for run in pool})
     if name in agents:
-        own = [run for run in pool if run.agent == name]
-        return _built(name, "agent", place, own, grid_of(pool))
+        return "agent", [run for run in pool if run.agent == name], grid_of(pool)
     codes = sorted({code_of(run) for run in pool} - {""})
     prefix = name.lower()
     begun = [code for code in codes if COMMIT.fullmatch(prefix) and code.startswith(prefix)]
@@ -101,37 +132,4 @@ def _side(name: str, place: Path, load: Callable[[], list[Run]]) -> Side:
     if not begun:
         valid = [*agents, *(code[:8] for code in codes)]
         raise unknown("folder, agent or commit", name, valid, str(place))
-    return _built(name, "commit", place, [run for run in pool if code_of(run) == begun[0]])
-
-
-def code_of(run: Run) -> str:
-    """The commit with which a run began; of an installed package, the hash of its code."""
-    provenance = run.record.provenance
-    return provenance.commit or provenance.sha256 or ""
-
-
-def _built(
-    name: str, kind: Kind, place: Path, runs: Sequence[Run], grid: Sequence[str] | None = None
-) -> Side:
-    """A side; of an agent's runs alone no `grid` can be seen."""
-    tables, older = grouped(runs, grid)
-    leftovers = [Leftover(run, "a newer record of the same run") for run in older]
-    rows = []
-    for table in tables:
-        for row in table.rows:
-            if kind == "agent" and row is not table.row_of(name):
-                leftovers += [Leftover(run, f"other settings: {row.label}") for run in row.runs]
-                continue
-            leftovers += [
-                Leftover(run, f"not finished: {run.record.status}")
-                for run in row.runs
-                if not run.finished
-            ]
-            if row.finished:
-                rows.append((table.key, row))
-    if not rows:
-        raise UserError(
-            f"{name} has no finished run among {len(runs)} records; finish one, for example with "
-            "`symsteer resume`"
-        )
-    return Side(name, kind, place, tuple(rows), tuple(leftovers))
+    return "commit", [run for run in pool if code_of(run) == begun[0]], None

@@ -10,7 +10,8 @@ import hashlib
 import json
 import math
 from codecs import BOM_UTF8
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -141,23 +142,22 @@ def file_hash(path: Path) -> str:
 def compare_records(record: RunRecord, again: RunRecord) -> tuple[list[Difference], Success, Area]:
     """What differs between a finished record and that of the same run made again.
 
-    What the record does not have, such as a diagnostic that is newer, is not compared.
+    What the record does not have, such as a diagnostic that is newer, is not compared. Raises
+    ValueError for a run that is not finished.
     """
-    differences = [_difference(part, list(_values(part, record, again))) for part in PARTS]
-    mine, theirs = (_final(one).success_once for one in (record, again))
-    trials = len(_final(record).episodes.seed)
-    low, high = newcombe((theirs * trials, trials), (mine * trials, trials))
-    areas = [
-        area_under_curve(
-            [e.env_steps for e in one.evaluations],
-            [e.success_once for e in one.evaluations],
-            record.settings.env_steps,
-        )
-        for one in (record, again)
-    ]
-    success = Success(recorded=mine, repeated=theirs, low=low, high=high)
-    found = [difference for difference in differences if difference.differ]
-    return found, success, Area(recorded=areas[0], repeated=areas[1])
+    differences = [_difference(part, _values(part, record, again)) for part in PARTS]
+    shares, areas = [], []
+    for run in (record, again):
+        if run.final is None:
+            raise ValueError("only finished runs are compared")
+        shares.append(run.final.success_once)
+        steps, values = zip(*((e.env_steps, e.success_once) for e in run.evaluations), strict=True)
+        areas.append(area_under_curve(steps, values, record.settings.env_steps))
+        trials = len(record.evaluations[-1].episodes.seed)
+    low, high = newcombe((shares[1] * trials, trials), (shares[0] * trials, trials))
+    success = Success(recorded=shares[0], repeated=shares[1], low=low, high=high)
+    differing = [difference for difference in differences if difference.differ]
+    return differing, success, Area(recorded=areas[0], repeated=areas[1])
 
 
 def reproduction_of(path: Path, again: Path, conditions: Sequence[str]) -> Reproduction:
@@ -244,20 +244,18 @@ def check_reproduction(
             f"{path} does not count, because the list of the study, which maintainers keep, lacks "
             "it: add its line to the list (docs/submit.md), or remove it"
         )
+    cure = "make it again with `symsteer reproduce RECORD --into`, or remove it"
     if not vouched and not again.is_file():
         raise UserError(
             f"{path} cannot be computed again, because the repeated record {again.name} is not "
-            "beside it: make it again with `symsteer reproduce RECORD --into`, or remove it"
+            f"beside it: {cure}"
         )
     try:
-        if _rounded(_wanted(found, record, again)) == _rounded(found):
-            return
+        agrees = _rounded(_wanted(found, record, again)) == _rounded(found)
     except ValueError:  # one of them is not finished, or they are the same file
-        pass
-    raise UserError(
-        f"{path} says something else than the records that it is about: make it again with "
-        "`symsteer reproduce RECORD --into`, or remove it"
-    )
+        agrees = False
+    if not agrees:
+        raise UserError(f"{path} says something else than the records that it is about: {cure}")
 
 
 def _wanted(found: Reproduction, record: Path, again: Path) -> Reproduction:
@@ -286,36 +284,27 @@ def _verdict(differences: Sequence[Difference], success: Success) -> Verdict:
     return "alike" if success.low <= 0 <= success.high else "different"
 
 
-def _final(record: RunRecord) -> Evaluation:
-    if record.final is None:
-        raise ValueError("only finished runs are compared")
-    return record.final
-
-
-Leaf = tuple[str, Any, Any]
-"""Name of a value, the recorded one and the repeated one."""
-
 _MISSING = object()
 
+Value = tuple[int | None, str, Any, Any]
+"""Step of the evaluation if it has one, name, the recorded value and the repeated one."""
 
-def _values(part: Part, record: RunRecord, again: RunRecord) -> Iterator[tuple[int | None, Leaf]]:
-    """Every value of a part, with the step of its evaluation if it has one."""
+
+def _values(part: Part, record: RunRecord, again: RunRecord) -> Iterator[Value]:
+    """Every value of a part."""
     if part not in OF_EVALUATIONS:
         key = part.lower().replace(" ", "_")
         mine = record.model_dump(include={key}, exclude=IGNORED, exclude_none=True)
         theirs = again.model_dump(include={key}, exclude=IGNORED)
-        for leaf in _leaves(mine.get(key), theirs.get(key)):
-            yield None, leaf
+        yield from _leaves(None, mine.get(key), theirs.get(key))
         return
-    repeated = [_measured(evaluation, part) for evaluation in again.evaluations]
-    for index, evaluation in enumerate(record.evaluations):
-        mine = _measured(evaluation, part)
-        mine = {key: value for key, value in mine.items() if value is not None}
-        theirs = repeated[index] if index < len(repeated) else {}
-        for leaf in _leaves(mine, theirs):
-            yield evaluation.env_steps, leaf
-    for evaluation in again.evaluations[len(record.evaluations) :]:
-        yield evaluation.env_steps, ("evaluation", _MISSING, evaluation.env_steps)
+    for one, other in zip_longest(record.evaluations, again.evaluations):
+        if one is None:
+            yield other.env_steps, "evaluation", _MISSING, other.env_steps
+            continue
+        mine, theirs = (_measured(e, part) if e else {} for e in (one, other))
+        known = {key: value for key, value in mine.items() if value is not None}
+        yield from _leaves(one.env_steps, known, theirs)
 
 
 def _measured(evaluation: Evaluation, part: Part) -> dict[str, Any]:
@@ -326,41 +315,41 @@ def _measured(evaluation: Evaluation, part: Part) -> dict[str, Any]:
     return place | evaluation.episodes.model_dump(by_alias=True)
 
 
-def _leaves(recorded: Any, repeated: Any, name: str = "") -> Iterator[Leaf]:
+def _leaves(step: int | None, recorded: Any, repeated: Any, name: str = "") -> Iterator[Value]:
     """Every value of nested data that the record has, and items of its lists that it lacks."""
     if isinstance(recorded, Mapping):
         theirs = repeated if isinstance(repeated, Mapping) else {}
-        for key, value in recorded.items():
-            yield from _leaves(value, theirs.get(key, _MISSING), f"{name}.{key}" if name else key)
-        if name == "nonfinite":
-            for key in theirs.keys() - recorded.keys():
-                yield f"{name}.{key}", _MISSING, theirs[key]
+        more = theirs.keys() - recorded.keys() if name == "nonfinite" else ()
+        for key in (*recorded, *more):
+            place = f"{name}.{key}" if name else key
+            one, other = recorded.get(key, _MISSING), theirs.get(key, _MISSING)
+            yield from _leaves(step, one, other, place)
     elif isinstance(recorded, list):
         others = repeated if isinstance(repeated, list) else []
-        for index in range(max(len(recorded), len(others))):
-            pair = [x[index] if index < len(x) else _MISSING for x in (recorded, others)]
-            yield f"{name}.{index}", pair[0], pair[1]
+        for index, (one, other) in enumerate(zip_longest(recorded, others, fillvalue=_MISSING)):
+            yield step, f"{name}.{index}", one, other
     elif recorded is not None or repeated not in (None, _MISSING):
-        yield name, recorded, repeated
+        yield step, name, recorded, repeated
 
 
-def _difference(part: Part, leaves: Sequence[tuple[int | None, Leaf]]) -> Difference:
-    differing = [(step, leaf) for step, leaf in leaves if leaf[1] != leaf[2]]
+def _difference(part: Part, values: Iterable[Value]) -> Difference:
+    values = list(values)
+    differing = [value for value in values if value[2] != value[3]]
     sizes = [
-        abs(one - other)
-        for _, (_, one, other) in differing
+        abs(float(one - other))
+        for _, _, one, other in differing
         if isinstance(one, int | float) and isinstance(other, int | float)
     ]
-    example = ""
+    first, example = None, ""
     if differing:
-        name, one, other = differing[0][1]
+        first, name, one, other = differing[0]
         example = f"{name.removeprefix('diagnostics.')}: {_shown(one)} -> {_shown(other)}"
     return Difference(
         part=part,
         differ=len(differing),
-        of=len(leaves),
-        first=differing[0][0] if differing else None,
-        largest=max((size for size in map(float, sizes) if math.isfinite(size)), default=None),
+        of=len(values),
+        first=first,
+        largest=max(filter(math.isfinite, sizes), default=None),
         example=example[:300],
     )
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from symsteer.leaderboard.compare.changes import Changes, find_changes
-from symsteer.leaderboard.compare.pairing import Pairing, pair_runs
+from symsteer.leaderboard.compare.changes import Changes
+from symsteer.leaderboard.compare.pairing import pair_runs
 from symsteer.leaderboard.compare.sides import read_sides
 from symsteer.leaderboard.records import RunRecord, write_record
 from tests.leaderboard.record_factory import make_evaluation, make_record
@@ -53,9 +53,5 @@ def at_commit(records: Iterable[RunRecord], commit: str) -> list[RunRecord]:
     return found
 
 
-def paired(a: Path | str, b: Path | str, place: Path = Path("runs")) -> Pairing:
-    return pair_runs(*read_sides(str(a), str(b), place))
-
-
-def changed(a: Path | str, b: Path | str, place: Path = Path("runs"), margin: float = 0) -> Changes:
-    return find_changes(paired(a, b, place), margin)
+def changed(a: Path | str, b: Path | str, place: Path | str = "runs", margin: float = 0) -> Changes:
+    return pair_runs(*read_sides(str(a), str(b), Path(place)), margin)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from symsteer.leaderboard.statistics import Sample, crossed_bootstrap, stratified_bootstrap
+from symsteer.leaderboard.statistics import Sample, crossed_bootstrap
 from tests.leaderboard.compare.runs import changed, runs_of, save
 from tests.leaderboard.record_factory import make_cell
 
@@ -81,7 +81,7 @@ def test_the_mean_over_cells_is_over_those_with_enough_pairs(tmp_path: Path):
     a += runs_of(*curves(0.5, 4), **few)
     b += runs_of(*curves(1.0, 4), **few)
     found = changed(*sides(tmp_path, a, b))
-    by_variant = {cell.cell.key.variant: cell.measures["success"] for cell in found.cells}
+    by_variant = {cell.key.variant: cell.measures["success"] for cell in found.cells}
     assert {name: round(c.difference.value, 9) for name, c in by_variant.items()} == {
         "none": 0.1,
         "wind:0.5": 0.5,
@@ -96,29 +96,6 @@ def test_the_mean_over_cells_is_over_those_with_enough_pairs(tmp_path: Path):
     assert overall.difference.value == pytest.approx(-0.05)
     assert (overall.a, overall.b, overall.pairs) == (pytest.approx(0.5), pytest.approx(0.45), 10)
     assert overall.counts
-
-
-def test_the_mean_over_cells_draws_shared_policies_together(tmp_path: Path):
-    settings = ({"variant": "none"}, {"variant": "wind:1"})
-    a = [r for s in settings for r in runs_of(*curves(0.5), policies=True, **s)]
-    b = [r for s in settings for r in runs_of(*curves(0.6, salt=1), policies=True, **s)]
-    found = changed(*sides(tmp_path, a, b))
-    samples = [
-        [
-            Sample.pooled(
-                (
-                    (seed, y - x)
-                    for (seed, x), y in zip(
-                        pair.a.final_success.items(), pair.b.final_success.values(), strict=True
-                    )
-                ),
-                pair.a.policy,
-            )
-            for pair in cell.cell.pairs
-        ]
-        for cell in found.cells
-    ]
-    assert found.overall["success"].difference == stratified_bootstrap(samples)
 
 
 def test_the_bias_of_q_is_compared_by_its_size(tmp_path: Path):
@@ -137,16 +114,6 @@ def test_references_have_no_curve(tmp_path: Path):
     assert "auc" not in found.overall
     assert found.overall["success"].difference.value == pytest.approx(0.25)
     assert found.verdict == "better"
-
-
-def test_wall_clock_is_information(tmp_path: Path):
-    a, b = runs_of(*curves(0.5)), runs_of(*curves(0.5))
-    for record in b:
-        record.wall_clock.total = 100_000
-    found = changed(*sides(tmp_path, a, b))
-    assert found.seconds == (250, 100_000)
-    assert found.cells[0].seconds == (250, 100_000)
-    assert found.verdict == "identical"
 
 
 @pytest.mark.parametrize(
@@ -178,32 +145,10 @@ def test_success_alone_or_the_area_alone_is_enough(tmp_path: Path):
     found = changed(a, b)
     assert found.overall["success"].difference.sign == 0
     assert found.verdict == "worse"
+    # Better in one and worse in the other, within the margin.
+    assert changed(a, b, margin=1.0).verdict == "not worse"
     end = [[*run[:2], [0] * EPISODES] for run in curves(0.02)]
     start = [[*run[:2], [1] * 4 + [0] * (EPISODES - 4)] for run in curves(0.02)]
     a, b = save(tmp_path / "c", runs_of(*start)), save(tmp_path / "d", runs_of(*end))
     assert changed(a, b).overall["success"].difference.high < 0
     assert changed(a, b).verdict == "worse"
-
-
-def test_better_in_one_and_worse_in_the_other_within_the_margin_is_not_better(tmp_path: Path):
-    late = [[[0] * EPISODES, [0] * EPISODES, [1] * EPISODES] for _ in range(5)]
-    a, b = sides(tmp_path, runs_of(*curves(0.8)), runs_of(*late))
-    assert changed(a, b).verdict == "worse"
-    assert changed(a, b, margin=1.0).verdict == "not worse"
-
-
-def test_too_few_pairs_have_no_verdict(tmp_path: Path):
-    a, b = sides(tmp_path, runs_of(*curves(1, 4)), runs_of(*curves(0, 4)))
-    found = changed(a, b)
-    assert found.overall["success"].difference.high < 0
-    assert found.verdict == "none"
-
-
-@pytest.mark.parametrize("runs", [1, 5])
-def test_identical_episodes(tmp_path: Path, runs):
-    a, b = runs_of(*curves(0.5, runs)), runs_of(*curves(0.5, runs))
-    assert changed(*sides(tmp_path, a, b)).verdict == "identical"
-    b[-1].evaluations[0].episodes.episode_len = [99] * EPISODES
-    assert changed(a := tmp_path / "a", save(tmp_path / "c", b)).verdict == (
-        "none" if runs == 1 else "not worse"
-    )

@@ -1,42 +1,149 @@
-"""Which runs are paired, and what is said of the others."""
+"""What the names A and B mean, which runs are paired, and what is said of the others."""
 
 from __future__ import annotations
 
+import shutil
+from itertools import product
 from pathlib import Path
 
 import pytest
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.compare.sides import read_sides
 from symsteer.leaderboard.records.retired import RETIRED
-from tests.leaderboard.compare.runs import at_commit, paired, runs_of, save
+from tests.leaderboard.compare.runs import at_commit, changed, runs_of, save
 from tests.leaderboard.record_factory import make_evaluation, make_record
 
 CURVES = [[[1, 0, 1]], [[0, 0, 1]], [[1, 1, 1]]]
 NESTED = {"lr": 0.1, "depth": 2}
+GOOD = [[[1, 0]]] * 2
+OLD, NEW = "aaaa1111" * 5, "aaaa2222" * 5
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two agents and two commits, some levels deep; the present folder is the one above."""
+    monkeypatch.chdir(tmp_path)
+    standard, equivariant = (runs_of(*GOOD, agent=name) for name in ("standard", "equivariant"))
+    save(tmp_path / "runs/some/deep/standard-runs", at_commit(standard, OLD))
+    save(tmp_path / "runs/more", at_commit(equivariant, NEW))
+    return tmp_path
+
+
+def agents(side):
+    return sorted(run.agent for run in side.runs)
+
+
+def test_agents_are_found_at_any_depth(place):
+    a, b = read_sides("standard", "equivariant", Path("runs"))
+    assert (a.kind, b.kind) == ("agent", "agent")
+    assert agents(a) == ["standard"] * 2
+    assert agents(b) == ["equivariant"] * 2
+
+
+def test_a_commit_is_named_by_its_beginning(place):
+    """Of an installed package it is the hash of its code."""
+    record = make_record(agent="zero")
+    record.provenance.commit, record.provenance.dirty = None, None
+    record.provenance.sha256 = "beef" * 16
+    save(place / "runs/installed", [record])
+    for prefix, agent in (("aaaa2", "equivariant"), ("AAAA2222", "equivariant"), ("beef", "zero")):
+        _, b = read_sides("standard", prefix, Path("runs"))
+        assert (b.kind, {*agents(b)}) == ("commit", {agent})
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("aaaa", ["2 commits", "aaaa1111aaaa", "aaaa2222aaaa", "more digits"]),
+        ("aaa", ["no folder, agent or commit 'aaa'", "aaaa1111"]),
+        ("bbbb", ["'bbbb'"]),
+        ("standrad", ["did you mean 'standard'"]),
+        ("runs/mroe", ["'runs/mroe'", "equivariant, standard"]),
+        ("", ["''"]),
+    ],
+)
+def test_a_name_that_means_nothing(place, name, words):
+    with pytest.raises(UserError) as error:
+        read_sides(name, "standard", Path("runs"))
+    assert all(word in str(error.value) for word in words), error.value
+
+
+def test_a_path_comes_before_an_agent(place):
+    shutil.copytree(place / "runs/more", place / "standard")
+    a, b = read_sides("standard", "runs/some", Path("runs"))
+    assert (a.kind, agents(a)) == ("folder", ["equivariant"] * 2)
+    assert (b.kind, agents(b)) == ("folder", ["standard"] * 2)
+    a, _ = read_sides("runs/more/run-1/record.json", "runs/some", Path("runs"))
+    assert (a.kind, [run.seed for run in a.runs]) == ("file", [1])
+
+
+def test_a_run_belongs_to_one_side(place):
+    with pytest.raises(UserError, match="2 of the runs belong to A"):
+        read_sides("runs", "runs/more", Path("runs"))
+    with pytest.raises(UserError, match="belong to A"):
+        read_sides("standard", "aaaa1", Path("runs"))
+
+
+def test_unfinished_and_older_runs_are_left_over(place):
+    folder = place / "again"
+    newer = make_record([make_evaluation([1, 1])], seed=0)
+    newer.started = newer.started.replace(year=2027)
+    newer.ended = newer.ended.replace(year=2027)
+    save(folder, [make_record(seed=0), newer, make_record(status="interrupted", seed=1)])
+    a, _ = read_sides(str(folder), "standard", Path("runs"))
+    assert [run.record for run in a.runs] == [newer]
+    reasons = {found.run.seed: found.reason for found in a.leftovers}
+    assert reasons == {0: "a newer record of the same run", 1: "not finished: interrupted"}
+    save(place / "begun", [make_record(status="running")])
+    with pytest.raises(UserError, match="begun has no finished run among 1 records"):
+        read_sides("begun", "standard", Path("runs"))
+
+
+def test_an_agent_stands_for_its_usual_settings(place):
+    others = runs_of(*GOOD[:1], agent="standard", learning_rate=0.1)
+    save(place / "runs/others", others)
+    a, _ = read_sides("standard", "equivariant", Path("runs"))
+    assert [run.record.config["learning_rate"] for run in a.runs] == [3e-4] * 2
+    (left,) = a.leftovers
+    assert left.reason == "other settings: standard (learning_rate 0.1)"
+
+
+def test_all_settings_of_a_grid_stand_for_an_agent(tmp_path: Path):
+    for tau, utd in product((0.005, 0.05), (1.0, 4.0)):
+        for agent in ("standard", "equivariant"):
+            runs = runs_of(*GOOD, agent=agent, agent_options={"tau": tau, "utd": utd})
+            save(tmp_path / f"{agent}-{tau}-{utd}", runs)
+    a, b = read_sides("standard", "equivariant", tmp_path)
+    assert [key.settings for key, _ in a.rows] == [key.settings for key, _ in b.rows]
+    assert (len(a.rows), len(a.runs), a.leftovers) == (4, 8, ())
+
+
+@pytest.mark.parametrize("text", ["{}", "{"])
+def test_foreign_and_damaged_records_are_named(place, text):
+    (place / "runs/more/run-0/record.json").write_text(text)
+    with pytest.raises(UserError, match=r"more/run-0/record\.json"):
+        read_sides("runs/some", "runs/more", Path("runs"))
+
+
+# Pairs
 
 
 def test_the_same_runs_of_other_code_are_paired_by_seed(tmp_path: Path):
+    """In two folders, or as two commits; settings of the machine need not agree."""
     records = runs_of(*CURVES, agent="standard") + runs_of(*CURVES, agent="base")
-    a = save(tmp_path / "a", records)
-    b = save(tmp_path / "b", at_commit(reversed(records), "f" * 40))
-    found = paired(a, b)
+    moved = runs_of(*CURVES, agent="standard", device="cuda") + records[3:]
+    a = save(tmp_path / "a", at_commit(records, "a" * 40))
+    b = save(tmp_path / "b", at_commit(reversed(moved), "f" * 40))
+    found = changed(a, b)
+    assert found == changed("aaaa", "ffff", tmp_path)
     assert [cell.label for cell in found.cells] == ["base", "standard"]
     for pair in found.pairs:
         assert pair.a.path != pair.b.path
-        assert pair.a.record.config == pair.b.record.config
+        assert pair.a.seed == pair.b.seed
     assert len(found.pairs) == 6
     assert found.alone == ((), ())
     assert found.one_sided == ((), ())
-
-
-def test_commits_of_one_folder(tmp_path: Path):
-    records = runs_of(*CURVES) + runs_of(*CURVES, agent="zero")
-    save(tmp_path / "old", at_commit(records, "a" * 40))
-    save(tmp_path / "new", at_commit(records, "b" * 40))
-    found = paired("aaaa", "bbbb", tmp_path)
-    assert len(found.pairs) == 6
-    assert {pair.a.record.provenance.commit for pair in found.pairs} == {"a" * 40}
-    assert {pair.b.record.provenance.commit for pair in found.pairs} == {"b" * 40}
 
 
 @pytest.mark.parametrize(
@@ -60,13 +167,12 @@ def test_commits_of_one_folder(tmp_path: Path):
         ({"policies": True}, "base policy"),
     ],
 )
-@pytest.mark.parametrize("agents", [("standard", "standard"), ("standard", "equivariant")])
-def test_all_but_the_agent_must_agree(tmp_path: Path, change, words, agents):
+def test_all_but_the_agent_must_agree(tmp_path: Path, change, words):
     usual = {"evaluation": {"episodes": 10}, "num_envs": 64}
-    a = save(tmp_path / "a", runs_of(CURVES[0], agent=agents[0], **usual))
-    b = save(tmp_path / "b", runs_of(CURVES[0], agent=agents[1], **(usual | change)))
+    a = save(tmp_path / "a", runs_of(CURVES[0], agent="standard", **usual))
+    b = save(tmp_path / "b", runs_of(CURVES[0], agent="equivariant", **(usual | change)))
     with pytest.raises(UserError) as error:
-        paired(a, b)
+        changed(a, b)
     assert f"differ in {words}" in str(error.value)
 
 
@@ -74,19 +180,13 @@ def test_the_episodes_must_agree(tmp_path: Path):
     a = save(tmp_path / "a", [make_record([make_evaluation([1, 0])])])
     b = save(tmp_path / "b", [make_record([make_evaluation([1, 0], first_seed=7)])])
     with pytest.raises(UserError, match=r"held-out episodes \(\[10000, 10001\], \[7, 8\]\)"):
-        paired(a, b)
-
-
-def test_settings_of_the_machine_need_not_agree(tmp_path: Path):
-    a = save(tmp_path / "a", runs_of(*CURVES, device="cpu"))
-    b = save(tmp_path / "b", runs_of(*CURVES, device="cuda"))
-    assert len(paired(a, b).pairs) == 3
+        changed(a, b)
 
 
 def test_two_agents_are_paired_whatever_their_options(tmp_path: Path):
     save(tmp_path / "a", runs_of(*CURVES, agent="standard", agent_options=NESTED))
     save(tmp_path / "b", runs_of(*CURVES[:2], agent="equivariant", agent_options={"group": "C8"}))
-    found = paired("standard", "equivariant", tmp_path)
+    found = changed("standard", "equivariant", tmp_path)
     assert [(pair.a.agent, pair.b.agent) for pair in found.pairs] == [
         ("standard", "equivariant")
     ] * 2
@@ -100,7 +200,7 @@ def test_two_agents_are_paired_whatever_their_options(tmp_path: Path):
 def test_one_set_of_options_against_another(tmp_path: Path):
     a = save(tmp_path / "a", runs_of(*CURVES, agent_options=NESTED))
     b = save(tmp_path / "b", runs_of(*CURVES, agent_options=NESTED | {"lr": 0.2, "new": True}))
-    found = paired(a, b)
+    found = changed(a, b)
     assert len(found.pairs) == 3
     assert found.changed == ("lr 0.1 -> 0.2", "new unset -> true")
 
@@ -109,7 +209,7 @@ def test_of_several_agents_the_options_must_agree(tmp_path: Path):
     zero = runs_of(*CURVES, agent="zero")
     a = save(tmp_path / "a", runs_of(*CURVES, agent_options=NESTED) + zero)
     b = save(tmp_path / "b", runs_of(*CURVES, agent_options=NESTED | {"lr": 0.2}) + zero)
-    found = paired(a, b)
+    found = changed(a, b)
     assert {pair.a.agent for pair in found.pairs} == {"zero"}
     for letter, alone in zip("BA", found.alone, strict=True):
         assert [left.reason for left in alone] == [f"the nearest run of {letter} differs in lr"] * 3
@@ -118,24 +218,16 @@ def test_of_several_agents_the_options_must_agree(tmp_path: Path):
 def test_agents_of_several_are_not_paired_with_each_other(tmp_path: Path):
     zero, base, standard = (runs_of(*CURVES, agent=name) for name in ("zero", "base", "standard"))
     a, b = save(tmp_path / "a", zero + base), save(tmp_path / "b", zero + standard)
-    found = paired(a, b)
+    found = changed(a, b)
     assert {(pair.a.agent, pair.b.agent) for pair in found.pairs} == {("zero", "zero")}
     assert {left.reason for left in found.alone[0]} == {"the nearest run of B differs in agent"}
-
-
-def test_one_agent_meets_itself_among_several(tmp_path: Path):
-    standard, zero = (runs_of(*CURVES, agent=name) for name in ("standard", "zero"))
-    a, b = save(tmp_path / "a", standard), save(tmp_path / "b", standard + zero)
-    for first, second in ((a, b), (b, a)):
-        found = paired(first, second)
-        assert {(pair.a.agent, pair.b.agent) for pair in found.pairs} == {("standard", "standard")}
 
 
 def test_a_setting_that_one_side_does_not_know_does_not_count(tmp_path: Path):
     zero = runs_of(*CURVES, agent="zero")
     a = save(tmp_path / "a", runs_of(*CURVES, agent_options=NESTED, old=1) + zero)
     b = save(tmp_path / "b", runs_of(*CURVES, agent_options=NESTED | {"new": True}) + zero)
-    found = paired(a, b)
+    found = changed(a, b)
     assert len(found.pairs) == 6
     assert found.one_sided == (("old",), ("agent_options.new",))
 
@@ -149,11 +241,11 @@ def test_an_option_that_is_no_more_has_its_one_value(tmp_path: Path):
         return save(tmp_path / name, runs)
 
     old, new, other = side("old", **RETIRED), side("new"), side("other", n_step=3)
-    found = paired(old, new)
+    found = changed(old, new)
     assert len(found.pairs) == 6
     assert (found.one_sided, found.changed) == (((), ()), ())
     with pytest.raises(UserError, match=r"differ in agent_options|differ in n_step \(1, 3\)"):
-        paired(old, other)
+        changed(old, other)
 
 
 def test_a_run_has_one_partner(tmp_path: Path):
@@ -166,7 +258,7 @@ def test_a_run_has_one_partner(tmp_path: Path):
     a = save(tmp_path / "a", runs_of(*CURVES, agent_options=NESTED) + zero)
     b = save(tmp_path / "b", twice + zero)
     for first, second, side in ((a, b, 1), (b, a, 0)):
-        found = paired(first, second)
+        found = changed(first, second)
         paths = [run.path for pair in found.pairs for run in (pair.a, pair.b)]
         assert len(paths) == len(set(paths)) == 12
         reason = f"its run of {'BA'[side]} has another partner"
@@ -175,14 +267,7 @@ def test_a_run_has_one_partner(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("field", "episodes", "diagnostics"),
-    [
-        (None, True, True),
-        ("success_at_end", False, True),
-        ("return_", False, True),
-        ("episode_len", False, True),
-        ("diagnostics", True, False),
-        ("wall_clock", True, True),
-    ],
+    [("wall_clock", True, True), ("return_", False, True), ("diagnostics", True, False)],
 )
 def test_what_agrees_bit_for_bit(tmp_path: Path, field, episodes, diagnostics):
     curve = [[[1, 1], [0, 1], [1, 1]]]
@@ -192,11 +277,7 @@ def test_what_agrees_bit_for_bit(tmp_path: Path, field, episodes, diagnostics):
         middle.diagnostics = {"q_bias": 7.0}
     elif field == "wall_clock":
         middle.wall_clock += 1
-    elif field == "success_at_end":
-        middle.episodes.success_at_end = [False, False]
-    elif field is not None:
-        values = list(getattr(middle.episodes, field))
-        values[1] += 1
-        setattr(middle.episodes, field, values)
-    (pair,) = paired(save(tmp_path / "a", a), save(tmp_path / "b", b)).pairs
+    else:
+        middle.episodes.return_[1] += 1
+    (pair,) = changed(save(tmp_path / "a", a), save(tmp_path / "b", b)).pairs
     assert (pair.same_episodes, pair.same_diagnostics) == (episodes, diagnostics)
