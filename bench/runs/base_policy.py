@@ -221,7 +221,7 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
         group=str(policy.group),
         content_hash=policy.content_hash(),
         base_success=report.get("success"),
-        draws=report.get("draws", DRAWS),
+        draws=report.get("draws") or DRAWS,
         training_seconds=policy.training_record.get("seconds"),
         parameters=policy.parameter_count(),
         **measured,

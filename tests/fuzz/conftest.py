@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import patch
 
 import pytest
@@ -16,7 +16,7 @@ from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep.plan import make_plan, write_manifest
 from symsteer.bench.sweep.suite import Suite
-from symsteer.leaderboard.records import dump_record, flat
+from symsteer.leaderboard.records import dump_record, repeat_command
 from tests.bench.tiny_run import tiny_config
 from tests.fuzz.kinds import Workshop
 from tests.leaderboard.record_factory import make_record
@@ -27,7 +27,7 @@ CONFIG = replace(tiny_config(agent="standard"), checkpoint_every=CHECKPOINT_EVER
 OTHER = tiny_config(agent="zero", checkpoint_every=CHECKPOINT_EVERY)
 
 
-def stop_after(config, out, checkpoints, progress=False):
+def stop_after(config, out, checkpoints):
     """The folder of a run that was interrupted right after some checkpoint."""
     written = []
 
@@ -39,30 +39,13 @@ def stop_after(config, out, checkpoints, progress=False):
 
     whole = Trainer._checkpoint
     with patch.object(Trainer, "_checkpoint", save), pytest.raises(KeyboardInterrupt):
-        execute(config, out, progress=progress)
+        execute(config, out, progress=False)
     return written[0]
 
 
 def options_of(config: RunConfig) -> list[str]:
     """The command line that asks for a configuration."""
-    named = RunConfig(agent=config.agent, policy_name=config.policy_name)
-    defaults = flat(named.to_json()) | {"agent": RunConfig.agent, "policy.name": None}
-    return [
-        word
-        for key, value in flat(config.to_json()).items()
-        if value != defaults[key]
-        for word in (option_of(key), str(value))
-    ]
-
-
-def option_of(key: str) -> str:
-    """The option of ``symsteer run`` for a key of a configuration."""
-    return "--" + key.replace("agent_options.", "agent.").replace("_", "-")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    names = ("config.json", "record.json", "checkpoint.pt", "policy.safetensors")
-    return {name: (folder / name).read_bytes() for name in names}
+    return shlex.split(str(repeat_command(config.to_json())))[2:]
 
 
 @pytest.fixture(scope="session")
@@ -80,13 +63,14 @@ def workshop(tmp_path_factory) -> Workshop:
         "b": make_record(agent="equivariant", seed=1),
         "c": make_record(agent="base", status="failed"),
     }
+    names = ("config", "record", "progress")
+    files = [*(f"{name}.json" for name in names), "checkpoint.pt", "policy.safetensors"]
     return Workshop(
         config=CONFIG,
         options=options_of(CONFIG),
-        run=contents(folder),
+        run={name: (folder / name).read_bytes() for name in files},
         run_id=folder.name,
         state=state,
-        progress=(folder / "progress.json").read_bytes(),
         sweeps=out / "sweeps",
         base=out / "base",
         demos=(h5.read_bytes(), h5.with_suffix(".json").read_bytes()),

@@ -13,7 +13,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from unittest.mock import patch
 
@@ -44,11 +44,13 @@ class Ending:
     Attributes:
         kind: "refused" (one sentence), "usage" (the parser's own message), "accepted", "done".
         sentence: on stderr, if refused.
-        found: what ``Reached`` brought.
+        notes: the lines on stderr that follow it.
+        found: what ``Reached`` brought, or the output.
     """
 
     kind: str
     sentence: str = ""
+    notes: list[str] = field(default_factory=list)
     found: Any = None
 
 
@@ -69,12 +71,13 @@ def stopped_at(*places: tuple[Any, str]) -> Iterator[None]:
         yield
 
 
-def end_of(arguments: Sequence[Any], mentions: Sequence[str] = ()) -> Ending:
+def end_of(arguments: Sequence[Any], mentions: Sequence[str] = (), notes: bool = False) -> Ending:
     """Run ``symsteer ARGUMENTS`` in this process.
 
     Args:
         arguments: of the command line.
         mentions: one of these has to occur in the sentence (the names of the files at fault).
+        notes: whether lines may follow the sentence.
 
     Raises:
         BadEndingError: if it ended in anything else than the endings of :class:`Ending`.
@@ -108,10 +111,12 @@ def end_of(arguments: Sequence[Any], mentions: Sequence[str] = ()) -> Ending:
     text = err.getvalue()
     if code != 2:
         raise BadEndingError(f"exit code {code}: {text[-500:]}")
-    return Ending("refused", one_sentence(text, mentions))
+    if not text and "NOT ADMISSIBLE" in out.getvalue():  # `report --check` says it on stdout
+        return Ending("refused", found=out.getvalue())
+    return Ending("refused", one_sentence(text, mentions, notes), text.splitlines()[1:])
 
 
-def one_sentence(text: str, mentions: Sequence[str] = ()) -> str:
+def one_sentence(text: str, mentions: Sequence[str] = (), notes: bool = False) -> str:
     """The sentence of an error, without "error: ".
 
     Raises:
@@ -119,7 +124,7 @@ def one_sentence(text: str, mentions: Sequence[str] = ()) -> str:
     """
     lines = text.removesuffix("\n").split("\n")
     problems = [
-        f"{len(lines)} lines" * (len(lines) != 1),
+        f"{len(lines)} lines" * (len(lines) != 1 and not notes),
         "no 'error: '" * (not text.startswith("error: ")),
         "unprintable characters" * (not lines[0].isprintable()),
         f"{len(lines[0])} characters" * (not 25 <= len(lines[0]) <= LONGEST),

@@ -1,4 +1,4 @@
-"""The kinds of input, how each is damaged, and what may happen.
+"""The kinds of input, how each is damaged, which commands read it, and what must then be true.
 
 ``KINDS[name](workshop, number, folder)`` damages an input in the way that belongs to the number,
 gives it to the command line and returns how that ended. It raises ``BadEndingError`` if it ended in
@@ -7,26 +7,19 @@ a traceback or an unclear sentence, or if damage was accepted.
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import hashlib
 import io
-import itertools
 import json
-import math
 import os
 import pickle
-import re
 import shutil
 import struct
-import tomllib
-import typing
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 from typing import Any
-from unittest.mock import patch
 
 import h5py
 import numpy as np
@@ -34,32 +27,34 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from symsteer import cli
 from symsteer.bench.runs import base_policy
 from symsteer.bench.runs import run as run_module
 from symsteer.bench.runs.checkpoint import CHECKSUM_BYTES, FORMAT, load_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.trainer import Trainer
-from symsteer.bench.sweep.suite import load_suite
-from symsteer.bench.tasks import task_class
+from symsteer.leaderboard import report
 from symsteer.leaderboard.records import config_hash, flat, read_record
-from symsteer.policies.files import save_policy
-from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
-from symsteer.variant import parse_variant, variant_text
+from symsteer.policies.files import _sha256, load_policy
+from tests.bench.tuning.tiny_plan import TEXT as PLAN
 from tests.fuzz.judge import BadEndingError, Ending, end_of, stopped_at
 from tests.fuzz.mutate import (
     POISON,
+    damage_bits,
+    damage_bytes,
+    damage_json,
+    damage_json_text,
+    damage_toml,
+    damage_toml_text,
     extreme,
     flip_bits,
+    nested,
     poison_bytes,
     poison_data,
-    poison_json,
-    poison_lines,
-    same,
+    to_toml,
 )
 
 
-@dataclasses.dataclass
+@dataclass
 class Workshop:
     """Intact inputs.
 
@@ -69,7 +64,6 @@ class Workshop:
         run: folder of a run that was stopped after its second checkpoint, name to bytes.
         run_id: its name.
         state: its checkpoint.
-        progress: its progress.json.
         sweeps: folder of the bookkeeping of a sweep.
         base: folder of its demonstrations and base policy.
         demos: its demonstrations, .h5 and .json.
@@ -83,7 +77,6 @@ class Workshop:
     run: dict[str, bytes]
     run_id: str
     state: dict[str, Any]
-    progress: bytes
     sweeps: Path
     base: Path
     demos: tuple[bytes, bytes]
@@ -101,12 +94,74 @@ class Workshop:
         return path
 
 
-def _require(condition: bool, complaint: str) -> None:
+Way = Callable[[Path, Random], None]
+"""Damages the file at a path."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file.
+
+    Attributes:
+        make: writes the intact input into a folder; the file to damage.
+        ways: in which it is damaged.
+        lines: command lines that read it.
+        stop: where their work would begin.
+        check: raises if damage was accepted.
+    """
+
+    make: Callable[[Workshop, Path], Path]
+    ways: Sequence[Way]
+    lines: Sequence[Callable[[Workshop, Path], list[Any]]]
+    stop: Sequence[tuple[Any, str]] = ()
+    check: Callable[[Workshop, Path, Ending], None] = lambda workshop, path, ending: None
+
+    def __call__(self, workshop: Workshop, number: int | None, folder: Path) -> Ending:
+        """Damage the input in the way of a number (None: in no way), and give it to a command."""
+        random = Random(f"{self.make.__name__} {number}")
+        path = self.make(workshop, folder)
+        if number is not None:
+            self.ways[number % len(self.ways)](path, random)
+        line = self.lines[0] if number is None else random.choice(self.lines)
+        arguments = line(workshop, path)
+        names = (path.stem, workshop.run_id, "record.json", "policy.safetensors", "sweeps")
+        with stopped_at(*self.stop):
+            ending = end_of(arguments, names)
+        if ending.kind == "accepted" and isinstance(ending.found[0], Trainer):
+            ending.found[0].evaluator.close()
+        if ending.kind == "done":
+            lines = ending.found.splitlines()
+            require(all(line.isprintable() for line in lines), "unprintable characters")
+        require("too little memory" not in ending.sentence, "it took gigabytes")
+        if number is not None and ending.kind in ("accepted", "done"):
+            self.check(workshop, path, ending)
+        return ending
+
+
+def require(condition: bool, complaint: str) -> None:
     if not condition:
         raise BadEndingError(complaint)
 
 
-# Suites.
+def new_run(workshop: Workshop, *more: Any) -> list[Any]:
+    return ["run", "--quiet", *more, "--out", "runs", *workshop.options]
+
+
+def in_run(name: str) -> Callable[[Workshop, Path], Path]:
+    """A file of the stopped run."""
+    return lambda workshop, folder: workshop.restore_run(folder) / name
+
+
+RESUME, EVALUATE = (
+    lambda workshop, path, verb=verb: [verb, path.parent] for verb in ("resume", "evaluate")
+)
+WORK = ((Trainer, "play"), (run_module, "Evaluator"))
+BYTES = (damage_bytes, damage_bits)
+JSON = (damage_json, damage_json, damage_json_text, damage_bytes)
+TOML = (damage_toml, damage_toml, damage_toml_text, damage_bytes)
+
+
+# TOML: suites, presets, plans and studies.
 
 SUITE: dict[str, Any] = {
     "description": "two tasks, a broken and an unbroken world",
@@ -126,503 +181,241 @@ SUITE: dict[str, Any] = {
     },
 }
 
+PRESET: dict[str, Any] = {
+    "all": {"lr": 1e-3, "utd": 0.5, "layer_norm": True, "reduce": "min", "batch_size": 64},
+    "equivariant": {"critics": 2, "lr": 2e-3},
+    "standard": {"width": 64},
+}
 
-def to_toml(data: dict[str, Any], prefix: str = "") -> str:
-    """A table as TOML; values that TOML does not have are written as in JSON."""
-    lines, tables = [], []
-    for key, value in data.items():
-        name = json.dumps(str(key))
-        if isinstance(value, dict):
-            tables.append(f"[{prefix}{name}]\n{to_toml(value, f'{prefix}{name}.')}")
-        elif isinstance(value, float) and not math.isfinite(value):
-            lines.append(f"{name} = {value}")
-        else:
-            lines.append(f"{name} = {_inline(value)}")
-    return "\n".join([*lines, *tables])
-
-
-def _inline(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{json.dumps(k)} = {_inline(v)}' for k, v in value.items())}}}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_inline, value))}]"
-    return json.dumps(value)
+TEXTS = {
+    "suite": to_toml(SUITE),
+    "preset": to_toml(PRESET),
+    "plan": PLAN + "[[further]]\nlr = 1e-2\ncritics = 4\n[run.agent]\ntau = 0.1\n",
+    "study": (Path(report.__file__).parent / "studies" / "paper.toml").read_text(),
+}
 
 
-def suite(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """A suite file, read by ``symsteer sweep --dry-run``."""
-    random = Random(f"suite {number}")
-    path = folder / "mutant.toml"
-    kind = random.randrange(10)
-    if kind < 6:
-        data = poison_data(SUITE, random, random.choice((1, 1, 2)))
-        path.write_text(to_toml(data), "utf-8", "surrogatepass")
-    elif kind == 6:
-        path.write_text(poison_lines(to_toml(SUITE), random))
-    elif kind == 7:
-        path.write_text(
-            random.choice(
-                (
-                    "",
-                    "[grid]\nseed = " + "[" * 3000 + "]" * 3000,
-                    "[grid]\nseed = [" + "0, " * 2000 + "1]\nnum_envs = [" + "1, " * 2000 + "2]",
-                    "[[grid]]\nseed = [0]\n[[grid]]\nsede = [1]",
-                    "[run]\nseed = 2026-01-31",
-                    "[run]\nenv_steps = 1e400",
-                    "run = [1]",
-                    "grid = 1",
-                    "description = 7",
-                    "[grid]\n'agent.lr.more' = [1]",
-                    "[grid]\n'' = [1]",
-                    "[grid]\n'.' = [1]",
-                    "[grid]\nstrength = [0.5]",
-                    "[grid]\nvariant = ['none']\nstrength = ['0.5']",
-                    "[grid]\nvariant = ['action_gain,wind']\nstrength = [0.5]",
-                    "[run]\nseed = 99999999999999999999999999",
-                )
-            )
-        )
-    else:
-        path.write_bytes(poison_bytes(to_toml(SUITE).encode(), random))
-    ending = end_of(["sweep", path, "--dry-run", "--out", folder / "runs"], [path.stem])
-    if ending.kind == "done":
-        found = [flat(config.to_json()) for config in load_suite(str(path)).runs]
-        wanted = _grid(tomllib.loads(path.read_text()))
-        _require(len(found) == len(wanted), f"{len(found)} runs of {len(wanted)}")
-        for have, want in zip(found, wanted, strict=True):
-            for name, value in want.items():
-                key = re.sub(r"^agent\.", "agent_options.", name)
-                have_value = list(have[key]) if isinstance(have[key], tuple) else have[key]
-                _require(have_value == value, f"{key} is {have_value!r}, not {value!r}")
-    return ending
+def toml_file(name: str) -> Callable[[Workshop, Path], Path]:
+    def make(workshop: Workshop, folder: Path) -> Path:
+        (folder / "a.json").write_text(workshop.records["a"])
+        (folder / "mutant.toml").write_text(TEXTS[name])
+        return folder / "mutant.toml"
+
+    return make
 
 
-def _grid(data: dict[str, Any]) -> list[dict[str, Any]]:
-    """The runs of a suite, read independently: one flat table per run, without repetitions."""
-    shared = flat(data.get("run", {}))
-    grids = data.get("grid", {})
-    wanted: list[dict[str, Any]] = []
-    for grid in grids if isinstance(grids, list) else [grids]:
-        for values in itertools.product(*grid.values()):
-            cell = dict(zip(grid, values, strict=True))
-            strength = cell.pop("strength", None)
-            variant = cell.get("variant", "none")
-            if strength is not None and variant != "none" and ":" not in variant:
-                cell["variant"] = "+".join(f"{v}:{strength:g}" for v in variant.split("+"))
-            run = {**shared, **cell}
-            if run not in wanted:
-                wanted.append(run)
-    return wanted
+def suite_with_preset(workshop: Workshop, path: Path) -> list[Any]:
+    suite = path.with_name("suite.toml")
+    suite.write_text(to_toml({"grid": {**SUITE["grid"], "agent.preset": [str(path)]}}))
+    return ["sweep", suite, "--dry-run"]
 
 
-# Configurations.
+# Configurations, records and what a display reads.
 
 
-def config_file(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """config.json of a stopped run, read by ``symsteer resume``."""
-    random = Random(f"config {number}")
-    run = workshop.restore_run(folder)
-    path = run / "config.json"
-    original = path.read_text()
-    path.write_text(poison_json(original, random), "utf-8", "surrogatepass")
-    verb = random.choice(("resume", "evaluate"))
-    with stopped_at((run_module, "Trainer"), (run_module, "Evaluator")):
-        ending = end_of([verb, run], ["config.json", workshop.run_id])
-    if ending.kind == "accepted":
-        _require(ending.found[0] == workshop.config, "another configuration was accepted")
-    return ending
+def same_configuration(workshop: Workshop, path: Path, ending: Ending) -> None:
+    config = getattr(ending.found[0], "config", ending.found[0])
+    require(config == workshop.config, "another configuration was accepted")
 
 
-NUMBERS = (
-    *("-1", "0", "1", "3", "7", "1e9", "nan", "inf", "-inf", "1e308", "-0.5", "0.5", "1.5", "+5"),
-    *("2", "16", "128", "100000", "10000000000000"),
-    *("4" * 10, "9" * 26, "-" + "9" * 26, "1_0", "0x10", " 5", "4,5", "1e-320", "0.3", "99999999"),
-)
-WORDS = (
-    *("many", "", "None", "True", "PickCube-v1", "panda", "none", "D4", "C8", "E8", "C0", "SO2"),
-    *("action_gain:0.5", "action_gain:0.5,wind:0.3", "action_gain:2", "wind:0.2+wind:0.3", "C97"),
-    *("action_gain: 0.5", "action_gain:0.50", "action_gain:nan", "wind:+0.5", "wind:1e-3", "D1"),
-    *("C999999999", "\x1b[31m", "a\nb", "x" * 3000, "../..", "-", "--", "ünï", "C8 C4", "diverse"),
-    *("zero", "epsilon", "obstacle:1+wind:1+gravity_tilt:1+friction_patch:1+frame_offset:1"),
-)
-"""Values on a command line."""
+def records(workshop: Workshop, folder: Path) -> Path:
+    """Side by side, one of which is damaged."""
+    for name, text in workshop.records.items():
+        (folder / "results" / name).mkdir(parents=True)
+        (folder / "results" / name / "record.json").write_text(text)
+    return folder / "results" / "b" / "record.json"
 
 
-def command(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """The command line of ``symsteer run``."""
-    random = Random(f"command {number}")
-    policy = folder / "policy.safetensors"
-    policy.write_bytes(workshop.run["policy.safetensors"])
-    options = [*workshop.options, "--base-policy", str(policy), "--out", str(folder / "runs")]
-    defaults = flat(workshop.config.to_json())
-    # In turn, so that every option is tested; another agent or policy has other options.
-    fields = sorted(set(defaults) - {"agent", "policy.name"})
-    key = fields[number % len(fields)]
-    option = "--" + key.replace("agent_options.", "agent.").replace("_", "-")
-    kind = random.randrange(8)
-    if kind == 0:
-        at = random.randrange(3, len(option))
-        options += [option[:at] + random.choice(("", "x", "y")) + option[at + 1 :], "3"]
-    elif kind == 1:
-        options += random.choice(([option], ["--" + option, "1"], ["-" + key[0]], [key, "1"]))
-    elif kind == 2:
-        options += ["--workers", random.choice(NUMBERS)]
-    else:
-        # Mostly values that the parser lets through.
-        numeric = isinstance(defaults[key], float | int | None)
-        likely, odd = (NUMBERS, WORDS) if numeric else (WORDS, NUMBERS)
-        options += [option, random.choice(likely if random.random() < 0.8 else odd)]
-    shutil.rmtree(folder / "runs", ignore_errors=True)
-    with stopped_at((Trainer, "play")):
-        ending = end_of(["run", "--quiet", *options])
-    if ending.kind == "accepted":
-        trainer = ending.found[0]
-        trainer.evaluator.close()
-        found, asked = flat(trainer.config.to_json()), defaults
-        if kind >= 3:
-            value = _read_as(workshop.config, key, options[-1])
-            asked[key] = variant_text(parse_variant(value)) if key == "variant" else value
-        elif options[-1] == option:  # a flag
-            asked[key] = True
-        for name, value in asked.items():
-            _require(same(found[name], value), f"{name} is {found[name]!r}, not {value!r}")
-    return ending
+def exaggerate(path: Path, random: Random) -> None:
+    data = extreme(json.loads(path.read_text()), random)
+    path.write_text(json.dumps({**data, "config_hash": config_hash(data["config"])}))
 
 
-def _read_as(config: RunConfig, key: str, text: str) -> Any:
-    """What an option's text means."""
-    owner: Any = config
-    *path, last = key.split(".")
-    for part in path:
-        owner = getattr(owner, part)
-    kind = typing.get_type_hints(type(owner))[last]
-    if typing.get_origin(kind) is tuple:
-        return (text,)
-    if text == "None" and type(None) in typing.get_args(kind):
-        return None
-    if kind is bool:
-        return {"True": True, "False": False}[text]
-    if kind is int:
-        return int(text)
-    return float(text) if kind is float or float in typing.get_args(kind) else text
-
-
-# Records.
-
-
-def record(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """A record, read by ``symsteer report`` beside intact ones, or by ``symsteer resume``."""
-    random = Random(f"record {number}")
-    if number % 3 == 2:
-        return _record_of_a_run(workshop, random, folder)
-    # As run folders, or as files side by side.
-    ending = random.choice(("/record.json", ".json"))
-    texts = {name + ending: text for name, text in workshop.records.items()}
-    name = random.choice(sorted(texts))
-    if random.random() < 0.4:
-        data = extreme(json.loads(texts[name]), random)
-        data["config_hash"] = config_hash(data["config"])
-        texts[name] = json.dumps(data)
-    else:
-        texts[name] = poison_json(texts[name], random)
-    results = folder / "results"
-    shutil.rmtree(results, ignore_errors=True)
-    for file, text in texts.items():
-        path = results / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, "utf-8", "surrogatepass")
-    path = results / name
-    if number % 3 == 1:
-        # Says of each record whether it is admissible, and why not.
-        return end_of_check(results, path)
-    ending = end_of(["report", results, "--out", folder / "board"], [name, "run_id"])
-    if ending.kind == "done":
-        _nothing_dropped(path)
-    return ending
-
-
-def end_of_check(results: Path, path: Path) -> Ending:
-    """``symsteer report --check`` has a verdict on every record, on stdout."""
-    out, err = io.StringIO(), io.StringIO()
-    arguments = ["symsteer", "report", str(results), "--check"]
-    with (
-        patch("sys.argv", arguments),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-    ):
-        try:
-            code = cli.main()
-        except BaseException as error:
-            raise BadEndingError(f"{type(error).__name__}: {error}") from error
-    text = out.getvalue() + err.getvalue()
-    _require("Traceback" not in text, text)
-    _require(all(line.isprintable() for line in text.splitlines()), "unprintable characters")
-    _require(code in (0, 2), f"exit code {code}")
-    admitted = f"{path}: admissible" in text
-    if admitted:
-        _nothing_dropped(path)
-        return Ending("done", found=text)
-    _require(str(path) in text, f"{path.name} is not named: {text[:500]}")
-    return Ending("refused", text)
-
-
-def _record_of_a_run(workshop: Workshop, random: Random, folder: Path) -> Ending:
-    run = workshop.restore_run(folder)
-    path = run / "record.json"
-    path.write_text(poison_json(path.read_text(), random), "utf-8", "surrogatepass")
-    original = json.loads(workshop.run["record.json"])
-    with stopped_at((Trainer, "play")):
-        ending = end_of(["resume", run], ["record.json", workshop.run_id])
-    if ending.kind == "accepted":
-        trainer = ending.found[0]
-        trainer.evaluator.close()
-        # The record is written before the run goes on.
-        found = json.loads(path.read_text())
-        kept = workshop.state["evaluations"]
-        for key in ("run_id", "config", "config_hash"):
-            _require(found[key] == original[key], f"another {key} was accepted")
-        _require(
-            len(found["evaluations"]) == kept
-            and json.dumps(found["evaluations"], sort_keys=True)
-            == json.dumps(original["evaluations"][:kept], sort_keys=True),
-            "other evaluations were accepted",
-        )
-    return ending
-
-
-def _nothing_dropped(path: Path) -> None:
+def nothing_dropped(workshop: Workshop, path: Path, ending: Ending) -> None:
     """A record that was accepted says in memory what its file says."""
     stored = json.loads(path.read_text("utf-8"))
     read = json.loads(read_record(path).model_dump_json(by_alias=True))
     stored.pop("schema_version"), read.pop("schema_version")
     for name, value in flat(stored).items():
         have = flat(read).get(name)
-        alike = have == value or (name in ("started", "ended") and have is not None)
-        if name == "failure":  # shortened, and without the paths of a machine
-            alike = True
-        _require(alike, f"{name} is {have!r} in memory and {value!r} in the file")
+        # Shortened and without the paths of a machine; in UTC.
+        changed = name == "failure" or (name in ("started", "ended") and have is not None)
+        require(have == value or changed, f"{name} is {have!r} in memory, {value!r} in the file")
+
+
+def same_history(workshop: Workshop, path: Path, ending: Ending) -> None:
+    """The record is written before the run goes on."""
+    found, original = json.loads(path.read_text()), json.loads(workshop.run["record.json"])
+    original["evaluations"] = original["evaluations"][: workshop.state["evaluations"]]
+    for key in ("run_id", "config", "config_hash", "evaluations"):
+        require(found[key] == original[key], f"another {key} was accepted")
+
+
+def display(workshop: Workshop, folder: Path) -> Path:
+    """The files of a run and of a sweep."""
+    shutil.copytree(workshop.sweeps, folder / "sweeps")
+    return workshop.restore_run(folder) / "progress.json"
+
+
+def damage_any(path: Path, random: Random) -> None:
+    path = random.choice([*path.parent.glob("*.json"), *(path.parents[1] / "sweeps").iterdir()])
+    random.choice(JSON if path.suffix == ".json" else BYTES)(path, random)
 
 
 # Demonstrations.
 
 
-def demonstrations(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """A pair of .h5 and .json, read by ``symsteer run --demos``."""
-    random = Random(f"demos {number}")
+def demonstrations(workshop: Workshop, folder: Path) -> Path:
     path = folder / "mutant.h5"
-    side = path.with_suffix(".json")
-    path.write_bytes(workshop.demos[0])
-    side.write_bytes(workshop.demos[1])
-    foreign = number % 5 == 0
-    if foreign:
-        _make_foreign(path, side)
-    kind = random.randrange(8)
-    if kind == 0:
-        path.write_bytes(poison_bytes(path.read_bytes(), random))
-    elif kind == 1:
-        path.write_bytes(flip_bits(path.read_bytes(), random))
-    elif kind in (2, 3):
-        side.write_text(poison_json(side.read_text(), random), "utf-8", "surrogatepass")
-    elif kind == 4:
-        data = json.loads(side.read_text())
-        _edit_description(data, random)
-        side.write_text(json.dumps(data))
-    else:
-        _edit_arrays(path, random)
-    count = str(random.choice((2, 2, 2, 2, 2, 3, 3, 4, 10**9)))
-    arguments = [*workshop.options, "--demonstrations.count", count, "--out", folder / "runs"]
-    with stopped_at((base_policy, "_train")):
-        ending = end_of(["run", "--quiet", "--demos", path, *arguments], ["mutant"])
-    if ending.kind == "accepted":
-        (demos,) = ending.found[1].values()
-        layout = task_class(workshop.config.task).observation_layout
-        for obs, actions in demos.episodes:
-            _require(bool(obs.isfinite().all() and actions.isfinite().all()), "NaN was accepted")
-            _require(obs.shape == (len(actions) + 1, layout.dim), "a wrong shape was accepted")
-        intact = _content(*workshop.demos, len(demos))
-        found = [(o.numpy().tobytes(), a.numpy().tobytes()) for o, a in demos.episodes]
-        _require(foreign or found == intact, "damaged arrays were accepted")
-    return ending
+    for file, data in zip((path, path.with_suffix(".json")), workshop.demos, strict=True):
+        file.write_bytes(data)
+    return path
 
 
-def _content(h5: bytes, side: bytes, count: int) -> list[tuple[bytes, ...]]:
-    with h5py.File(io.BytesIO(h5)) as file:
-        return [
-            (
-                np.asarray(file[f"traj_{i}/obs"]).tobytes(),
-                np.asarray(file[f"traj_{i}/actions"]).tobytes(),
-            )
-            for i in range(count)
-        ]
+def beside(way: Way) -> Way:
+    """The same for the .json file beside it."""
+    return lambda path, random: way(path.with_suffix(".json"), random)
 
 
-def _make_foreign(path: Path, side: Path) -> None:
+def make_foreign(path: Path, random: Random) -> None:
     """As if ManiSkill had written it: states, no observations, no section or checksum of ours."""
-    data = json.loads(side.read_text())
+    data = json.loads(path.with_suffix(".json").read_text())
     del data["symsteer"]
-    side.write_text(json.dumps(data))
+    path.with_suffix(".json").write_text(json.dumps(data))
     with h5py.File(path, "r+") as file:
         file.attrs.clear()
         for group in file.values():
             del group["obs"]
+    edit_arrays(path, random)
 
 
-def _edit_description(data: dict[str, Any], random: Random) -> None:
-    episode = random.choice(data["episodes"])
-    kwargs = data["env_info"]["env_kwargs"]
-    edits: tuple[Callable[[], Any], ...] = (
-        lambda: episode.update(control_mode="pd_joint_delta_pos"),
-        lambda: episode.update(control_mode=["pd_ee_delta_pose"]),
-        lambda: episode.update(episode_id=random.choice((99, -1, None, "x/y", [], "../x"))),
-        lambda: episode.update(success=random.choice((False, None, "no", [], 0))),
-        lambda: kwargs.update(embodiment=random.choice(("panda", None, 3, ["floating"]))),
-        lambda: kwargs.update(variant=random.choice(("wind:1", 5, None))),
-        lambda: data["env_info"].update(env_id=random.choice(("PushCube-v1", "", None, 3))),
-        lambda: data.update(episodes=random.choice(([], [None], [[]], ["traj_0"], {"0": {}}))),
-        lambda: data.update(episodes=data["episodes"] * 3),
-        lambda: data["env_info"].update(env_kwargs=random.choice(([], None, "x", 3))),
-        lambda: data.update(symsteer=random.choice((None, [], "x", {"observation_layout": 3}))),
-    )
-    random.choice(edits)()
-
-
-def _edit_arrays(path: Path, random: Random) -> None:
-    names = ["actions", "obs", "env_states/actors/cube", "env_states"]
-    with h5py.File(path, "r+") as file:
-        name = f"traj_{random.randrange(2)}/{random.choice(names)}"
-        if name not in file:
-            name = "traj_0/actions"
-        item = file[name]
-        array = None if isinstance(item, h5py.Group) else np.asarray(item)
-        kind = random.randrange(10)
-        if kind == 0 or array is None:
-            del file[name]
-            if kind == 1:
-                file[name] = h5py.SoftLink("/nowhere")
-            elif kind == 2:
-                file[name] = h5py.ExternalLink("/etc/hostname", "/x")
-            elif kind == 3:
-                file[name] = np.zeros(3)
-            return
-        if kind in (1, 2):
-            index = tuple(random.randrange(size) for size in array.shape)
-            array[index] = random.choice((np.nan, np.inf, -np.inf, 1e30, 0.125))
-        changed = {
-            3: lambda: array[:0],
-            4: lambda: array[:-1],
-            5: lambda: array[:, : array.shape[1] // 2],
-            6: lambda: array.astype(random.choice(("i4", "f2", "c8", "S4", "?", "f8"))),
-            7: lambda: array.ravel(),
-            8: lambda: np.repeat(array, 2, axis=random.randrange(2)),
-            9: lambda: np.array(random.choice((3.0, b"text", np.nan))),
-        }.get(kind, lambda: array)()
-        del file[name]
-        file[name] = changed
-
-
-# What a display reads.
-
-
-def status(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """A file of a sweep or of its runs, read by ``symsteer status``."""
-    random = Random(f"status {number}")
-    run = workshop.restore_run(folder)
-    shutil.copytree(workshop.sweeps, folder / "sweeps")
-    (run / "progress.json").write_bytes(workshop.progress)
-    path = random.choice(
-        [run / name for name in ("progress.json", "progress.json", "config.json", "record.json")]
-        + sorted((folder / "sweeps").iterdir())
-    )
-    if path.suffix == ".json":
-        path.write_text(poison_json(path.read_text(), random), "utf-8", "surrogatepass")
-    else:
-        path.write_bytes(poison_bytes(path.read_bytes(), random))
-    ending = end_of(["status", folder], [path.name])
-    if ending.kind == "done":
-        _require(
-            all(line.isprintable() for line in ending.found.splitlines()), "unprintable characters"
+def edit_description(path: Path, random: Random) -> None:
+    data = json.loads(path.read_text())
+    episode, kwargs = random.choice(data["episodes"]), data["env_info"]["env_kwargs"]
+    table, key, values = random.choice(
+        (
+            (episode, "control_mode", ("pd_joint_delta_pos", ["pd_ee_delta_pose"])),
+            (episode, "episode_id", (99, -1, None, "x/y", [], "../x")),
+            (episode, "success", (False, None, "no", [], 0)),
+            (kwargs, "embodiment", ("panda", None, 3, ["floating"])),
+            (kwargs, "variant", ("wind:1", 5, None)),
+            (data["env_info"], "env_id", ("PushCube-v1", "", None, 3)),
+            (data["env_info"], "env_kwargs", ([], None, "x", 3)),
+            (data, "episodes", ([], [None], [[]], ["traj_0"], {"0": {}}, data["episodes"] * 3)),
+            (data, "symsteer", (None, [], "x", {"observation_layout": 3})),
         )
-    return ending
+    )
+    table[key] = random.choice(values)
+    path.write_text(json.dumps(data))
+
+
+def edit_arrays(path: Path, random: Random) -> None:
+    with h5py.File(path, "r+") as file:
+        group = file[f"traj_{random.randrange(2)}"]
+        name = random.choice([name for name in ("actions", "obs", "env_states") if name in group])
+        item = group[name]
+        odd: list[Any] = [None, h5py.SoftLink("/nowhere"), np.zeros(3)]
+        odd.append(h5py.ExternalLink("/etc/hostname", "/x"))
+        if isinstance(item, h5py.Dataset):
+            array = np.asarray(item)
+            wrong = array.copy()
+            index = tuple(random.randrange(size) for size in array.shape)
+            wrong[index] = random.choice((np.nan, np.inf, -np.inf, 1e30, 0.125))
+            odd += [wrong, wrong, array[:0], array[:-1], array[:, : array.shape[1] // 2]]
+            odd += [array.astype(random.choice(("i4", "f2", "c8", "S4", "?", "f8"))), array.ravel()]
+            odd += [np.repeat(array, 2, axis=random.randrange(2)), np.array(b"text")]
+        del group[name]
+        if (changed := random.choice(odd)) is not None:
+            group[name] = changed
+
+
+def same_arrays(workshop: Workshop, path: Path, ending: Ending) -> None:
+    (demos,) = ending.found[1].values()
+    foreign = "symsteer" not in json.loads(path.with_suffix(".json").read_text())
+    with h5py.File(io.BytesIO(workshop.demos[0])) as file:
+        for index, (obs, actions) in enumerate(demos.episodes):
+            require(bool(obs.isfinite().all() and actions.isfinite().all()), "NaN was accepted")
+            require(len(obs) == len(actions) + 1, "a wrong shape was accepted")
+            for name, array in (("obs", obs), ("actions", actions)):
+                same = np.array_equal(np.asarray(file[f"traj_{index}/{name}"]), array.numpy())
+                require(foreign or same, "damaged arrays were accepted")
 
 
 # Base policies.
 
 
-def policy(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """A saved base policy, read by ``symsteer run --base-policy`` or in the folder of a run."""
-    random = Random(f"policy {number}")
-    original = workshop.run["policy.safetensors"]
-    in_run = number % 4 == 3
-    path = (workshop.restore_run(folder) if in_run else folder) / "policy.safetensors"
-    path.write_bytes(original)
-    kind = random.randrange(6)
-    if kind in (0, 1):
-        path.write_bytes(flip_bits(original, random, random.choice((1, 1, 3))))
-    elif kind == 2:
-        # The header holds all that is not a number of the network.
-        size = 8 + struct.unpack("<Q", original[:8])[0]
-        path.write_bytes(flip_bits(original[:size], random) + original[size:])
-    elif kind == 3:
-        path.write_bytes(poison_bytes(original, random))
-    else:
-        _edit_policy(path, random)
-    verb = (
-        ["resume", path.parent]
-        if in_run
-        else ["run", "--quiet", "--base-policy", path, "--out", folder / "runs", *workshop.options]
-    )
-    with stopped_at((run_module, "Trainer")):
-        ending = end_of(verb, ["policy.safetensors", workshop.run_id])
-    if ending.kind == "accepted":
-        found, intact = ending.found[2], folder / "intact.safetensors"
-        intact.write_bytes(original)
-        (have, said), (want, meant) = _policy_content(path), _policy_content(intact)
-        _require(have.keys() == want.keys(), "other tensors were accepted")
-        _require(all(torch.equal(have[k], want[k]) for k in have), "other numbers were accepted")
-        _require(said == meant == found.report, "another report was accepted")
-    return ending
+def policy_file(workshop: Workshop, folder: Path) -> Path:
+    return workshop.restore_run(folder) / "policy.safetensors"
 
 
-def _policy_content(path: Path) -> tuple[dict[str, torch.Tensor], Any]:
+def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        return tensors, json.loads(file.metadata()["policy"])["report"]
+        return tensors, dict(file.metadata())
 
 
-def _edit_policy(path: Path, random: Random) -> None:
-    with safe_open(path, framework="pt") as file:
-        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        meta = dict(file.metadata())
-    key = random.choice(sorted(tensors))
-    kind = random.randrange(8)
-    if kind == 0:
-        del tensors[key]
-    elif kind == 1:
-        tensors["more"] = torch.zeros(2)
-    elif kind == 2:
-        tensors[key] = tensors[key].to(random.choice((torch.float16, torch.float64, torch.int32)))
-    elif kind == 3:
-        tensors[key] = torch.full_like(tensors[key], float("nan"))
-    elif kind == 4:
-        tensors[key] = tensors[key].flatten()[: tensors[key].numel() // 2]
-    elif kind == 5:
-        meta[random.choice(sorted(meta))] = random.choice(("", "{}", "1", "99", "[]", "null"))
-    elif kind == 6:
+def damage_header(path: Path, random: Random) -> None:
+    """The header holds all that is not a number of the network."""
+    data = path.read_bytes()
+    size = 8 + struct.unpack("<Q", data[:8])[0]
+    path.write_bytes(flip_bits(data[:size], random) + data[size:])
+
+
+def edit_tensors(path: Path, random: Random) -> None:
+    tensors, meta = read_tensors(path)
+    save_tensors(path, poison_tensors(tensors, random), meta)
+
+
+def edit_metadata(path: Path, random: Random) -> None:
+    tensors, meta = read_tensors(path)
+    if random.random() < 0.5:
         meta["policy"] = json.dumps(poison_data(json.loads(meta["policy"]), random))
     else:
-        task = task_class("PushCube-v1")
-        options = EquivariantOptions(channels=8, width=16, depth=1)
-        save_policy(
-            EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout), path
-        )
-        return
+        meta[random.choice(sorted(meta))] = random.choice(("", "{}", "1", "99", "[]", "null"))
     save_file(tensors, path, meta)
+
+
+def seal_policy(path: Path, random: Random) -> None:
+    """A wrong description, or wrong numbers, with the checksums that belong to it."""
+    tensors, meta = read_tensors(path)
+    said = json.loads(meta["policy"])
+    if random.random() < 0.3:
+        tensors, intact = poison_tensors(tensors, random), load_policy(path)
+        tensors = {key: value for key, value in tensors.items() if isinstance(value, torch.Tensor)}
+        try:
+            intact.load_state_dict(tensors)
+            said["content_hash"] = intact.content_hash()
+        except RuntimeError:
+            pass
+    else:
+        said["training_record"].pop("losses", None)
+        part = random.choice(("options", "report", "obs_layout", "act_layout", None))
+        said = (
+            {**said, part: poison_data(said[part], random)} if part else poison_data(said, random)
+        )
+    meta["policy"] = json.dumps(said)
+    save_tensors(path, tensors, {**meta, "policy_sha256": _sha256(meta["policy"])})
+
+
+def save_tensors(path: Path, tensors: dict[str, Any], meta: dict[str, str]) -> None:
+    tensors = {k: v.contiguous() for k, v in tensors.items() if isinstance(v, torch.Tensor)}
+    save_file(tensors, path, meta)
+
+
+def same_policy(workshop: Workshop, path: Path, ending: Ending) -> None:
+    intact = path.with_name("intact.safetensors")
+    intact.write_bytes(workshop.run["policy.safetensors"])
+    (have, said), (want, meant) = read_tensors(path), read_tensors(intact)
+    have, want = ({k: v.double() for k, v in tensors.items()} for tensors in (have, want))
+    require(alike(have, want), "other numbers were accepted")
+    reports = [json.loads(meta["policy"])["report"] for meta in (said, meant)]
+    require(reports[0] == reports[1], "another report was accepted")
 
 
 # Checkpoints.
 
 
-class _Trap:
+class Trap:
     """Creates a folder if a reader unpickles it."""
 
     def __init__(self, path: Path):
@@ -632,58 +425,50 @@ class _Trap:
         return os.mkdir, (self.path,)
 
 
-def checkpoint(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """checkpoint.pt of a stopped run, read by ``symsteer resume`` or ``symsteer evaluate``."""
-    random = Random(f"checkpoint {number}")
-    run = workshop.restore_run(folder)
-    path, trap = run / "checkpoint.pt", folder / "sprung"
-    original = path.read_bytes()
-    kind = random.randrange(7)
-    if kind in (0, 1, 2):
-        path.write_bytes(flip_bits(original, random, random.choice((1, 1, 1, 4))))
-    elif kind == 3:
-        path.write_bytes(poison_bytes(original, random))
-    elif kind == 4:
-        path.write_bytes(_trapped(_Trap(trap), random))
-    elif kind == 5:
-        path.write_bytes(_edited_state(original, random))
-    else:
-        path.write_bytes(workshop.other)
-    verb = random.choice(("resume", "evaluate"))
-    with stopped_at((Trainer, "play"), (run_module, "Evaluator")):
-        ending = end_of([verb, run], ["checkpoint.pt"])
-    _require(not trap.exists(), "code in a checkpoint was executed")
-    if ending.kind == "accepted":
-        if verb == "resume":
-            ending.found[0].evaluator.close()
-        _require(_alike(load_checkpoint(run), workshop.state), "another state was accepted")
-    return ending
-
-
-def _trapped(trap: _Trap, random: Random) -> bytes:
-    """Four ways to insert code: with and without a checksum, pickle and torch's two formats."""
-    buffer = io.BytesIO()
-    kind = random.randrange(4)
-    if kind == 0:
-        return pickle.dumps(trap)
-    content = {"format": FORMAT, "state": trap}
-    torch.save(content, buffer, _use_new_zipfile_serialization=kind != 1)
-    return _sealed(buffer.getvalue()) if kind == 3 else buffer.getvalue()
-
-
-def _edited_state(original: bytes, random: Random) -> bytes:
-    """The state was edited; the checksum is the old one, or there is none."""
-    content = torch.load(io.BytesIO(original[:-CHECKSUM_BYTES]), weights_only=True)
-    buffer = io.BytesIO()
-    torch.save(_poison_tensors(content, random), buffer)
-    return buffer.getvalue() + original[-CHECKSUM_BYTES:] * random.randrange(2)
-
-
-def _sealed(archive: bytes) -> bytes:
+def sealed(archive: bytes) -> bytes:
     return archive + hashlib.sha256(archive).digest()
 
 
-def _poison_tensors(state: dict[str, Any], random: Random) -> dict[str, Any]:
+def set_trap(path: Path, random: Random) -> None:
+    """Four ways to insert code: with and without a checksum, pickle and torch's two formats."""
+    trap, kind, buffer = Trap(path.with_name("sprung")), random.randrange(4), io.BytesIO()
+    torch.save({"format": FORMAT, "state": trap}, buffer, _use_new_zipfile_serialization=kind != 1)
+    archives = (pickle.dumps(trap), buffer.getvalue(), buffer.getvalue(), sealed(buffer.getvalue()))
+    path.write_bytes(archives[kind])
+
+
+def edit_state(path: Path, random: Random) -> None:
+    """The state was edited; the checksum is the old one, or there is none."""
+    original = path.read_bytes()
+    content = torch.load(io.BytesIO(original[:-CHECKSUM_BYTES]), weights_only=True)
+    buffer = io.BytesIO()
+    torch.save(poison_tensors(content, random), buffer)
+    path.write_bytes(buffer.getvalue() + original[-CHECKSUM_BYTES:] * random.randrange(2))
+
+
+def seal_archive(path: Path, random: Random) -> None:
+    path.write_bytes(sealed(poison_bytes(path.read_bytes()[:-CHECKSUM_BYTES], random)))
+
+
+def seal_state(path: Path, random: Random) -> None:
+    """Another state with the checksum that belongs to it."""
+    file = torch.load(io.BytesIO(path.read_bytes()[:-CHECKSUM_BYTES]), weights_only=True)
+    inner = random.choice([file["state"], file["state"]["agent"], file["state"]["replay"]])
+    key = random.choice(sorted(inner, key=str))
+    odd: tuple[Any, ...] = (
+        *(torch.zeros(1).expand(10**9), nested(200, random.randrange(2)), {}, torch.zeros(())),
+        *(torch.zeros(0, 2**40), torch.zeros(3, dtype=torch.complex64), random.choice(POISON)),
+    )
+    if random.random() < 0.5:
+        inner[random.choice((key, key, "more"))] = random.choice(odd)
+    else:
+        poison_tensors(inner, random)
+    buffer = io.BytesIO()
+    torch.save(file, buffer, _use_new_zipfile_serialization=random.random() < 0.95)
+    path.write_bytes(sealed(buffer.getvalue()))
+
+
+def poison_tensors(state: dict[str, Any], random: Random) -> dict[str, Any]:
     """A key dropped, or a value replaced, at any depth; tensors lose an element or get NaN."""
     container: Any = state
     key = random.choice(sorted(container, key=str))
@@ -693,77 +478,188 @@ def _poison_tensors(state: dict[str, Any], random: Random) -> dict[str, Any]:
     value = container[key]
     if random.random() < 0.3:
         del container[key]
-    elif isinstance(value, torch.Tensor) and value.numel() > 1 and random.random() < 0.7:
-        flat_value = value.flatten()
-        container[key] = random.choice(
-            (flat_value[1:], flat_value.flip(0), value.double(), torch.zeros_like(value))
-        )
+    elif isinstance(value, torch.Tensor) and value.numel() > 1 and random.random() < 0.8:
+        line = value.flatten()
+        changed = (line[1:], line.flip(0), value.double(), torch.full_like(value, float("nan")))
+        container[key] = random.choice(changed if value.is_floating_point() else changed[:3])
     else:
         container[key] = random.choice(POISON)
     return state
 
 
-def _alike(a: Any, b: Any) -> bool:
-    """Whether two states agree to the last bit."""
+def alike(a: Any, b: Any) -> bool:
+    """Whether two states agree to the last bit, types included."""
+    if type(a) is not type(b):
+        return False
     if isinstance(a, torch.Tensor):
-        return isinstance(b, torch.Tensor) and a.dtype == b.dtype and torch.equal(a, b)
+        return a.dtype == b.dtype and torch.equal(a, b)
     if isinstance(a, dict):
-        return isinstance(b, dict) and a.keys() == b.keys() and all(_alike(a[k], b[k]) for k in a)
+        return a.keys() == b.keys() and all(alike(a[key], b[key]) for key in a)
     if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(_alike, a, b))
-    return same(a, b)
+        return len(a) == len(b) and all(map(alike, a, b))
+    return a == b or (a != a and b != b)
+
+
+def same_state(workshop: Workshop, path: Path, ending: Ending) -> None:
+    require(alike(load_checkpoint(path.parent), workshop.state), "another state was accepted")
 
 
 # Bundles.
 
 
-def bundle(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """A bundle, read by ``symsteer fetch-bundle``."""
-    random = Random(f"bundle {number}")
-    path, out = folder / "mutant.zip", folder / "base"
-    with zipfile.ZipFile(io.BytesIO(workshop.bundle)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    whole = set(members.values())
-    kind = random.randrange(6)
-    if kind == 0:
-        path.write_bytes(poison_bytes(workshop.bundle, random))
-    elif kind == 1:
-        path.write_bytes(flip_bits(workshop.bundle, random))
-    else:
-        if kind in (2, 3):
-            text = poison_json(members["manifest.json"].decode(), random)
-            members["manifest.json"] = text.encode("utf-8", "surrogatepass")
-        elif kind == 4:
-            old = random.choice(sorted(members))
-            new = random.choice(("../x", "/x", "a/../../x", ".x", "a/b/c", "x\\y", "x\n", " ", old))
-            members[new if random.random() < 0.8 else "more"] = members.pop(old)
-        else:
-            name = random.choice(sorted(members))
-            members[name] = poison_bytes(members[name], random)
+def bundle(workshop: Workshop, folder: Path) -> Path:
+    (folder / "mutant.zip").write_bytes(workshop.bundle)
+    return folder / "mutant.zip"
+
+
+def rewrite(edit: Callable[[dict[str, bytes], Random], None]) -> Way:
+    """Edit the files in an archive."""
+
+    def way(path: Path, random: Random) -> None:
+        with zipfile.ZipFile(path) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        edit(members, random)
         with zipfile.ZipFile(path, "w", random.choice((0, 0, 0, zipfile.ZIP_DEFLATED))) as archive:
             for name, data in members.items():
                 archive.writestr(name, data)
-    ending = end_of(["fetch-bundle", path, "--out", out], ["mutant.zip"])
-    written = [file for file in folder.rglob("*") if file.is_file() and file != path]
-    if ending.kind == "refused":
-        _require(not written, f"{written} were written")
-    for file in written:
-        known = file.name == "manifest.json" or file.read_bytes() in whole
-        _require(known and out in file.parents, f"{file} was written")
-    return ending
+
+    return way
 
 
-Runner = Callable[[Workshop, int, Path], Ending]
+def edit_manifest(members: dict[str, bytes], random: Random) -> None:
+    data = poison_data(json.loads(members["manifest.json"]), random)
+    members["manifest.json"] = json.dumps(data).encode("utf-8", "surrogatepass")
 
-KINDS: dict[str, tuple[Runner, int]] = {
-    "suite": (suite, 170),
-    "config": (config_file, 100),
-    "command": (command, 110),
-    "record": (record, 170),
-    "demonstrations": (demonstrations, 150),
-    "policy": (policy, 90),
-    "checkpoint": (checkpoint, 90),
-    "status": (status, 60),
-    "bundle": (bundle, 60),
+
+def rename_member(members: dict[str, bytes], random: Random) -> None:
+    old = random.choice(sorted(members))
+    new = random.choice(("../x", "/x", "a/../../x", ".x", "a/b/c", "x\\y", "x\n", " ", "more"))
+    members[new] = members.pop(old)
+
+
+def edit_member(members: dict[str, bytes], random: Random) -> None:
+    name = random.choice(sorted(members))
+    members[name] = poison_bytes(members[name], random)
+
+
+def same_members(workshop: Workshop, path: Path, ending: Ending) -> None:
+    with zipfile.ZipFile(io.BytesIO(workshop.bundle)) as archive:
+        whole = {archive.read(name) for name in archive.namelist()}
+    for file in path.with_name("base").rglob("*"):
+        known = file.name == "manifest.json" or file.is_dir() or file.read_bytes() in whole
+        require(known, f"{file} was written")
+
+
+KINDS: dict[str, Kind] = {
+    "suite": Kind(toml_file("suite"), TOML, [lambda workshop, path: ["sweep", path, "--dry-run"]]),
+    "preset": Kind(
+        toml_file("preset"),
+        TOML,
+        [lambda workshop, path: new_run(workshop, "--agent.preset", path), suite_with_preset],
+        [(run_module, "prepare_base")],
+    ),
+    "plan": Kind(toml_file("plan"), TOML, [lambda workshop, path: ["tune", path, "--dry-run"]]),
+    "study": Kind(
+        toml_file("study"),
+        TOML,
+        [lambda w, path: ["report", path.with_name("a.json"), "--study", path, "--out", "board"]],
+        [(report, "render")],
+    ),
+    "config": Kind(in_run("config.json"), JSON, [RESUME, EVALUATE], WORK, same_configuration),
+    "record": Kind(
+        records,
+        (*JSON, exaggerate, exaggerate),
+        [
+            lambda workshop, path: ["report", path.parents[1], "--out", "board"],
+            lambda workshop, path: ["report", path.parents[1], "--check"],
+        ],
+        check=nothing_dropped,
+    ),
+    "record of a run": Kind(in_run("record.json"), JSON, [RESUME], WORK, same_history),
+    "status": Kind(display, (damage_any,) * 4, [lambda w, path: ["status", path.parents[1]]]),
+    "demonstrations": Kind(
+        demonstrations,
+        (*BYTES, *map(beside, JSON[1:]), beside(edit_description), edit_arrays, make_foreign),
+        [
+            lambda workshop, path, count=count: [
+                *new_run(workshop, "--demos", path),
+                *("--demonstrations.count", count),
+            ]
+            for count in (2, 2, 3, 4, 10**9)
+        ],
+        [(base_policy, "_train")],
+        same_arrays,
+    ),
+    "policy": Kind(
+        policy_file,
+        (*BYTES, damage_header, edit_tensors, edit_metadata),
+        [lambda workshop, path: new_run(workshop, "--base-policy", path), RESUME],
+        WORK,
+        same_policy,
+    ),
+    "checkpoint": Kind(
+        in_run("checkpoint.pt"),
+        (*BYTES, set_trap, edit_state),
+        [RESUME, EVALUATE],
+        WORK,
+        same_state,
+    ),
+    "bundle": Kind(
+        bundle,
+        (*BYTES, *map(rewrite, (edit_manifest, rename_member, edit_member))),
+        [lambda workshop, path: ["fetch-bundle", path, "--out", path.with_name("base")]],
+        check=same_members,
+    ),
 }
-"""How each kind is tried, and how many times in the whole test."""
+KINDS |= {
+    "sealed policy": replace(
+        KINDS["policy"], ways=[seal_policy], check=lambda workshop, path, ending: None
+    ),
+    "sealed checkpoint": replace(
+        KINDS["checkpoint"],
+        ways=[seal_archive, seal_state],
+        check=lambda workshop, path, ending: None,
+    ),
+}
+"""The sealed ones have wrong contents and the checksums that belong to them."""
+
+
+# The command line of `symsteer run`.
+
+VALUES = (
+    *("-1", "0", "1", "7", "1e9", "nan", "inf", "-inf", "1e308", "-0.5", "0.5", "1.5", "+5", "16"),
+    *("100000", "10000000000000", "9" * 26, "-" + "9" * 26, "1_0", "0x10", " 5", "4,5", "1e-320"),
+    *("many", "", "None", "True", "PickCube-v1", "panda", "none", "D4", "C8", "E8", "C0", "SO2"),
+    *("action_gain:0.5", "action_gain:0.5,wind:0.3", "action_gain:2", "wind:0.2+wind:0.3", "C97"),
+    *("action_gain: 0.5", "action_gain:0.50", "action_gain:nan", "wind:+0.5", "wind:1e-3", "D1"),
+    *("C999999999", "\x1b[31m", "a\nb", "x" * 3000, "../..", "-", "--", "ünï", "C8 C4", "diverse"),
+)
+
+
+def command(workshop: Workshop, number: int, folder: Path) -> Ending:
+    """An option with an odd value, or a misspelt one; the other options keep their values."""
+    random = Random(f"command {number}")
+    policy = folder / "policy.safetensors"
+    policy.write_bytes(workshop.run["policy.safetensors"])
+    defaults = flat(workshop.config.to_json())
+    # In turn, so that every option is tested; another agent or policy has other options.
+    keys = sorted(set(defaults) - {"agent", "policy.name"})
+    key = keys[number % len(keys)]
+    option = "--" + key.replace("agent_options.", "agent.").replace("_", "-")
+    at = random.randrange(3, len(option))
+    odd = random.choice(
+        (
+            [option[:at] + random.choice("xy") + option[at + 1 :], "3"],
+            *([option], ["--" + option, "1"], [key, "1"], ["--workers", random.choice(VALUES)]),
+            *([option, random.choice(VALUES)] for _ in range(8)),
+        )
+    )
+    with stopped_at((Trainer, "play")):
+        ending = end_of([*new_run(workshop, "--base-policy", policy), *odd])
+    if ending.kind == "accepted":
+        trainer = ending.found[0]
+        trainer.evaluator.close()
+        found = flat(trainer.config.to_json())
+        changed = {name for name in defaults if not alike(found[name], defaults[name])}
+        require(changed <= {key}, f"{changed} have other values")
+    return ending

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable
+import math
+import tomllib
+from pathlib import Path
 from random import Random
 from typing import Any
 
 POISON: tuple[Any, ...] = (
-    *(None, True, False, 0, 1, -1, 2, 7, 2**31, 2**63, 10**30, -(2**40)),
+    *(None, True, False, 0, 1, -1, 2, 7, 2**31, 2**40, 2**63, 10**9, 10**30, -(2**40)),
     *(0.5, -0.25, 1.5, 1e308, -1e308, 1e-320, float("nan"), float("inf"), -float("inf")),
     *("", "none", "nan", "1", "PickCube-v1", "a" * 5000, "a\nb", "\x1b[31mred", "\u202eabc", "\0"),
     *("../../etc/passwd", "<script>alert(1)</script>", "|x|[a](b)", "ünïcode", "'\"`", "%s%n{0}"),
@@ -18,25 +20,28 @@ POISON: tuple[Any, ...] = (
 """Values that are valid nowhere, or only in some places."""
 
 
+def nested(depth: int, kind: int = 0) -> Any:
+    """Lists or tables in each other."""
+    value: Any = 1
+    for _ in range(depth):
+        value = [value] if kind else {"a": value}
+    return value
+
+
 def poison_bytes(data: bytes, random: Random) -> bytes:
-    """Cut, flip, insert, repeat, overwrite or erase."""
-    kind = random.randrange(8)
+    """Cut, insert, repeat, overwrite, erase or flip."""
     at, size = random.randrange(len(data) + 1), random.choice((1, 2, 8, 64, 512))
-    if kind == 0:
-        return data[:at]
-    if kind == 1:
-        return data[at:]
-    if kind == 2:
-        return data + random.randbytes(size)
-    if kind == 3:
-        return data[:at] + random.randbytes(size) + data[at:]
-    if kind == 4:
-        return data[:at] + data[at + size :]
-    if kind == 5:
-        return data[:at] + bytes(size) + data[at + size :]
-    if kind == 6:
-        return random.choice((b"", b"\0", b"\xff\xfe", random.randbytes(size), b"null", b"{", b"["))
-    return flip_bits(data, random, random.choice((1, 1, 1, 2, 16)))
+    return random.choice(
+        (
+            lambda: data[:at],
+            lambda: data[at:],
+            lambda: data[:at] + random.randbytes(size) + data[at:],
+            lambda: data[:at] + data[at + size :],
+            lambda: data[:at] + bytes(size) + data[at + size :],
+            lambda: random.choice((b"", b"\0", b"\xff\xfe", random.randbytes(size), b"null", b"{")),
+            lambda: flip_bits(data, random, random.choice((1, 2, 16))),
+        )
+    )()
 
 
 def flip_bits(data: bytes, random: Random, count: int = 1) -> bytes:
@@ -47,62 +52,43 @@ def flip_bits(data: bytes, random: Random, count: int = 1) -> bytes:
     return bytes(damaged)
 
 
-def poison_lines(text: str, random: Random) -> str:
-    """Drop, repeat, swap, shorten or garble lines."""
-    lines = text.split("\n")
-    i, j = random.randrange(len(lines)), random.randrange(len(lines))
-    kind = random.randrange(6)
-    if kind == 0:
-        del lines[i]
-    elif kind == 1:
-        lines.insert(j, lines[i])
-    elif kind == 2:
-        lines[i], lines[j] = lines[j], lines[i]
-    elif kind == 3:
-        lines[i] = lines[i][: random.randrange(len(lines[i]) + 1)]
-    elif kind == 4:
-        lines[i] = "".join(random.sample(lines[i], len(lines[i])))
-    else:
-        lines[i] += random.choice(("]", "}", "=", "'", '"', "\\", "\t", "[x]", ", ,", "#", "\r"))
-    return "\n".join(lines)
-
-
 def places(data: Any) -> list[tuple[Any, Any]]:
     """Every (container, key) of nested dicts and lists."""
     found: list[tuple[Any, Any]] = []
-    items = data.items() if isinstance(data, dict) else enumerate(data)
-    for key, value in items:
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data):
         found.append((data, key))
         if isinstance(value, dict | list):
             found += places(value)
     return found
 
 
-def poison_data(data: Any, random: Random, changes: int = 1) -> Any:
+def poison_data(data: Any, random: Random) -> Any:
     """A copy with keys dropped, misspelt, added, or values replaced, wherever they stand."""
     data = copy.deepcopy(data)
-    for _ in range(changes):
-        container, key = random.choice(places(data))
-        value = container[key]
-        kind = random.randrange(7)
+    for _ in range(random.choice((1, 1, 1, 2, 3))):
+        if not (everywhere := places(data)):
+            break
+        container, key = random.choice(everywhere)
+        value, table = container[key], isinstance(container, dict)
+        kind = random.randrange(8)
         if kind == 0:
             del container[key]
-        elif kind == 1 and isinstance(container, dict):
-            word = str(key)
-            cut = random.randrange(len(word) + 1)
+        elif kind == 1 and table:
+            cut = random.randrange(len(str(key)) + 1)
             del container[key]
-            container[word[:cut] + random.choice(("x", "", "_")) + word[cut + 1 :]] = value
-        elif kind == 2 and isinstance(container, dict):
+            container[str(key)[:cut] + random.choice(("x", "", "_")) + str(key)[cut + 1 :]] = value
+        elif kind == 2 and table:
             container[random.choice(("colour", "", "a\nb", "\x1b[1m", "k" * 3000))] = value
-        elif kind == 3 and isinstance(container, list):
+        elif kind == 2:
             container.insert(key, copy.deepcopy(value))
-        elif kind == 4 and type(value) in (int, float):
-            container[key] = random.choice(
-                (-value, value + 1, value * 1e6, str(value), [value], value + 0.5, -value - 1)
-            )
-        elif kind == 4 and isinstance(value, str) and value:
+        elif kind == 3 and type(value) in (int, float):
+            changed = (-value, value + 1, value * 1e6, str(value), [value], value + 0.5)
+            container[key] = random.choice(changed)
+        elif kind == 3 and isinstance(value, str) and value:
             at = random.randrange(len(value))
             container[key] = value[:at] + random.choice("x-/:+\n") + value[at + 1 :]
+        elif kind == 4:
+            container[key] = nested(random.choice((3, 40, 150)), random.randrange(2))
         else:
             container[key] = copy.deepcopy(random.choice(POISON))
     return data
@@ -111,54 +97,82 @@ def poison_data(data: Any, random: Random, changes: int = 1) -> Any:
 def extreme(data: Any, random: Random) -> Any:
     """A copy in which some numbers and texts are extreme, but of the type that they were."""
     data = copy.deepcopy(data)
+    values = {
+        int: (0, 1, 2, 2**31, 2**53, 10**18),
+        float: (0.0, 1.0, 1e308, -1e308, 1e-308, -0.5, 1e15),
+        str: ("<b>|`a`|</b>", "[x](javascript:1)", "a" * 119, "ä" * 60, "a\nb", "../x", "0"),
+    }
     for _ in range(random.choice((1, 1, 2, 5))):
         container, key = random.choice(places(data))
-        kind = type(container[key])
-        if kind is int:
-            container[key] = random.choice((0, 1, 2, 2**31, 2**53, 10**18))
-        elif kind is float:
-            container[key] = random.choice((0.0, 1.0, 1e308, -1e308, 1e-308, -0.5, 1e15))
-        elif kind is str:
-            container[key] = random.choice(
-                ("<b>|`a`|</b>", "[x](javascript:1)", "a" * 119, "ä" * 60, "a\nb", "../x", "0")
-            )
+        if type(container[key]) in values:
+            container[key] = random.choice(values[type(container[key])])
     return data
 
 
-def poison_json(text: str, random: Random) -> str:
-    """JSON with its content, its text or its bytes damaged."""
-    kind = random.randrange(10)
-    if kind < 6:
-        return json.dumps(poison_data(json.loads(text), random, random.choice((1, 1, 1, 3))))
-    if kind == 6:
-        return poison_lines(text, random)
-    if kind == 7:  # a key twice, a comment, a deep nest, a lone value
-        return random.choice(
-            (
-                text.replace("{", '{"a": 1, "a": 2,', 1),
-                "// a run\n" + text,
-                "[" * 100_000,
-                '{"a":' * 5000 + "1" + "}" * 5000,
-                "3",
-                '"text"',
-                "[]",
-                "{}",
-                text + text,
-                "9" * 5000,
-            )
-        )
-    return poison_bytes(text.encode(), random).decode("latin-1")
+# Ways to damage the file at a path.
 
 
-def same(a: Any, b: Any) -> bool:
-    """Whether nested plain data are equal, types included (1 is not 1.0, NaN is NaN)."""
-    if type(a) is not type(b):
-        return False
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return a == b or (a != a and b != b)
+def damage_bytes(path: Path, random: Random) -> None:
+    path.write_bytes(poison_bytes(path.read_bytes(), random))
 
 
-Mutator = Callable[[Random], Any]
+def damage_bits(path: Path, random: Random) -> None:
+    path.write_bytes(flip_bits(path.read_bytes(), random, random.choice((1, 1, 3))))
+
+
+def damage_json(path: Path, random: Random) -> None:
+    data = poison_data(json.loads(path.read_text()), random)
+    path.write_text(json.dumps(data), "utf-8", "surrogatepass")
+
+
+def damage_json_text(path: Path, random: Random) -> None:
+    """A key twice, a comment, a deep nest, a lone value."""
+    text = path.read_text()
+    texts = (
+        *(text.replace("{", '{"a": 1, "a": 2,', 1), "// a run\n" + text, "[" * 100_000),
+        *('{"a":' * 5000 + "1" + "}" * 5000, "3", '"text"', "[]", "{}", text + text, "9" * 5000),
+    )
+    path.write_text(random.choice(texts))
+
+
+def damage_toml(path: Path, random: Random) -> None:
+    data = poison_data(tomllib.loads(path.read_text()), random)
+    path.write_text(to_toml(data), "utf-8", "surrogatepass")
+
+
+def damage_toml_text(path: Path, random: Random) -> None:
+    """One table is deep, or none; a value that JSON does not have."""
+    table = random.choice(list(tomllib.loads(path.read_text())))
+    depth = random.choice((20, 900, 5000))
+    texts = (
+        *("", f"{table} = 1", f"[[{table}]]\nseed = [0]\n[[{table}]]\nsede = [1]"),
+        *(f"[{table}]\nseed = 2026-01-31", f"[{table}]\nlr = 1e400", f"[{table}]\n'.' = [1]"),
+        *(f"[{table}]\nvariant = 'wind,obstacle'", f"[{table}]\nseed = {'9' * 26}"),
+        f"[{table}.{'.'.join('a' * depth)}]\nb = 1\n",
+        f"{table} = {'[' * depth}{']' * depth}\n",
+        f"{table}.x = {'{a=' * depth}1{'}' * depth}\n",
+        "[grid]\nseed = [" + "0, " * 2000 + "1]\nnum_envs = [" + "1, " * 2000 + "2]",
+    )
+    path.write_text(random.choice(texts))
+
+
+def to_toml(data: dict[str, Any], prefix: str = "") -> str:
+    """A table as TOML; values that TOML does not have are written as in JSON."""
+    lines, tables = [], []
+    for key, value in data.items():
+        name = json.dumps(str(key))
+        if isinstance(value, dict):
+            tables.append(f"[{prefix}{name}]\n{to_toml(value, f'{prefix}{name}.')}")
+        else:
+            lines.append(f"{name} = {_inline(value)}")
+    return "\n".join([*lines, *tables])
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{json.dumps(k)} = {_inline(v)}' for k, v in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_inline, value))}]"
+    return (
+        str(value) if isinstance(value, float) and not math.isfinite(value) else json.dumps(value)
+    )

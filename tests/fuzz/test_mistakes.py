@@ -10,127 +10,89 @@ from tests.fuzz.judge import end_of
 
 MISTAKES = """
 list extra
-list --nothing
 run --task Nothing
 run --variant action_gain:0.5,wind:0.3
 run --out file
-run --out file/x
-run --base-policy folder
 run --base-policy file
-run --demos folder
 run --demos file
 run --demos folder.h5
-run --env-steps -5
 run --num-envs many
 run --num-envs 99999999
-run --workers -1
 run --policy.steps 0
-run --variant action_gain:0
 run --env-steps 100
 sweep nowhere.toml
-sweep folder.toml
 sweep demoo
 sweep file
-sweep smoke --workers -3
 sweep smoke --out file
 sweep smoke --workers many
 resume nowhere
-resume file
-resume folder
 resume loop
 resume
 evaluate nowhere
-evaluate file
 evaluate folder --episodes -1
 evaluate folder --episodes many
 status nowhere
-status file
 status folder extra
 report nowhere
 report file
-report folder
 report x.json
-report x.json --out file
 report nowhere --check
 report folder --verify
 compare folder
-compare nowhere folder
 compare folder folder
-compare file folder
 compare x.json x.json
 compare standard equivariant
 compare standard equivariant --runs folder
-compare folder folder --margin much
 compare folder folder --picture file
 reproduce
-reproduce nowhere
-reproduce folder
 reproduce file
 reproduce x.json
-reproduce x.json --workers many
 advise
 advise --task Nothing
 advise --task PickCube-v1 --variant wnid:1
 advise --task PickCube-v1 --audit x.json
 advise --task PickCube-v1 --states few
 advise --audit nowhere
-advise --audit folder
-advise --audit file
 advise --audit x.json
 advise --task PickCube-v1 --records nowhere
 advise --task PickCube-v1 --records folder
 audit --task Nothing
-audit --count -3
 audit --group E8
 audit --states nobody
 audit --base-policy folder
-audit --variant wnid:1
 audit --strength 0.5
 audit --resume
 audit --out file
 audit --seed 99999999999999999999
 throughput --task Nothing
 throughput --agent nobody
-throughput --num-envs -4
 throughput --num-envs 99999999
 throughput --seconds nan
 throughput --workers 100000
 demos
 demos folder.h5
-demos folder
 demos file/a.h5
-demos a.h5 --count -1
 demos a.h5 --seed 99999999999999
 demos a.h5 --mode messy
 base --task Nothing
 base --demonstrations -5
-base --out file
 base --policies none
 export
 export --out a.zip
 export nowhere --out a.zip
-export file --out a.zip
-export folder --out a.zip
 export folder --task PickCube-v1 --out a.zip
 export --task Nothing --out a.zip
 export --task PickCube-v1 --embodiment hand --out a.zip
 export --task PickCube-v1 --count 0 --out a.zip
-export --task PickCube-v1 --policy none --out a.zip
 export --task PickCube-v1 --out a.tar
 export --task PickCube-v1 --out folder
-export --task PickCube-v1 --contents nothing --out a.zip
-export --task PickCube-v1 --format lerobot --out file
 export --task PickCube-v1 --format rlds --out new
 export --task PickCube-v1 --format lerobot --contents policy --out new
 fetch-bundle
-fetch-bundle nowhere
-fetch-bundle folder
 fetch-bundle file
 fetch-bundle x.json
 fetch-bundle https://example.org/a.zip
 doctor extra
-doctor --nothing
-demo extra
 demo --out file
 """
 
