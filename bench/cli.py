@@ -546,87 +546,100 @@ def fetch_bundle(
 
 def audit(
     task: tuple[str, ...] = ("PickCube-v1",),
-    embodiment: tuple[str, ...] = ("floating",),
+    embodiment: str = "floating",
     variant: tuple[str, ...] = ("none",),
-    strength: tuple[float, ...] = (),
     group: str = "C8",
-    states: Literal["both", "expert", "policy"] = "both",
     count: int = 32,
-    chunk: int = 4,
-    resets: int = 256,
-    seed: int = 0,
-    sim: Literal["cpu", "cuda"] = "cpu",
     base_policy: Path | None = None,
-    runs: Path = Path("runs"),
     out: Path | None = None,
-    resume: bool = False,
-    json: bool = False,
-    rollouts: int = 0,
-    actions: Literal["expert", "random", "policy"] = "expert",
     trust: Trust = (),
 ) -> int:
     """Measure how broken the symmetry of a task is, in simulation (docs/audit.md).
 
-    Several tasks, embodiments, variants or strengths give a table with a row for each.
+    Several tasks or variants give a table with a row for each. The same command continues an audit
+    that was stopped: what OUT holds already is not measured again.
 
     Args:
         task: Tasks, or all; `symsteer list` names them.
-        embodiment: floating, panda, or all.
-        variant: none, names, name:strength, several of these joined with +, or all.
-        strength: Strengths of the variants that are named without one.
+        embodiment: floating or panda.
+        variant: none, name:strength, several of these joined with +, or all:strength.
         group: Symmetry group, e.g. C8, D4 (with reflections).
-        states: Whose states: those of the scripted expert, of the base policy with random noise,
-            or both.
-        count: Number of states of each, every one from a different episode.
-        chunk: Control steps of a decision: those that are executed of an action chunk.
-        resets: Number of initial states that are compared with as many rotated ones.
-        seed: Seed of states, draws and intervals.
-        sim: Where physics runs.
-        base_policy: Saved base policy; default: the one that `symsteer run` would train.
-        runs: Folder of the runs; demonstrations and base policies are kept in RUNS/base.
+        count: Number of states of the scripted expert and of the base policy with random noise,
+            each; every one is from a different episode.
+        base_policy: Saved base policy; default: the one that `symsteer run` would train and keep in
+            runs/base. none: only the states of the expert.
         out: Folder for audit.json, map.csv and map.png; of several cells, each has its own folder
             there, beside table.csv, table.md and summary.json.
-        resume: Do not measure again what OUT holds with the same settings.
-        json: Print only JSON.
-        rollouts: If above 0: compare this many whole episodes of the floating gripper with their
-            turned copies instead.
-        actions: Who acts in these episodes.
     """
     allow(*task, *variant, *trust)
-    from json import dumps
-
     from symsteer.bench.audit.report import summary, text, to_markdown, write_table
-    from symsteer.bench.audit.result import AuditSettings
-    from symsteer.bench.audit.study import compare_rollouts, grid, run_audits
+    from symsteer.bench.audit.result import AuditResult, AuditSettings
+    from symsteer.bench.audit.study import cells, run_audits
 
-    template = AuditSettings(
-        group=group, states=states, count=count, chunk=chunk, resets=resets, seed=seed, sim=sim
-    )
-    wanted = grid(task, embodiment, variant, strength, template)
+    states: Literal["both", "expert"] = "both"
+    if base_policy == Path("none"):
+        base_policy, states = None, "expert"
+    template = AuditSettings(embodiment=embodiment, group=group, states=states, count=count)
+    wanted = cells(task, variant, template)
     several = len(wanted) > 1
-    if rollouts:
-        for settings in wanted:
-            error = compare_rollouts(settings, rollouts, actions, runs, base_policy, not json)
-            print(f"{settings.name}, {actions}")
-            print(error.summary())
-        return 0
 
-    def done(result: Any) -> None:
+    def done(result: AuditResult) -> None:
         if several:
             _tell(f"{result.settings.name}: {result.seconds:.1f} s")
 
-    found = run_audits(wanted, runs, base_policy, out, resume, progress=not json, done=done)
+    results = run_audits(wanted, base_policy=base_policy, out=out, done=done)
     if several and out is not None:
-        write_table(found, out)
-    if json:
-        plain = [result.to_json() for result in found]
-        print(dumps(plain if several else plain[0]))
-    elif several:
-        print(to_markdown([summary(result) for result in found]), end="")
+        write_table(results, out)
+    if several:
+        print(to_markdown([summary(result) for result in results]), end="")
     else:
-        print(text(found[0]))
-    if out is not None and not json:
+        print(text(results[0]))
+    if out is not None:
         print(f"wrote {out}")
+    return 0
+
+
+def audit_episodes(
+    task: str = "PickCube-v1",
+    variant: str = "none",
+    group: str = "C8",
+    episodes: int = 25,
+    actions: Literal["expert", "random", "policy"] = "expert",
+    base_policy: Path | None = None,
+    trust: Trust = (),
+) -> int:
+    """Compare whole episodes of the floating gripper with their turned copies (docs/tasks.md).
+
+    Args:
+        task: Task; `symsteer list` names them.
+        variant: How the symmetry is broken, e.g. action_gain:0.5, or none.
+        group: Symmetry group, e.g. C8, D4 (with reflections).
+        episodes: Number of episodes.
+        actions: Who acts: the expert or noise, whose actions are turned, or the base policy, whose
+            noise is turned.
+        base_policy: Saved base policy; default: the one that `symsteer run` would train and keep in
+            runs/base.
+    """
+    allow(task, variant, *trust)
+    from symsteer.bench.audit.result import AuditSettings
+    from symsteer.bench.audit.rollout import rotated_rollout_error
+    from symsteer.bench.audit.study import audited_policy, cells
+
+    (settings,) = cells([task], [variant], AuditSettings(group=group))
+    settings.check()
+    if base_policy is not None and actions != "policy":
+        raise UserError(f"--actions {actions} does not use --base-policy; leave one of them out")
+    policy = audited_policy(settings, base_policy) if actions == "policy" else None
+    error = rotated_rollout_error(
+        settings.task,
+        episodes=episodes,
+        actions=actions,
+        group=group,
+        variant=settings.variant,
+        policy=policy,
+    )
+    print(f"{settings.name}, {actions}")
+    print(error.summary())
     return 0
 
 

@@ -98,13 +98,13 @@ def advise(
 def _named(task: str, embodiment: str, variant: str, group: str, states: int) -> AuditSettings:
     """The settings of an audit of a world that is named."""
     from symsteer.bench.audit.result import AuditSettings
-    from symsteer.bench.audit.study import grid
+    from symsteer.bench.audit.study import cells
 
-    template = AuditSettings(group=group, count=states)
-    found = grid([task], [embodiment], [variant], [], template)
-    if len(found) != 1:
-        raise UserError("name one task, one embodiment and one variant, not all")
-    (settings,) = found
+    template = AuditSettings(embodiment=embodiment, group=group, count=states)
+    named = cells([task], [variant], template)
+    if len(named) != 1:
+        raise UserError("name one task and one variant, not all")
+    (settings,) = named
     settings.check()
     return settings
 

@@ -85,6 +85,9 @@ VERBS = {
         f"{BENCH}:fetch_bundle", "Check such a file and unpack it.", computes=False
     ),
     "audit": Verb(f"{BENCH}:audit", "Measure how broken the symmetry of a task is."),
+    "audit-episodes": Verb(
+        f"{BENCH}:audit_episodes", "Compare whole episodes with their turned copies."
+    ),
     "advise": Verb("symsteer.advise:advise", "Say which agent to take in a world, and how sure."),
     "new": Verb("symsteer.agents.new:new", "Write a new agent and its tests.", computes=False),
     "throughput": Verb(f"{BENCH}:throughput", "Measure how fast this machine steers."),
@@ -186,7 +189,7 @@ def _run(arguments: Sequence[str]) -> int:
 def _overview() -> str:
     """The help text of ``symsteer``."""
     lines = ["usage: symsteer VERB [OPTIONS]", "", folded("", ABOUT), "", "verbs:"]
-    lines += [folded(f"  {name:12s} ", verb.summary) for name, verb in VERBS.items()]
+    lines += [folded(f"  {name:14s} ", verb.summary) for name, verb in VERBS.items()]
     lines += ["", "symsteer VERB --help: the options of a verb; symsteer --version: the version"]
     return "\n".join(lines)
 

@@ -6,7 +6,7 @@ whole resets, never single numbers of a state.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ PERMUTATIONS = 999
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Measurement:
     """A number with its 95 % bootstrap interval."""
 
     value: float
@@ -54,7 +54,7 @@ def root_share(squares: Array, chance: Array, whole: Array, axis: int = -1) -> A
         return np.where(below > 0, root_excess(squares, chance, axis) / below, np.nan)
 
 
-def bootstrap(statistic: Callable[..., Any], *columns: Any, seed: int) -> Estimate:
+def bootstrap(statistic: Callable[..., Any], *columns: Any, seed: int) -> Measurement:
     """Compute ``statistic`` of ``columns``, each ``[S]``, with a percentile interval over states.
 
     The columns are resampled together: entry i of each belongs to state i.
@@ -65,22 +65,31 @@ def bootstrap(statistic: Callable[..., Any], *columns: Any, seed: int) -> Estima
     data = tuple(np.asarray(column, dtype=np.float64) for column in columns)
     value = float(statistic(*data))
     if all(np.ptp(column) == 0 for column in data) and len(data[0]) > 1:
-        return Estimate(value, value, value)
-    result = stats.bootstrap(
+        return Measurement(value, value, value)
+    return _with_interval(value, statistic, data, np.random.default_rng(seed), paired=True)
+
+
+def _with_interval(
+    value: float,
+    statistic: Callable[..., Any],
+    data: Sequence[Any],
+    generator: np.random.Generator,
+    **options: Any,
+) -> Measurement:
+    interval = stats.bootstrap(
         data,
         statistic,
-        paired=True,
         vectorized=True,
         n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE,
         method="percentile",
-        rng=np.random.default_rng(seed),
-    )
-    low, high = result.confidence_interval
-    return Estimate(value, float(low), float(high))
+        rng=generator,
+        **options,
+    ).confidence_interval
+    return Measurement(value, float(interval.low), float(interval.high))
 
 
-def energy_distance(x: Array, y: Array, seed: int) -> tuple[Estimate, float]:
+def energy_distance(x: Array, y: Array, seed: int) -> tuple[Measurement, float]:
     """Normalised energy distance of two samples.
 
     The coefficient of inhomogeneity (Szekely and Rizzo 2013)
@@ -106,26 +115,18 @@ def energy_distance(x: Array, y: Array, seed: int) -> tuple[Estimate, float]:
     def inhomogeneity(rows: Any, columns: Any, axis: int = -1) -> Array:
         first, second = _counts(rows, n), _counts(columns, m)
         cross = ((first @ between) * second).sum(axis=-1) / (n * m)
-        own = sum(
+        within = sum(
             # Pairs of a reset with itself do not count, also if it was drawn twice.
             ((w @ d) * w).sum(axis=-1) / (w.sum(axis=-1) ** 2 - (w**2).sum(axis=-1))
             for w, d in ((first, within_x), (second, within_y))
         )
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(cross > 0, 1 - own / (2 * cross), 0.0)
+            return np.where(cross > 0, 1 - within / (2 * cross), 0.0)
 
     value = float(inhomogeneity(np.arange(n), np.arange(m)))
     generator = np.random.default_rng(seed)
-    interval = stats.bootstrap(
-        (np.arange(n), np.arange(m)),
-        inhomogeneity,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=100,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=generator,
-    ).confidence_interval
+    resets = np.arange(n), np.arange(m)
+    measured = _with_interval(value, inhomogeneity, resets, generator, batch=100)
     # Sums over the permuted first sample give all three expectations of a permutation.
     labels = np.zeros((PERMUTATIONS, n + m))
     labels[:, :n] = 1
@@ -136,10 +137,10 @@ def energy_distance(x: Array, y: Array, seed: int) -> tuple[Estimate, float]:
     first_all = to_first.sum(axis=1)
     cross = (first_all - first_first) / (n * m)
     second_second = total - 2 * first_all + first_first
-    own = first_first / (n * (n - 1)) + second_second / (m * (m - 1))
-    permuted = np.where(cross > 0, 1 - own / np.maximum(2 * cross, 1e-300), 0.0)
+    within = first_first / (n * (n - 1)) + second_second / (m * (m - 1))
+    permuted = np.where(cross > 0, 1 - within / np.maximum(2 * cross, 1e-300), 0.0)
     p_value = (1 + int((permuted >= value - 1e-12).sum())) / (1 + PERMUTATIONS)
-    return Estimate(value, float(interval.low), float(interval.high)), p_value
+    return measured, p_value
 
 
 def _counts(index: Any, size: int) -> Array:

@@ -8,7 +8,6 @@ rounding only and shows how small a defect can be measured.
 
 from __future__ import annotations
 
-import gc
 import itertools
 import math
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ import torch
 
 from symsteer.bench.audit.states import Element, Turner, Visited, seen_from, task_state
 from symsteer.bench.sim.environment import Simulator
-from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
+from symsteer.bench.sim.rotations import planar_matrix, quaternion_to_matrix, transform_quaternion
 from symsteer.bench.sim.trees import join_trees, map_trees, rows_of
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
@@ -52,11 +51,10 @@ class Copies:
         positions, quaternions: turned-back positions ``[S, G + 1, 2, 3]`` and quaternions
             ``[S, G + 1, 2, 4]`` of tool and object at the start and the end of the decision; the
             last of the G + 1 is the copy that differs by rounding.
-        cost: cost of a step (1 plus the extra cost of the variants until success, then 0), mean
-            over the decision's steps, ``[S, G]``.
-        dense: ManiSkill's normalised dense reward minus the extra cost of the variants, likewise.
-        function_cost, function_dense: the same where every step starts and ends in the turned
-            states of the unbroken task, ``[S, G]``.
+        rewards: mean over the decision's steps, ``[S, G]`` each: ``cost`` of a step (1 plus the
+            extra cost of the variants until success, then 0) and ``dense`` (ManiSkill's normalised
+            dense reward minus the extra cost) where every step starts and ends in the turned states
+            of the unbroken task; ``outcome_cost`` and ``outcome_dense`` of what was simulated.
         observations: turned-back observations of the copies, K draws each,
             ``[S, G, K, obs_dim]``.
         observations_again: a second set of draws for the state itself, ``[S, K, obs_dim]``.
@@ -68,20 +66,44 @@ class Copies:
     place: Tensors
     positions: Tensors
     quaternions: Tensors
-    cost: torch.Tensor
-    dense: torch.Tensor
-    function_cost: torch.Tensor
-    function_dense: torch.Tensor
+    rewards: Tensors
     observations: torch.Tensor
     observations_again: torch.Tensor
 
+    @property
+    def compared(self) -> np.ndarray:
+        """States that have at least one turned copy, ``[S]`` bool."""
+        return self.reached[:, 1:].any(dim=1).numpy()
 
-@dataclass(frozen=True)
-class Resets:
-    """Features of R resets, and of R other resets turned at random, ``[R, obs_dim]`` each."""
+    def mean(self, values: torch.Tensor, first: int = 1) -> np.ndarray:
+        """Mean over the copies that exist, from ``first`` on: ``[S, G]`` or ``[S, G + 1]`` to
+        ``[S]``; nan if there is none."""
+        mask = self.reached[:, first:].double()
+        total = (values[:, first : self.reached.shape[1]].double() * mask).sum(dim=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return total.numpy() / mask.sum(dim=1).numpy()
 
-    original: torch.Tensor
-    turned: torch.Tensor
+    def lengths(self, body: str, corners: torch.Tensor) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Mean distance of the copies from the state's own, and mean motion of all: ``[S]`` each.
+
+        Horizontally and vertically: of the tool's centre point, or of the object's corners (mean
+        over these).
+        """
+        points = self.positions[body][..., None, :]
+        if body == "object":
+            points = points + corners @ quaternion_to_matrix(self.quaternions[body]).mT
+        start, end = points.unbind(dim=2)
+        apart, moved = end - end[:, :1], end - start
+        return {
+            "horizontal": (
+                self.mean(apart[..., :2].norm(dim=-1).mean(dim=-1)),
+                self.mean(moved[..., :2].norm(dim=-1).mean(dim=-1), first=0),
+            ),
+            "vertical": (
+                self.mean(apart[..., 2].abs().mean(dim=-1)),
+                self.mean(moved[..., 2].abs().mean(dim=-1), first=0),
+            ),
+        }
 
 
 class Experiment:
@@ -125,80 +147,81 @@ class Experiment:
         self.corners = torch.tensor(list(itertools.product(*mesh.bounds.T)), dtype=torch.float64)
         """Corners of the manipulated object's bounding box in its own frame, ``[8, 3]``."""
 
-    def close(self) -> None:
-        """Free the scenes at once: the number that a process can hold is limited."""
+    def __enter__(self) -> Experiment:
+        return self
+
+    def __exit__(self, *error: object) -> None:
         self.env.close()
-        del self.env
-        gc.collect()
 
     # ------------------------------------------------------------------ copies
 
     def copies(self) -> Copies:
         """Simulate all copies of all states."""
         random = self._observation_is_random()
-        parts = []
+        batches = []
         for start in range(0, len(self.visited), self.batch):
             # A short last batch is filled with copies of the last state, which are dropped.
             rows = torch.arange(start, start + self.batch).clamp(max=len(self.visited) - 1)
             keep = min(self.batch, len(self.visited) - start)
-            parts.append(rows_of(self._batch(rows, random), torch.arange(keep)))
-        return join_trees(parts)
+            batches.append(rows_of(self._batch(rows, random), torch.arange(keep)))
+        return join_trees(batches)
 
     def _batch(self, rows: torch.Tensor, random: bool) -> Copies:
-        env, visited, elements = self.env, self.visited, self.elements
-        order, count = len(elements), len(rows)
-        state, path = rows_of(visited.state, rows), rows_of(visited.path, rows)
-        turned = [self.turner.turn(state, g, self.centre) for g in elements]
-        starts = [copy for copy, _ in turned]
-        reached = torch.stack([mask for _, mask in turned], dim=1)
-        floor = self._rounded(state)
-        actions = visited.actions[rows]
-        layout = env.action_layout
-        plan = torch.cat([layout.transform(actions, *g) for g in elements] + [actions])
+        env, elements = self.env, self.elements
+        visited = rows_of(self.visited, rows)
+        starts, reached = self._turned(visited.state)
+        scenes = join_trees([*starts, self._rounded(visited.state)])
+        turned_actions = [env.action_layout.transform(visited.actions, *g) for g in elements]
+        plan = torch.cat([*turned_actions, visited.actions])
 
         # New scenes, so that all copies have the same history.
-        options = {} if self.fresh else {"reconfigure": True}
-        env.reset(seed=[self.seed] * env.num_envs, options=options)
+        env.reset(
+            seed=[self.seed] * env.num_envs, options={} if self.fresh else {"reconfigure": True}
+        )
         self.fresh = False
-        scenes = join_trees([*starts, floor])
         self._put(scenes)
-        observations, again = self._observe(scenes, count, random)
+        observations, again = self._observe(scenes, random)
         if random:
             env.reset(seed=[self.seed] * env.num_envs)
             self._put(scenes)
 
         poses = [self._poses()]
         place = {
-            body: self._split(p[:, :2] - self.centre, count)[:, :order]
-            for body, (p, _) in poses[0].items()
+            body: self._split(position[:, :2] - self.centre)[:, : len(elements)]
+            for body, (position, _) in poses[0].items()
         }
-        cost, dense = torch.zeros(env.num_envs), torch.zeros(env.num_envs)
-        alive = torch.ones(env.num_envs)
-        steps = plan.shape[1]
-        for step in range(steps):
-            before = env.agent.tcp_pose.p.clone()
-            _, reward, _, _, info = env.step(plan[:, step].to(env.device))
-            alive = alive * (~info["success"].cpu()).float()
-            cost = cost + alive * (1 + self._extra_cost(before, info)).cpu() / steps
-            dense = dense + reward.cpu() / steps
+        outcome_cost, outcome_dense = self._rewards(plan)
         poses.append(self._poses())
-
-        function_cost, function_dense, both = self._reward_function(scenes, path, plan, count)
-        positions, quaternions = self._turned_back(poses, count)
+        positions, quaternions = self._turned_back(poses)
+        outcomes = []
+        for step in range(plan.shape[1]):
+            after = map_trees(lambda later, k=step: later[:, k], visited.path)
+            copies, possible = self._turned(after)
+            outcomes.append(join_trees([*copies, after]))
+            reached &= possible
+        self._put(scenes)
+        cost, dense = self._rewards(plan, outcomes)
         return Copies(
-            moving=visited.moving[rows],
-            policy=visited.policy[rows],
-            reached=reached & both,
+            moving=visited.moving,
+            policy=visited.policy,
+            reached=reached,
             place=place,
             positions=positions,
             quaternions=quaternions,
-            cost=self._split(cost, count)[:, :order],
-            dense=self._split(dense, count)[:, :order],
-            function_cost=function_cost,
-            function_dense=function_dense,
+            rewards={
+                "cost": cost,
+                "dense": dense,
+                "outcome_cost": outcome_cost,
+                "outcome_dense": outcome_dense,
+            },
             observations=observations,
             observations_again=again,
         )
+
+    def _turned(self, state: dict[str, Any]) -> tuple[list[dict[str, Any]], torch.Tensor]:
+        """The G copies of states, and which of them can be reached, ``[S, G]`` bool."""
+        turned = [self.turner.turn(state, g, self.centre) for g in self.elements]
+        return [copy for copy, _ in turned], torch.stack([mask for _, mask in turned], dim=1)
 
     def _rounded(self, state: dict[str, Any]) -> dict[str, Any]:
         """The state turned by one radian and back: equal up to rounding."""
@@ -218,37 +241,65 @@ class Experiment:
 
     def _poses(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         """Positions and quaternions of tool and object in every scene."""
-        tool, thing = self.env.agent.tcp_pose, self.env.manipulated.pose
-        return {
-            "tool": (tool.p.cpu().clone(), tool.q.cpu().clone()),
-            "object": (thing.p.cpu().clone(), thing.q.cpu().clone()),
-        }
+        bodies = {"tool": self.env.agent.tcp_pose, "object": self.env.manipulated.pose}
+        return {name: (pose.p.cpu().clone(), pose.q.cpu().clone()) for name, pose in bodies.items()}
 
-    def _split(self, values: torch.Tensor, count: int) -> torch.Tensor:
+    def _split(self, values: torch.Tensor) -> torch.Tensor:
         """Reshape ``[(G + 1) * S, ...]``, ordered by copy, to ``[S, G + 1, ...]``."""
-        return values.unflatten(0, (-1, count)).transpose(0, 1)
+        return values.unflatten(0, (-1, self.batch)).transpose(0, 1)
 
     def _turned_back(
-        self, poses: list[dict[str, tuple[torch.Tensor, torch.Tensor]]], count: int
+        self, poses: list[dict[str, tuple[torch.Tensor, torch.Tensor]]]
     ) -> tuple[Tensors, Tensors]:
         positions, quaternions = {}, {}
-        inverses = [_inverse(g) for g in self.elements] + [(0.0, False)]
         mirrored = self.env.manipulated.name in self.env.mirrored_across_yz
+        centre = torch.cat([self.centre.double(), torch.zeros(1, dtype=torch.float64)])
         for body in ("tool", "object"):
-            p = self._split(torch.stack([w[body][0] for w in poses], dim=1), count).double()
-            q = self._split(torch.stack([w[body][1] for w in poses], dim=1), count).double()
-            centre = torch.cat([self.centre.double(), torch.zeros(1, dtype=torch.float64)])
-            back_p, back_q = [], []
-            for g, inverse in enumerate(inverses):
+            p, q = (
+                self._split(torch.stack([pose[body][kind] for pose in poses], dim=1)).double()
+                for kind in (0, 1)
+            )
+            back = []
+            for g, inverse in enumerate([*map(_inverse, self.elements), (0.0, False)]):
                 matrix = planar_matrix(*inverse, p)
-                back_p.append((p[:, g] - centre) @ matrix.T + centre)
-                across_yz = body == "object" and mirrored
-                back_q.append(transform_quaternion(q[:, g], *inverse, across_yz))
-            positions[body] = torch.stack(back_p, dim=1)
-            quaternions[body] = torch.stack(back_q, dim=1)
+                turned = transform_quaternion(q[:, g], *inverse, body == "object" and mirrored)
+                back.append(((p[:, g] - centre) @ matrix.T + centre, turned))
+            positions[body], quaternions[body] = (
+                torch.stack(column, dim=1) for column in zip(*back, strict=True)
+            )
         return positions, quaternions
 
     # ------------------------------------------------------------------ reward
+
+    def _rewards(
+        self, plan: torch.Tensor, outcomes: list[dict[str, Any]] | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Cost and dense reward of a step, mean over the decision, ``[S, G]`` each.
+
+        Args:
+            plan: the actions of all scenes, ``[(G + 1) * S, T, 7]``.
+            outcomes: the states of all scenes after each step. Without them the actions are
+                simulated; with them neither dynamics nor contact forces enter.
+        """
+        env, steps = self.env, plan.shape[1]
+        cost, dense = torch.zeros(env.num_envs), torch.zeros(env.num_envs)
+        alive = torch.ones(env.num_envs)
+        for step in range(steps):
+            action, before = plan[:, step].to(env.device), env.agent.tcp_pose.p.clone()
+            if outcomes is None:
+                _, reward, _, _, info = env.step(action)
+                extra = self._extra_cost(before, info)
+            else:
+                self._put(outcomes[step])
+                info = env.get_info()
+                extra = self._extra_cost(before, info)
+                obs = env.get_obs(info)
+                reward = env.compute_normalized_dense_reward(obs, action=action, info=info) - extra
+            alive = alive * (~info["success"].cpu()).float()
+            cost = cost + alive * (1 + extra).cpu() / steps
+            dense = dense + reward.cpu() / steps
+        order = len(self.elements)
+        return self._split(cost)[:, :order], self._split(dense)[:, :order]
 
     def _extra_cost(self, before: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
         """Extra cost of the variants for a step whose tool started at ``before``, ``[N]``."""
@@ -258,82 +309,46 @@ class Experiment:
             cost = cost + variant.extra_cost(moved)
         return torch.where(info["success"], torch.zeros_like(cost), cost)
 
-    def _reward_function(
-        self, scenes: dict[str, Any], path: dict[str, Any], plan: torch.Tensor, count: int
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Cost and dense reward of turned transitions of the unbroken task, and which copies exist.
-
-        All are ``[S, G]``. The outcomes are set, not simulated: neither the broken dynamics nor
-        contact forces enter.
-
-        Args:
-            scenes: the states in which all scenes start.
-            path: the states after each step, ``[S, T, ...]``.
-            plan: the actions of all scenes, ``[(G + 1) * S, T, 7]``.
-            count: number S of states.
-        """
-        env, steps = self.env, plan.shape[1]
-        self._put(scenes)
-        before = env.agent.tcp_pose.p.clone()
-        reached = torch.ones(count, len(self.elements), dtype=torch.bool)
-        cost, dense = torch.zeros(env.num_envs), torch.zeros(env.num_envs)
-        alive = torch.ones(env.num_envs)
-        for step in range(steps):
-            after = map_trees(lambda later, k=step: later[:, k], path)
-            turned = [self.turner.turn(after, g, self.centre) for g in self.elements]
-            reached &= torch.stack([mask for _, mask in turned], dim=1)
-            self._put(join_trees([*[copy for copy, _ in turned], after]))
-            info = env.get_info()
-            extra = self._extra_cost(before, info)
-            before = env.agent.tcp_pose.p.clone()
-            reward = env.compute_normalized_dense_reward(
-                env.get_obs(info), action=plan[:, step].to(env.device), info=info
-            )
-            alive = alive * (~info["success"].cpu()).float()
-            cost = cost + alive * (1 + extra).cpu() / steps
-            dense = dense + (reward - extra).cpu() / steps
-        order = len(self.elements)
-        return self._split(cost, count)[:, :order], self._split(dense, count)[:, :order], reached
-
     # ------------------------------------------------------------- observation
+
+    def _draw(self, seeds: list[int], state: dict[str, Any]) -> torch.Tensor:
+        """Observations of states in scenes that were reset with seeds of their own."""
+        self.env.reset(seed=seeds)
+        self._put(state)
+        return self.env.get_obs().cpu().clone()
 
     def _observation_is_random(self) -> bool:
         """Whether the observation of the same state depends on the seed of the reset."""
         rows = torch.zeros(self.env.num_envs, dtype=torch.long)
         state = rows_of(self.visited.state, rows)
-        seen = []
-        for seed in (self.seed, self.seed + 1):
-            self.env.reset(seed=[seed] * self.env.num_envs)
-            self._put(state)
-            seen.append(self.env.get_obs().cpu().clone())
-        return not torch.equal(seen[0], seen[1])
+        one, other = (
+            self._draw([seed] * self.env.num_envs, state) for seed in (self.seed, self.seed + 1)
+        )
+        return not torch.equal(one, other)
 
-    def _observe(
-        self, states: dict[str, Any], count: int, random: bool
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def _observe(self, states: dict[str, Any], random: bool) -> tuple[torch.Tensor, torch.Tensor]:
         """Turned-back observations ``[S, G, K, dim]`` and of the states again ``[S, K, dim]``.
 
         Every scene and every draw of random observations has its own seed.
         """
-        env, layout = self.env, self.env.observation_layout
-        draws = []
+        layout = self.env.observation_layout
         if random:
             rng = np.random.default_rng([self.seed, 5])
-            for _ in range(DRAWS):
-                env.reset(seed=np.asarray(rng.integers(2**31, size=env.num_envs)).tolist())
-                self._put(states)
-                draws.append(env.get_obs().cpu().clone())
+            draws = [self._draw(self._seeds(rng), states) for _ in range(DRAWS)]
         else:
-            draws.append(env.get_obs().cpu().clone())
-        seen = self._split(torch.stack(draws, dim=1), count).double()
-        order = len(self.elements)
-        back = [layout.transform(seen[:, g], *_inverse(self.elements[g])) for g in range(order)]
-        return torch.stack(back, dim=1), seen[:, order]
+            draws = [self.env.get_obs().cpu().clone()]
+        seen = self._split(torch.stack(draws, dim=1)).double()
+        back = [layout.transform(seen[:, g], *_inverse(e)) for g, e in enumerate(self.elements)]
+        return torch.stack(back, dim=1), seen[:, -1]
+
+    def _seeds(self, rng: np.random.Generator) -> list[int]:
+        """A seed for each scene."""
+        return np.asarray(rng.integers(2**31, size=self.env.num_envs)).tolist()
 
     # ------------------------------------------------------------------ resets
 
-    def resets(self, count: int) -> Resets:
-        """Features of ``count`` resets, and of as many other resets turned at random.
+    def resets(self, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Features of ``count`` resets, and of as many others turned at random, ``[R, dim]`` each.
 
         Features are the unbroken task's observation of the state, relative to the policy's
         origin.
@@ -341,24 +356,22 @@ class Experiment:
         rng = np.random.default_rng([self.seed, 6])
         features = self._features(rng, 2 * count)
         original, turned = features[:count], features[count:].clone()
-        layout = self.env.observation_layout
         choice = rng.integers(1, len(self.elements), size=count)
         for g, element in enumerate(self.elements):
             rows = torch.as_tensor(choice == g)
-            turned[rows] = layout.transform(turned[rows], *element)
-        return Resets(original, turned)
+            turned[rows] = self.env.observation_layout.transform(turned[rows], *element)
+        return original, turned
 
     def _features(self, rng: np.random.Generator, count: int) -> torch.Tensor:
-        found: list[torch.Tensor] = []
+        features: list[torch.Tensor] = []
         known = self.visited.state
-        while sum(map(len, found)) < count:
-            seeds = np.asarray(rng.integers(2**31, size=self.env.num_envs)).tolist()
-            self.env.reset(seed=seeds)
+        while sum(map(len, features)) < count:
+            self.env.reset(seed=self._seeds(rng))
             state = task_state(self.env)
             state |= {k: {n: state[k][n] for n in known[k]} for k in ("actors", "articulations")}
             state.pop("controller", None)
-            found.append(self._observe_unbroken(seen_from(state, self.centre)))
-        return torch.cat(found)[:count].double()
+            features.append(self._observe_unbroken(seen_from(state, self.centre)))
+        return torch.cat(features)[:count].double()
 
     def _observe_unbroken(self, state: dict[str, Any]) -> torch.Tensor:
         env = self.reference

@@ -1,22 +1,24 @@
-"""Output of the audit: a text page of one result, tables of many, a map."""
+"""Output of the audit: one list of its numbers, from which page, tables and files are made."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
-from dataclasses import astuple
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib import style as mpl_style
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
-from symsteer.bench.audit.estimates import Estimate
-from symsteer.bench.audit.result import BIN, AuditResult, Defect
+from symsteer.bench.audit.estimates import Measurement
+from symsteer.bench.audit.result import BIN, BODIES, AuditResult, Body, Square, Subset
 from symsteer.errors import UserError
 from symsteer.files import csv_text, write_together
+from symsteer.tables import aligned, markdown
+from symsteer.variant import UNBROKEN
 
 EXACT = 1e-3
 """Reward and observation defects below this are rounding errors, also of inverse kinematics."""
@@ -24,69 +26,103 @@ EXACT = 1e-3
 SIGNIFICANT = 0.01
 """Resets differ from their turned copies below this p-value."""
 
-MEANING = {
-    "tool": "turned copies of a decision move the tool to places that differ by",
-    "object": "the object to places that differ by",
-}
-"""Defects of motion in words, before their share of the motion."""
-
 MIN_COPIES = 3
 """Squares of the map with fewer copies are not drawn."""
 
 
-def text(result: AuditResult) -> str:
-    """A result as a page for the terminal."""
-    s = result.settings
-    visitors = " and ".join(f"{s.count} of the {v}" for v in s.visitors)
-    lines = [
-        f"{s.task}, {s.embodiment}, {_variant(result)}: group {s.group}, decisions of {s.chunk} "
-        f"steps from {result.states} states",
-        f"({visitors}; the object moves in {result.moving})",
-        "",
-        f"{'defect of a decision':26s} {_percent(result.decision)}, of the {result.part}",
-    ]
-    for body in ("tool", "object"):
-        for subset in ("all", "moving") if body == "object" else ("all",):
-            defect = result.defect(body, subset)  # type: ignore[arg-type]
-            if defect is None:
-                continue
-            name = body if subset == "all" else f"{body}, where it moves"
-            lines.append(f"{name:26s} {_relative(defect)}")
-            mm = f"{_number(defect.mm, 2)} of {defect.displacement_mm:.1f} mm"
-            lines.append(f"{'':26s} {mm}, {_number(defect.degrees, 2)} degrees")
-    floors = [result.defect(b) for b in ("tool", "object")]  # type: ignore[arg-type]
-    lines.append(
-        f"{'floor (rounding alone)':26s} "
-        + ", ".join(f"{d.body} {d.floor_mm:.2g} mm" for d in floors if d)
-    )
-    r = result.reward
-    lines += [
-        f"{'reward, mean of a step':26s} cost {_number(r['cost'], 3)}, "
-        f"dense {_number(r['dense'], 4)}",
-        f"{'  by way of the dynamics':26s} cost {_number(r['outcome_cost'], 3)}, "
-        f"dense {_number(r['outcome_dense'], 4)}",
-    ]
-    worst = result.worst_field
-    noise = " (random: Gaussians compared)" if result.random_observation else ""
-    observed = _percent(worst.relative) if worst.relative else "no"
-    lines.append(f"{'observation':26s} {observed} of the tool's displacement{noise}")
-    if breaks_observation(result):
-        unit = f", {_number(worst.value, 1)} mm" if worst.unit else ""
-        lines.append(f"{'  most in':26s} {worst.name}{unit}")
-    lines.append(
-        f"{'resets':26s} energy distance {_number(result.resets, 3)}, p = {result.resets_p:.3g}"
-    )
-    if any(result.origin_mm):
-        x, y = result.origin_mm
-        lines.append(f"{'origin':26s} the group acts about ({x:.0f}, {y:.0f}) mm, the policy's")
-    if s.embodiment != "floating":
-        lines.append(
-            f"{'reach':26s} {result.unreachable:.1%} of the turned states are out of reach"
-        )
-    top = _largest(result)
-    if top is not None:
-        lines.append(f"{'where':26s} {top}")
-    return "\n".join([*lines, "", meaning(result), f"({result.seconds:.1f} s)"])
+@dataclass(frozen=True)
+class AuditNumber:
+    """A number with an interval that an audit has.
+
+    Attributes:
+        of: its value in a result; None if the body is at rest.
+        text: what it is, on the page of one result.
+        unit: shares are stored as such and shown in per cent.
+        key: its name in table and summary; empty if only the page has it.
+        column: its head in the markdown table; empty if that leaves it out.
+        exact: shown as 0 if value and interval are below it.
+    """
+
+    of: Callable[[AuditResult], Measurement | None]
+    text: str
+    unit: str = "%"
+    key: str = ""
+    column: str = ""
+    exact: float = 0.0
+
+    def interval(self, result: AuditResult) -> tuple[float, ...] | None:
+        """Value, low and high."""
+        measured = self.of(result)
+        return None if measured is None else astuple(measured)
+
+    def show(self, interval: Sequence[float] | None, in_table: bool = False) -> str:
+        """``value [low, high]`` with its unit, which in a table only shares have."""
+        share = self.unit == "%"
+        unit = "" if in_table and not share else self.unit
+        return _interval(interval, 100 if share else 1, unit, self.exact)
+
+
+def _motion(body: Body, name: str, subset: Subset = "all") -> Callable[[AuditResult], Any]:
+    def of(result: AuditResult) -> Any:
+        defect = result.defect(body, subset)
+        return None if defect is None else getattr(defect, name)
+
+    return of
+
+
+NUMBERS = (
+    AuditNumber(lambda r: r.decision, "defect of a decision", "%", "decision", "decision"),
+    AuditNumber(_motion("tool", "horizontal"), "tool, horizontally", "%", "tool", "tool"),
+    AuditNumber(
+        _motion("tool", "vertical"), "tool, vertically", "%", "tool_vertical", "tool, vertical"
+    ),
+    AuditNumber(_motion("tool", "mm"), "tool", "mm", "tool_mm"),
+    AuditNumber(_motion("tool", "degrees"), "tool, its orientation", "degrees", "tool_deg"),
+    AuditNumber(_motion("object", "horizontal"), "object, horizontally", "%", "object", "object"),
+    AuditNumber(_motion("object", "vertical"), "object, vertically", "%", "object_vertical"),
+    AuditNumber(_motion("object", "mm"), "object", "mm", "object_mm", "object, mm"),
+    AuditNumber(_motion("object", "degrees"), "object, its orientation", "degrees", "object_deg"),
+    AuditNumber(_motion("object", "horizontal", "moving"), "object where it moves, horizontally"),
+    AuditNumber(_motion("object", "vertical", "moving"), "object where it moves, vertically"),
+    AuditNumber(_motion("object", "mm", "moving"), "object where it moves", "mm"),
+    AuditNumber(lambda r: r.reward["cost"], "cost of a step", "%", "cost", "cost", EXACT),
+    AuditNumber(
+        lambda r: r.reward["dense"], "dense reward of a step", "%", "dense", "dense", EXACT
+    ),
+    AuditNumber(lambda r: r.reward["outcome_cost"], "cost, by way of the dynamics", exact=EXACT),
+    AuditNumber(lambda r: r.reward["outcome_dense"], "dense, by way of the dynamics", exact=EXACT),
+    AuditNumber(
+        lambda r: r.worst_field.relative,
+        "observation, of the tool's motion",
+        "%",
+        "observation",
+        "observed",
+        EXACT,
+    ),
+    AuditNumber(lambda r: r.resets, "resets, energy distance", "", "resets", "resets"),
+)
+"""All numbers with an interval, in the order of the page."""
+
+LISTED = tuple(number for number in NUMBERS if number.key)
+"""The numbers of table and summary."""
+
+FACTS: dict[str, Callable[[AuditResult], Any]] = {
+    "version": lambda r: r.version,
+    "task": lambda r: r.settings.task,
+    "embodiment": lambda r: r.settings.embodiment,
+    "variant": lambda r: r.settings.variant,
+    "group": lambda r: r.settings.group,
+    "chunk": lambda r: r.settings.chunk,
+    "states": lambda r: r.states,
+    "moving": lambda r: r.moving,
+    "unreachable": lambda r: _short(r.unreachable),
+    "part": lambda r: r.part,
+    "resets_p": lambda r: _short(r.resets_p),
+    "field": lambda r: r.worst_field.name if breaks_observation(r) else None,
+    "tool_floor_mm": lambda r: _short(_motion("tool", "floor_mm")(r)),
+    "object_floor_mm": lambda r: _short(_motion("object", "floor_mm")(r)),
+}
+"""What else table and summary have."""
 
 
 def breaks_observation(result: AuditResult) -> bool:
@@ -95,139 +131,79 @@ def breaks_observation(result: AuditResult) -> bool:
     return relative is not None and relative.value > EXACT
 
 
-def meaning(result: AuditResult) -> str:
-    """A result in one sentence."""
-    parts = [
-        f"{MEANING[name]} {_short_percent(estimate.value)}"
-        for name, estimate in result.parts.items()
-        if name in MEANING
-    ]
-    broken: list[str] = []
-    kept: list[str] = []
-    reward = max(result.reward["cost"].value, result.reward["dense"].value)
-    for name, is_broken in (
-        ("reward", reward > EXACT),
-        ("observation", breaks_observation(result)),
-        ("resets", result.resets_p < SIGNIFICANT),
-    ):
-        (broken if is_broken else kept).append(name)
-    parts.append(
-        " and ".join(
-            f"{_and(names)} {verb if len(names) == 1 and names != ['resets'] else plural}"
-            for names, verb, plural in (
-                (kept, "keeps the symmetry", "keep the symmetry"),
-                (broken, "breaks it", "break it"),
-            )
-            if names
-        )
-    )
-    sentence = "; ".join(parts)
-    return sentence[0].upper() + sentence[1:] + "."
-
-
-def _and(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
-
-
-def _variant(result: AuditResult) -> str:
-    return "unbroken" if result.settings.variant == "none" else result.settings.variant
-
-
-def _largest(result: AuditResult) -> str | None:
-    drawn = [b for b in result.map if b.copies >= MIN_COPIES]
-    tops = []
-    for body in ("tool", "object"):
-        bins = [b for b in drawn if b.body == body]
-        if bins:
-            top = max(bins, key=lambda b: b.mm)
-            tops.append(f"({top.x_mm:.0f}, {top.y_mm:.0f}) mm: {body} {top.mm:.2g} mm")
-    return "most in the square at " + "; ".join(tops) if tops else None
-
-
-def _relative(defect: Defect) -> str:
-    directions = {"horizontal": defect.horizontal, "vertical": defect.vertical}
-    return ", ".join(f"{k} {_percent(v) if v else 'at rest'}" for k, v in directions.items())
-
-
-def _short_percent(value: float) -> str:
-    return f"{100 * value:.2g} % of their length" if value < 1 else f"{value:.2g} of their length"
-
-
-def _percent(estimate: Estimate) -> str:
-    value, low, high = (100 * v for v in (estimate.value, estimate.low, estimate.high))
-    digits = 2 if abs(value) < 1 else 1
-    return f"{value:.{digits}f} % [{low:.{digits}f}, {high:.{digits}f}]"
-
-
-def _number(estimate: Estimate, digits: int) -> str:
-    value, low, high = (_plain(v, digits) for v in (estimate.value, estimate.low, estimate.high))
-    return f"{value} [{low}, {high}]"
-
-
-def _plain(value: float, digits: int) -> str:
-    rounded = f"{value:.{digits}f}"
-    return rounded.lstrip("-") if float(rounded) == 0 else rounded
-
-
-# ------------------------------------------------------------------------- tables
-
-ESTIMATES = {
-    "decision": lambda c: c.decision,
-    "tool": lambda c: _of(c.defect("tool"), "horizontal"),
-    "tool_vertical": lambda c: _of(c.defect("tool"), "vertical"),
-    "tool_mm": lambda c: _of(c.defect("tool"), "mm"),
-    "tool_deg": lambda c: _of(c.defect("tool"), "degrees"),
-    "object": lambda c: _of(c.defect("object"), "horizontal"),
-    "object_vertical": lambda c: _of(c.defect("object"), "vertical"),
-    "object_mm": lambda c: _of(c.defect("object"), "mm"),
-    "object_deg": lambda c: _of(c.defect("object"), "degrees"),
-    "cost": lambda c: c.reward["cost"],
-    "dense": lambda c: c.reward["dense"],
-    "observation": lambda c: c.worst_field.relative,
-    "resets": lambda c: c.resets,
-}
-"""Columns of the table that are numbers with an interval."""
-
-PLAIN = {
-    "version": lambda c: c.version,
-    "task": lambda c: c.settings.task,
-    "embodiment": lambda c: c.settings.embodiment,
-    "variant": lambda c: c.settings.variant,
-    "group": lambda c: c.settings.group,
-    "chunk": lambda c: c.settings.chunk,
-    "states": lambda c: c.states,
-    "moving": lambda c: c.moving,
-    "unreachable": lambda c: _short(c.unreachable),
-    "part": lambda c: c.part,
-    "resets_p": lambda c: _short(c.resets_p),
-    "field": lambda c: c.worst_field.name if breaks_observation(c) else None,
-    "tool_floor_mm": lambda c: _short(_of(c.defect("tool"), "floor_mm")),
-    "object_floor_mm": lambda c: _short(_of(c.defect("object"), "floor_mm")),
-}
-
-
-def _of(defect: Defect | None, name: str) -> Any:
-    return None if defect is None else getattr(defect, name)
-
-
 def _short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.3g}")
 
 
+def text(result: AuditResult) -> str:
+    """A result as a page for the terminal."""
+    s, worst = result.settings, result.worst_field
+    visitors = " and ".join(f"{s.count} of the {v}" for v in s.visitors)
+    notes = {"decision": f"of the {result.part}", "resets": f"p = {result.resets_p:.3g}"}
+    for body in BODIES:
+        if defect := result.defect(body):
+            notes[f"{body}_mm"] = (
+                f"of {defect.displacement_mm:.1f} mm; rounding alone: {defect.floor_mm:.2g} mm"
+            )
+    if breaks_observation(result):
+        size = f", {_interval(astuple(worst.value), 1, worst.unit)}" if worst.unit else ""
+        random = "; random: Gaussians compared" if result.random_observation else ""
+        notes["observation"] = f"most in {worst.name}{size}{random}"
+    rows = [
+        [number.text, number.show(number.interval(result)), notes.get(number.key, "")]
+        for number in NUMBERS
+        if number.key or number.of(result)
+    ]
+    for body in BODIES:
+        if squares := _drawn(result, body):
+            top = max(squares, key=lambda square: square.mm)
+            place = f"in the square at ({top.x_mm:.0f}, {top.y_mm:.0f}) mm"
+            rows.append([f"{body}, most in the map", f"{top.mm:.2g} mm", place])
+    if any(result.origin_mm):
+        x, y = result.origin_mm
+        rows.append(["origin of the group", f"({x:.0f}, {y:.0f}) mm", "the policy's"])
+    if s.embodiment != "floating":
+        rows.append(["turned states out of reach", f"{result.unreachable:.1%}", ""])
+    beside = {
+        "reward": max(result.reward["cost"].value, result.reward["dense"].value) > EXACT,
+        "observation": breaks_observation(result),
+        "resets": result.resets_p < SIGNIFICANT,
+    }
+    broken = ", ".join(name for name, breaks in beside.items() if breaks) or "nothing"
+    return (
+        f"{s.task}, {s.embodiment}, {_variant(s.variant)}: group {s.group}, decisions of {s.chunk} "
+        f"steps from {result.states} states\n({visitors}; the object moves in {result.moving})\n\n"
+        f"{aligned((), rows, left=3)}\n\nBroken beyond rounding, beside motion: {broken}.\n"
+        f"({result.seconds:.1f} s)"
+    )
+
+
+def _variant(name: str) -> str:
+    return "unbroken" if name == UNBROKEN else name
+
+
+def _drawn(result: AuditResult, body: Body) -> list[Square]:
+    return [s for s in result.map if s.body == body and s.copies >= MIN_COPIES]
+
+
+# ------------------------------------------------------------------------- tables
+
+
 def summary(result: AuditResult) -> dict[str, Any]:
     """A row of the table: numbers with three digits, an interval as [value, low, high]."""
-    row: dict[str, Any] = {name: get(result) for name, get in PLAIN.items()}
-    for name, get in ESTIMATES.items():
-        estimate = get(result)
-        row[name] = estimate and [_short(v) for v in astuple(estimate)]
+    row: dict[str, Any] = {name: get(result) for name, get in FACTS.items()}
+    for number in LISTED:
+        interval = number.interval(result)
+        row[number.key] = interval and [_short(v) for v in interval]
     return row
 
 
 def to_csv(rows: Sequence[dict[str, Any]]) -> str:
     """Rows of :func:`summary` as CSV: three columns for each interval."""
-    head = [*PLAIN, *(f"{name}{end}" for name in ESTIMATES for end in ("", "_low", "_high"))]
+    names = [number.key for number in LISTED]
+    head = [*FACTS, *(f"{name}{end}" for name in names for end in ("", "_low", "_high"))]
     table = [
-        [row[name] for name in PLAIN] + [v for name in ESTIMATES for v in row[name] or [None] * 3]
+        [row[fact] for fact in FACTS] + [v for name in names for v in row[name] or [None] * 3]
         for row in rows
     ]
     return csv_text([head, *table])
@@ -235,28 +211,28 @@ def to_csv(rows: Sequence[dict[str, Any]]) -> str:
 
 def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
     """Rows of :func:`summary` as a markdown table."""
-    several = len({(r["task"], r["embodiment"], r["group"]) for r in rows}) > 1
-    head = ["variant", "decision", "part", "tool", "tool, vertical", "object", "object, mm"]
-    head += ["cost", "dense", "observed", "most in", "resets", "p"]
-    lines = []
+    several = len({(row["task"], row["embodiment"], row["group"]) for row in rows}) > 1
+    table: list[dict[str, str]] = []
     for row in rows:
-        name = "unbroken" if row["variant"] == "none" else f"`{row['variant']}`"
+        name = "unbroken" if row["variant"] == UNBROKEN else f"`{row['variant']}`"
         if several:
             name = f"{row['task'].removesuffix('-v1')}, {row['embodiment']}, {name}"
-        cells = [name, percent(row["decision"]), row["part"]]
-        cells += [percent(row[c]) for c in ("tool", "tool_vertical", "object")]
-        cells += [_interval(row["object_mm"], 1)]
-        cells += [_interval(row[c], 100, "%", EXACT) for c in ("cost", "dense", "observation")]
-        cells += [f"`{row['field']}`" if row["field"] else "-"]
-        differ = row["resets_p"] < SIGNIFICANT
-        cells += [_interval(row["resets"], 1) if differ else "alike", f"{row['resets_p']:.3f}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    rule = "|---|" + "--:|" * (len(head) - 1)
-    return "\n".join(["| " + " | ".join(head) + " |", rule, *lines]) + "\n"
+        cells = {"variant": name}
+        for number in LISTED:
+            if number.column:
+                cells[number.column] = number.show(row[number.key], in_table=True)
+            if number.key == "decision":
+                cells["part"] = row["part"]
+            if number.key == "observation":
+                cells["most in"] = f"`{row['field']}`" if row["field"] else "-"
+        if row["resets_p"] >= SIGNIFICANT:
+            cells["resets"] = "alike"
+        table.append(cells | {"p": f"{row['resets_p']:.3f}"})
+    return markdown(list(table[0]), [list(cells.values()) for cells in table]) + "\n"
 
 
 def _interval(
-    interval: list[float] | None, scale: float, unit: str = "", exact: float = 0.0
+    interval: Sequence[float] | None, scale: float, unit: str = "", exact: float = 0.0
 ) -> str:
     """``value [low, high]``; just 0 if all three are below ``exact``."""
     if interval is None:
@@ -267,7 +243,7 @@ def _interval(
     return f"{value}{unit and ' ' + unit} [{low}, {high}]"
 
 
-def percent(interval: list[float] | None) -> str:
+def percent(interval: Sequence[float] | None) -> str:
     """An interval of shares in per cent."""
     return _interval(interval, 100, "%")
 
@@ -304,7 +280,7 @@ def write_result(result: AuditResult, folder: Path) -> None:
         UserError: the folder cannot be written.
     """
     head = ["body", "x_mm", "y_mm", "copies", "mm"]
-    rows = [[b.body, b.x_mm, b.y_mm, b.copies, float(f"{b.mm:.4g}")] for b in result.map]
+    rows = [[s.body, s.x_mm, s.y_mm, s.copies, float(f"{s.mm:.4g}")] for s in result.map]
     picture = io.BytesIO()
     map_figure(result).savefig(picture, format="png", dpi=110, metadata={"Software": None})
     write_together(
@@ -342,13 +318,12 @@ def write_table(results: Sequence[AuditResult], folder: Path) -> None:
         UserError: the folder cannot be written.
     """
     rows = [summary(result) for result in results]
-    write_together(
-        {
-            folder / "table.csv": to_csv(rows).encode(),
-            folder / "table.md": to_markdown(rows).encode(),
-            folder / "summary.json": summary_json(rows).encode(),
-        }
-    )
+    files = {
+        "table.csv": to_csv(rows),
+        "table.md": to_markdown(rows),
+        "summary.json": summary_json(rows),
+    }
+    write_together({folder / name: content.encode() for name, content in files.items()})
 
 
 def summary_json(rows: Sequence[dict[str, Any]]) -> str:
@@ -359,39 +334,18 @@ def summary_json(rows: Sequence[dict[str, Any]]) -> str:
 def map_figure(result: AuditResult) -> Figure:
     """Map of the workspace: distance of copies from the majority, for tool and object."""
     figure = Figure(figsize=(9, 4.2), layout="constrained")
-    axes = figure.subplots(1, 2)
     side = 1e3 * BIN
-    drawn = [b for b in result.map if b.copies >= MIN_COPIES]
-    reach = max([abs(v) for b in drawn for v in (b.x_mm, b.y_mm)], default=100.0) + side
-    for ax, body in zip(axes, ("tool", "object"), strict=True):
-        bins = [b for b in drawn if b.body == body]
-        top = max((b.mm for b in bins), default=0.0) or 1.0
-        for b in bins:
-            shade = b.mm / top
-            ax.add_patch(
-                Rectangle((b.x_mm - side / 2, b.y_mm - side / 2), side, side, color=_color(shade))
-            )
-            ax.text(
-                b.x_mm,
-                b.y_mm,
-                f"{b.mm:.2g}",
-                ha="center",
-                va="center",
-                fontsize=6,
-                color="white" if shade > 0.55 else "black",
-            )
+    places = [abs(v) for body in BODIES for s in _drawn(result, body) for v in (s.x_mm, s.y_mm)]
+    count = round(max(places, default=2 * side) / side) + 1
+    edges = side * np.arange(-count, count + 1)
+    for ax, body in zip(figure.subplots(1, 2), BODIES, strict=True):
+        squares = _drawn(result, body)
+        x, y, mm = ([getattr(s, name) for s in squares] for name in ("x_mm", "y_mm", "mm"))
+        shades = ax.hist2d(x, y, bins=(edges, edges), weights=mm, cmin=1e-9, cmap="OrRd", vmin=0)[3]
+        figure.colorbar(shades, ax=ax, shrink=0.8)
         ax.plot(0, 0, "+", color="#0072B2", markersize=9)
-        ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-        ax.set(xlabel="x from the policy's origin, mm", ylabel="y, mm")
+        ax.set(aspect="equal", xlabel="x from the policy's origin, mm", ylabel="y, mm")
         ax.set_title(f"{body}: mm after {result.settings.chunk} steps", fontsize=10)
     s = result.settings
-    figure.suptitle(f"{s.task}, {s.embodiment}, {_variant(result)}, {s.group}", fontsize=11)
+    figure.suptitle(f"{s.task}, {s.embodiment}, {_variant(s.variant)}, {s.group}", fontsize=11)
     return figure
-
-
-def _color(shade: float) -> tuple[float, float, float]:
-    """White to vermilion to dark."""
-    low, middle, high = (0.97, 0.97, 0.97), (0.84, 0.37, 0.0), (0.25, 0.06, 0.0)
-    first, second, part = (low, middle, 2 * shade) if shade < 0.5 else (middle, high, 2 * shade - 1)
-    r, g, b = (p + part * (q - p) for p, q in zip(first, second, strict=True))
-    return r, g, b

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-import torch
 from pydantic import TypeAdapter, ValidationError
 
-from symsteer.bench.audit.estimates import Estimate
+from symsteer.bench.audit.estimates import Measurement
 from symsteer.bench.sim.environment import Simulator
 from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import read
@@ -21,11 +19,14 @@ from symsteer.variant import file_name
 VERSION = 2
 """2: decisions (chunks) in place of single steps, horizontal motion by itself."""
 
-Part = Literal["tool", "object", "cost", "observation"]
-PARTS: tuple[Part, ...] = get_args(Part)
-"""The parts of a decision whose largest defect is its defect."""
+Body = Literal["tool", "object"]
+BODIES: tuple[Body, ...] = get_args(Body)
 
-Visitors = Literal["both", "expert", "policy"]
+Part = Literal["tool", "object", "cost", "observation"]
+"""A part of a decision; the largest defect of a part is the defect of the decision."""
+
+Subset = Literal["all", "expert", "policy", "still", "moving"]
+"""States by who visited them, or by whether the object moves."""
 
 LEAST_STATES = 8
 """Subsets of the states with fewer are left out."""
@@ -65,7 +66,8 @@ class AuditSettings:
     embodiment: str = "floating"
     variant: str = "none"
     group: str = "C8"
-    states: Visitors = "both"
+    states: Literal["both", "expert", "policy"] = "both"
+    """Who visits states."""
     count: int = 32
     """States of each visitor."""
     chunk: int = 4
@@ -79,10 +81,10 @@ class AuditSettings:
         """Check everything before anything is built.
 
         Raises:
-            UserError: an unknown task, embodiment, variant or group, CUDA is missing, or a number
-                is out of range.
+            UserError: an unknown task, embodiment, variant or group, or a number is out of range.
         """
-        if task_class(self.task).needs_cameras:
+        task = task_class(self.task)
+        if task.needs_cameras:
             raise UserError(
                 f"what cameras see of {self.task} cannot be compared point by point; audit the "
                 "task that tells the poses of its bodies: its physics are the same"
@@ -95,18 +97,13 @@ class AuditSettings:
                     f"give a number, e.g. {spec.name}:{spec.strength}"
                 )
         check_group(self.group)
-        for name, least in (("count", LEAST_STATES), ("chunk", 1), ("resets", 16)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name} is {getattr(self, name)}; it must be at least {least}")
-        if not 0 <= self.seed < 2**32:
-            raise UserError(f"seed is {self.seed}; it must lie in [0, 2^32)")
-        if self.chunk > task_class(self.task).max_episode_steps:
+        if self.count < LEAST_STATES:
+            raise UserError(f"count is {self.count}; it must be at least {LEAST_STATES}")
+        if not 1 <= self.chunk <= task.max_episode_steps:
             raise UserError(
-                f"a chunk of {self.chunk} steps is longer than an episode of {self.task}; "
-                "use a smaller --chunk"
+                f"a chunk of {self.chunk} steps does not fit into an episode of {self.task}, which "
+                f"has {task.max_episode_steps}"
             )
-        if self.sim == "cuda" and not torch.cuda.is_available():
-            raise UserError("--sim cuda needs a GPU, but torch finds no CUDA device; use cpu")
 
     @property
     def name(self) -> str:
@@ -120,7 +117,7 @@ class AuditSettings:
 
 
 @dataclass(frozen=True)
-class Defect:
+class MotionDefect:
     """Dynamics defect of one body over a decision, for one subset of the states.
 
     Attributes:
@@ -132,13 +129,13 @@ class Defect:
         p95_mm: 95th percentile of the distances over states and copies.
     """
 
-    body: Literal["tool", "object"]
-    subset: Literal["all", "expert", "policy", "still", "moving"]
+    body: Body
+    subset: Subset
     states: int
-    horizontal: Estimate | None
-    vertical: Estimate | None
-    mm: Estimate
-    degrees: Estimate
+    horizontal: Measurement | None
+    vertical: Measurement | None
+    mm: Measurement
+    degrees: Measurement
     displacement_mm: float
     floor_mm: float
     floor_degrees: float
@@ -155,15 +152,15 @@ class FieldDefect:
 
     name: str
     unit: Literal["mm", ""]
-    value: Estimate
-    relative: Estimate | None
+    value: Measurement
+    relative: Measurement | None
 
 
 @dataclass(frozen=True)
-class Bin:
+class Square:
     """A square of the map: mean distance of its copies to their orbit's medoid at the end."""
 
-    body: Literal["tool", "object"]
+    body: Body
     x_mm: float
     y_mm: float
     copies: int
@@ -181,20 +178,19 @@ class AuditResult:
     moving: int
     unreachable: float
     origin_mm: tuple[float, float]
-    dynamics: tuple[Defect, ...]
-    reward: dict[str, Estimate]
+    dynamics: tuple[MotionDefect, ...]
+    reward: dict[str, Measurement]
     fields: tuple[FieldDefect, ...]
     random_observation: bool
-    resets: Estimate
+    resets: Measurement
     resets_p: float
-    map: tuple[Bin, ...] = ()
+    map: tuple[Square, ...] = ()
     seconds: float = 0.0
-    version: int = field(default=VERSION)
+    version: int = VERSION
 
-    def defect(self, body: Literal["tool", "object"], subset: str = "all") -> Defect | None:
+    def defect(self, body: Body, subset: Subset = "all") -> MotionDefect | None:
         """An entry of ``dynamics``, or None if the subset has too few states."""
-        rows = (d for d in self.dynamics if (d.body, d.subset) == (body, subset))
-        return next(rows, None)
+        return next((d for d in self.dynamics if (d.body, d.subset) == (body, subset)), None)
 
     @property
     def worst_field(self) -> FieldDefect:
@@ -203,16 +199,16 @@ class AuditResult:
         return max(self.fields, key=lambda f: round(f.relative.value, 4) if f.relative else -1.0)
 
     @property
-    def parts(self) -> dict[Part, Estimate]:
+    def parts(self) -> dict[Part, Measurement]:
         """Defects of the parts of a decision, without those of bodies at rest."""
         tool, thing = self.defect("tool"), self.defect("object")
-        found: dict[Part, Estimate | None] = {
+        defects: dict[Part, Measurement | None] = {
             "tool": tool.horizontal if tool else None,
             "object": thing.horizontal if thing else None,
             "cost": self.reward["cost"],
             "observation": self.worst_field.relative,
         }
-        return {name: estimate for name, estimate in found.items() if estimate is not None}
+        return {name: defect for name, defect in defects.items() if defect is not None}
 
     @property
     def part(self) -> Part:
@@ -220,7 +216,7 @@ class AuditResult:
         return max(self.parts, key=lambda name: self.parts[name].value)
 
     @property
-    def decision(self) -> Estimate:
+    def decision(self) -> Measurement:
         """The defect of a decision: the largest of its parts."""
         return self.parts[self.part]
 
@@ -242,15 +238,14 @@ class AuditResult:
             return TypeAdapter(cls).validate_python(data)
         except ValidationError as error:
             raise UserError(
-                f"an audit file is damaged ({first_problem(error)}); run the audit again"
+                f"an audit file is damaged ({first_problem(error)}); remove it and run the audit "
+                "again"
             ) from error
 
 
 def _rounded(tree: Any) -> Any:
     if isinstance(tree, dict):
         return {key: _rounded(value) for key, value in tree.items()}
-    if isinstance(tree, Sequence) and not isinstance(tree, str):
+    if isinstance(tree, list | tuple):
         return [_rounded(value) for value in tree]
-    if isinstance(tree, float):
-        return float(f"{tree:.6g}")
-    return tree
+    return float(f"{tree:.6g}") if isinstance(tree, float) else tree

@@ -7,28 +7,33 @@ element. The paths are turned back and compared: with the symmetry they coincide
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
 
-from symsteer.bench.audit.states import MOVED
+from symsteer.bench.audit.result import check_group
+from symsteer.bench.audit.states import MOVED, Element
+from symsteer.bench.sim.environment import MAX_SCENES
 from symsteer.bench.sim.rotations import planar_matrix
-from symsteer.bench.sim.trees import map_trees
+from symsteer.bench.sim.trees import join_trees, rows_of
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
+from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.geometry import Group
 
 Actions = Literal["random", "expert", "policy"]
+
+BATCH = 25
+"""Largest number of episodes in parallel, with one environment per group element each."""
 
 
 @dataclass(frozen=True)
 class RolloutError:
-    """Comparison of E episodes with their turned copies; every attribute is ``[E]``.
+    """Comparison of E episodes with their turned copies; every attribute is a tensor ``[E]``.
 
     Attributes:
         path: length of the path of the original's tool centre point until success or the time
@@ -43,15 +48,15 @@ class RolloutError:
         same_outcome: whether success is the same for all copies.
     """
 
-    path: np.ndarray
-    tcp: np.ndarray
-    objects: np.ndarray
-    contact_free_path: np.ndarray
-    contact_free_tcp: np.ndarray
-    steps: np.ndarray
-    contact: np.ndarray
-    success: np.ndarray
-    same_outcome: np.ndarray
+    path: torch.Tensor
+    tcp: torch.Tensor
+    objects: torch.Tensor
+    contact_free_path: torch.Tensor
+    contact_free_tcp: torch.Tensor
+    steps: torch.Tensor
+    contact: torch.Tensor
+    success: torch.Tensor
+    same_outcome: torch.Tensor
 
     def share_within(self, limit: float = 0.01, contacts: bool = False) -> float:
         """Share of episodes whose error is at most ``limit`` of the path.
@@ -60,28 +65,32 @@ class RolloutError:
             limit: relative error.
             contacts: compare whole episodes, not only the part before contact.
         """
-        if contacts:
-            error, path = self.tcp, self.path
-        else:
-            error, path = self.contact_free_tcp, self.contact_free_path
-        return float(np.mean(error / np.maximum(path, 1e-9) <= limit))
+        error, path = (
+            (self.tcp, self.path) if contacts else (self.contact_free_tcp, self.contact_free_path)
+        )
+        return float((error / path.clamp(min=1e-9) <= limit).double().mean())
 
     def summary(self) -> str:
         """Text of three lines."""
-        free, full = 1e3 * self.contact_free_tcp, 1e3 * self.tcp
-        moved = 1e3 * self.objects
+
+        def mm(values: torch.Tensor) -> str:
+            median, high = np.quantile(1e3 * values.numpy(), [0.5, 0.95])
+            return f"median {median:.4f}, 95th percentile {high:.4f}, max {1e3 * values.max():.4f}"
+
+        contact, success, agree, path, steps = (
+            float(values.double().mean())
+            for values in (
+                *(self.contact, self.success, self.same_outcome),
+                *(self.contact_free_path, self.steps),
+            )
+        )
         return (
-            f"{len(self.path)} episodes, {np.mean(self.contact):.0%} with contact\n"
+            f"{len(self.path)} episodes, {contact:.0%} with contact\n"
             f"before contact: within 1 % of the path {self.share_within():.1%}; error mm "
-            f"median {np.median(free):.4f}, 95th percentile {np.quantile(free, 0.95):.4f}, "
-            f"max {free.max():.4f}; path mean {np.mean(self.contact_free_path):.3f} m over "
-            f"{np.mean(self.steps):.1f} steps\n"
+            f"{mm(self.contact_free_tcp)}; path mean {path:.3f} m over {steps:.1f} steps\n"
             f"whole episode:  within 1 % of the path {self.share_within(contacts=True):.1%}; "
-            f"error mm median {np.median(full):.4f}, 95th percentile "
-            f"{np.quantile(full, 0.95):.4f}, max {full.max():.4f}; objects mm median "
-            f"{np.median(moved):.4f}, 95th percentile {np.quantile(moved, 0.95):.4f}; "
-            f"success {np.mean(self.success):.1%}, "
-            f"all copies agree {np.mean(self.same_outcome):.1%}"
+            f"error mm {mm(self.tcp)}; objects mm {mm(self.objects)}; success {success:.1%}, "
+            f"all copies agree {agree:.1%}"
         )
 
 
@@ -94,7 +103,6 @@ def rotated_rollout_error(
     steps: int | None = None,
     seed: int = 0,
     variant: str = "none",
-    batch: int = 25,
     policy: ChunkPolicy | None = None,
 ) -> RolloutError:
     """Compare episodes of the floating gripper with their turned copies.
@@ -110,174 +118,124 @@ def rotated_rollout_error(
         steps: steps per episode; by default the task's limit.
         seed: of the first episode.
         variant: symmetry-breaking variant of all environments.
-        batch: number of episodes in parallel, with one environment per group element each.
         policy: the policy for ``actions="policy"``.
 
     Raises:
-        UserError: unknown task, group or variant.
+        UserError: unknown task, group or variant, or no episodes.
         ValueError: ``actions`` and ``policy`` do not fit together.
     """
     if (actions == "policy") != (policy is not None):
         raise ValueError("a policy is needed for actions='policy', and only there")
-    elements = Group.parse(group).elements
+    if episodes < 1:
+        raise UserError(f"the number of episodes must be at least 1; it is {episodes}")
+    elements = check_group(group).elements
+    batch = min(episodes, BATCH, MAX_SCENES // len(elements))
     env = make(task, num_envs=batch * len(elements), variant=variant)
     steps = env.max_episode_steps if steps is None else steps
-    parts = []
-    for start in range(seed, seed + episodes, batch):
-        parts.append(_rollout(env, start, batch, elements, steps, actions, policy))
+    played = [
+        _rollout(env, range(start, start + batch), elements, steps, actions, policy)
+        for start in range(seed, seed + episodes, batch)
+    ]
     env.close()
-    merged = {
-        name: np.concatenate([getattr(part, name) for part in parts])[:episodes]
-        for name in RolloutError.__dataclass_fields__
-    }
-    return RolloutError(**merged)
+    return rows_of(join_trees(played), slice(episodes))
 
 
 def _rollout(
     env: SymmetricTask,
-    start: int,
-    count: int,
-    elements: tuple[tuple[float, bool], ...],
+    seeds: Sequence[int],
+    elements: tuple[Element, ...],
     steps: int,
     kind: Actions,
     policy: ChunkPolicy | None,
 ) -> RolloutError:
-    """``count`` episodes; environment g * count + i is copy g of episode i."""
-    order = len(elements)
-    env.reset(seed=[start + i for i in range(count)] * order)
+    """An episode for each of the seeds; environment g * count + i is copy g of episode i."""
+    count, order = len(seeds), len(elements)
+    env.reset(seed=[*seeds] * order)
     state = env.get_state_dict()
-    copies = [env.transform_state(state, angle, reflect) for angle, reflect in elements]
-    # Rows g * count ... of copy g.
-    env.set_state_dict(
-        map_trees(
-            lambda *c: torch.cat([x[g * count : (g + 1) * count] for g, x in enumerate(c)]), *copies
-        )
-    )
-    if policy is not None:
-        choose = _policy_actions(env, policy, start, count, elements)
-    elif kind == "expert":
-        expert = Expert(env)
-        choose = _turned(env, lambda step: expert.act()[:count], elements)
-    else:
-        choose = _turned(env, _noise(env, start, count, steps), elements)
-    tcp, objects, success = [_tcp(env)], [_objects(env)], []
-    for step in range(steps):
-        _, _, _, _, info = env.step(choose(step))
-        tcp.append(_tcp(env))
-        objects.append(_objects(env))
-        success.append(info["success"].clone())
+    copies = [
+        rows_of(env.transform_state(state, *element), slice(g * count, (g + 1) * count))
+        for g, element in enumerate(elements)
+    ]
+    env.set_state_dict(join_trees(copies))
+    tcp, objects, success = [], [], []
 
-    back = [planar_matrix(angle, reflect, tcp[0]).T for angle, reflect in elements]
-    paths = _turn_back(torch.stack(tcp), back, count)
-    bodies = _turn_back(torch.stack(objects), back, count)
+    def look() -> None:
+        tcp.append(env.agent.tcp_pose.p.clone())
+        objects.append(torch.stack([body.pose.p.clone() for body in env.moving_bodies], dim=1))
+
+    look()
+    for action in _actions(env, seeds, elements, steps, kind, policy):
+        success.append(env.step(action)[-1]["success"].clone())
+        look()
+
+    def turned_back(points: list[torch.Tensor]) -> torch.Tensor:
+        """``[order * count, ..., 3]`` of every step to ``[steps, order, count, ..., 3]``."""
+        split = torch.stack(points).unflatten(1, (order, count))
+        matrices = [planar_matrix(*element, split) for element in elements]
+        return torch.stack([split[:, g] @ matrix for g, matrix in enumerate(matrices)], dim=1)
+
+    paths, bodies = turned_back(tcp), turned_back(objects)
     error = (paths - paths[:, :1]).norm(dim=-1).amax(dim=1)
     body_error = (bodies - bodies[:, :1]).norm(dim=-1).amax(dim=(1, 3))
     travelled = torch.cat(
         [torch.zeros(1, count), (paths[1:, 0] - paths[:-1, 0]).norm(dim=-1).cumsum(dim=0)]
     )
     touched = ((bodies - bodies[:1]).norm(dim=-1) > MOVED).any(dim=1).any(dim=-1)
-    free = (touched.cumsum(dim=0) == 0).sum(dim=0) - 1
     won = torch.stack(success).unflatten(1, (order, count))
     # An episode ends with its first success; later steps do not count.
     end = 1 + (won[:, 0].cumsum(dim=0) == 0).sum(dim=0).clamp(max=steps - 1)
-    free = free.minimum(end)
-    every = torch.arange(count)
-    time = torch.arange(steps + 1)[:, None]
+    free = ((touched.cumsum(dim=0) == 0).sum(dim=0) - 1).minimum(end)
+    every, time = torch.arange(count), torch.arange(steps + 1)[:, None]
     before, during = time <= free, time <= end
     won = won.any(dim=0)
     return RolloutError(
-        path=travelled[end, every].numpy(),
-        tcp=(error * during).amax(dim=0).numpy(),
-        objects=(body_error * during).amax(dim=0).numpy(),
-        contact_free_path=travelled[free, every].numpy(),
-        contact_free_tcp=(error * before).amax(dim=0).numpy(),
-        steps=free.numpy(),
-        contact=(touched & during).any(dim=0).numpy(),
-        success=won[0].numpy(),
-        same_outcome=(won == won[:1]).all(dim=0).numpy(),
+        path=travelled[end, every],
+        tcp=(error * during).amax(dim=0),
+        objects=(body_error * during).amax(dim=0),
+        contact_free_path=travelled[free, every],
+        contact_free_tcp=(error * before).amax(dim=0),
+        steps=free,
+        contact=(touched & during).any(dim=0),
+        success=won[0],
+        same_outcome=(won == won[:1]).all(dim=0),
     )
 
 
-def _turn_back(points: torch.Tensor, back: list[torch.Tensor], count: int) -> torch.Tensor:
-    """Turn points back: ``[steps, order * count, ..., 3]`` to ``[steps, order, count, ..., 3]``."""
-    split = points.unflatten(1, (len(back), count))
-    return torch.stack([split[:, g] @ matrix.T for g, matrix in enumerate(back)], dim=1)
-
-
-def _turned(
+def _actions(
     env: SymmetricTask,
-    choose: Callable[[int], torch.Tensor],
-    elements: tuple[tuple[float, bool], ...],
-) -> Callable[[int], torch.Tensor]:
-    """Turn the actions of the originals ``[count, 7]`` for all copies, ``[order * count, 7]``."""
+    seeds: Sequence[int],
+    elements: tuple[Element, ...],
+    steps: int,
+    kind: Actions,
+    policy: ChunkPolicy | None,
+) -> Iterator[torch.Tensor]:
+    """The actions of all copies, ``[order * count, 7]``, of one step after the other."""
+    layout, count = env.action_layout, len(seeds)
 
-    def chosen(step: int) -> torch.Tensor:
-        original = choose(step)
-        return torch.cat([env.action_layout.transform(original, *element) for element in elements])
+    def turned(originals: torch.Tensor) -> torch.Tensor:
+        return torch.cat([layout.transform(originals, *element) for element in elements])
 
-    return chosen
-
-
-def _policy_actions(
-    env: SymmetricTask,
-    policy: ChunkPolicy,
-    start: int,
-    count: int,
-    elements: tuple[tuple[float, bool], ...],
-) -> Callable[[int], torch.Tensor]:
-    """Actions ``[order * count, 7]`` that each copy decodes from the turned noise."""
-    layout = policy.act_layout
-    streams = [np.random.default_rng([start + i, 3]) for i in range(count)]
-    chunk = torch.zeros(0)
-
-    def choose(step: int) -> torch.Tensor:
-        nonlocal chunk
-        if step % policy.execute == 0:
-            draws = [stream.standard_normal((policy.horizon, layout.dim)) for stream in streams]
-            noise = torch.as_tensor(np.stack(draws), dtype=torch.float32)
-            turned = torch.cat([layout.transform(noise, *element) for element in elements])
-            chunk = policy.decode(env.get_obs(), turned)
-        return chunk[:, step % policy.execute]
-
-    return choose
-
-
-def _noise(env: SymmetricTask, start: int, count: int, steps: int) -> Callable[[int], torch.Tensor]:
-    """Correlated random actions, one stream per episode.
-
-    The vertical action moves the gripper towards a random height above the objects, so that it
-    touches nothing.
-    """
-    layout = env.action_layout
-    draws = np.stack(
-        [
-            np.random.default_rng([start + i, 2]).standard_normal((steps, layout.dim))
-            for i in range(count)
-        ],
-        axis=1,
-    )
-    level = np.zeros_like(draws)
-    level[0] = draws[0]
-    for step in range(1, steps):
-        level[step] = 0.8 * level[step - 1] + 0.6 * draws[step]
-    noise = torch.as_tensor(level, dtype=torch.float32)
-
-    def choose(step: int) -> torch.Tensor:
-        action = noise[step].clone()
-        height = env.agent.tcp_pose.p[:count, 2]
-        clear = 0.18 + 0.04 * noise[step][:, layout.slice("z")]
-        action[:, layout.slice("z")] = (clear - height[:, None]) / 0.03
-        copies = env.body.bound(action).repeat(env.num_envs // count, 1)
-        return env.commanded(copies)[:count]
-
-    return choose
-
-
-def _tcp(env: SymmetricTask) -> torch.Tensor:
-    return env.agent.tcp_pose.p.clone()
-
-
-def _objects(env: SymmetricTask) -> torch.Tensor:
-    """Positions of the movable bodies, ``[N, bodies, 3]``."""
-    bodies = [a for a in env.scene.actors.values() if a.px_body_type == "dynamic"]
-    return torch.stack([body.pose.p.clone() for body in bodies], dim=1)
+    if policy is not None:
+        streams = [np.random.default_rng([seed, 3]) for seed in seeds]
+        for step in range(steps):
+            if step % policy.execute == 0:
+                draws = [stream.standard_normal((policy.horizon, layout.dim)) for stream in streams]
+                noise = torch.as_tensor(np.stack(draws), dtype=torch.float32)
+                chunk = policy.decode(env.get_obs(), turned(noise))
+            yield chunk[:, step % policy.execute]
+    elif kind == "expert":
+        expert = Expert(env)
+        for _ in range(steps):
+            yield turned(expert.act()[:count])
+    else:
+        rngs = [np.random.default_rng([seed, 2]) for seed in seeds]
+        draws = np.stack([rng.standard_normal((steps, layout.dim)) for rng in rngs], axis=1)
+        for step in range(1, steps):
+            draws[step] = 0.8 * draws[step - 1] + 0.6 * draws[step]
+        height = layout.slice("z")
+        for noise in torch.as_tensor(draws, dtype=torch.float32):
+            # Towards a random height above the objects, so that the gripper touches nothing.
+            action = noise.clone()
+            clear = 0.18 + 0.04 * noise[:, height]
+            action[:, height] = (clear - env.agent.tcp_pose.p[:count, 2:]) / 0.03
+            yield turned(env.commanded(env.body.bound(action).repeat(len(elements), 1))[:count])

@@ -8,7 +8,7 @@ simulation state: bodies, robot, controller targets.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +20,6 @@ from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import Expert
 from symsteer.policies.contract import ChunkPolicy
 
-Visitor = Literal["expert", "policy"]
 Element = tuple[float, bool]
 """A planar symmetry: angle in radians, and whether the reflection of y comes first."""
 
@@ -52,41 +51,35 @@ class Visited:
 
 
 def visit(
-    env: SymmetricTask,
-    visitor: Visitor,
-    count: int,
-    steps: int,
-    seed: int,
-    policy: ChunkPolicy | None = None,
+    env: SymmetricTask, count: int, steps: int, seed: int, policy: ChunkPolicy | None = None
 ) -> Visited:
     """Sample one state from each of ``count`` episodes, uniformly in time before success.
 
     Args:
         env: the unbroken task; each of its environments plays one episode at a time.
-        visitor: ``expert`` acts in closed loop; ``policy`` decodes standard normal noise and
-            executes its chunks, and only states at the start of a chunk are sampled.
         count: number of states.
         steps: number T of following actions to keep.
         seed: of episodes, noise and sampled times.
-        policy: the base policy.
+        policy: acts in place of the scripted expert: it decodes standard normal noise, its chunks
+            are executed, and only states at the start of a chunk are sampled.
     """
-    parts = []
+    batches = []
     for start in range(0, count, env.num_envs):
-        part = _visit_batch(env, visitor, steps, [seed, start], policy)
-        parts.append(rows_of(part, torch.arange(min(env.num_envs, count - start))))
-    return join_trees(parts)
+        batch = _visit_batch(env, steps, [seed, start], policy)
+        batches.append(rows_of(batch, torch.arange(min(env.num_envs, count - start))))
+    return join_trees(batches)
 
 
 def _visit_batch(
-    env: SymmetricTask, visitor: Visitor, steps: int, seeds: list[int], policy: ChunkPolicy | None
+    env: SymmetricTask, steps: int, seeds: list[int], policy: ChunkPolicy | None
 ) -> Visited:
-    rng = np.random.default_rng([*seeds, visitor == "policy"])
+    rng = np.random.default_rng([*seeds, policy is not None])
     episodes = np.asarray(rng.integers(2**31, size=env.num_envs)).tolist()
     generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
     obs, _ = env.reset(seed=episodes, options={"reconfigure": True})
     expert = Expert(env)
     chunk = torch.zeros(0)
-    trail, actions, objects = [task_state(env)], [], [env.manipulated.pose.p.cpu().clone()]
+    trail, actions = [task_state(env)], []
     length = torch.full((env.num_envs,), env.max_episode_steps - steps + 1)
     for step in range(env.max_episode_steps):
         if policy is None:
@@ -102,7 +95,6 @@ def _visit_batch(
         obs, _, _, _, info = env.step(action)
         trail.append(task_state(env))
         actions.append(action.cpu().clone())
-        objects.append(env.manipulated.pose.p.cpu().clone())
         won = info["success"].cpu() & (length > step + 1)
         length = torch.where(won, step + 1, length)
         if step + 1 >= int(length.max()) - 1 + steps:
@@ -110,26 +102,17 @@ def _visit_batch(
     stride = 1 if policy is None else policy.execute
     choices = (length + stride - 1) // stride
     drawn = torch.as_tensor(rng.uniform(size=env.num_envs)) * choices
-    time = stride * drawn.long()
+    # Steps after that one, and the episodes' numbers: [T + 1, N].
+    time = stride * drawn.long() + torch.arange(steps + 1)[:, None]
     every = torch.arange(env.num_envs)
-    path = torch.stack(objects)
-    window = torch.stack([path[time + k, every] for k in range(steps + 1)])
+    window = map_trees(lambda *states: torch.stack(states)[time, every], *trail)
+    thing = window["actors"][env.manipulated.name][..., :3]
     return Visited(
-        state=_pick(trail, time),
-        actions=torch.stack([torch.stack(actions)[time + k, every] for k in range(steps)], dim=1),
-        path=map_trees(
-            lambda *later: torch.stack(later, dim=1),
-            *(_pick(trail, time + k) for k in range(1, steps + 1)),
-        ),
-        moving=((window - window[0]).norm(dim=-1) > MOVED).any(dim=0),
+        state=rows_of(window, 0),
+        actions=torch.stack(actions)[time[:-1], every].transpose(0, 1),
+        path=map_trees(lambda states: states[1:].transpose(0, 1), window),
+        moving=((thing - thing[0]).norm(dim=-1) > MOVED).any(dim=0),
         policy=torch.full((env.num_envs,), policy is not None),
-    )
-
-
-def _pick(trail: list[Any], time: torch.Tensor) -> Any:
-    """Row i of the tree at ``time[i]``."""
-    return map_trees(
-        lambda *steps: torch.stack([steps[int(t)][i] for i, t in enumerate(time)]), *trail
     )
 
 
@@ -171,21 +154,18 @@ class Turner:
         # x -> M x + (1 - M) c: the turn about the workspace centre, then a shift.
         matrix = planar_matrix(*element, centre)[:2, :2]
         offset = (centre - matrix @ centre).expand(count, 2)
-        shifted = bool(centre.any())
+        shifted, robot, body = bool(centre.any()), self.env.agent.robot.name, self.env.body
         if self.arm is not None:
             turned = self.env.transform_state({**state, "articulations": {}}, *element)
-            robot = self.env.agent.robot.name
-            arm, reached = self.arm.turn(state["articulations"][robot], *element, offset)
-            turned["articulations"] = {**state["articulations"], robot: arm}
+            joints, reached = self.arm.turn(state["articulations"][robot], *element, offset)
+            turned["articulations"] = {**state["articulations"], robot: joints}
         else:
             turned = self.env.transform_state(state, *element)
             if shifted:
-                robot = self.env.agent.robot.name
-                body = self.env.body
                 joints = body.shift_robot(turned["articulations"][robot], offset)
                 turned["articulations"] = {**turned["articulations"], robot: joints}
-                if "controller" in turned:
-                    turned["controller"] = body.shift_controller(turned["controller"], offset)
+            if shifted and "controller" in turned:
+                turned["controller"] = body.shift_controller(turned["controller"], offset)
         if shifted:
             turned["actors"] = {k: _shift(v, offset) for k, v in turned["actors"].items()}
         return turned, reached

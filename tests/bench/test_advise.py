@@ -75,7 +75,7 @@ def test_worlds_of_an_audit(advise, tmp_path):
 
 @pytest.mark.long
 def test_the_file_of_one_audit(advise, tmp_path, monkeypatch, capsys):
-    small = ("--states", "expert", "--count", "8", "--resets", "16", "--out", str(tmp_path))
+    small = ("--base-policy", "none", "--count", "8", "--out", str(tmp_path))
     words = ["symsteer", "audit", "--task", "PushCube-v1", "--variant", "wind:0.3", *small]
     monkeypatch.setattr("sys.argv", words)
     assert main() == 0

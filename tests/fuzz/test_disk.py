@@ -188,7 +188,7 @@ def test_the_bookkeeping_of_a_sweep(tmp_path):
     assert not list(tmp_path.rglob("record.json"))
 
 
-SMALL_AUDIT = ("--states", "expert", "--count", 8, "--resets", 16, "--group", "C2")
+SMALL_AUDIT = ("--base-policy", "none", "--count", 8, "--group", "C2")
 
 PAIR = ("standard", "equivariant")
 

@@ -58,12 +58,12 @@ advise --task PickCube-v1 --records nowhere
 advise --task PickCube-v1 --records folder
 audit --task Nothing
 audit --group E8
-audit --states nobody
+audit-episodes --actions nobody
+audit-episodes --episodes 0
 audit --base-policy folder
-audit --strength 0.5
-audit --resume
+audit --variant wnid:1
+audit --variant all
 audit --out file
-audit --seed 99999999999999999999
 throughput --task Nothing
 throughput --agent nobody
 throughput --num-envs 99999999

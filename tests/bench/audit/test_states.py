@@ -5,19 +5,16 @@ import math
 import pytest
 import torch
 
-from symsteer.bench.audit.result import check_group
 from symsteer.bench.audit.states import Turner, visit
 from symsteer.bench.sim.rotations import planar_matrix, transform_quaternion
 from symsteer.bench.sim.trees import map_trees
 from symsteer.bench.tasks import make
-from symsteer.errors import UserError
-from symsteer.policies.geometry import Group
 
 
 @pytest.fixture(scope="module", params=["floating", "panda"])
 def visited(request):
     env = make("PickCube-v1", num_envs=12, embodiment=request.param)
-    yield env, visit(env, "expert", 12, 4, seed=0)
+    yield env, visit(env, 12, 4, seed=0)
     env.close()
 
 
@@ -85,15 +82,8 @@ def test_turned_tools_move_as_they_should(visited):
 
 def test_out_of_reach_is_said():
     env = make("PickCube-v1", num_envs=8, embodiment="panda")
-    states = visit(env, "expert", 8, 4, seed=0)
+    states = visit(env, 8, 4, seed=0)
     far = torch.tensor([1.0, 0.0])
     _, reached = Turner(env).turn(states.state, (math.pi, False), far)
     assert not reached.any()
     env.close()
-
-
-def test_groups_with_nothing_to_compare():
-    assert check_group("D4") == Group(4, True)
-    for name, words in (("C1", "nothing to compare"), ("SO2", "not finite"), ("E8", "C8")):
-        with pytest.raises(UserError, match=words):
-            check_group(name)

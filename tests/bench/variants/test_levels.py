@@ -1,7 +1,7 @@
 import pytest
 
 from symsteer.bench.audit.result import AuditSettings
-from symsteer.bench.audit.study import grid
+from symsteer.bench.audit.study import cells
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.tasks import make
 from symsteer.bench.variants.levels import LEVELS, points_of, strength, table, with_numbers
@@ -69,7 +69,7 @@ def test_runs_audits_and_environments_take_levels():
     tasks = ["PushCube-v1", "PickCube-v1"]
     texts = {
         settings.task: settings.variant
-        for settings in grid(tasks, ["floating"], ["perception_bias:hard"], (), AuditSettings())
+        for settings in cells(tasks, ["perception_bias:hard"], AuditSettings())
     }
     assert texts == {
         task: f"perception_bias:{strength('perception_bias', 'hard', task, 'floating'):g}"
