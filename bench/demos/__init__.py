@@ -4,8 +4,8 @@
 - `load(...)` reads them, and ManiSkill's published ones.
 """
 
-from symsteer.bench.demos.collect import CLEAN, DIVERSE, MODES, Diversity, collect
+from symsteer.bench.demos.collect import MODES, Diversity, collect
 from symsteer.bench.demos.files import FORMAT
 from symsteer.bench.demos.load import Demonstrations, load
 
-__all__ = ["CLEAN", "DIVERSE", "FORMAT", "MODES", "Demonstrations", "Diversity", "collect", "load"]
+__all__ = ["FORMAT", "MODES", "Demonstrations", "Diversity", "collect", "load"]

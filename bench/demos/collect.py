@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from symsteer.bench.demos.files import write
-from symsteer.bench.sim.environment import Simulator
+from symsteer.bench.demos.files import Episode, write
 from symsteer.bench.sim.trees import map_trees
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
@@ -42,26 +41,11 @@ class Diversity:
     """Radius of the disc from which the grasp or contact offset is drawn, metres."""
 
 
-CLEAN = Diversity(noise=0.0, scale=(1.0, 1.0), offset=0.0)
-DIVERSE = Diversity()
-MODES = {"clean": CLEAN, "diverse": DIVERSE}
+MODES = {"clean": Diversity(noise=0.0, scale=(1.0, 1.0), offset=0.0), "diverse": Diversity()}
 """Named kinds of demonstrations."""
 
 ATTEMPTS_PER_DEMO = 20
 """Give up when the experts need more attempts than this for each demonstration."""
-
-Progress = Callable[[int, int], None]
-
-
-@dataclass
-class Attempt:
-    """One successful episode, arrays over time."""
-
-    seed: int
-    obs: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
-    states: dict[str, Any]
 
 
 def collect(
@@ -73,10 +57,7 @@ def collect(
     out_path: str | os.PathLike[str],
     *,
     num_envs: int = 32,
-    variant: str = "none",
-    sim: Simulator = "cpu",
-    diversity: Diversity | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> Path:
     """Write ``count`` successful expert episodes to ``out_path`` (``.h5``) and its ``.json``.
 
@@ -93,9 +74,6 @@ def collect(
         seed: of the whole file.
         out_path: ends in ``.h5``.
         num_envs: attempts that run side by side.
-        variant: symmetry-breaking variant in which the expert acts.
-        sim: ``cpu`` or ``cuda``.
-        diversity: replaces the settings of ``mode``.
         progress: called with (demonstrations so far, count).
 
     Returns:
@@ -116,31 +94,28 @@ def collect(
         raise UserError(f"the seed must lie in [0, 2^32); it is {seed}")
     if mode not in MODES:
         raise unknown("mode", mode, MODES)
-    settings = diversity or MODES[mode]
     prepare_folder(path.parent)
-    env = make(
-        task, num_envs=min(num_envs, 2 * count), embodiment=embodiment, variant=variant, sim=sim
-    )
+    env = make(task, num_envs=min(num_envs, 2 * count), embodiment=embodiment)
     seeds = np.random.RandomState(seed)
-    kept: list[Attempt] = []
+    episodes: list[Episode] = []
     tried = 0
-    while len(kept) < count:
+    while len(episodes) < count:
         if tried >= ATTEMPTS_PER_DEMO * count:
             raise UserError(
-                f"the expert of {task!r} ({embodiment}, variant {variant}) succeeded only "
-                f"{len(kept)} times in {tried} attempts; ask for less diversity or a milder variant"
+                f"the expert of {task!r} ({embodiment}) succeeded only {len(episodes)} times in "
+                f"{tried} attempts; collect clean demonstrations, or of another task"
             )
         batch = np.asarray(seeds.randint(2**31, size=env.num_envs)).tolist()
-        kept += _run(env, batch, settings)
+        episodes += _run(env, batch, MODES[mode])
         tried += len(batch)
-        if progress is not None:
-            progress(min(len(kept), count), count)
-    write(path, env, kept[:count], mode, settings, seed, tried, variant)
+        progress(min(len(episodes), count), count)
+    origin = {"mode": mode, "diversity": asdict(MODES[mode]), "seed": seed, "attempts": tried}
+    write(path, env, episodes[:count], origin)
     env.close()
     return path
 
 
-def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[Attempt]:
+def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[Episode]:
     """Attempt one episode per seed side by side; return the successful ones in order."""
     obs, _ = env.reset(seed=seeds)
     expert = Expert(env)
@@ -161,7 +136,7 @@ def _run(env: SymmetricTask, seeds: list[int], settings: Diversity) -> list[Atte
         if (length > 0).all():
             break
     return [
-        Attempt(
+        Episode(
             seed=seeds[i],
             obs=np.stack([o[i] for o in observations[: end + 1]]),
             actions=np.stack([a[i] for a in actions[:end]]),

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import io
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +18,9 @@ import numpy as np
 from symsteer.bench.tasks import gym_id
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.variant import UNBROKEN
 
 if TYPE_CHECKING:
-    from symsteer.bench.demos.collect import Attempt, Diversity
     from symsteer.bench.tasks.base import SymmetricTask
 
 FORMAT = 2
@@ -33,27 +33,25 @@ LARGEST, MOST_COMPRESSED = 2**30, 20
 """Bytes that every file may unpack to; a larger one to so many times its size."""
 
 
-def write(
-    path: Path,
-    env: SymmetricTask,
-    attempts: list[Attempt],
-    mode: str,
-    settings: Diversity,
-    seed: int,
-    tried: int,
-    variant: str,
-) -> None:
+@dataclass(frozen=True)
+class Episode:
+    """One successful episode of the expert, arrays over time: T actions, T + 1 states."""
+
+    seed: int
+    obs: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    states: dict[str, Any]
+
+
+def write(path: Path, env: SymmetricTask, episodes: list[Episode], origin: dict[str, Any]) -> None:
     """Write episodes as a pair of .h5 and .json.
 
     Args:
         path: the .h5 file.
         env: where they were recorded.
-        attempts: the episodes.
-        mode: the name of the kind of demonstrations.
-        settings: how they differ from one another.
-        seed: of the whole file.
-        tried: how many episodes the expert played.
-        variant: in which the expert acted.
+        episodes: what is written.
+        origin: how they were collected, as plain data; ``mode`` is the name of their kind.
 
     Raises:
         UserError: if the files cannot be written; earlier ones stay as they were.
@@ -65,9 +63,9 @@ def write(
                 "obs_mode": "state",
                 "control_mode": env.control_mode,
                 "embodiment": env.embodiment,
-                "variant": variant,
+                "variant": UNBROKEN,
                 "reward_mode": env.reward_mode,
-                "sim_backend": "physx_cpu" if env.device.type == "cpu" else "physx_cuda",
+                "sim_backend": "physx_cpu",
                 "num_envs": 1,
             },
             "max_episode_steps": env.max_episode_steps,
@@ -75,22 +73,19 @@ def write(
         "episodes": [
             {
                 "episode_id": i,
-                "episode_seed": attempt.seed,
+                "episode_seed": episode.seed,
                 "control_mode": env.control_mode,
-                "elapsed_steps": len(attempt.actions),
-                "reset_kwargs": {"seed": attempt.seed},
+                "elapsed_steps": len(episode.actions),
+                "reset_kwargs": {"seed": episode.seed},
                 "success": True,
             }
-            for i, attempt in enumerate(attempts)
+            for i, episode in enumerate(episodes)
         ],
         "source_type": "scripted",
-        "source_desc": f"SymSteer's scripted expert, {mode} demonstrations",
+        "source_desc": f"SymSteer's scripted expert, {origin['mode']} demonstrations",
         "symsteer": {
             "format": FORMAT,
-            "mode": mode,
-            "diversity": dataclasses.asdict(settings),
-            "seed": seed,
-            "attempts": tried,
+            **origin,
             "observation_layout": env.observation_layout.to_json(),
             "action_layout": env.action_layout.to_json(),
         },
@@ -98,17 +93,17 @@ def write(
     # In memory first: on a full disk HDF5 would leave a damaged file.
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
-        for i, attempt in enumerate(attempts):
+        for i, episode in enumerate(episodes):
             group = file.create_group(f"traj_{i}", track_order=True)
-            end = len(attempt.actions)
+            end = len(episode.actions)
             last = np.arange(end) == end - 1
-            group.create_dataset("obs", data=attempt.obs, dtype=np.float32)
-            group.create_dataset("actions", data=attempt.actions, dtype=np.float32)
+            group.create_dataset("obs", data=episode.obs, dtype=np.float32)
+            group.create_dataset("actions", data=episode.actions, dtype=np.float32)
             group.create_dataset("terminated", data=last)
             group.create_dataset("truncated", data=last & (end >= env.max_episode_steps))
             group.create_dataset("success", data=last)
-            group.create_dataset("rewards", data=attempt.rewards, dtype=np.float32)
-            _write_tree(group.create_group("env_states", track_order=True), attempt.states)
+            group.create_dataset("rewards", data=episode.rewards, dtype=np.float32)
+            _write_tree(group.create_group("env_states", track_order=True), episode.states)
         file.attrs[SEAL] = checksum(file, description)
     text = json.dumps(description, indent=2) + "\n"
     write_together({path.with_suffix(".json"): text.encode(), path: buffer.getvalue()})

@@ -14,7 +14,7 @@ import torch
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 from mani_skill.trajectory.utils import dict_to_list_of_dicts
 
-from symsteer.bench.demos import Diversity, collect, load
+from symsteer.bench.demos import MODES, Diversity, collect, load
 from symsteer.bench.sim import make_env_class
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
@@ -237,22 +237,62 @@ def test_other_control_modes_are_refused(tmp_path):
         load(path, TASK, "panda")
 
 
-def refusal(path, *, task=TASK, embodiment="floating", count=None):
+def refused(path, words, *, task=TASK, embodiment="floating", count=None):
     with pytest.raises(UserError) as error:
         load(path, task, embodiment, count)
-    message = str(error.value)
-    assert "\n" not in message
-    return message
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
 
 
-def test_wrong_task_is_refused(clean):
-    assert "PickCube-v1, but PushCube-v1 is wanted" in refusal(clean, task="PushCube-v1")
-    assert "no task 'Nothing'" in refusal(clean, task="Nothing")
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ({"task": "PushCube-v1"}, "PickCube-v1, but PushCube-v1 is wanted"),
+        ({"task": "Nothing"}, "no task 'Nothing'"),
+        ({"embodiment": "panda"}, "'floating', but 'panda' is wanted"),
+        ({"embodiment": "hand"}, "no embodiment 'hand'"),
+        ({"count": 7}, "holds 6 successful episodes, but 7 are wanted"),
+    ],
+)
+def test_other_demonstrations_are_refused(clean, wanted, words):
+    refused(clean, words, **wanted)
 
 
-def test_wrong_embodiment_is_refused(clean):
-    assert "'floating', but 'panda' is wanted" in refusal(clean, embodiment="panda")
-    assert "no embodiment 'hand'" in refusal(clean, embodiment="hand")
+def cut(group, key, rows):
+    values = group[key][rows]
+    del group[key]
+    group[key] = values
+
+
+def not_a_number(key):
+    def change(group):
+        group[key][2, 0] = np.nan
+
+    return change
+
+
+def without(key):
+    def change(group):
+        del group[key]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (not_a_number("actions"), "NaN or infinite actions in traj_1"),
+        (not_a_number("obs"), "NaN or infinite observations in traj_1"),
+        (lambda group: cut(group, "actions", np.s_[:, :4]), "7] is wanted"),
+        (lambda group: cut(group, "actions", np.s_[:0]), "actions of shape [0, 7]"),
+        (lambda group: cut(group, "obs", np.s_[:-1]), "observations of shape"),
+        (without("actions"), "lacks actions or obs of traj_1"),
+    ],
+)
+def test_damaged_arrays_are_refused(copy, change, words):
+    with h5py.File(copy, "r+") as file:
+        change(file["traj_1"])
+    refused(copy, words)
 
 
 def test_data_in_other_files_are_refused(copy, tmp_path):
@@ -280,72 +320,31 @@ def test_data_in_other_files_are_refused(copy, tmp_path):
         copy.write_bytes(intact)
         with h5py.File(copy, "r+") as file:
             change(file["traj_0"])
-        word = "unpacks to 4096.0 GiB" if change is bomb else "from another file"
-        assert word in refusal(copy), change.__name__
+        refused(copy, "unpacks to 4096.0 GiB" if change is bomb else "from another file")
 
 
-def test_missing_files_are_refused(copy, tmp_path):
-    copy.with_suffix(".json").unlink()
-    assert "clean.json is missing" in refusal(copy)
-    assert "no demonstration file" in refusal(tmp_path / "nothing.h5")
+def test_damaged_files_are_refused(copy, tmp_path):
+    whole, side = copy.read_bytes(), copy.with_suffix(".json")
+    for content in (whole[: len(whole) // 2], b"nothing of the kind"):
+        copy.write_bytes(content)
+        refused(copy, "truncated or not an HDF5 file")
+    copy.write_bytes(whole)
+    text = side.read_text()
+    edit_json(copy, lambda data: [episode.update(success=False) for episode in data["episodes"]])
+    refused(copy, "holds 0 successful episodes")
+    side.write_text(text)
+    edit_json(copy, lambda data: data["episodes"].append(data["episodes"][0]))
+    refused(copy, "an episode_id occurs twice")
+    side.write_text("{")
+    refused(copy, "does not describe ManiSkill trajectories")
+    side.write_text('{"episodes": []}')
+    refused(copy, "env_info")
+    side.unlink()
+    refused(copy, "clean.json is missing")
+    refused(tmp_path / "nothing.h5", "no demonstration file")
 
 
-def test_truncated_file_is_refused(copy):
-    whole = copy.read_bytes()
-    copy.write_bytes(whole[: len(whole) // 2])
-    assert "truncated or not an HDF5 file" in refusal(copy)
-    copy.write_bytes(b"nothing of the kind")
-    assert "truncated or not an HDF5 file" in refusal(copy)
-
-
-def test_damaged_json_is_refused(copy):
-    copy.with_suffix(".json").write_text("{")
-    assert "does not describe ManiSkill trajectories" in refusal(copy)
-    copy.with_suffix(".json").write_text('{"episodes": []}')
-    assert "env_info" in refusal(copy)
-
-
-@pytest.mark.parametrize(("key", "word"), [("actions", "actions"), ("obs", "observations")])
-def test_nan_is_refused(copy, key, word):
-    with h5py.File(copy, "r+") as file:
-        file[f"traj_1/{key}"][2, 0] = np.nan
-    assert f"NaN or infinite {word} in traj_1" in refusal(copy)
-
-
-def test_wrong_action_dimension_is_refused(copy):
-    with h5py.File(copy, "r+") as file:
-        actions = file["traj_0/actions"][:, :4]
-        del file["traj_0/actions"]
-        file["traj_0/actions"] = actions
-    assert "7] is wanted" in refusal(copy)
-
-
-def test_cut_observations_are_refused(copy):
-    with h5py.File(copy, "r+") as file:
-        obs = file["traj_0/obs"][:-1]
-        del file["traj_0/obs"]
-        file["traj_0/obs"] = obs
-    assert "observations of shape" in refusal(copy)
-
-
-def test_too_few_episodes_are_refused(clean, copy):
-    assert "holds 6 successful episodes, but 7 are wanted" in refusal(clean, count=7)
-
-    def fail(data):
-        for record in data["episodes"]:
-            record["success"] = False
-
-    edit_json(copy, fail)
-    assert "holds 0 successful episodes" in refusal(copy)
-
-
-def test_missing_trajectory_is_refused(copy):
-    with h5py.File(copy, "r+") as file:
-        del file["traj_3"]
-    assert "traj_3" in refusal(copy)
-
-
-def test_bad_arguments_of_collect_are_explained(tmp_path):
+def test_bad_arguments_of_collect_are_explained(tmp_path, monkeypatch):
     path = tmp_path / "a.h5"
     with pytest.raises(UserError, match="valid: clean, diverse"):
         collect(TASK, "floating", 1, "messy", 0, path)
@@ -353,7 +352,7 @@ def test_bad_arguments_of_collect_are_explained(tmp_path):
         collect(TASK, "floating", 0, "clean", 0, path)
     with pytest.raises(UserError, match=r"\.h5"):
         collect(TASK, "floating", 1, "clean", 0, tmp_path / "a.hdf")
-    wild = Diversity(noise=30.0)
+    monkeypatch.setitem(MODES, "diverse", Diversity(noise=30.0))
     with pytest.raises(UserError, match="succeeded only 0 times"):
-        collect(TASK, "floating", 1, "diverse", 0, path, diversity=wild)
+        collect(TASK, "floating", 1, "diverse", 0, path)
     assert not path.exists()
