@@ -5,12 +5,12 @@ Runs without ManiSkill, torch or a driver: a failed import is a finding, not a c
 
 from __future__ import annotations
 
-import ctypes.util
+import ctypes
 import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
@@ -33,7 +33,6 @@ RENDERING_CURE = (
 
 _ROOT = Path(__file__).resolve().parents[2]
 _IN_CHECKOUT = (_ROOT / "Makefile").is_file() and (_ROOT / "pyproject.toml").is_file()
-_REINSTALL = "make setup" if _IN_CHECKOUT else "pip install --force-reinstall symsteer"
 
 _DEVELOPMENT = "dev"
 """The extra that only developers of SymSteer need."""
@@ -45,17 +44,21 @@ class Check:
 
     Attributes:
         name: what was checked.
+        required: whether SymSteer needs it.
         ok: whether it was found.
         detail: what was found, one line.
         cure: what to do about it, one line; empty if nothing is needed.
-        required: whether SymSteer needs it.
     """
 
     name: str
+    required: bool
     ok: bool
     detail: str
     cure: str = ""
-    required: bool = False
+
+
+class _AbsentError(Exception):
+    """Something is not there; its arguments are the detail and the cure of a `Check`."""
 
 
 def probe() -> list[Check]:
@@ -63,81 +66,69 @@ def probe() -> list[Check]:
 
     Never raises: an unexpected error of a check is its finding.
     """
-    return [_guarded(name, check) for name, check in _CHECKS.items()]
+    return [_checked(name, required, find) for name, (required, find) in _CHECKS.items()]
 
 
-def _guarded(name: str, check: Callable[[], Check]) -> Check:
+def _checked(name: str, required: bool, find: Callable[[], str]) -> Check:
     try:
-        return check()
+        return Check(name, required, True, find())
+    except _AbsentError as absent:
+        return Check(name, required, False, *absent.args)
     except Exception as error:
-        return Check(name, False, f"{type(error).__name__}: {error}")
+        return Check(name, required, False, f"{type(error).__name__}: {error}")
 
 
-def _check_processors() -> Check:
+def _processors() -> str:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return Check("processors", True, f"{cores} usable; one simulation process uses one")
+    return f"{cores} usable; one simulation process uses one"
 
 
-def _check_memory() -> Check:
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    limit = _container_memory_gib()
-    usable = total if limit is None else min(total, limit)
-    enough = usable >= 4
-    return Check(
-        "memory",
-        enough,
-        f"{usable:.1f} GiB",
-        "" if enough else "a demo run needs about 4 GiB: close other programs",
-    )
+def _memory() -> str:
+    usable = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    container = Path("/sys/fs/cgroup/memory.max")
+    limit = container.read_text().strip() if container.exists() else "max"
+    usable = usable if limit == "max" else min(usable, int(limit) / 2**30)
+    if usable < 4:
+        raise _AbsentError(
+            f"{usable:.1f} GiB", "a demo run needs about 4 GiB: close other programs"
+        )
+    return f"{usable:.1f} GiB"
 
 
-def _container_memory_gib() -> float | None:
-    path = Path("/sys/fs/cgroup/memory.max")
-    text = path.read_text().strip() if path.exists() else "max"
-    return None if text == "max" else int(text) / 2**30
-
-
-def _check_python() -> Check:
+def _python() -> str:
     found = ".".join(map(str, sys.version_info[:3]))
-    ok = sys.version_info[:2] == (3, 11)
-    return Check("python", ok, found, "" if ok else "install Python 3.11", required=True)
+    if sys.version_info[:2] != (3, 11):
+        raise _AbsentError(found, "install Python 3.11")
+    return found
 
 
-def _check_versions() -> Check:
+def _versions() -> str:
     requirements = _requirements("")
     wrong = [r for r in requirements if not _satisfied(r)]
+    if wrong:
+        details = [f"{r.name}{r.specifier} (found: {_installed(r.name)})" for r in wrong]
+        packages = " ".join(f"'{r.name}{r.specifier}'" for r in wrong)
+        raise _AbsentError(f"wrong: {', '.join(details)}", _install(packages))
     shown = [r.name for r in requirements if r.name in (*PINNED, "torch", "numpy")]
-    details = [f"{r.name}{r.specifier} (found: {_installed(r.name)})" for r in wrong]
-    packages = " ".join(f"'{r.name}{r.specifier}'" for r in wrong)
-    return Check(
-        "package versions",
-        not wrong,
-        f"wrong: {', '.join(details)}"
-        if wrong
-        else ", ".join(f"{name} {_installed(name)}" for name in shown),
-        "" if not wrong else "make setup" if _IN_CHECKOUT else f"pip install {packages}",
-        required=True,
-    )
+    return ", ".join(f"{name} {_installed(name)}" for name in shown)
 
 
-def _check_extras() -> Check:
+def _extras() -> str:
     try:
         names = metadata("symsteer").get_all("Provides-Extra") or []
     except PackageNotFoundError:
         names = []
     extras = [name for name in names if name != _DEVELOPMENT]
     absent = [name for name in extras if not all(map(_satisfied, _requirements(name)))]
-    found = ", ".join(name for name in extras if name not in absent) or "none"
-    return Check(
-        "optional packages",
-        not absent,
-        f"{found} found; absent: {', '.join(absent)}" if absent else f"{found} found",
-        f"optional: {_install(absent)}" if absent else "",
-    )
+    found = (", ".join(name for name in extras if name not in absent) or "none") + " found"
+    if absent:
+        cure = _install(f"'symsteer[{','.join(absent)}]'")
+        raise _AbsentError(f"{found}; absent: {', '.join(absent)}", f"optional: {cure}")
+    return found
 
 
-def _install(extras: Sequence[str]) -> str:
-    return "make setup" if _IN_CHECKOUT else f"pip install 'symsteer[{','.join(extras)}]'"
+def _install(packages: str) -> str:
+    return "make setup" if _IN_CHECKOUT else f"pip install {packages}"
 
 
 def _requirements(extra: str) -> list[Requirement]:
@@ -149,12 +140,14 @@ def _requirements(extra: str) -> list[Requirement]:
         texts = requires("symsteer") or []
     except PackageNotFoundError:
         texts = [f"{package}=={wanted}" for package, wanted in PINNED.items()]
-    found = []
-    for requirement in map(Requirement, texts):
-        always = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
-        if always != bool(extra) and (always or requirement.marker.evaluate({"extra": extra})):  # type: ignore[union-attr]
-            found.append(requirement)
-    return found
+
+    def needed(requirement: Requirement, extra: str) -> bool:
+        return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+
+    found = [Requirement(text) for text in texts]
+    if not extra:
+        return [r for r in found if needed(r, "")]
+    return [r for r in found if needed(r, extra) and not needed(r, "")]
 
 
 def _installed(package: str) -> str:
@@ -169,21 +162,7 @@ def _satisfied(requirement: Requirement) -> bool:
     return installed != "missing" and requirement.specifier.contains(installed)
 
 
-def _check_x11() -> Check:
-    try:
-        ctypes.CDLL("libX11.so.6")
-    except OSError:
-        return Check(
-            "libX11",
-            False,
-            "libX11.so.6 is missing; SAPIEN links to it, also without a display",
-            "apt install libx11-6 (Fedora: dnf install libX11)",
-            required=True,
-        )
-    return Check("libX11", True, "found", required=True)
-
-
-def _check_simulator() -> Check:
+def _maniskill() -> str:
     from symsteer.bench.sim.headless import silence_import_noise
 
     silence_import_noise()
@@ -193,34 +172,31 @@ def _check_simulator() -> Check:
         # The usual reason is a missing shared library; the message begins with its name.
         library = str(error).split(":")[0]
         packages = {"libX11.so.6": "libx11-6", "libGL.so.1": "libgl1", "libEGL.so.1": "libegl1"}
-        cure = f"apt install {packages[library]}" if library in packages else _REINSTALL
-        return Check("ManiSkill", False, f"cannot be imported: {error}", cure, required=True)
-    return Check("ManiSkill", True, "imports", required=True)
+        cure = _install("--force-reinstall symsteer")
+        if library in packages:
+            cure = f"apt install {packages[library]}"
+        raise _AbsentError(f"cannot be imported: {error}", cure) from error
+    return "imports"
 
 
-def _check_torch() -> Check:
+def _cuda() -> str:
     torch = importlib.import_module("torch")
     if not torch.cuda.is_available():
-        return Check(
-            "CUDA",
-            False,
+        raise _AbsentError(
             f"torch {torch.__version__} sees no GPU; everything runs on the CPU",
             "optional: an NVIDIA GPU with its driver and the CUDA build of torch",
         )
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    return Check("CUDA", True, f"torch {torch.__version__}: {', '.join(names)}")
+    return f"torch {torch.__version__}: {', '.join(names)}"
 
 
-def _check_physx_gpu() -> Check:
+def _physx_gpu() -> str:
     physx = importlib.import_module("sapien.physx")
     library = Path.home() / ".sapien" / "physx" / physx.version() / "libPhysXGpu_64.so"
-    torch = importlib.import_module("torch")
-    if not torch.cuda.is_available():
-        return Check("PhysX on GPU", False, "needs CUDA; sim=cpu works without", "")
+    if not importlib.import_module("torch").cuda.is_available():
+        raise _AbsentError("needs CUDA; sim=cpu works without")
     if not library.exists():
-        return Check(
-            "PhysX on GPU",
-            False,
+        raise _AbsentError(
             f"{library.name} has not been downloaded yet",
             "optional: python -c 'import sapien.physx as p; p.enable_gpu()' downloads it; "
             "sim=cpu with the learner on CUDA works without",
@@ -228,56 +204,38 @@ def _check_physx_gpu() -> Check:
     try:
         ctypes.CDLL(str(library))
     except OSError as error:
-        return Check(
-            "PhysX on GPU",
-            False,
-            f"{library.name} does not load: {error}",
-            f"delete {library.parent} and let SAPIEN download it again",
-        )
-    return Check("PhysX on GPU", True, f"{library.name} found: sim=cuda works")
+        cure = f"delete {library.parent} and let SAPIEN download it again"
+        raise _AbsentError(f"{library.name} does not load: {error}", cure) from error
+    return f"{library.name} found: sim=cuda works"
 
 
-def _check_rendering() -> Check:
+def _rendering() -> str:
     # In a process of its own: a broken driver may crash it.
+    command = [sys.executable, "-P", "-c", _RENDER_PROBE]
     try:
-        result = subprocess.run(
-            [sys.executable, "-P", "-c", _RENDER_PROBE],
-            capture_output=True,
-            text=True,
-            timeout=_PROBE_SECONDS,
-        )
-        lines = result.stdout.strip().splitlines()
-        ok = result.returncode == 0 and bool(lines)
-        errors = result.stderr.strip().splitlines()
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_SECONDS)
+        devices = done.stdout.strip().splitlines() if done.returncode == 0 else []
+        errors = done.stderr.strip().splitlines()
     except subprocess.TimeoutExpired:
-        ok, errors = False, [f"the driver did not answer in {_PROBE_SECONDS} s"]
-    if ok:
-        return Check("rendering", True, f"Vulkan device: {lines[-1]}")
-    reason = errors[-1].split(": ", 1)[-1] if errors else "the driver crashed"
-    return Check(
-        "rendering",
-        False,
-        f"{reason}; pictures and videos need a Vulkan device, state-only runs do not",
-        f"optional: {RENDERING_CURE}",
-    )
+        devices, errors = [], [f"the driver did not answer in {_PROBE_SECONDS} s"]
+    if not devices:
+        reason = errors[-1].split(": ", 1)[-1] if errors else "the driver crashed"
+        raise _AbsentError(
+            f"{reason}; pictures and videos need a Vulkan device, state-only runs do not",
+            f"optional: {RENDERING_CURE}",
+        )
+    return f"Vulkan device: {devices[-1]}"
 
 
-def _check_tensorboard() -> Check:
-    if (found := _installed("tensorboard")) == "missing":
-        return Check("TensorBoard", False, found, "pip install tensorboard", required=True)
-    return Check("TensorBoard", True, f"{found}: tensorboard --logdir runs", required=True)
-
-
-_CHECKS: dict[str, Callable[[], Check]] = {
-    "processors": _check_processors,
-    "memory": _check_memory,
-    "python": _check_python,
-    "package versions": _check_versions,
-    "optional packages": _check_extras,
-    "libX11": _check_x11,
-    "ManiSkill": _check_simulator,
-    "CUDA": _check_torch,
-    "PhysX on GPU": _check_physx_gpu,
-    "rendering": _check_rendering,
-    "TensorBoard": _check_tensorboard,
+_CHECKS: dict[str, tuple[bool, Callable[[], str]]] = {
+    "processors": (False, _processors),
+    "memory": (False, _memory),
+    "python": (True, _python),
+    "package versions": (True, _versions),
+    "optional packages": (False, _extras),
+    "ManiSkill": (True, _maniskill),
+    "CUDA": (False, _cuda),
+    "PhysX on GPU": (False, _physx_gpu),
+    "rendering": (False, _rendering),
 }
+"""Whether SymSteer needs it, and how it is found."""

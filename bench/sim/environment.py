@@ -13,7 +13,6 @@ import sapien
 import sapien.physx as physx
 import torch
 from mani_skill.agents.base_agent import BaseAgent
-from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.system.backend import BackendInfo
@@ -168,26 +167,6 @@ class BatchedCpuMixin(Unique, BaseEnv):
         )
         self.scene.timestep = 1.0 / self._sim_freq
         _LIVE_SCENES.add(self.scene)
-
-    def _load_agent(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_agent(*args, **kwargs)
-        self._check_controllers()
-
-    def _check_controllers(self) -> None:
-        """Refuse what ManiSkill refuses on the GPU: its batched solver needs the root frame."""
-        agents = self.agent.agents if isinstance(self.agent, MultiAgent) else [self.agent]
-        for agent in agents:
-            controller = getattr(agent, "controller", None)
-            for part in getattr(controller, "controllers", {"": controller}).values():
-                if isinstance(part, PDEEPosController):
-                    try:
-                        part._check_gpu_sim_works()
-                    except AssertionError as error:
-                        raise UserError(
-                            f'Control mode "{agent.control_mode}" moves the end effector in the '
-                            f'frame "{part.config.frame}", which batched simulation does not '
-                            'support: use "pd_ee_delta_pose" or a joint-space mode.'
-                        ) from error
 
     def hold_force(self, body: Actor, force: torch.Tensor) -> None:
         """Apply a force to a dynamic body in every substep until the next call for that body.

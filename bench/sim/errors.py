@@ -4,7 +4,7 @@ from symsteer.errors import UserError
 
 
 class WorkerError(Exception):
-    """A worker process failed; its cause holds the worker's traceback."""
+    """A worker process failed; a note holds its traceback."""
 
 
 class WorkerLostError(WorkerError):

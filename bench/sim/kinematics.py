@@ -15,7 +15,7 @@ _TOLERANCE = 1e-4
 
 
 class SerialChain:
-    """A chain of revolute and prismatic joints, built from a pytorch_kinematics chain.
+    """A chain of revolute joints, built from a pytorch_kinematics chain.
 
     It has the two methods of that chain which ManiSkill's solver calls.
 
@@ -26,7 +26,7 @@ class SerialChain:
     def __init__(self, chain: Any) -> None:
         self.chain = chain
         offset = torch.eye(4, dtype=torch.float64)
-        offsets, axes, revolute = [], [], []
+        offsets, axes = [], []
         for frame in chain._serial_frames:
             if frame.joint.offset is not None:
                 offset = offset @ frame.joint.offset.get_matrix()[0].double()
@@ -34,26 +34,22 @@ class SerialChain:
                 continue
             offsets.append(offset)
             axes.append(frame.joint.axis.double())
-            revolute.append(frame.joint.joint_type == "revolute")
             offset = torch.eye(4, dtype=torch.float64)
         stacked = torch.stack(offsets)
         self._rotation = stacked[:, :3, :3].float()
         self._translation = stacked[:, :3, 3:].float()
         self._tool = offset[:3, 3:].float()
         self._axis = torch.stack(axes).float()[..., None]
-        self._revolute = torch.tensor(revolute)
-        cross = torch.zeros(len(axes), 3, 3)
-        for matrix, (x, y, z) in zip(cross, self._axis[..., 0].tolist(), strict=True):
+        self._cross = torch.zeros(len(axes), 3, 3)
+        for matrix, (x, y, z) in zip(self._cross, self._axis[..., 0].tolist(), strict=True):
             matrix[:] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        # Rodrigues: R(q) = 1 + sin(q) K + (1 - cos(q)) K^2; a prismatic joint does not turn.
-        self._cross = cross * self._revolute[:, None, None]
         self._cross_squared = self._cross @ self._cross
 
     @classmethod
     def replace(cls, chain: Any) -> Any:
         """Our chain, or the given one if the Jacobians differ (another kind of joint)."""
         ours = cls(chain)
-        q = torch.linspace(-1.1, 0.7, len(ours._revolute))[None]
+        q = torch.linspace(-1.1, 0.7, len(ours._axis))[None]
         same = torch.allclose(ours.jacobian(q), chain.jacobian(q), atol=_TOLERANCE)
         return ours if same else chain
 
@@ -65,23 +61,20 @@ class SerialChain:
         """Geometric Jacobian of the end link in the base frame.
 
         Args:
-            q: joint positions [B, J], radians or metres.
+            q: joint positions [B, J], radians.
 
         Returns:
             ``[B, 6, J]``: per joint velocity, three rows of linear and three of angular velocity.
         """
         angle = q[:, :, None, None]
+        # Rodrigues: R(q) = 1 + sin(q) K + (1 - cos(q)) K^2.
         turn = torch.sin(angle) * self._cross + (1 - torch.cos(angle)) * self._cross_squared
         steps = self._rotation + self._rotation @ turn
-        shifts = self._translation
-        if not self._revolute.all():
-            slide = self._rotation @ self._axis * angle
-            shifts = shifts + torch.where(self._revolute[:, None, None], 0.0, slide)
         rotation = steps[:, 0]
-        position = shifts[..., 0, :, :].expand(len(q), 3, 1)
+        position = self._translation[0].expand(len(q), 3, 1)
         rotations, positions = [rotation], [position]
         for j in range(1, q.shape[1]):
-            position = position + _turned(rotation, shifts[..., j, :, :])
+            position = position + _turned(rotation, self._translation[j])
             rotation = rotation @ steps[:, j]
             rotations.append(rotation)
             positions.append(position)
@@ -89,16 +82,13 @@ class SerialChain:
         axis = (torch.stack(rotations, 1) @ self._axis)[..., 0]
         arm = (end[:, None] - torch.stack(positions, 1))[..., 0]
         linear = torch.cross(axis, arm, dim=-1)
-        if not self._revolute.all():
-            linear = torch.where(self._revolute[:, None], linear, axis)
-            axis = axis * self._revolute[:, None]
         return torch.cat([linear, axis], dim=-1).transpose(1, 2)
 
 
 def _turned(rotation: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """``rotation [B, 3, 3]`` times ``vector [3, 1]`` or ``[B, 3, 1]``.
+    """``rotation [B, 3, 3]`` times ``vector [3, 1]``, as one small product per row.
 
-    As one small product per row. torch multiplies all rows at once with a single vector, and on
-    some processors the last bits of that product depend on the number of rows.
+    torch multiplies all rows at once with a single vector, and on some processors the last bits
+    of that product depend on the number of rows.
     """
     return rotation @ vector.expand(len(rotation), 3, 1)

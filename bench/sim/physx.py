@@ -25,7 +25,7 @@ velocity (3), in metres, radians and seconds, in the world frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partialmethod
 from typing import Any
@@ -34,7 +34,7 @@ import numpy as np
 import sapien
 import sapien.physx as physx
 
-from symsteer.bench.sim.contacts import BodyImpulseQuery, Buffer, ContactReader, PairImpulseQuery
+from symsteer.bench.sim.contacts import Buffer, ContactReader, ImpulseQuery
 
 _POSE = slice(0, 7)
 _VELOCITY = slice(7, 13)
@@ -42,9 +42,25 @@ _VELOCITY = slice(7, 13)
 # Where `pack` puts a body's 13 numbers: quaternion first, then position, then velocities.
 _PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
 
+_NOTHING = np.zeros(3, dtype=np.float32)
+
+
+class Mirror(Buffer):
+    """A buffer that tasks read and write, beside what the simulation held when it was last read."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        super().__init__(np.zeros((rows, columns), dtype=np.float32))
+        self.state = np.zeros_like(self.array)
+
+    def changed(self, rows: Any = slice(None), columns: slice = slice(None)) -> np.ndarray:
+        """In which of these rows the buffer differs from the simulation, bool."""
+        return (self.array[rows, columns] != self.state[rows, columns]).any(axis=1)
+
 
 class BatchedPhysx:
     """N ``PhysxCpuSystem`` scenes with the interface of one ``PhysxGpuSystem``.
+
+    Its members are those that ManiSkill's batched branch uses.
 
     Args:
         scenes: one SAPIEN scene per environment, each with its own ``PhysxCpuSystem``.
@@ -55,8 +71,7 @@ class BatchedPhysx:
     __class__ = property(lambda self: physx.PhysxGpuSystem)  # type: ignore[assignment]
 
     def __init__(self, scenes: Sequence[sapien.Scene]) -> None:
-        self.scenes = list(scenes)
-        self.systems: list[physx.PhysxCpuSystem] = [s.physx_system for s in self.scenes]
+        self.systems: list[physx.PhysxCpuSystem] = [s.physx_system for s in scenes]
         self._pending_substeps = 0
         self._deferring = False
         self._initialized = False
@@ -74,19 +89,6 @@ class BatchedPhysx:
     def timestep(self, value: float) -> None:
         for system in self.systems:
             system.timestep = value
-
-    def get_timestep(self) -> float:
-        """Duration of a substep in seconds."""
-        return self.timestep
-
-    def set_timestep(self, value: float) -> None:
-        """Set the duration of a substep in seconds."""
-        self.timestep = value
-
-    @property
-    def config(self) -> physx.PhysxSceneConfig:
-        """The scene configuration, the same for all scenes."""
-        return self.systems[0].config
 
     @property
     def rigid_dynamic_components(self) -> list[physx.PhysxRigidDynamicComponent]:
@@ -114,141 +116,95 @@ class BatchedPhysx:
 
     # ------------------------------------------------------------------ setup
     def gpu_init(self) -> None:
-        """Index every body and articulation, allocate the buffers and fill them.
-
-        Raises:
-            RuntimeError: SAPIEN packs a scene in another order than this module expects.
-        """
+        """Index every body and articulation, allocate the buffers and fill them."""
         self._index_scenes()
-        n, m = len(self._bodies), len(self._articulations)
-        d = max(self._dof, default=0)
-        # State of the simulation at the last fetch: buffers that differ were written by the task.
-        self._body_state = np.zeros((n, 13), dtype=np.float32)
-        self._joint_state = {
-            name: np.zeros((m, d), dtype=np.float32)
-            for name in ("qpos", "qvel", "qf", "target_qpos", "target_qvel")
+        self.cuda_rigid_body_data = Mirror(len(self._bodies), 13)
+        self.cuda_rigid_body_force = Buffer(np.zeros((len(self._bodies), 4), dtype=np.float32))
+        shape = len(self._articulations), max(self._dof, default=0)
+        self.joints = {
+            name: Mirror(*shape) for name in ("qpos", "qvel", "qf", "target_qpos", "target_qvel")
         }
-        self._body_buffer = np.zeros((n, 13), dtype=np.float32)
-        self._joint_buffer = {k: np.zeros_like(v) for k, v in self._joint_state.items()}
-        self.cuda_rigid_body_data = Buffer(self._body_buffer)
-        self.cuda_rigid_dynamic_data = Buffer(self._body_buffer[: self._n_rigid])
-        self.cuda_rigid_body_force = Buffer(np.zeros((n, 4), dtype=np.float32))
-        self.cuda_rigid_body_torque = Buffer(np.zeros((n, 4), dtype=np.float32))
-        self.cuda_articulation_qpos = Buffer(self._joint_buffer["qpos"])
-        self.cuda_articulation_qvel = Buffer(self._joint_buffer["qvel"])
-        self.cuda_articulation_qf = Buffer(self._joint_buffer["qf"])
-        self.cuda_articulation_target_qpos = Buffer(self._joint_buffer["target_qpos"])
-        self.cuda_articulation_target_qvel = Buffer(self._joint_buffer["target_qvel"])
-        self.cuda_articulation_qacc = Buffer(
-            np.zeros((m, d), dtype=np.float32), fill=self._read_qacc
-        )
-        links = max((len(a.links) for a in self._articulations), default=0)
-        self.cuda_articulation_link_data = Buffer(
-            np.zeros((m, links, 13), dtype=np.float32), fill=self._read_link_data
-        )
-        self.cuda_articulation_link_incoming_joint_forces = Buffer(
-            np.zeros((m, links, 6), dtype=np.float32)
-        )
+        """By name; each is an attribute too, such as ``cuda_articulation_qpos``."""
+        for name, mirror in self.joints.items():
+            setattr(self, f"cuda_articulation_{name}", mirror)
         self._contacts = ContactReader(self.systems)
         self._stale = np.ones(len(self.systems), dtype=bool)
-        self._qacc_stale = True
         # Articulations whose drives a controller sets. Their targets are written at each control
         # step, as in stock ManiSkill; this also prevents PhysX from putting them to sleep.
-        self._driven = np.zeros(m, dtype=bool)
+        self._driven = np.zeros(len(self._articulations), dtype=bool)
         self._initialized = True
-        self._refresh()
-        self._check_packing()
         self.fetch_all()
 
     def _index_scenes(self) -> None:
         """Assign rows to bodies and articulations, and find their places in packed scenes."""
-        rigid: list[Any] = []
-        links: list[Any] = []
-        rigid_scene: list[int] = []
-        link_scene: list[int] = []
+        rigid: list[tuple[Any, int]] = []
+        links: list[tuple[Any, int]] = []
         self._articulations: list[physx.PhysxArticulation] = []
         self._articulation_scene: list[int] = []
-        self._pack_calls = [system.pack for system in self.systems]
-        self._step_calls = [system.step for system in self.systems]
         # Offsets of each scene in the concatenation of all packed scenes.
         self._pack_start = [0]
         rigid_at: list[int] = []
-        articulation_at: list[int] = []
+        root_at: list[int] = []
         for i, system in enumerate(self.systems):
             at = self._pack_start[-1]
             for body in system.rigid_dynamic_components:
-                rigid.append(body)
-                rigid_scene.append(i)
+                rigid.append((body, i))
                 rigid_at.append(at)
                 at += 13
             for link in system.articulation_link_components:
-                links.append(link)
-                link_scene.append(i)
+                links.append((link, i))
                 if link.is_root:
                     self._articulations.append(link.articulation)
                     self._articulation_scene.append(i)
-                    articulation_at.append(at)
+                    root_at.append(at)
                     # Root pose and velocity; per joint: position, velocity, two drive targets.
                     at += 13 + 4 * link.articulation.dof
             self._pack_start.append(at)
-        self._n_rigid = len(rigid)
-        self._bodies = rigid + links
-        self._body_scene = np.array(rigid_scene + link_scene, dtype=np.int64)
+        self._pack_calls = [system.pack for system in self.systems]
+        self._step_calls = [system.step for system in self.systems]
+        self._bodies = [body for body, _ in rigid + links]
+        self._scene_of = [scene for _, scene in rigid + links]
         self._body_row = {body: row for row, body in enumerate(self._bodies)}
         self._articulation_row = {a: row for row, a in enumerate(self._articulations)}
-        self._kinematic = np.array([body.kinematic for body in rigid], dtype=bool)
-        self._dof = [a.dof for a in self._articulations]
-        self._joints = [a.active_joints for a in self._articulations]
-        self._set_target_calls = [[j.set_drive_target for j in js] for js in self._joints]
-        self._set_target_velocity_calls = [
-            [j.set_drive_velocity_target for j in js] for js in self._joints
-        ]
-        self._fixed_root = [a.root.joint.type == "fixed" for a in self._articulations]
-        self._root_row = np.array([self._body_row[a.root] for a in self._articulations], int)
+        self._rigid_rows = np.arange(len(rigid))
+        self._root_rows = np.array([self._body_row[a.root] for a in self._articulations], int)
+        self._roots = dict(zip(self._root_rows.tolist(), self._articulations, strict=True))
+        self._kinematic = {row for row, (body, _) in enumerate(rigid) if body.kinematic}
+        fixed = {row for row, a in self._roots.items() if a.root.joint.type == "fixed"}
+        self._without_velocity = self._kinematic | fixed
+        # Links are read only once somebody has asked for their rows.
+        self._live = {*self._rigid_rows.tolist(), *self._roots}
         self._live_links: list[list[int]] = [[] for _ in self.systems]
-        self._live = set(range(self._n_rigid)) | set(self._root_row.tolist())
+        self._dof = [a.dof for a in self._articulations]
+        joints = [a.active_joints for a in self._articulations]
+        self._set_targets = {
+            "target_qpos": [[j.set_drive_target for j in js] for js in joints],
+            "target_qvel": [[j.set_drive_velocity_target for j in js] for js in joints],
+        }
+        self._rigid_at = np.array(rigid_at, int).reshape(-1, 1) + _PACKED_BODY
+        self._root_at = np.array(root_at, int).reshape(-1, 1) + _PACKED_BODY
         # Padded joints point to the last number of the flat array, which is zero.
         total = self._pack_start[-1]
         self._packed = np.zeros(total + 1, dtype=np.float32)
-        self._rigid_at = np.array(rigid_at, int).reshape(-1, 1) + _PACKED_BODY
-        self._root_at = np.array(articulation_at, int).reshape(-1, 1) + _PACKED_BODY
-        d = max(self._dof, default=0)
+        shape = len(joints), max(self._dof, default=0)
         self._joint_at = {
-            name: np.full((len(self._articulations), d), total, dtype=np.int64)
-            for name in ("qpos", "qvel", "target_qpos", "target_qvel")
+            name: np.full(shape, total) for name in ("qpos", "qvel", "target_qpos", "target_qvel")
         }
-        for row, (at, dof) in enumerate(zip(articulation_at, self._dof, strict=True)):
-            joints = np.arange(dof)
-            self._joint_at["qpos"][row, :dof] = at + 13 + joints
-            self._joint_at["qvel"][row, :dof] = at + 13 + dof + joints
-            self._joint_at["target_qpos"][row, :dof] = at + 13 + 2 * dof + 2 * joints
-            self._joint_at["target_qvel"][row, :dof] = at + 14 + 2 * dof + 2 * joints
-
-    def _check_packing(self) -> None:
-        """Compare unpacked values with those of SAPIEN's objects, once per set-up."""
-        for row, body in enumerate(self._bodies[: self._n_rigid]):
-            if tuple(self._body_state[row, :7].tolist()) != body.entity.pose.__getstate__():
-                raise RuntimeError(f"SAPIEN packs the pose of {body.name} in an unknown order")
-        for row, articulation in enumerate(self._articulations):
-            dof, state = self._dof[row], self._joint_state
-            root = self._body_state[self._root_row[row], :7]
-            targets = [float(j.drive_target[0]) for j in self._joints[row]]
-            if (
-                tuple(root.tolist()) != articulation.root.entity.pose.__getstate__()
-                or (state["qpos"][row, :dof] != articulation.qpos).any()
-                or (state["qvel"][row, :dof] != articulation.qvel).any()
-                or state["target_qpos"][row, :dof].tolist() != targets
-            ):
-                raise RuntimeError(f"SAPIEN packs {articulation.name} in an unknown order")
+        for row, (at, dof) in enumerate(zip(root_at, self._dof, strict=True)):
+            first, count = at + 13, np.arange(dof)
+            self._joint_at["qpos"][row, :dof] = first + count
+            self._joint_at["qvel"][row, :dof] = first + dof + count
+            self._joint_at["target_qpos"][row, :dof] = first + 2 * dof + 2 * count
+            self._joint_at["target_qvel"][row, :dof] = first + 2 * dof + 2 * count + 1
 
     def body_index(self, body: Any) -> int:
         """Row of a rigid body or link in the body buffer; from now on it is kept up to date."""
         row = self._body_row[body]
         if row not in self._live:
             self._live.add(row)
-            self._live_links[self._body_scene[row]].append(row)
-            self._body_state[row] = self._read_link(row)
-            self._body_buffer[row] = self._body_state[row]
+            self._live_links[self._scene_of[row]].append(row)
+            self._read_links([row])
+            self.cuda_rigid_body_data.array[row] = self.cuda_rigid_body_data.state[row]
         return row
 
     def articulation_index(self, articulation: physx.PhysxArticulation) -> int:
@@ -289,34 +245,24 @@ class BatchedPhysx:
         if count == 0:
             return
         substeps = range(count)
-        nothing = np.zeros(3, dtype=np.float32)
         moving = np.flatnonzero(~self._paused)
         for i in moving.tolist():
             step, held = self._step_calls[i], self._held[i]
             pushes = [(self._bodies[row].add_force_torque, force) for row, force in held.items()]
             for _ in substeps:
                 for push, force in pushes:
-                    push(force, nothing)
+                    push(force, _NOTHING)
                 step()
         if self._initialized:
             self._stale[moving] = True
             self._contacts.invalidate()
 
     # ------------------------------------------------------------------ fetch
-    def _read_link(self, row: int) -> tuple[float, ...]:
-        link = self._bodies[row]
-        return (
-            *link.entity.pose.__getstate__(),
-            *link.linear_velocity.tolist(),
-            *link.angular_velocity.tolist(),
-        )
-
     def _refresh(self) -> None:
         """Read the scenes that may have changed since they were last read."""
         self.finish_substeps()
         if not self._stale.any():
             return
-        self._qacc_stale = True
         stale = np.flatnonzero(self._stale).tolist()
         packed, start = self._packed, self._pack_start
         if len(stale) == len(self.systems):
@@ -324,188 +270,114 @@ class BatchedPhysx:
         else:
             for i in stale:
                 packed[start[i] : start[i + 1]] = np.frombuffer(self._pack_calls[i](), "f4")
-        self._body_state[: self._n_rigid] = packed[self._rigid_at]
-        self._body_state[self._root_row] = packed[self._root_at]
+        state = self.cuda_rigid_body_data.state
+        state[: len(self._rigid_rows)] = packed[self._rigid_at]
+        state[self._root_rows] = packed[self._root_at]
         for name, at in self._joint_at.items():
-            self._joint_state[name][:] = packed[at]
+            self.joints[name].state[:] = packed[at]
         rows = [row for i in stale for row in self._live_links[i]]
         if rows:
-            bodies = self._bodies
-            self._body_state[rows, _POSE] = [bodies[r].entity.pose.__getstate__() for r in rows]
-            self._body_state[rows, 7:10] = [bodies[r].linear_velocity for r in rows]
-            self._body_state[rows, 10:13] = [bodies[r].angular_velocity for r in rows]
+            self._read_links(rows)
         self._stale[:] = False
 
+    def _read_links(self, rows: list[int]) -> None:
+        state, links = self.cuda_rigid_body_data.state, [self._bodies[row] for row in rows]
+        state[rows, _POSE] = [link.entity.pose.__getstate__() for link in links]
+        state[rows, 7:10] = [link.linear_velocity for link in links]
+        state[rows, 10:13] = [link.angular_velocity for link in links]
+
     def fetch_all(self) -> None:
-        """Update every buffer, except those that are filled on demand."""
+        """Update every buffer."""
         self._refresh()
-        self._body_buffer[:] = self._body_state
-        for name, state in self._joint_state.items():
-            if name != "qf":
-                self._joint_buffer[name][:] = state
+        self.cuda_rigid_body_data.array[:] = self.cuda_rigid_body_data.state
+        for name in self._joint_at:
+            self.joints[name].array[:] = self.joints[name].state
 
     def gpu_fetch_rigid_dynamic_data(self) -> None:
         """Fetch poses and velocities of rigid bodies."""
         self._refresh()
-        self._body_buffer[: self._n_rigid] = self._body_state[: self._n_rigid]
-
-    def gpu_fetch_articulation_link_pose(self) -> None:
-        """Fetch poses of articulation links."""
-        self._refresh()
-        self._body_buffer[self._n_rigid :, _POSE] = self._body_state[self._n_rigid :, _POSE]
-
-    def gpu_fetch_articulation_link_velocity(self) -> None:
-        """Fetch velocities of articulation links."""
-        self._refresh()
-        self._body_buffer[self._n_rigid :, _VELOCITY] = self._body_state[self._n_rigid :, _VELOCITY]
-
-    def _fetch_joints(self, name: str) -> None:
-        """Fetch joint positions or velocities, or their drive targets."""
-        self._refresh()
-        self._joint_buffer[name][:] = self._joint_state[name]
-
-    gpu_fetch_articulation_qpos = partialmethod(_fetch_joints, "qpos")
-    gpu_fetch_articulation_qvel = partialmethod(_fetch_joints, "qvel")
-    gpu_fetch_articulation_target_qpos = partialmethod(_fetch_joints, "target_qpos")
-    gpu_fetch_articulation_target_qvel = partialmethod(_fetch_joints, "target_qvel")
-
-    def gpu_fetch_articulation_qacc(self) -> None:
-        """Do nothing: joint accelerations are read on demand, see `_read_qacc`."""
-
-    def _read_qacc(self) -> None:
-        self._refresh()
-        if self._qacc_stale:
-            for row, articulation in enumerate(self._articulations):
-                self.cuda_articulation_qacc.array[row, : self._dof[row]] = articulation.qacc
-            self._qacc_stale = False
-
-    def _read_link_data(self) -> None:
-        self._refresh()
-        data = self.cuda_articulation_link_data.array
-        for row, articulation in enumerate(self._articulations):
-            for i, link in enumerate(articulation.links):
-                data[row, i] = self._read_link(self._body_row[link])
-
-    def gpu_fetch_articulation_link_incoming_joint_forces(self) -> None:
-        """Fetch the spatial force that each link receives through its joint."""
-        self.finish_substeps()
-        data = self.cuda_articulation_link_incoming_joint_forces.array
-        for row, articulation in enumerate(self._articulations):
-            forces = articulation.get_link_incoming_joint_forces()
-            data[row, : len(forces)] = forces
+        rigid, data = slice(len(self._rigid_rows)), self.cuda_rigid_body_data
+        data.array[rigid] = data.state[rigid]
 
     # ------------------------------------------------------------------ apply
     def apply_all(self) -> None:
         """Write everything that a task changed in the buffers to the simulation."""
-        self.gpu_apply_rigid_dynamic_data()
-        self.gpu_apply_articulation_qpos()
-        self.gpu_apply_articulation_qvel()
-        self.gpu_apply_articulation_qf()
-        self.gpu_apply_articulation_root_pose()
-        self.gpu_apply_articulation_root_velocity()
-        self._apply_targets("target_qpos", self._set_target_calls, refresh_driven=False)
-        self._apply_targets("target_qvel", self._set_target_velocity_calls, refresh_driven=False)
-
-    @staticmethod
-    def _changed(buffer: np.ndarray, state: np.ndarray) -> list[int]:
-        """Rows in which the buffer differs from the simulation."""
-        return np.flatnonzero((buffer != state).any(axis=1)).tolist()
+        self._apply_bodies(self._rigid_rows)
+        self._apply_joints("qpos", moved=True)
+        self._apply_joints("qvel")
+        self._apply_joints("qf")
+        self._apply_bodies(self._root_rows)
+        self._apply_targets("target_qpos")
+        self._apply_targets("target_qvel")
 
     def _touch(self, scene: int, moved: bool = False) -> None:
         self._stale[scene] = True
         if moved:
             self._contacts.forget(scene)
 
+    def _apply_bodies(self, rows: np.ndarray) -> None:
+        """Apply changed poses and velocities of rigid bodies or roots of articulations."""
+        self.finish_substeps()
+        data = self.cuda_rigid_body_data
+        for row in rows[data.changed(rows, _POSE)].tolist():
+            pose = sapien.Pose(data.array[row, :3], data.array[row, 3:7])
+            if row in self._roots:
+                self._roots[row].root_pose = pose
+            else:
+                self._bodies[row].entity.pose = pose
+            self._touch(self._scene_of[row], moved=row not in self._kinematic)
+        for row in rows[data.changed(rows, _VELOCITY)].tolist():
+            linear, angular = data.array[row, 7:10], data.array[row, 10:13]
+            if row in self._roots and row not in self._without_velocity:
+                self._roots[row].set_root_linear_velocity(linear)
+                self._roots[row].set_root_angular_velocity(angular)
+            elif row not in self._without_velocity:
+                self._bodies[row].linear_velocity = linear
+                self._bodies[row].angular_velocity = angular
+            self._touch(self._scene_of[row])
+        data.state[rows] = data.array[rows]
+
     def gpu_apply_rigid_dynamic_data(self) -> None:
         """Apply poses and velocities of rigid bodies."""
-        self.finish_substeps()
-        n = self._n_rigid
-        buffer, state = self._body_buffer[:n], self._body_state[:n]
-        for row in self._changed(buffer[:, _POSE], state[:, _POSE]):
-            self._bodies[row].entity.pose = sapien.Pose(buffer[row, :3], buffer[row, 3:7])
-            self._touch(self._body_scene[row], moved=not self._kinematic[row])
-        for row in self._changed(buffer[:, _VELOCITY], state[:, _VELOCITY]):
-            if not self._kinematic[row]:
-                self._bodies[row].linear_velocity = buffer[row, 7:10]
-                self._bodies[row].angular_velocity = buffer[row, 10:13]
-            self._touch(self._body_scene[row])
-        state[:] = buffer
+        self._apply_bodies(self._rigid_rows)
 
-    def gpu_apply_articulation_root_pose(self) -> None:
-        """Apply root poses."""
-        self.finish_substeps()
-        roots, buffer = self._root_row, self._body_buffer
-        for i in self._changed(buffer[roots, _POSE], self._body_state[roots, _POSE]):
-            pose = buffer[roots[i]]
-            self._articulations[i].root_pose = sapien.Pose(pose[:3], pose[3:7])
-            self._touch(self._articulation_scene[i], moved=True)
-        self._body_state[roots, _POSE] = buffer[roots, _POSE]
-
-    def gpu_apply_articulation_root_velocity(self) -> None:
-        """Apply root velocities; fixed roots are skipped."""
-        self.finish_substeps()
-        roots, buffer = self._root_row, self._body_buffer
-        for i in self._changed(buffer[roots, _VELOCITY], self._body_state[roots, _VELOCITY]):
-            if not self._fixed_root[i]:
-                velocity = buffer[roots[i]]
-                self._articulations[i].set_root_linear_velocity(velocity[7:10])
-                self._articulations[i].set_root_angular_velocity(velocity[10:13])
-            self._touch(self._articulation_scene[i])
-        self._body_state[roots, _VELOCITY] = buffer[roots, _VELOCITY]
-
-    def _apply_joints(self, name: str, moved: bool) -> None:
+    def _apply_joints(self, name: str, moved: bool = False) -> None:
         """Apply joint positions, velocities, or forces, which act until others are applied."""
         self.finish_substeps()
-        buffer, state = self._joint_buffer[name], self._joint_state[name]
-        for row in self._changed(buffer, state):
-            setattr(self._articulations[row], name, buffer[row, : self._dof[row]])
+        mirror = self.joints[name]
+        for row in np.flatnonzero(mirror.changed()).tolist():
+            setattr(self._articulations[row], name, mirror.array[row, : self._dof[row]])
             self._touch(self._articulation_scene[row], moved)
-        state[:] = buffer
+        mirror.state[:] = mirror.array
 
-    gpu_apply_articulation_qpos = partialmethod(_apply_joints, "qpos", moved=True)
-    gpu_apply_articulation_qvel = partialmethod(_apply_joints, "qvel", moved=False)
-    gpu_apply_articulation_qf = partialmethod(_apply_joints, "qf", moved=False)
-
-    def _apply_targets(
-        self, name: str, calls: list[list[Callable[[float], None]]], refresh_driven: bool
-    ) -> None:
+    def _apply_targets(self, name: str, refresh_driven: bool = False) -> None:
+        """Apply drive targets; those of controlled articulations maybe even if unchanged."""
         self.finish_substeps()
-        buffer, state = self._joint_buffer[name], self._joint_state[name]
-        write = (buffer != state).any(axis=1)
+        mirror = self.joints[name]
+        write = mirror.changed()
         self._driven |= write
         if refresh_driven:
             write = self._driven
-        values = buffer.tolist()
+        values = mirror.array.tolist()
         for row in np.flatnonzero(write).tolist():
-            for set_target, value in zip(calls[row], values[row], strict=False):
+            for set_target, value in zip(self._set_targets[name][row], values[row], strict=False):
                 set_target(value)
-        state[:] = buffer
+        mirror.state[:] = mirror.array
         # The next refresh must find the new targets.
-        self._packed[self._joint_at[name]] = buffer
+        self._packed[self._joint_at[name]] = mirror.array
         self._packed[-1] = 0
 
-    def gpu_apply_articulation_target_position(self) -> None:
-        """Apply drive targets; those of controlled articulations even if unchanged."""
-        self._apply_targets("target_qpos", self._set_target_calls, refresh_driven=True)
-
-    def gpu_apply_articulation_target_velocity(self) -> None:
-        """Apply drive velocity targets; those of controlled articulations even if unchanged."""
-        self._apply_targets("target_qvel", self._set_target_velocity_calls, refresh_driven=True)
-
-    def _apply_forces(self, buffer: Buffer, is_force: bool) -> None:
-        """Apply forces for the next substep only, and clear the buffer."""
-        self.finish_substeps()
-        zero = np.zeros(3, dtype=np.float32)
-        for row in np.flatnonzero(buffer.array[: self._n_rigid].any(axis=1)).tolist():
-            vector = buffer.array[row, :3].copy()
-            force, torque = (vector, zero) if is_force else (zero, vector)
-            if not self._kinematic[row]:
-                self._bodies[row].add_force_torque(force, torque)
-        buffer.array[:] = 0
+    gpu_apply_articulation_target_position = partialmethod(_apply_targets, "target_qpos", True)
+    gpu_apply_articulation_target_velocity = partialmethod(_apply_targets, "target_qvel", True)
 
     def gpu_apply_rigid_dynamic_force(self) -> None:
-        """Apply forces (newtons, world frame) at the centres of mass for the next substep."""
-        self._apply_forces(self.cuda_rigid_body_force, is_force=True)
+        """Apply forces (newtons, world frame) for the next substep only, and clear the buffer."""
+        self.finish_substeps()
+        forces = self.cuda_rigid_body_force.array
+        for row in np.flatnonzero(forces[: len(self._rigid_rows)].any(axis=1)).tolist():
+            if row not in self._kinematic:
+                self._bodies[row].add_force_torque(forces[row, :3].copy(), _NOTHING)
+        forces[:] = 0
 
     def hold_forces(self, rows: np.ndarray, forces: np.ndarray) -> None:
         """Apply forces to bodies in every substep, until the next call for the same bodies.
@@ -520,15 +392,11 @@ class BatchedPhysx:
         """
         self.finish_substeps()
         for row, force in zip(rows.tolist(), forces, strict=True):
-            held = self._held[self._body_scene[row]]
-            if force.any() and not self._kinematic[row]:
+            held = self._held[self._scene_of[row]]
+            if force.any() and row not in self._kinematic:
                 held[row] = force.astype(np.float32)
             else:
                 held.pop(row, None)
-
-    def gpu_apply_rigid_dynamic_torque(self) -> None:
-        """Apply torques (newton metres, world frame) for the next substep."""
-        self._apply_forces(self.cuda_rigid_body_torque, is_force=False)
 
     def gpu_update_articulation_kinematics(self) -> None:
         """Nothing to do: the CPU system updates link poses when joints are set."""
@@ -540,20 +408,17 @@ class BatchedPhysx:
     # ------------------------------------------------------------------ contacts
     def gpu_create_contact_pair_impulse_query(
         self, body_pairs: Sequence[tuple[Any, Any]]
-    ) -> PairImpulseQuery:
+    ) -> ImpulseQuery:
         """A query for the impulse on the first body of each pair by the second."""
-        return self._contacts.register(PairImpulseQuery(body_pairs))
+        return self._contacts.register(body_pairs)
 
-    def gpu_query_contact_pair_impulses(self, query: PairImpulseQuery) -> None:
-        """Answer a pair query with the impulses of the last substep."""
-        self.finish_substeps()
-        self._contacts.answer(query)
-
-    def gpu_create_contact_body_impulse_query(self, bodies: Sequence[Any]) -> BodyImpulseQuery:
+    def gpu_create_contact_body_impulse_query(self, bodies: Sequence[Any]) -> ImpulseQuery:
         """A query for the net contact impulse on each body."""
-        return self._contacts.register(BodyImpulseQuery(bodies))
+        return self._contacts.register((body, None) for body in bodies)
 
-    def gpu_query_contact_body_impulses(self, query: BodyImpulseQuery) -> None:
-        """Answer a body query with the impulses of the last substep."""
+    def gpu_query_contact_pair_impulses(self, query: ImpulseQuery) -> None:
+        """Answer a query with the impulses of the last substep."""
         self.finish_substeps()
-        self._contacts.answer(query)
+        self._contacts.update()
+
+    gpu_query_contact_body_impulses = gpu_query_contact_pair_impulses

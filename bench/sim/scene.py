@@ -48,8 +48,8 @@ class BatchedScene(ManiSkillScene):
             articulation.set_pose(articulation.initial_pose)
         for velocity in (
             self.px.cuda_rigid_body_data.torch()[:, 7:],
-            self.px.cuda_articulation_qvel.torch(),
-            self.px.cuda_articulation_qf.torch(),
+            self.px.joints["qvel"].torch(),
+            self.px.joints["qf"].torch(),
         ):
             torch.zero_(velocity)
         self._gpu_sim_initialized = True

@@ -27,7 +27,8 @@ from symsteer.bench.sim.rotations import (
     transform_angular,
     transform_quaternion,
 )
-from symsteer.bench.sim.trees import rows_of
+from symsteer.bench.sim.seeds import reset_order
+from symsteer.bench.sim.trees import rows_of, write_rows
 from symsteer.bench.tasks.embodiments import BODIES, Embodiment
 from symsteer.bench.tasks.experts import Intent
 from symsteer.bench.tasks.floating import ACTION_LAYOUT
@@ -115,13 +116,7 @@ class SymmetricTask(GymEnv):
         self.embodiment = embodiment
         self.body: Embodiment = BODIES[embodiment]
         self.variants = parse(variant, strength, (self.task_id, embodiment))
-        num_envs = kwargs.get("num_envs", 1)
         for part in self.variants:
-            if torch.is_tensor(part.strength) and len(part.strength) != num_envs:
-                raise UserError(
-                    f"{len(part.strength)} strengths of {part.name!r} were given for {num_envs} "
-                    "environments; give one number, or one for each environment"
-                )
             part.bind(self)
         self._reset_rows: torch.Tensor | None = None
         self._closed = False
@@ -353,21 +348,11 @@ class SymmetricTask(GymEnv):
         """
         self._check_open()
         options = dict(options or {})
-        partial = options.get("env_idx")
+        if "env_idx" in options:
+            self._check_rows(options["env_idx"])
+        partial, seed = reset_order(seed, options.get("env_idx"), self.num_envs)
         if partial is not None:
-            self._check_rows(partial)
-            # ManiSkill writes the rows of a partial reset in the order of the environments.
-            partial, order = torch.as_tensor(partial, dtype=torch.long, device=self.device).sort()
-            options["env_idx"] = partial
-        if seed is not None:
-            seed = [int(s) for s in np.atleast_1d(common.to_numpy(seed))]
-            count = self.num_envs if partial is None else len(partial)
-            if len(seed) not in (1, count):
-                raise UserError(
-                    f"{len(seed)} seeds were given for {count} environments; give one each"
-                )
-            if partial is not None and len(seed) == len(partial):
-                seed = [seed[i] for i in order.tolist()]
+            options["env_idx"] = partial = partial.to(self.device)
         kept = None
         if partial is not None and self.agent is not None:
             # ManiSkill resets the controllers of all environments after a partial reset.
@@ -379,7 +364,7 @@ class SymmetricTask(GymEnv):
             self._reset_rows = None
         if kept and partial is not None:
             fresh = self.agent.get_controller_state()
-            _write_rows(kept, rows_of(fresh, partial), partial)
+            write_rows(kept, rows_of(fresh, partial), partial)
             self.agent.set_controller_state(kept)
         return obs, info
 
@@ -395,10 +380,9 @@ class SymmetricTask(GymEnv):
     def _set_main_rng(self, seed: list[int] | None) -> None:
         if seed is not None and self._reset_rows is not None:
             rows = self._reset_rows.tolist()
-            seeds = _expand(seed, len(rows))
-            for row, value in zip(rows, seeds, strict=True):
+            for row, value in zip(rows, seed, strict=True):
                 self._main_seed[row] = value
-            self._batched_main_rng[rows] = BatchedRNG.from_seeds(seeds)
+            self._batched_main_rng[rows] = BatchedRNG.from_seeds(seed)
         else:
             super()._set_main_rng(seed)
             self._main_seed = list(self._main_seed)
@@ -406,9 +390,8 @@ class SymmetricTask(GymEnv):
     def _set_episode_rng(self, seed: list[int] | None, env_idx: torch.Tensor) -> None:
         if seed is not None and self._reset_rows is not None:
             rows = self._reset_rows.tolist()
-            seeds = _expand(seed, len(rows))
-            self._episode_seed[rows] = seeds
-            self._batched_episode_rng[rows] = BatchedRNG.from_seeds(seeds)
+            self._episode_seed[rows] = seed
+            self._batched_episode_rng[rows] = BatchedRNG.from_seeds(seed)
             self._episode_rng = self._batched_episode_rng[0]
         else:
             super()._set_episode_rng(seed, env_idx)
@@ -451,11 +434,11 @@ class SymmetricTask(GymEnv):
         else:
             targets = self.agent.get_controller_state()
             if targets and "controller" in state:
-                _write_rows(targets, state["controller"], env_idx)
+                write_rows(targets, state["controller"], env_idx)
             elif targets:
                 self.agent.set_controller_state({})
                 present = self.agent.get_controller_state()
-                _write_rows(targets, rows_of(present, env_idx), env_idx)
+                write_rows(targets, rows_of(present, env_idx), env_idx)
             if targets:
                 self.agent.set_controller_state(targets)
 
@@ -545,22 +528,6 @@ def _transform_body(
         ],
         dim=1,
     )
-
-
-def _expand(seed: list[int], count: int) -> list[int]:
-    """ManiSkill's expansion of a single seed to ``count`` environments."""
-    if len(seed) == count:
-        return seed
-    return seed + np.random.RandomState(seed[0]).randint(2**31, size=count - 1).tolist()
-
-
-def _write_rows(target: Any, source: Any, rows: torch.Tensor) -> None:
-    """Write ``source``, whose tensors have one row per entry of ``rows``, into those rows."""
-    for key, value in target.items():
-        if isinstance(value, dict):
-            _write_rows(value, source[key], rows)
-        else:
-            value[rows] = torch.as_tensor(source[key], device=value.device, dtype=value.dtype)
 
 
 def _as_batched(tree: Any, device: Any) -> Any:

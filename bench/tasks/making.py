@@ -78,6 +78,12 @@ def make(
     env_class = task_class(task)
     check_embodiment(embodiment)
     specs = read(variant, strength, (task_name(task), embodiment))
+    for spec in specs:
+        if isinstance(spec.strength, tuple) and len(spec.strength) != num_envs:
+            raise UserError(
+                f"{len(spec.strength)} strengths of {spec.name!r} were given for {num_envs} "
+                "environments; give one number, or one for each environment"
+            )
     kwargs.update(
         sim=sim,
         render=render,
@@ -90,12 +96,10 @@ def make(
     if workers == 1:
         return create(env_class, num_envs, **kwargs)
     if len(specs) == 1 and isinstance(specs[0].strength, tuple):
-        strengths = torch.as_tensor(specs[0].strength)
-        kwargs.update(variant=specs[0].name, per_env={"strength": strengths})
-    variants = build(specs)
-    attributes = {"variants": variants, "task_id": kwargs["task_id"]}
-    env = create(env_class, num_envs, workers=workers, attributes=attributes, **kwargs)
-    for part in variants:
+        kwargs.update(variant=specs[0].name, strength=torch.as_tensor(specs[0].strength))
+    env = create(env_class, num_envs, workers=workers, **kwargs)
+    env.variants = build(specs)
+    for part in env.variants:
         part.bind(env)
     return env
 

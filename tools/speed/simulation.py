@@ -33,7 +33,7 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 from symsteer.bench.sim import create, prepare_headless
 from symsteer.bench.sim.environment import MAX_SCENES
-from symsteer.bench.sim.shards.messages import divide
+from symsteer.bench.sim.parallel import divide
 from symsteer.bench.sim.shards.processes import start_process
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError

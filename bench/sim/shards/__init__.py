@@ -1,10 +1,6 @@
-"""Parallel environments divided among processes, with the interface of one process.
+"""Worker processes that hold a part of the parallel environments each.
 
-SAPIEN's step holds Python's global lock, so using more cores takes more processes. `env` is the
-caller's side, `worker` runs in each process, `messages` is what they send to each other, `block`
-the memory that they share, and `processes` starts the workers.
+SAPIEN's step holds Python's global lock, so using more cores takes more processes. `processes`
+starts them, `workers` is the caller's side (requests and their answers), `worker` runs in each of
+them. `symsteer.bench.sim.parallel` makes one environment of them.
 """
-
-from symsteer.bench.sim.shards.env import ShardedEnv
-
-__all__ = ["ShardedEnv"]

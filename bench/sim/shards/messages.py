@@ -1,38 +1,39 @@
-"""Messages between the caller's process and its workers."""
+"""How requests and answers become bytes."""
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import dataclass, field
+import copyreg
+import io
+import pickle
 from typing import Any
 
-SAME, RESULT, MISTAKE, FAILURE = b"=", b"!", b"?", b"x"
-"""First byte of an answer. SAME: fields and skeleton equal those of the last answer to this
-request, only the numbers in the shared memory are new. RESULT: fields and skeleton follow.
-MISTAKE: the text of a `UserError`. FAILURE: summary and traceback of another error."""
+import torch
+
+from symsteer.errors import UserError
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """How a worker makes its environments.
+class _Pickler(pickle.Pickler):
+    """Stores tensors as arrays, which is faster than torch's own way."""
 
-    Attributes:
-        env_cls: the task class, not yet bound to a simulator.
-        start: index of the shard's first environment among all.
-        count: how many environments it holds.
-        seed: of the process's global random generators.
-        kwargs: further arguments of `environment.create_in_process`.
+    dispatch_table = copyreg.dispatch_table.copy()
+    dispatch_table[torch.Tensor] = lambda tensor: (
+        torch.from_numpy,
+        (tensor.detach().cpu().numpy(),),
+    )
+
+
+def dumps(message: Any) -> memoryview:
+    """A message as bytes; `pickle.loads` reads them.
+
+    Raises:
+        UserError: something in it cannot be sent.
     """
-
-    env_cls: type
-    start: int
-    count: int
-    seed: int
-    kwargs: dict[str, Any] = field(default_factory=dict)
-
-
-def divide(total: int, workers: int) -> list[slice]:
-    """Rows of each worker: sizes differ by at most one, larger ones first."""
-    size, more = divmod(total, workers)
-    bounds = [i * size + min(i, more) for i in range(workers + 1)]
-    return [slice(a, b) for a, b in itertools.pairwise(bounds)]
+    buffer = io.BytesIO()
+    try:
+        _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(message)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise UserError(
+            f"an argument of the environment cannot be sent to a worker process ({error}): "
+            "pass plain data, or use workers=1"
+        ) from error
+    return buffer.getbuffer()

@@ -120,8 +120,6 @@ def test_buffers_agree_with_sapien(playground):
     px, chain = playground.scene.px, playground.chain
     box = playground.boxes["dynamic"]
     rows = px.cuda_rigid_body_data.torch()[box._body_data_index]
-    links = px.cuda_articulation_link_data.torch()[chain._data_index]
-    qacc = chain.qacc
     for i in range(3):
         body = box._bodies[i]
         expected = [*body.entity.pose.p, *body.entity.pose.q]
@@ -130,12 +128,6 @@ def test_buffers_agree_with_sapien(playground):
         articulation = chain._objs[i]
         assert chain.qpos[i].tolist() == articulation.qpos.tolist()
         assert chain.qvel[i].tolist() == articulation.qvel.tolist()
-        assert qacc[i].tolist() == articulation.qacc.tolist()
-        for j, link in enumerate(articulation.links):
-            assert links[i, j, :3].tolist() == link.entity.pose.p.tolist()
-            assert links[i, j, 10:].tolist() == link.angular_velocity.tolist()
-    forces = chain.get_link_incoming_joint_forces()
-    assert forces.shape == (3, 2, 6)
 
 
 def test_apply_writes_joints_and_targets(playground):
@@ -297,30 +289,16 @@ def test_jacobian_equals_pytorch_kinematics(kit):
     assert torch.equal(single, chain.jacobian(q))
 
 
-def test_jacobian_of_prismatic_joints():
-    """A chain with sliding, turning and fixed joints."""
+def test_other_joints_keep_pytorch_kinematics():
     import pytorch_kinematics as pk
 
     joint = (
-        '<joint name="{n}" type="{t}"><parent link="l{i}"/><child link="l{j}"/>'
-        '<origin xyz="0.1 0.2 0.3" rpy="0.4 -0.2 0.7"/><axis xyz="{a}"/>'
+        '<joint name="j{i}" type="{t}"><parent link="l{i}"/><child link="l{j}"/>'
+        '<origin xyz="0.1 0.2 0.3" rpy="0.4 -0.2 0.7"/><axis xyz="0 0 1"/>'
         '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
     )
-    kinds = [
-        ("prismatic", "0 0 1"),
-        ("revolute", "0 1 0"),
-        ("fixed", "0 0 1"),
-        ("revolute", "1 0 0"),
-        ("prismatic", "0 1 0"),
-        ("fixed", "0 0 1"),
-    ]
-    joints = "".join(
-        joint.format(n=f"j{i}", t=t, i=i, j=i + 1, a=a) for i, (t, a) in enumerate(kinds)
-    )
-    links = "".join(f'<link name="l{i}"/>' for i in range(len(kinds) + 1))
-    urdf = f'<robot name="r">{links}{joints}</robot>'
-    chain = pk.build_serial_chain_from_urdf(urdf, end_link_name=f"l{len(kinds)}")
-    ours = SerialChain.replace(chain)
-    assert isinstance(ours, SerialChain)
-    q = torch.randn(5, 4, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(ours.jacobian(q), chain.jacobian(q), atol=2e-6, rtol=0)
+    links = "".join(f'<link name="l{i}"/>' for i in range(4))
+    for kinds in (("revolute", "fixed", "revolute"), ("revolute", "prismatic", "revolute")):
+        joints = "".join(joint.format(t=t, i=i, j=i + 1) for i, t in enumerate(kinds))
+        chain = pk.build_serial_chain_from_urdf(f'<robot name="r">{links}{joints}</robot>', "l3")
+        assert (SerialChain.replace(chain) is chain) == ("prismatic" in kinds)
