@@ -23,11 +23,22 @@ def reset_order(
         num_envs: how many there are.
 
     Raises:
-        UserError: the number of seeds is neither 1 nor that of the environments.
+        UserError: ``env_idx`` names environments that are not there, or one of them twice, or the
+            number of seeds is neither 1 nor that of the environments.
     """
     index = order = None
     if env_idx is not None:
-        index, order = torch.as_tensor(common.to_numpy(env_idx), dtype=torch.long).sort()
+        rows = np.atleast_1d(common.to_numpy(env_idx))
+        if (
+            rows.dtype == bool
+            or not np.isin(rows, range(num_envs)).all()
+            or len({*rows.tolist()}) < len(rows)
+        ):
+            raise UserError(
+                f"env_idx lists environments by number, each once, from 0 to {num_envs - 1}; it "
+                f"is {rows.tolist()}"
+            )
+        index, order = torch.as_tensor(rows, dtype=torch.long).sort()
     if seed is None:
         return index, None
     seeds = [int(s) for s in np.atleast_1d(common.to_numpy(seed))]

@@ -32,7 +32,7 @@ def rows_of(tree: Any, rows: Any) -> Any:
     return map_trees(lambda tensor: tensor[rows], tree)
 
 
-def write_rows(target: Any, source: Any, rows: torch.Tensor) -> None:
+def write_rows(target: Any, source: Any, rows: Any) -> None:
     """Write a tree, whose tensors have one row per entry of ``rows``, into those rows."""
 
     def write(value: torch.Tensor, new: Any) -> None:

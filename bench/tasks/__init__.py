@@ -15,8 +15,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
+
 from symsteer.names import unknown
-from symsteer.registry import Registry
+from symsteer.registry import NAME, Registry
 
 if TYPE_CHECKING:
     from symsteer.bench.tasks.base import SymmetricTask
@@ -39,8 +42,8 @@ TASKS: Registry[type[SymmetricTask]] = Registry(
     "task",
     "symsteer.tasks",
     {
-        "PushCube-v1": "symsteer.bench.tasks.push_cube:PushCube",
-        "PullCube-v1": "symsteer.bench.tasks.pull_cube:PullCube",
+        "PushCube-v1": "symsteer.bench.tasks.move_cube:PushCube",
+        "PullCube-v1": "symsteer.bench.tasks.move_cube:PullCube",
         "PickCube-v1": "symsteer.bench.tasks.pick_cube:PickCube",
         "StackCube-v1": "symsteer.bench.tasks.stack_cube:StackCube",
         "PlaceSphere-v1": "symsteer.bench.tasks.place_sphere:PlaceSphere",
@@ -107,5 +110,54 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
 
 
-# At the end: it needs the names above.
-importlib.import_module(f"{__name__}.registration").register()
+class TaskSpec(EnvSpec):
+    """Takes the limit of episodes from the task's class, which is imported on first use."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.task = self.kwargs["task"]  # gymnasium empties ``kwargs`` in gym.make_vec
+
+    @property
+    def max_episode_steps(self) -> int | None:  # type: ignore[override]
+        """Control steps of an episode."""
+        return self._limit or task_class(self.task).max_episode_steps
+
+    @max_episode_steps.setter
+    def max_episode_steps(self, limit: int | None) -> None:
+        self._limit = limit
+
+
+def register() -> None:
+    """Register four ids of every task with gymnasium, also of those of other distributions.
+
+    ``SymSteer/PickCube-v1`` is N environments on torch tensors, as ManiSkill's;
+    ``SymSteer/PickCube-single-v1`` is one environment on NumPy arrays, for software that calls
+    ``gym.make`` with an id only. Rewards are sparse; ``SymSteer/PickCube-dense-v1`` and
+    ``SymSteer/PickCube-single-dense-v1`` have ManiSkill's normalised dense reward instead.
+    """
+    for name in filter(NAME.fullmatch, TASKS):
+        stem, dash, version = name.rpartition("-v")
+        stem, dash, version = (stem, dash, version) if version.isdigit() else (name, "", "")
+        for suffix, reward in (("", {}), ("-dense", {"reward_mode": "normalized_dense"})):
+            batched = TaskSpec(
+                f"{NAMESPACE}{stem}{suffix}{dash}{version}",
+                entry_point=f"{__name__}:make_batched",
+                # Makes gym.make_vec refuse, which would put batches of one into a batch.
+                vector_entry_point=f"{__name__}:make_batched",
+                # gymnasium's checker does not expect batched torch tensors.
+                disable_env_checker=True,
+                order_enforce=False,
+                kwargs={"task": name, **reward},
+                additional_wrappers=(
+                    WrapperSpec("EpisodeLimit", f"{__name__}.making:EpisodeLimit", {}),
+                ),
+            )
+            single = TaskSpec(
+                f"{NAMESPACE}{stem}-single{suffix}{dash}{version}",
+                entry_point=f"{__name__}:make_single",
+                kwargs={"task": name, **reward},
+            )
+            gym.registry.update({batched.id: batched, single.id: single})
+
+
+register()

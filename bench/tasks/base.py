@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 import sapien
 import torch
@@ -21,6 +23,7 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils import common
 from mani_skill.utils.structs import Actor, Pose
 
+from symsteer.bench.sim import rendering_works
 from symsteer.bench.sim.rotations import (
     planar_matrix,
     quaternion_to_matrix,
@@ -28,14 +31,13 @@ from symsteer.bench.sim.rotations import (
     transform_quaternion,
 )
 from symsteer.bench.sim.seeds import reset_order
-from symsteer.bench.sim.trees import rows_of, write_rows
+from symsteer.bench.sim.trees import map_trees, rows_of, write_rows
 from symsteer.bench.tasks.embodiments import BODIES, Embodiment
 from symsteer.bench.tasks.experts import Intent
 from symsteer.bench.tasks.floating import ACTION_LAYOUT
-from symsteer.bench.tasks.gym_env import GymEnv
 from symsteer.bench.variants import parse
 from symsteer.bench.variants.base import Role, overriding
-from symsteer.bench.variants.friction import Frictions
+from symsteer.bench.variants.bodies import Frictions
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Layout
 from symsteer.variant import UNBROKEN, VariantSpec
@@ -55,7 +57,21 @@ LCG = (6364136223846793005, 1442695040888963407)
 """Knuth's linear congruential generator modulo 2^64: one episode's key to the next one's."""
 
 
-class SymmetricTask(GymEnv):
+def _in_batched_branch(method: Callable) -> Callable:
+    """A method during which ``gpu_sim_enabled`` says that the batched branch is used."""
+
+    @functools.wraps(method)
+    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
+        before, self._batched_branch = self._batched_branch, True
+        try:
+            return method(self, *args, **kwargs)
+        finally:
+            self._batched_branch = before
+
+    return run
+
+
+class SymmetricTask(BaseEnv):
     """Mixin; list it before the ManiSkill task class.
 
     Args:
@@ -77,6 +93,8 @@ class SymmetricTask(GymEnv):
     task_fields: ClassVar[tuple[Field, ...]]
     action_layout: ClassVar[Layout] = ACTION_LAYOUT
     workspace_center: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    manipulated_name: ClassVar[str]
+    """Attribute that holds the object which the robot has to move."""
     spawn_extent: ClassVar[float]
     """Radius about the origin, metres, within which all colliding bodies lie at a reset; parts of
     them that are higher than 10 cm do not count."""
@@ -93,7 +111,8 @@ class SymmetricTask(GymEnv):
     observation_layout: ClassVar[Layout]
     _gripper_layout: ClassVar[Layout]
     _task_layout: ClassVar[Layout]
-    _main_seed: list[int]
+    _main_seed: Any
+    _batched_branch = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -117,12 +136,32 @@ class SymmetricTask(GymEnv):
         self.body: Embodiment = BODIES[embodiment]
         self.variants = parse(variant, strength, (self.task_id, embodiment))
         for part in self.variants:
-            part.bind(self)
+            part.env = self
         self._reset_rows: torch.Tensor | None = None
         self._closed = False
         kwargs.setdefault("control_mode", self.body.control_mode)
         kwargs.setdefault("robot_uids", self.body.robot_uid)
         super().__init__(*args, **kwargs)
+        # ManiSkill's belongs to the class and lists modes that this machine may lack.
+        modes = self.SUPPORTED_RENDER_MODES if rendering_works() else ()
+        self.metadata = {
+            "render_modes": [m for m in modes if m != "human" or "DISPLAY" in os.environ],
+            "render_fps": self.control_freq,
+        }
+
+    @property
+    def gpu_sim_enabled(self) -> bool:
+        """Whether ManiSkill's batched branch is used, as the caller sees it.
+
+        ManiSkill's own methods choose that branch by it, which runs here on any device. Its
+        wrappers conclude that tensors live on a GPU, and ``CPUGymWrapper`` refuses such an
+        environment. So it is true while ManiSkill's methods run; at other times it is false for
+        one environment on the CPU.
+        """
+        one_on_cpu = self.num_envs == 1 and self.device.type == "cpu"
+        return self.scene.gpu_sim_enabled and (self._batched_branch or not one_on_cpu)
+
+    render_human = _in_batched_branch(BaseEnv.render_human)
 
     # ------------------------------------------------------------------ scene
 
@@ -150,18 +189,12 @@ class SymmetricTask(GymEnv):
             self.agent.reset(torch.as_tensor(qpos, device=self.device))
             self.agent.robot.set_pose(sapien.Pose(p=self.body.root_position))
             self._place_objects(rng, len(env_idx))
-            self._draw_strengths(env_idx)
             for variant in self.variants:
+                variant.draw(env_idx)
                 variant.reset(env_idx)
-
-    def _draw_strengths(self, env_idx: torch.Tensor) -> None:
-        """New strengths of the variants whose episodes draw theirs."""
-        drawing = [variant for variant in self.variants if variant.low is not None]
-        for variant in drawing:
-            variant.draw(env_idx)
-        if drawing:
-            self._forces_held = False
-            self.__dict__.pop("policy_origin", None)
+            if any(variant.low is not None for variant in self.variants):
+                self._forces_held = False
+                self.__dict__.pop("policy_origin", None)
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """The scripted expert's intent in the present state.
@@ -174,7 +207,7 @@ class SymmetricTask(GymEnv):
     @property
     def manipulated(self) -> Actor:
         """The object that the robot has to move."""
-        raise NotImplementedError
+        return getattr(self, self.manipulated_name)
 
     def _place_objects(self, rng: BatchedRNG, count: int) -> None:
         """Sample objects and goal of ``count`` environments, one generator each."""
@@ -239,11 +272,7 @@ class SymmetricTask(GymEnv):
         """Where the policy takes the workspace's centre to be, ``[N, 2]`` metres in the world."""
         center = torch.tensor(self.workspace_center, device=self.device)
         origin = center.expand(self.num_envs, 2)
-        for variant in self.variants:
-            shift = variant.origin()
-            if shift is not None:
-                origin = origin + shift
-        return origin
+        return sum((variant.origin() for variant in self.variants), origin)
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         """The task's own fields ``[N, dim]``, in the order of ``task_fields``."""
@@ -256,12 +285,21 @@ class SymmetricTask(GymEnv):
         return action
 
     def step(self, action: Any) -> tuple:
-        """As ManiSkill's; ``truncated`` is set after ``max_episode_steps``, reward is float32.
+        """As ManiSkill's, also for whole numbers; reward is float32.
+
+        ``truncated`` is set after ``max_episode_steps``.
 
         Raises:
-            UserError: if the environment was closed.
+            UserError: if the environment was closed, or the action is a list.
         """
         self._check_open()
+        if isinstance(action, list | tuple):
+            raise UserError(
+                f"an action is a tensor or array of shape {self.action_space.shape}, not a "
+                f"{type(action).__name__}"
+            )
+        if hasattr(action, "dtype"):
+            action = common.to_tensor(action, device=self.device).float()
         obs, reward, terminated, _, info = super().step(action)
         return obs, reward.float(), terminated, self.elapsed_steps >= self.max_episode_steps, info
 
@@ -274,11 +312,12 @@ class SymmetricTask(GymEnv):
         if self._closed:
             raise UserError("this environment was closed and cannot be used any more; make another")
 
+    @_in_batched_branch
     def _step_action(self, action: Any) -> Any:
         if not self.variants:
             return super()._step_action(action)
-        if isinstance(action, np.ndarray | torch.Tensor):
-            commanded = common.to_tensor(action, device=self.device).reshape(self.num_envs, -1)
+        if isinstance(action, torch.Tensor):
+            commanded = action.reshape(self.num_envs, -1)
             executed = self.body.bound(commanded)
             for variant in self.variants:
                 executed = variant.action(executed)
@@ -305,6 +344,7 @@ class SymmetricTask(GymEnv):
             if forces:
                 self.hold_force(body, torch.stack(forces).sum(dim=0))
 
+    @_in_batched_branch
     def get_info(self) -> dict:
         """As ManiSkill's; where a variant makes steps costly, also ``extra_cost [N]``.
 
@@ -334,6 +374,7 @@ class SymmetricTask(GymEnv):
 
     # ------------------------------------------------------------------ resets
 
+    @_in_batched_branch
     def reset(self, seed: Any = None, options: dict | None = None) -> tuple:
         """As ManiSkill's, with one seed per environment that is reset.
 
@@ -348,11 +389,11 @@ class SymmetricTask(GymEnv):
         """
         self._check_open()
         options = dict(options or {})
-        if "env_idx" in options:
-            self._check_rows(options["env_idx"])
         partial, seed = reset_order(seed, options.get("env_idx"), self.num_envs)
         if partial is not None:
             options["env_idx"] = partial = partial.to(self.device)
+        if seed is not None:
+            gym.Env.reset(self, seed=seed[0])  # for its ``np_random``
         kept = None
         if partial is not None and self.agent is not None:
             # ManiSkill resets the controllers of all environments after a partial reset.
@@ -368,33 +409,23 @@ class SymmetricTask(GymEnv):
             self.agent.set_controller_state(kept)
         return obs, info
 
-    def _check_rows(self, env_idx: Any) -> None:
-        rows = np.atleast_1d(common.to_numpy(env_idx))
-        named = rows.dtype != bool and ((rows >= 0) & (rows < self.num_envs)).all()
-        if not named or len(np.unique(rows)) != len(rows):
-            raise UserError(
-                f"env_idx lists environments by number, each once, from 0 to {self.num_envs - 1}; "
-                f"it is {rows.tolist()}"
-            )
-
     def _set_main_rng(self, seed: list[int] | None) -> None:
-        if seed is not None and self._reset_rows is not None:
-            rows = self._reset_rows.tolist()
-            for row, value in zip(rows, seed, strict=True):
-                self._main_seed[row] = value
-            self._batched_main_rng[rows] = BatchedRNG.from_seeds(seed)
-        else:
+        if seed is None or self._reset_rows is None:
             super()._set_main_rng(seed)
-            self._main_seed = list(self._main_seed)
+        else:
+            rows = self._reset_rows.numpy(force=True)
+            self._main_seed = np.array(self._main_seed)
+            self._main_seed[rows] = seed
+            self._batched_main_rng[rows] = BatchedRNG.from_seeds(seed)
 
     def _set_episode_rng(self, seed: list[int] | None, env_idx: torch.Tensor) -> None:
-        if seed is not None and self._reset_rows is not None:
-            rows = self._reset_rows.tolist()
+        if seed is None or self._reset_rows is None:
+            super()._set_episode_rng(seed, env_idx)
+        else:
+            rows = self._reset_rows.numpy(force=True)
             self._episode_seed[rows] = seed
             self._batched_episode_rng[rows] = BatchedRNG.from_seeds(seed)
             self._episode_rng = self._batched_episode_rng[0]
-        else:
-            super()._set_episode_rng(seed, env_idx)
         self._advance_episode_keys(seed is not None)
 
     def _advance_episode_keys(self, seeded: bool) -> None:
@@ -415,13 +446,16 @@ class SymmetricTask(GymEnv):
 
     # ------------------------------------------------------------------- state
 
+    @_in_batched_branch
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """As ManiSkill's, and restores the controller's targets too.
 
         States may be tensors or arrays, batched or (for one environment) not. A state without
         controller targets makes the present pose the target.
         """
-        state = _as_batched(state, self.device)
+        state = map_trees(
+            lambda x: x[None] if x.ndim == 1 else x, common.to_tensor(state, device=self.device)
+        )
         if env_idx is not None:
             # ManiSkill writes rows in the order of the environments.
             env_idx, order = torch.as_tensor(env_idx, dtype=torch.long, device=self.device).sort()
@@ -429,18 +463,14 @@ class SymmetricTask(GymEnv):
         super().set_state_dict(
             {key: state[key] for key in ("actors", "articulations") if key in state}, env_idx
         )
-        if env_idx is None:
-            self.agent.set_controller_state(state.get("controller", {}))
-        else:
-            targets = self.agent.get_controller_state()
-            if targets and "controller" in state:
-                write_rows(targets, state["controller"], env_idx)
-            elif targets:
-                self.agent.set_controller_state({})
-                present = self.agent.get_controller_state()
-                write_rows(targets, rows_of(present, env_idx), env_idx)
-            if targets:
-                self.agent.set_controller_state(targets)
+        rows = slice(None) if env_idx is None else env_idx
+        targets, restored = self.agent.get_controller_state(), state.get("controller")
+        if targets and not restored:
+            self.agent.set_controller_state({})
+            restored = rows_of(self.agent.get_controller_state(), rows)
+        if targets:
+            write_rows(targets, restored, rows)
+            self.agent.set_controller_state(targets)
 
     def transform_state(self, state: dict, angle: float, reflect: bool = False) -> dict:
         """Turn a whole simulation state about the workspace centre.
@@ -485,13 +515,12 @@ class SymmetricTask(GymEnv):
     ) -> tuple[float, float]:
         """Bounds of the discounted return of -``step_cost`` a step until success, 0 from then on.
 
-        The discount is per decision of ``steps_per_decision`` steps, whose rewards are summed:
-        [-c (1 - gamma^N) / (1 - gamma), 0] with cost c a decision and N decisions an episode
-        (DSRL, arXiv 2506.15799).
+        They are [-c (1 - gamma^N) / (1 - gamma), 0], with cost c a decision and N decisions an
+        episode (DSRL, arXiv 2506.15799).
 
         Args:
             gamma: discount per decision, in [0, 1].
-            steps_per_decision: executed steps of an action chunk.
+            steps_per_decision: executed steps of an action chunk, whose rewards are summed.
             bootstrap_truncation: values bootstrap through time-outs, so that N is infinite.
             step_cost: the largest cost of a step, see :func:`symsteer.bench.variants.highest_cost`.
 
@@ -528,12 +557,3 @@ def _transform_body(
         ],
         dim=1,
     )
-
-
-def _as_batched(tree: Any, device: Any) -> Any:
-    """Tensors on ``device`` with a leading axis of environments."""
-    if isinstance(tree, dict):
-        return {key: _as_batched(value, device) for key, value in tree.items()}
-    value = torch.as_tensor(np.asarray(tree) if not torch.is_tensor(tree) else tree)
-    value = value.to(device=device, dtype=torch.float32)
-    return value[None] if value.ndim == 1 else value

@@ -21,8 +21,8 @@ from mani_skill.utils.sapien_utils import look_at
 from mani_skill.utils.structs import Link
 
 from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.move_cube import PushCube
 from symsteer.bench.tasks.pick_cube import PickCube
-from symsteer.bench.tasks.push_cube import PushCube
 from symsteer.policies.geometry import Field
 
 POINTS = 64

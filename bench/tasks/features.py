@@ -1,4 +1,4 @@
-"""Geometry that tasks share: where things are placed, and what is observed of them."""
+"""What tasks share: where things are placed, the fields of observations and their values."""
 
 from __future__ import annotations
 
@@ -9,6 +9,23 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
+from symsteer.policies.geometry import Field
+
+GRASP_YAW = (Field("grasp_yaw_cos", 0), Field("grasp_yaw_sin", 0, odd=True))
+"""Of :func:`grasp_yaw` and :func:`bar_grasp_yaw`."""
+
+
+def vector_fields(*names: str) -> tuple[Field, ...]:
+    """Fields of vectors in space: a horizontal and a vertical part of each."""
+    return tuple(f for name in names for f in (Field(f"{name}_xy", 1), Field(f"{name}_z", 0)))
+
+
+def in_parts(**vectors: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Vectors ``[N, 3]`` as the parts that :func:`vector_fields` names."""
+    fields: dict[str, torch.Tensor] = {}
+    for name, vector in vectors.items():
+        fields |= {f"{name}_xy": vector[:, :2], f"{name}_z": vector[:, 2:]}
+    return fields
 
 
 def is_direction(name: str) -> bool:

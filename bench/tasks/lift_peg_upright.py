@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.lift_peg_upright import LiftPegUprightEnv
-from mani_skill.utils.structs import Actor
 
 from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
@@ -22,8 +21,15 @@ from symsteer.bench.tasks.experts import (
     grasp_at,
     yaw_along,
 )
-from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose, twofold_yaw
-from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
+from symsteer.bench.tasks.features import (
+    GRASP_YAW,
+    bar_grasp_yaw,
+    disc,
+    flat_pose,
+    in_parts,
+    twofold_yaw,
+    vector_fields,
+)
 from symsteer.policies.geometry import Field
 
 
@@ -54,6 +60,7 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         *vector_fields("tcp_to_peg"),
         *GRASP_YAW,
     )
+    manipulated_name = "peg"
     spawn_radius = 0.1
     spawn_extent = 0.223
     upright_tolerance = 0.08
@@ -68,11 +75,6 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         yaw = 2 * np.pi * u[:, 2]
         xy = disc(u[:, :2], self.spawn_radius)
         self.peg.set_pose(flat_pose(xy, self.peg_half_width, yaw, self.device))
-
-    @property
-    def manipulated(self) -> Actor:
-        """The peg."""
-        return self.peg
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """``success [N]``: the peg is upright to 0.08 rad and stands at its height to 5 mm."""

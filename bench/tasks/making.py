@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  (fills ManiSkill's own registry first)
 import torch
+from gymnasium.envs.registration import EnvSpec
 from mani_skill import logger
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
@@ -19,7 +20,6 @@ from symsteer.bench.sim.environment import Simulator
 from symsteer.bench.tasks import check_embodiment, task_class, task_name
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.embodiments import BODIES
-from symsteer.bench.tasks.gym_env import EpisodeLimit
 from symsteer.bench.variants import build, read
 from symsteer.errors import UserError
 from symsteer.names import unknown
@@ -100,7 +100,7 @@ def make(
     env = create(env_class, num_envs, workers=workers, **kwargs)
     env.variants = build(specs)
     for part in env.variants:
-        part.bind(env)
+        part.env = env
     return env
 
 
@@ -204,3 +204,46 @@ def _keywords(*functions: Any) -> set[str]:
     kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     parameters = (p for f in functions for p in inspect.signature(f).parameters.values())
     return {p.name for p in parameters if p.kind in kinds}
+
+
+class EpisodeLimit(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """gymnasium's ``TimeLimit`` for batched environments: each counts its own steps.
+
+    Replaces the ``TimeLimit`` that ``gym.make`` put around the environment and takes over its
+    limit, so that ``gym.make(..., max_episode_steps=100)`` works. Without one (gymnasium's
+    ``max_episode_steps=-1``) nothing is truncated.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self)
+        self.max_episode_steps: int | None = None
+        if isinstance(env, gym.wrappers.TimeLimit):
+            self.max_episode_steps = env._max_episode_steps
+            env = env.env
+        gym.Wrapper.__init__(self, env)
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What ``gym.make`` needs to make this environment again, limit included."""
+        spec = super().spec
+        if spec is not None:
+            spec.max_episode_steps = self.max_episode_steps
+            strength: Any = spec.kwargs.get("strength")
+            if hasattr(strength, "tolist"):
+                spec.kwargs["strength"] = strength.tolist()  # JSON has no tensors
+        return spec
+
+    def __getattr__(self, name: str) -> Any:
+        """What ManiSkill's wrapper for Stable-Baselines3 reads of the environment."""
+        if name in ("num_envs", "single_observation_space", "single_action_space"):
+            return getattr(self.env, name)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def step(self, action: Any) -> tuple:
+        """As the environment's; ``truncated`` ``[N]`` depends on the limit only."""
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if self.max_episode_steps is None:
+            truncated = truncated & False
+        else:
+            truncated = self.get_wrapper_attr("elapsed_steps") >= self.max_episode_steps
+        return obs, reward, terminated, truncated, info

@@ -1,4 +1,4 @@
-"""What PushCube and PullCube share: a cube on the table and a goal disc 20 cm away from it."""
+"""The tasks PushCube-v1 and PullCube-v1: a cube on the table, a goal disc 20 cm away from it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from mani_skill.envs.tasks.tabletop.pull_cube import PullCubeEnv
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.structs import Actor
 
 from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, HOVER, Intent, funnel
-from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, goal_disc_pose
-from symsteer.bench.tasks.fields import in_parts, vector_fields
+from symsteer.bench.tasks.features import (
+    disc,
+    flat_pose,
+    fourfold_yaw,
+    goal_disc_pose,
+    in_parts,
+    vector_fields,
+)
 from symsteer.policies.geometry import Field
 
 
@@ -34,6 +42,7 @@ class MoveCube(SymmetricTask):
         Field("tcp_to_goal_xy", 1),
     )
     max_episode_steps = 50
+    manipulated_name = "obj"
     spawn_radius = 0.1
     spawn_extent = 0.13
 
@@ -49,11 +58,6 @@ class MoveCube(SymmetricTask):
         ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
         goal = xy + (0.1 + self.goal_radius) * ahead
         self.goal_region.set_pose(goal_disc_pose(goal, yaw, self.device))
-
-    @property
-    def manipulated(self) -> Actor:
-        """The cube."""
-        return self.obj
 
     def direction(self) -> torch.Tensor:
         """Unit vectors ``[N, 2]`` from the cube's spawn point to the goal."""
@@ -101,3 +105,46 @@ class MoveCube(SymmetricTask):
         level = torch.where(pushing[:, None], push, start)
         rise = torch.where(pushing, height, height + lift)
         return Intent.to(torch.cat([level, rise[:, None]], dim=1), CLOSED)
+
+
+class PushCube(MoveCube, PushCubeEnv):
+    """Push a cube into a disc on the table, in any direction.
+
+    ManiSkill's PushCube-v1 turned by a uniform angle in every episode.
+
+    Stock PushCube always pushes along +x, in reset and dense reward; here the direction is
+    uniform (see :class:`MoveCube`). Success (cube within 10 cm of the goal, on the table) is
+    ManiSkill's; the dense reward has ManiSkill's terms with its +x replaced by the direction.
+    """
+
+    task_id = "PushCube-v1"
+
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Reach a point behind the cube, then bring the cube to the goal flat on the table."""
+        placing = 1 - torch.tanh(5 * self._goal_distance())
+        level = 1 - torch.tanh(5 * (self.obj.pose.p[:, 2] - self.cube_half_size).abs())
+        gap = self._gap_behind(0.005)
+        reward = 1 - torch.tanh(5 * gap) + (placing + placing * level) * (gap < 0.01)
+        return torch.where(info["success"], torch.full_like(reward, 4.0), reward)
+
+
+class PullCube(MoveCube, PullCubeEnv):
+    """Pull a cube into a disc on the table, in any direction.
+
+    ManiSkill's PullCube-v1 turned by a uniform angle in every episode.
+
+    Stock PullCube always pulls along -x, towards the arm, in reset and dense reward; here the
+    direction is uniform (see :class:`MoveCube`), which leaves two differences from PushCube:
+    success (cube within 10 cm of the goal) does not depend on the cube's height, and the dense
+    reward wants the tool 1 cm instead of 0.5 cm behind the cube. Success is ManiSkill's; the
+    dense reward has ManiSkill's terms with its -x replaced by the direction.
+    """
+
+    task_id = "PullCube-v1"
+
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Reach a point behind the cube, then bring the cube to the goal."""
+        placing = 1 - torch.tanh(5 * self._goal_distance())
+        gap = self._gap_behind(0.01)
+        reward = 1 - torch.tanh(5 * gap) + placing * (gap < 0.01)
+        return torch.where(info["success"], torch.full_like(reward, 3.0), reward)

@@ -7,12 +7,19 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Pose
 
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, funnel, grasp
-from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
-from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
+from symsteer.bench.tasks.features import (
+    GRASP_YAW,
+    disc,
+    flat_pose,
+    fourfold_yaw,
+    grasp_yaw,
+    in_parts,
+    vector_fields,
+)
 from symsteer.policies.geometry import Field
 
 
@@ -35,6 +42,7 @@ class PickCube(SymmetricTask, PickCubeEnv):
         *GRASP_YAW,
         *vector_fields("goal", "cube_to_goal"),
     )
+    manipulated_name = "cube"
     spawn_radius = 0.1
     spawn_extent: ClassVar[float] = 0.13
     goal_lift = 0.2
@@ -50,11 +58,6 @@ class PickCube(SymmetricTask, PickCubeEnv):
         self.goal_site.set_pose(
             Pose.create_from_pq(torch.as_tensor(goal, dtype=torch.float32, device=self.device))
         )
-
-    @property
-    def manipulated(self) -> Actor:
-        """The cube."""
-        return self.cube
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         tcp = self.seen(self.agent.tcp_pose, "tool")

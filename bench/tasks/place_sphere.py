@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.place_sphere import PlaceSphereEnv
-from mani_skill.utils.structs import Actor
 
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, finger_width, funnel, grasp_at
-from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw
-from symsteer.bench.tasks.fields import in_parts, vector_fields
+from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, in_parts, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -38,6 +36,7 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
         Field("bin_yaw", 4),
         *vector_fields("sphere_to_bin"),
     )
+    manipulated_name = "obj"
     spawn_radius = 0.07
     distance_range = (0.11, 0.18)
     spawn_extent = 0.2
@@ -53,11 +52,6 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
         self.obj.set_pose(flat_pose(middle + offset, self.radius, still, self.device))
         floor = self.block_half_size[0]
         self.bin.set_pose(flat_pose(middle - offset, floor, yaw, self.device))
-
-    @property
-    def manipulated(self) -> Actor:
-        """The sphere."""
-        return self.obj
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         tcp = self.seen(self.agent.tcp_pose, "tool").p

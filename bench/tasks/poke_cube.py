@@ -8,20 +8,21 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.poke_cube import PokeCubeEnv
-from mani_skill.utils.structs import Actor
 
 from symsteer.bench.sim.rotations import quaternion_to_matrix, wrap
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, OPEN, Intent, choose, funnel, grasp_at, yaw_along
 from symsteer.bench.tasks.features import (
+    GRASP_YAW,
     bar_grasp_yaw,
     disc,
     flat_pose,
     fourfold_yaw,
     goal_disc_pose,
+    in_parts,
     twofold_yaw,
+    vector_fields,
 )
-from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -62,6 +63,7 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         Field("goal_xy", 1),
         Field("cube_to_goal_xy", 1),
     )
+    manipulated_name = "cube"
     spawn_radius = 0.05
     peg_behind = 0.07
     peg_to_cube = 0.22
@@ -83,11 +85,6 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         self.cube.set_pose(flat_pose(cube, self.cube_half_size, yaw + turn, self.device))
         goal = cube + (0.05 + self.goal_radius) * ahead
         self.goal_region.set_pose(goal_disc_pose(goal, yaw, self.device))
-
-    @property
-    def manipulated(self) -> Actor:
-        """The cube, which the peg pokes."""
-        return self.cube
 
     @property
     def peg_head_pos(self) -> torch.Tensor:

@@ -8,13 +8,20 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Pose
 
 from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, grasp_at, yaw_along
-from symsteer.bench.tasks.features import bar_grasp_yaw, disc, flat_pose, goal_disc_pose
-from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
+from symsteer.bench.tasks.features import (
+    GRASP_YAW,
+    bar_grasp_yaw,
+    disc,
+    flat_pose,
+    goal_disc_pose,
+    in_parts,
+    vector_fields,
+)
 from symsteer.policies.geometry import Field, Layout
 
 HORIZONTAL = Layout([Field("xy", 1)])
@@ -54,6 +61,7 @@ class PushT(SymmetricTask, PushTEnv):
         Field("turn_cos", 0),
         Field("turn_sin", 0, odd=True),
     )
+    manipulated_name = "tee"
     spawn_radius = 0.1
     goal_spawn_radius = 0.05
     spawn_extent = 0.24
@@ -82,11 +90,6 @@ class PushT(SymmetricTask, PushTEnv):
         xy, yaw = disc(u[:, 3:5], self.goal_spawn_radius), yaw + self.max_turn * (2 * u[:, 5] - 1)
         self.goal_tee.set_pose(flat_pose(xy, 1e-3, yaw, self.device))
         self.ee_goal_pos.set_pose(goal_disc_pose(xy, yaw, self.device))
-
-    @property
-    def manipulated(self) -> Actor:
-        """The T-shaped block."""
-        return self.tee
 
     # ------------------------------------------------------------ success, reward
 

@@ -7,12 +7,18 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from mani_skill.envs.tasks.tabletop.stack_cube import StackCubeEnv
-from mani_skill.utils.structs import Actor
 
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, finger_width, funnel, grasp
-from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, grasp_yaw
-from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
+from symsteer.bench.tasks.features import (
+    GRASP_YAW,
+    disc,
+    flat_pose,
+    fourfold_yaw,
+    grasp_yaw,
+    in_parts,
+    vector_fields,
+)
 from symsteer.policies.geometry import Field
 
 
@@ -37,6 +43,7 @@ class StackCube(SymmetricTask, StackCubeEnv):
         *GRASP_YAW,
         *vector_fields("a_to_b"),
     )
+    manipulated_name = "cubeA"
     spawn_radius = 0.07
     spawn_extent: ClassVar[float] = 0.18
     distance_range = (0.08, 0.16)
@@ -51,11 +58,6 @@ class StackCube(SymmetricTask, StackCubeEnv):
         yaw_a, yaw_b = 2 * np.pi * u[:, 4], 2 * np.pi * u[:, 5]
         self.cubeA.set_pose(flat_pose(middle + offset, height, yaw_a, self.device))
         self.cubeB.set_pose(flat_pose(middle - offset, height, yaw_b, self.device))
-
-    @property
-    def manipulated(self) -> Actor:
-        """The cube that is stacked."""
-        return self.cubeA
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         tcp = self.seen(self.agent.tcp_pose, "tool")

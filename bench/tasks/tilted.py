@@ -25,10 +25,9 @@ from symsteer.bench.sim.rotations import (
     yaw_quaternion,
 )
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.features import grasp_yaw
-from symsteer.bench.tasks.fields import GRASP_YAW, in_parts, vector_fields
+from symsteer.bench.tasks.features import GRASP_YAW, grasp_yaw, in_parts, vector_fields
+from symsteer.bench.tasks.move_cube import PushCube
 from symsteer.bench.tasks.pick_cube import PickCube
-from symsteer.bench.tasks.push_cube import PushCube
 from symsteer.bench.variants.base import STREAM
 from symsteer.bench.variants.noise import uniform
 from symsteer.errors import UserError

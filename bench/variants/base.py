@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 
 from symsteer.bench.variants.noise import uniform
-from symsteer.bench.variants.world import World
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Layout
 from symsteer.variant import VariantSpec
@@ -44,7 +43,11 @@ class Variant:
         strength: one number, or one per environment as a tensor ``[N]``; the highest one, where
             each episode draws its own.
         low: None, or the lowest strength that an episode draws.
-        env: the environments that it acts in, once :meth:`bind` was called.
+        env: the task, set before its first scene is built. A variant may use its ``num_envs``,
+            ``device``, ``action_layout``, ``workspace_center``, ``spawn_extent``, ``manipulated``,
+            ``moving_bodies``, ``elapsed_steps``, ``episode_key`` (a number for each episode that
+            seeds noise, ``[N]`` int64) and ``body`` (``horizontal_step``, ``set_bias``), and
+            ManiSkill's ``scene``, ``sim_config``, ``table_scene`` and ``agent``.
     """
 
     training_only: ClassVar[bool] = False
@@ -52,7 +55,7 @@ class Variant:
     part_of_scene: ClassVar[bool] = False
     """Whether its strength cannot change while a scene exists."""
 
-    env: World
+    env: Any
 
     def __init__(self, spec: VariantSpec):
         self.name = spec.name
@@ -65,28 +68,22 @@ class Variant:
                 f"for each episode; give one number, e.g. {self.name}:0.5"
             )
 
-    def bind(self, env: World) -> None:
-        """Remember the environments that it acts in, before their first scene is built."""
-        self.env = env
-
     @functools.cached_property
     def amount(self) -> torch.Tensor:
         """Strength of each environment, ``[N]`` float32 on the environments' device."""
         strength = torch.as_tensor(self.strength, dtype=torch.float32, device=self.env.device)
-        strength = strength.expand(self.env.num_envs)
-        return strength if self.low is None else strength.clone()
+        return strength.expand(self.env.num_envs).clone()
 
     @functools.cached_property
     def active(self) -> torch.Tensor:
         """Where the strength is, or may be, above zero, ``[N]`` bool."""
-        return self.amount > 0
+        return self.amount > 0 if self.low is None else torch.ones_like(self.amount) > 0
 
     def draw(self, env_idx: torch.Tensor) -> None:
         """New strengths of the environments ``env_idx``, each a function of its episode's key."""
         if self.low is None:
             return
         share = uniform(self.env.episode_key[env_idx], STREAM)
-        _ = self.active
         self.amount[env_idx] = (self.low + (self.strength - self.low) * share).float()
         self.strengths_changed()
 
@@ -147,9 +144,9 @@ class Variant:
         """The largest :meth:`extra_cost` that a step can have."""
         return 0.0
 
-    def origin(self) -> torch.Tensor | None:
+    def origin(self) -> torch.Tensor:
         """Where the policy takes the workspace's centre to be, from the true one, ``[N, 2]`` m."""
-        return None
+        return torch.zeros(self.env.num_envs, 2, device=self.env.device)
 
 
 def overriding(variants: Iterable[Variant], hook: str) -> list[Variant]:

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from symsteer.errors import UserError
+from symsteer.tables import markdown
 from symsteer.variant import UNBROKEN, parts_of
 
 LEVELS = {"easy": 0.1, "medium": 0.25, "hard": 0.5}
@@ -100,28 +101,23 @@ def strength(
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The strengths of all levels, in markdown: a row for each task, a column for each variant."""
     audited = points_of(rows)
-    cells = {
-        (place, name): _cell(name, *place, audited) for place in audited for name in audited[place]
-    }
-    names = sorted({name for (_, name), cell in cells.items() if cell.strip("- /")})
+
+    def cell(name: str, place: tuple[str, str]) -> str:
+        strengths = []
+        for level in LEVELS:
+            try:
+                strengths.append(f"{strength(name, level, *place, audited):g}")
+            except UserError:
+                strengths.append("-")
+        return " / ".join(strengths) if {*strengths} != {"-"} else "-"
+
+    names = sorted({name for place in audited for name in audited[place]})
+    cells = {name: [cell(name, place) for place in audited] for name in names}
+    shown = [name for name in names if {*cells[name]} != {"-"}]
     lines = [
-        "| task | " + " | ".join(f"`{name}`" for name in names) + " |",
-        "|---|" + "---|" * len(names),
+        [", ".join(place), *(cells[name][i] for name in shown)] for i, place in enumerate(audited)
     ]
-    for place in audited:
-        found = [cells.get((place, name), "") for name in names]
-        lines.append(f"| {', '.join(place)} | " + " | ".join(found) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _cell(name: str, task: str, embodiment: str, audited: Points) -> str:
-    found = []
-    for level in LEVELS:
-        try:
-            found.append(f"{strength(name, level, task, embodiment, audited):g}")
-        except UserError:
-            found.append("-")
-    return " / ".join(found) if set(found) != {"-"} else "-"
+    return markdown(["task", *(f"`{name}`" for name in shown)], lines) + "\n"
 
 
 def points_of(rows: Sequence[Mapping[str, Any]]) -> Points:

@@ -90,7 +90,7 @@ def test_the_flow_policy_learns_depends_on_its_noise_and_is_saved(tmp_path):
 def test_the_dead_zone_shortens_steps_in_one_direction(strength):
     (variant,) = parse(f"symsteer_lab.dead_zone:DeadZone:{strength}")
     count = 5
-    variant.bind(SimpleNamespace(num_envs=count, device=torch.device("cpu"), action_layout=ACT))
+    variant.env = SimpleNamespace(num_envs=count, device=torch.device("cpu"), action_layout=ACT)
     commanded = torch.zeros(count, ACT.dim)
     commanded[:, 0] = torch.tensor([-1.0, -0.1, 0.0, 0.1, 1.0])
     commanded[:, 1] = -0.1

@@ -4,8 +4,7 @@ import gymnasium as gym
 import pytest
 
 from symsteer.bench.demos import collect, load
-from symsteer.bench.tasks import TASKS, gym_id, make, task_class
-from symsteer.bench.tasks.registration import register
+from symsteer.bench.tasks import TASKS, gym_id, make, register, task_class
 from symsteer.errors import UserError
 from symsteer.registry import allow
 
