@@ -229,7 +229,7 @@ def sweep(
 
     from symsteer.bench.runs.tracking import checked
     from symsteer.bench.sweep.command import preview, run_plan
-    from symsteer.bench.sweep.plan import make_plan, manifest_path
+    from symsteer.bench.sweep.plan import make_plan, sweep_path
     from symsteer.bench.sweep.suite import load_suite
 
     plan = make_plan(load_suite(suite), out, elsewhere=ray is not None)
@@ -237,14 +237,14 @@ def sweep(
         print(preview(plan, workers, ray))
         return 0
     plan = replace(plan, tracking=checked(track, plan.name))
-    outcomes = run_plan(plan, workers, ray, together)
-    failed = [outcome for outcome in outcomes if outcome.status == "failed"]
-    for outcome in failed:
-        print(f"failed: {outcome.run.label}: {outcome.reason}", file=sys.stderr)
-    if any(outcome.trace for outcome in failed):
-        log = manifest_path(out, plan.name).with_suffix(".log")
+    ends = run_plan(plan, workers, ray, together)
+    failed = [end for end in ends if end.status == "failed"]
+    for end in failed:
+        print(f"failed: {end.run.label}: {end.reason}", file=sys.stderr)
+    if any(end.trace for end in failed):
+        log = sweep_path(out, plan.name).with_suffix(".log")
         print(f"tracebacks: {log}", file=sys.stderr)
-    elsewhere = sum(outcome.status == "elsewhere" for outcome in outcomes)
+    elsewhere = sum(end.status == "elsewhere" for end in ends)
     if elsewhere:
         print(
             f"another process works on {elsewhere} of the runs; this shows when they are finished: "
@@ -278,11 +278,11 @@ def tune(
         dry_run: Only show what would be tried.
     """
     allow(*trust)
+    with _extra("tune", "optuna", "tuning needs Optuna"):
+        from symsteer.bench.tuning.command import Tuner, preview
     from symsteer.bench.tuning.plan import read_plan
 
     found = read_plan(plan)
-    with _extra("tune", "optuna", "tuning needs Optuna"):
-        from symsteer.bench.tuning.command import Tuner, preview
     if dry_run:
         print(preview(found))
         return 0
@@ -313,8 +313,8 @@ def status(
     from symsteer.bench.sweep.status import read_status, to_text
 
     overview = read_status(folder, suite)
-    if overview.found or not overview.damage:
-        print(printable(to_text(overview.found, folder)))
+    if overview.sweeps or not overview.damage:
+        print(printable(to_text(overview.sweeps, folder)))
     for error in overview.damage:
         complain(error, f"error: {error}", 2)
     return 2 if overview.damage else 0
@@ -337,10 +337,10 @@ def list_names() -> int:
     )
     _print_names("agents (--agent)", _summaries(AGENTS))
     _print_names("policies (--policy.name)", _summaries(POLICIES))
-    suites = [read_suite(name) for name in suite_names()]
+    suites = {name: read_suite(name)[0] for name in suite_names()}
     _print_names(
         "suites (symsteer sweep SUITE)",
-        ((suite.name, f"{suite.description} ({len(suite.runs)} runs)") for suite in suites),
+        ((name, f"{suite.description} ({suite.count} runs)") for name, suite in suites.items()),
     )
     _print_names("tuning plans (symsteer tune PLAN)", plan_summaries().items())
     return 0

@@ -10,12 +10,12 @@ import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from symsteer.errors import UserError
-from symsteer.files import read_toml
+from symsteer.files import read_model
 from symsteer.leaderboard.records.provenance import is_committed
 from symsteer.names import unknown
 
@@ -25,7 +25,6 @@ PAPER = "paper"
 FOLDER = Path(__file__).resolve().parent / "studies"
 
 Measure = Literal["auc", "success", "diverged", "magnitude", "bias"]
-MEASURES: tuple[Measure, ...] = get_args(Measure)
 
 Words = Annotated[str, Field(pattern=r"^[\w ,;:.()'=%-]{1,120}$")]
 """Text that the page shows as it is."""
@@ -110,7 +109,7 @@ class _File(_Table):
         for statement in self.statement:
             for name in statement.claims:
                 if name not in names:
-                    raise ValueError(str(unknown("claim", name, names, repr(statement.says))))
+                    raise unknown("claim", name, names, repr(statement.says))
         return self
 
 
@@ -148,10 +147,10 @@ def read_study(name_or_path: str) -> Study:
             measure, the message has the nearest valid one. Where git is there, also if the commit
             that the study names does not hold the claims as they are.
     """
-    file, source = _read(name_or_path)
-    path = source
+    file, path = read_model(name_or_path, "study", FOLDER, _File)
+    source = path
     if file.claims:
-        declaring, source = _read(str(path.parent / file.claims))
+        declaring, source = read_model(str(path.parent / file.claims), "study", FOLDER, _File)
         if file.claim or declaring.claims:
             raise UserError(
                 f"{path.name}: claims must name a file that declares claims itself, in place of own"
@@ -188,27 +187,3 @@ def read_list(study: Path) -> frozenset[str] | None:
 def all_listed() -> frozenset[str]:
     """The hashes in the lists of all studies that come with SymSteer."""
     return frozenset().union(*(read_list(path) or () for path in FOLDER.glob("*.toml")))
-
-
-def _read(name_or_path: str) -> tuple[_File, Path]:
-    data, path = read_toml(name_or_path, "study", FOLDER)
-    try:
-        return _File.model_validate(data), path
-    except ValidationError as error:
-        raise UserError(f"{path.name}: {_problem(error)}; correct it there") from error
-
-
-def _problem(error: ValidationError) -> str:
-    """The first thing that is wrong with a study's file, in words."""
-    found = error.errors(include_url=False)
-    # A key that is misspelt is missing, too.
-    first = next((one for one in found if one["type"] == "extra_forbidden"), found[0])
-    words = [str(part + 1) if isinstance(part, int) else part for part in first["loc"]]
-    where, last = " ".join(words[:-1]), words[-1] if words else ""
-    if first["type"] == "extra_forbidden":
-        tables: dict[str, type[_Table]] = {"": _File, "claim": Claim, "statement": Statement}
-        table = tables[words[0] if where else ""] if len(words) < 4 else Cells
-        return str(unknown("key", last, table.model_fields, where))
-    if last == "measure" and isinstance(first["input"], str):
-        return str(unknown("measure", first["input"], MEASURES, where))
-    return ": ".join(filter(None, [" ".join(words), first["msg"].removeprefix("Value error, ")]))

@@ -13,10 +13,15 @@ import sysconfig
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO, TypeVar, get_args
 
 from symsteer.errors import UserError
-from symsteer.names import nearest
+from symsteer.names import nearest, unknown
+
+if TYPE_CHECKING:  # slow to import
+    from pydantic import BaseModel, ValidationError
+
+Model = TypeVar("Model", bound="BaseModel")
 
 
 def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any], Path]:
@@ -49,6 +54,58 @@ def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any
     except (ValueError, RecursionError) as error:
         problem = f"the {kind} {path} cannot be read as TOML: {error}"
         raise UserError(f"{problem}; correct it there") from error
+
+
+def read_model(
+    name_or_path: str, kind: str, folder: Path, model: type[Model]
+) -> tuple[Model, Path]:
+    """The content of a TOML file as its pydantic model, and its path.
+
+    Args:
+        name_or_path, kind, folder: as for :func:`read_toml`.
+        model: of the content; its validators may raise `UserError`.
+
+    Raises:
+        UserError: if there is no such file, or its content does not fit. The sentence names the
+            first mistake and, for an unknown key or choice, the nearest valid one.
+    """
+    data, path = read_toml(name_or_path, kind, folder)
+    try:
+        return model.model_validate(data), path
+    except UserError as error:
+        raise UserError(f"the {kind} {path}: {error}") from error
+    except ValueError as error:
+        if not hasattr(error, "error_count"):
+            raise
+        mistake = _first_mistake(error, model)  # type: ignore[arg-type]
+        raise UserError(f"the {kind} {path}: {mistake}; correct it there") from error
+
+
+def _first_mistake(error: ValidationError, model: type[BaseModel]) -> str:
+    """The place of the first mistake in words, with list items counted from 1, and what it is."""
+    mistakes = error.errors(include_url=False)
+    # A key that is misspelt is missing, too.
+    first = next((one for one in mistakes if one["type"] == "extra_forbidden"), mistakes[0])
+    words = [str(step + 1) if isinstance(step, int) else step for step in first["loc"]]
+    where, last = " ".join(words[:-1])[:120], words[-1] if words else ""
+    if first["type"] == "extra_forbidden":
+        for step in first["loc"][:-1]:
+            if step in model.model_fields:
+                model = next(_models_in(model.model_fields[str(step)].annotation))
+        return str(unknown("key", last, model.model_fields, where))
+    if first["type"] == "literal_error" and isinstance(first["input"], str):
+        choices = re.findall("'(.*?)'", first["ctx"]["expected"])
+        return str(unknown(last, first["input"], choices, where))
+    place = " ".join(words)[:120]
+    return ": ".join(filter(None, [place, first["msg"].removeprefix("Value error, ")]))
+
+
+def _models_in(kind: Any) -> Iterator[type[BaseModel]]:
+    """The models that an annotation such as ``tuple[Claim, ...]`` names."""
+    if hasattr(kind, "model_fields"):
+        yield kind
+    for inner in get_args(kind):
+        yield from _models_in(inner)
 
 
 def away() -> contextlib.AbstractContextManager[None]:

@@ -10,10 +10,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import RootModel
 
-from symsteer.errors import UserError, first_problem
-from symsteer.files import read_toml
+from symsteer.files import read_model
 from symsteer.names import check
 
 T = TypeVar("T", bound=Any)
@@ -33,12 +32,8 @@ def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
         UserError: if there is no such preset, it is damaged, or it sets an option of the agent's
             own table that the agent does not have.
     """
-    found, path = read_toml(name, "preset", FOLDER)
-    try:
-        tables = TypeAdapter(dict[str, dict[str, Any]]).validate_python(found)
-    except ValidationError as error:
-        problem = f"the preset {path} is not made of tables of TOML: {first_problem(error)}"
-        raise UserError(f"{problem}; correct it") from error
+    preset, path = read_model(name, "preset", FOLDER, RootModel[dict[str, dict[str, Any]]])
+    tables = preset.root
     valid = [field.name for field in dataclasses.fields(options)]
     own = tables.get(agent, {})
     check(f"option of {agent}", own, valid, path.name)

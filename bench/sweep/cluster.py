@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -43,47 +43,40 @@ class RayCluster:
 
     def __init__(self, address: str, out: Path, capacity: int | None):
         self.capacity = capacity
-        self._out = out.resolve()
         self._ray = _connect(address)
         self._references: dict[Future, Any] = {}
-        self._functions: dict[tuple, Any] = {}
         try:
-            _check_shared(self._ray, self._out)
+            _check_shared(self._ray, out)
         except BaseException:
             self.stop()
             raise
 
-    def submit(self, function: Callable[..., Result], *args: Any) -> Future:
-        """Start a task."""
-        flat = [part for a in args for part in (a if isinstance(a, tuple) else (a,))]
-        cuda = any(isinstance(a, RunConfig) and "cuda" in (a.sim, a.device) for a in flat)
-        # Other machines need the full path of the folder.
-        args = tuple(self._out if isinstance(a, Path) else a for a in args)
-        if (function, cuda) not in self._functions:
-            options = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)
-            self._functions[function, cuda] = options(function)
-        reference = self._functions[function, cuda].remote(*args)
+    def submit(
+        self, function: Callable[..., list[Result]], configs: Sequence[RunConfig], *args: Any
+    ) -> Future:
+        cuda = any("cuda" in (config.sim, config.device) for config in configs)
+        remote = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)(function)
+        reference = remote.remote(configs, *args)
         future = reference.future()
         self._references[future] = reference
         return future
 
-    def result(self, future: Future) -> Result:
-        """The result of a task that has ended; also if its machine was lost."""
+    def result(self, future: Future) -> list[Result]:
         del self._references[future]
         errors = self._ray.exceptions
         try:
             return future.result()
         except errors.OutOfMemoryError:
-            return Result("failed", "Ray ended its process because memory ran out")
+            result = Result("failed", "Ray ended its process because memory ran out")
         except errors.RayTaskError as error:
-            return Result("failed", f"Ray could not run it: {_first_line(error)}", str(error))
+            result = Result("failed", f"Ray could not run it: {_first_line(error)}", str(error))
         except errors.WorkerCrashedError as error:
-            return Result("failed", f"its process died: {_first_line(error)}")
+            result = Result("failed", f"its process died: {_first_line(error)}")
         except errors.RayError as error:
-            return Result("lost", _first_line(error))
+            result = Result("lost", _first_line(error))
+        return [result]
 
     def stop(self) -> None:
-        """End all tasks and leave the cluster."""
         for reference in self._references.values():
             self._ray.cancel(reference, force=True)
         self._references.clear()
@@ -143,51 +136,37 @@ def _check_shared(ray: Any, out: Path) -> None:
     """Check that every machine of the cluster sees the files of this machine in a folder."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+    nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
+    if not nodes:
+        raise UserError("the Ray cluster has no processor; add a machine with `ray start`")
     token = out / f".token-{uuid.uuid4().hex}"
-    token.write_text(token.name)
+    token.touch()
     try:
-        nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
-        if not nodes:
-            raise UserError("the Ray cluster has no processor; add a machine with `ray start`")
-        answers = {
-            node["NodeID"]: ray.remote(
-                num_cpus=1,
-                max_retries=0,
-                scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False),
-            )(_answer).remote(token, node["NodeID"])
-            for node in nodes
-        }
-        blind = []
+        answers = {}
         for node in nodes:
+            there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            remote = ray.remote(num_cpus=1, max_retries=0, scheduling_strategy=there)(_sees)
+            answers[node["NodeManagerAddress"], node["NodeID"]] = remote.remote(token)
+        for (address, _), answer in answers.items():
             try:
-                seen = ray.get(answers[node["NodeID"]])
+                seen = ray.get(answer)
             except ray.exceptions.RayError as error:
                 raise UserError(
-                    f"the machine {node['NodeManagerAddress']} of the Ray cluster cannot run "
-                    f"SymSteer ({_first_line(error)}); install the same version there"
+                    f"the machine {address} of the Ray cluster cannot run SymSteer "
+                    f"({_first_line(error)}); install the same version there"
                 ) from error
-            reply = token.with_name(f"{token.name}-{node['NodeID']}")
-            if not seen or not reply.is_file():
-                blind.append(node["NodeManagerAddress"])
-        if blind:
-            raise UserError(
-                f"the folder {out} is not shared: {', '.join(blind)} of the Ray cluster does not "
-                "see the same files there; choose one that all machines mount with --out"
-            )
+            if not seen:
+                raise UserError(
+                    f"the folder {out} is not shared: {address} of the Ray cluster does not see "
+                    "the same files there; choose one that all machines mount with --out"
+                )
     finally:
-        for path in out.glob(f"{token.name}*"):
-            path.unlink(missing_ok=True)
+        token.unlink()
 
 
-def _answer(token: Path, node: str) -> bool:
-    """On another machine: whether the token exists and a file can be written next to it."""
-    try:
-        if token.read_text() != token.name:
-            return False
-        token.with_name(f"{token.name}-{node}").touch()
-    except OSError:
-        return False
-    return True
+def _sees(path: Path) -> bool:
+    """Whether a machine sees a file. A function of this module, so it asks for SymSteer there."""
+    return path.is_file()
 
 
 def _first_line(error: BaseException) -> str:

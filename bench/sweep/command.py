@@ -6,17 +6,15 @@ import contextlib
 import os
 import sys
 
-from rich.console import Console
-
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.sweep.display import Display, LiveDisplay
-from symsteer.bench.sweep.estimate import Estimate, duration
-from symsteer.bench.sweep.plan import Plan, PlannedRun, manifest_path, write_manifest
-from symsteer.bench.sweep.pool import LocalPool
-from symsteer.bench.sweep.schedule import Outcome, Workers, execute_plan, tasks_of, teams_of
-from symsteer.bench.sweep.survey import Sighting, look
+from symsteer.bench.sweep.display import Display
+from symsteer.bench.sweep.plan import Plan, PlannedRun, sweep_path, title, write_sweep
+from symsteer.bench.sweep.pool import LocalPool, Workers
+from symsteer.bench.sweep.schedule import EndedRun, execute_plan, tasks_of, teams_of
+from symsteer.bench.sweep.survey import Sighting, duration, look, time_left
 from symsteer.errors import UserError
 from symsteer.files import open_log
+from symsteer.tables import aligned
 
 COLUMNS = ("runs", "finished", "running", "unfinished", "missing")
 
@@ -43,7 +41,7 @@ def number_of_workers(asked: int, configs: list[RunConfig]) -> int:
 
 def run_plan(
     plan: Plan, workers: int = 0, ray: str | None = None, together: int = 1
-) -> list[Outcome]:
+) -> list[EndedRun]:
     """Execute every run of a plan that is not finished, and report on stdout.
 
     Args:
@@ -53,7 +51,7 @@ def run_plan(
         together: learners that share a process, if they differ in seeds and variants alone.
 
     Returns:
-        The outcome of each run, in the order in which they ended; skipped ones first.
+        How each run has ended, in the order in which they ended; skipped ones first.
 
     Raises:
         UserError: if ``workers``, ``ray`` or ``together`` is wrong.
@@ -62,19 +60,18 @@ def run_plan(
     if together < 1:
         raise UserError(f"--together is {together}; it must be at least 1")
     number = number_of_workers(workers, list(plan.configs.values()))
-    estimate = Estimate()
-    outcomes, todo = [], []
-    for run, seen in look_at(plan).items():
-        if seen.state == "finished":
-            estimate.add(run, seen.seconds)
-            outcomes.append(Outcome(run, "skipped", seen.success))
-        else:
-            todo.append(run)
+    seen = look_at(plan)
+    todo = [run for run, sighting in seen.items() if sighting.state != "finished"]
+    ends = [
+        EndedRun(run, "skipped", sighting.success)
+        for run, sighting in seen.items()
+        if sighting.state == "finished"
+    ]
     teams_of(plan, todo, together)  # before anything is written: they may be too large
     limit = workers if ray is not None else number
-    log = manifest_path(plan.out, plan.name).with_suffix(".log")
+    log = sweep_path(plan.out, plan.name).with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)
-    console = Console(file=sys.stdout)
+    output = sys.stdout
     with contextlib.ExitStack() as stack:
         pool: Workers | None = None
         if todo and ray is not None:
@@ -85,37 +82,34 @@ def run_plan(
             pool = RayCluster(ray, plan.out, limit or None)
         elif todo:
             pool = LocalPool(min(number, len(todo)), log)
-        write_manifest(plan, limit, {})
-        if console.is_terminal:
-            print(f"{plan.title} ({len(plan.runs)} runs)", file=console.file)
-        if outcomes:
-            words = f"{len(outcomes)} of {len(plan.runs)} runs are finished already"
-            print(f"{'skipped':9s} {words}", file=console.file, flush=True)
+        write_sweep(plan, limit, {})
+        if ends:
+            words = f"{len(ends)} of {len(plan.configs)} runs are finished already"
+            print(f"{'skipped':9s} {words}", file=output, flush=True)
         if pool is None:
-            return outcomes
+            return ends
         stack.callback(pool.stop)
-        kind = LiveDisplay if console.is_terminal else Display
-        display = stack.enter_context(kind(plan, todo, estimate, pool.capacity, console))
+        display = stack.enter_context(Display(plan, seen, pool.capacity, output))
         failures = {}
         try:
-            for outcome in execute_plan(plan, todo, pool, display, together):
-                outcomes.append(outcome)
-                display.ended(outcome)
-                if outcome.status == "failed":
-                    failures[outcome.run.run_id] = outcome.reason
-                    write_manifest(plan, limit, failures)
-                if outcome.trace:
+            for end in execute_plan(plan, todo, pool, display, together):
+                ends.append(end)
+                display.ended(end)
+                if end.status == "failed":
+                    failures[end.run.run_id] = end.reason
+                    write_sweep(plan, limit, failures)
+                if end.trace:
                     with open_log(log) as file:
-                        file.write(f"{outcome.run.label}\n{outcome.trace}\n")
+                        file.write(f"{end.run.label}\n{end.trace}\n")
         except KeyboardInterrupt as error:
             error.add_note("the same command continues the sweep")
             raise
-    return outcomes
+    return ends
 
 
 def look_at(plan: Plan) -> dict[PlannedRun, Sighting]:
     """The state of each run of a plan."""
-    return {run: look(plan.out / run.run_id) for run in plan.runs}
+    return {run: look(plan.out / run.run_id) for run in plan.configs}
 
 
 def preview(plan: Plan, workers: int = 0, ray: str | None = None) -> str:
@@ -131,54 +125,47 @@ def preview(plan: Plan, workers: int = 0, ray: str | None = None) -> str:
         check_address(ray)
         number = workers or None
     seen = look_at(plan)
-    lines = [plan.title, "", *_counts(seen), ""]
-    todo = [run for run in plan.runs if seen[run].state != "finished"]
-    bases = [task for task in tasks_of(plan, todo) if task.kind == "base policy"]
+    todo = [run for run in seen if seen[run].state != "finished"]
+    bases = [task.label for task in tasks_of(plan, todo) if task.kind == "base policy"]
+    lines = [title(plan.name, plan.description), "", _counts(seen), ""]
     lines.append(f"base policies to build: {len(bases) or 'none'}")
-    lines += [f"  {task.label}" for task in bases]
-    estimate = Estimate()
-    for run, sighting in seen.items():
-        if sighting.state == "finished":
-            estimate.add(run, sighting.seconds)
-    lines.append(f"time: {_time(estimate, todo, number, bool(bases))}")
+    lines += [f"  {label}" for label in bases]
+    lines.append(f"time: {_time(seen, len(todo), number, bool(bases))}")
     return "\n".join(lines)
 
 
-def _time(estimate: Estimate, todo: list[PlannedRun], workers: int | None, bases: bool) -> str:
+def _time(
+    seen: dict[PlannedRun, Sighting], todo: int, workers: int | None, with_bases: bool
+) -> str:
     if not todo:
         return "none, all runs are finished"
     if workers is None:
         return "depends on the size of the cluster; --workers N estimates it for N runs at a time"
-    left = estimate.left(todo, {}, workers)
+    left = time_left(seen, workers)
     if left is None:
         return "unknown, no similar run is finished yet"
     workers_text = f"{workers} worker{'s' if workers > 1 else ''}"
-    known = f"estimated from {estimate.runs} finished run{'s' if estimate.runs > 1 else ''}"
-    without = ", without the base policies" if bases else ""
+    finished = len(seen) - todo
+    known = "estimated from " + (
+        f"{finished} finished run{'s' if finished > 1 else ''}" if finished else "running runs"
+    )
+    without = ", without the base policies" if with_bases else ""
     return f"about {duration(left)} with {workers_text}, {known}{without}"
 
 
-def _counts(seen: dict[PlannedRun, Sighting]) -> list[str]:
+def _counts(seen: dict[PlannedRun, Sighting]) -> str:
     """A table: the number of runs by state, for each value of the settings in which runs differ."""
-    rows = []
-    names = {"interrupted": "unfinished", "failed": "unfinished"}
-    states = {run: names.get(s.state, s.state) for run, s in seen.items()}
+    lines = []
     for key in dict.fromkeys(key for run in seen for key in run.keys):
         values = dict.fromkeys(run.keys[key] for run in seen if key in run.keys)
-        for i, value in enumerate(values):
-            runs = [run for run in seen if key in run.keys and run.keys[key] == value]
-            rows.append(["" if i else key, str(value), *_tally(runs, states)])
-    rows.append(["all", "", *_tally(list(seen), states)])
-    rows.insert(0, ["", "", *COLUMNS])
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return [
-        "  ".join(
-            text.ljust(width) if i < 2 else text.rjust(width)
-            for i, (text, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+        for index, value in enumerate(values):
+            of_value = [s for run, s in seen.items() if key in run.keys and run.keys[key] == value]
+            lines.append(["" if index else key, str(value), *_tally(of_value)])
+    lines.append(["all", "", *_tally(list(seen.values()))])
+    return aligned(["", "", *COLUMNS], lines, left=2)
 
 
-def _tally(runs: list[PlannedRun], states: dict[PlannedRun, str]) -> list[str]:
-    return [str(len(runs)), *(str(sum(states[r] == name for r in runs)) for name in COLUMNS[1:])]
+def _tally(sightings: list[Sighting]) -> list[str]:
+    names = {"interrupted": "unfinished", "failed": "unfinished"}
+    states = [names.get(sighting.state, sighting.state) for sighting in sightings]
+    return [str(len(states)), *(str(states.count(name)) for name in COLUMNS[1:])]

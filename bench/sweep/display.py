@@ -1,185 +1,131 @@
-"""The output of a sweep: live lines on a terminal, otherwise one plain line per finished run."""
+"""The output of a sweep: a line for each run that has ended; on a terminal, bars for the others."""
 
 from __future__ import annotations
 
 import contextlib
-import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from typing import TextIO
 
-from rich.console import Console, Group
-from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
+from tqdm import tqdm
 
 from symsteer.bench.runs.folder import read_progress
-from symsteer.bench.sweep.estimate import Estimate, duration, share_done, steps_done
-from symsteer.bench.sweep.plan import Plan, PlannedRun, short_labels
-from symsteer.bench.sweep.schedule import Outcome, Task, Watcher
-from symsteer.bench.sweep.survey import look
+from symsteer.bench.sweep.plan import BASIC, Plan, PlannedRun
+from symsteer.bench.sweep.schedule import EndedRun, Task, Watcher
+from symsteer.bench.sweep.survey import Sighting, duration, look, time_left
 from symsteer.bench.sweep.work import Result
-
-BAR, NUMBERS = 20, (15, 4, 11, 6)
-"""Widths in columns: of the bar, and of the numbers after it (steps, success, speed, time left)."""
-
-GAP = 2
-"""Columns between the parts of a live line."""
 
 SKEW = timedelta(seconds=5)
 """Largest difference between the clocks of two machines."""
 
+Line = tuple[Task, PlannedRun | None]
+"""A task that executes no run, or one of the runs of a task."""
+
 
 class Display(contextlib.AbstractContextManager, Watcher):
-    """Prints one line for each run that ends, for logs and pipes.
+    """Prints one line for each run that ends. A terminal has a bar for each run, and one for all.
 
     Args:
         plan: of the sweep.
-        todo: the runs that are not finished.
-        estimate: of the time that runs take.
+        seen: the states of its runs at the beginning.
         workers: number of runs at the same time; None if the cluster decides.
-        console: where to print.
+        output: where to print the lines.
     """
 
     def __init__(
-        self,
-        plan: Plan,
-        todo: list[PlannedRun],
-        estimate: Estimate,
-        workers: int | None,
-        console: Console,
+        self, plan: Plan, seen: dict[PlannedRun, Sighting], workers: int | None, output: TextIO
     ):
-        self.out, self.estimate, self.workers = plan.out, estimate, workers
-        self.console = console
-        self.waiting = dict.fromkeys(todo)
-        self.total = len(plan.runs)
-        self.counts = Counter({"finished": self.total - len(todo)})
-        self.labels = {run: run.label for run in todo}
+        self.out, self.workers, self.output, self.seen = plan.out, workers, output, dict(seen)
+        todo = [run for run, sighting in seen.items() if sighting.state != "finished"]
+        self.counts = Counter({"finished": len(seen) - len(todo)})
+        self.begun: dict[Line, datetime] = {}
+        self.bars: dict[Line, tqdm] = {}
+        self.whole = self._bar(plan.name, len(seen))
+        self.labels = {run: run.label for run in todo} if self.whole.disable else _short(todo)
 
     def __exit__(self, *details: object) -> None:
-        pass
+        for bar in (*self.bars.values(), self.whole):
+            bar.close()
 
-    def ended(self, outcome: Outcome) -> None:
+    def ended(self, end: EndedRun) -> None:
         """A run has ended."""
-        self.waiting.pop(outcome.run, None)
-        self.counts[outcome.status] += 1
-        detail = outcome.reason
-        if outcome.status == "finished":
-            seen = look(self.out / outcome.run.run_id)
-            self.estimate.add(outcome.run, seen.seconds)
-            detail = f"{seen.success}, {duration(seen.seconds)}"
-        count = f"[{self.counts.total():{len(str(self.total))}d}/{self.total}]"
-        width = max(len(label) for label in self.labels.values())
-        self.write(outcome.status, f"{count} {self.labels[outcome.run]:{width}s}  {detail}")
-
-    def write(self, status: str, text: str) -> None:
-        """Print one line."""
-        # Not with the console, because it wraps lines. A closed pipe does not stop the sweep.
-        with contextlib.suppress(BrokenPipeError):
-            print(f"{status:9s} {text}", file=self.console.file, flush=True)
-
-
-class LiveDisplay(Display):
-    """For terminals: in addition a live line for each run, and one for the whole sweep."""
-
-    STYLES: Mapping[str, str] = {"finished": "green", "failed": "red"}
-
-    def __init__(self, *args: Any):
-        super().__init__(*args)
-        todo = list(self.waiting)
-        self.room = self.console.width - sum(NUMBERS) - GAP * len(NUMBERS)
-        for everything in (True, False):
-            self.labels = short_labels(todo, everything)
-            self.longest = max((len(label) for label in self.labels.values()), default=0)
-            if self.longest <= self.room:
-                break
-        self.begun: dict[Task, tuple[float, datetime]] = {}
-        self.live = Live(console=self.console, transient=True, refresh_per_second=2)
-
-    def __enter__(self) -> LiveDisplay:
-        self.live.start()
-        return self
-
-    def __exit__(self, *details: object) -> None:
-        self.live.stop()
-
-    def started(self, task: Task) -> None:
-        self.begun[task] = time.monotonic(), datetime.now(UTC)
+        self.counts[end.status] += 1
+        detail = end.reason
+        if end.status == "finished":
+            self.seen[end.run] = sighting = look(self.out / end.run.run_id)
+            detail = f"{sighting.success}, {duration(sighting.seconds)}"
+        else:
+            del self.seen[end.run]  # it is not waited for
+        total = self.whole.total
+        count = f"[{self.counts.total():{len(str(total))}d}/{total}]"
+        width = max(map(len, self.labels.values()))
+        self.write(end.status, f"{count} {self.labels[end.run]:{width}s}  {detail}")
 
     def retried(self, task: Task, result: Result) -> None:
-        run = task.team[0] if task.team else None
-        self.write("again", f"{self._label(task, run)}: {result.reason}")
+        if not self.whole.disable:
+            self.write("again", f"{task.kind} {task.label}: {result.reason}")
 
     def write(self, status: str, text: str) -> None:
-        """Print one line above the live ones."""
-        line = Text(f"{status:9s} ", style=self.STYLES.get(status, "yellow"))
-        line.append(text, style="default")
-        # A long reason is cut; the list at the end of the sweep shows all of it.
-        line.truncate(self.console.width, overflow="ellipsis")
-        self.console.print(line)
+        """Print one line above the bars; a closed pipe does not stop the sweep."""
+        with contextlib.suppress(BrokenPipeError), tqdm.external_write_mode(self.output):
+            print(f"{status:9s} {text}", file=self.output, flush=True)
 
     def refresh(self, running: list[Task]) -> None:
-        """Draw the live lines again."""
-        lines_of = [(task, run) for task in running for run in task.team or (None,)]
-        progress = {line: self._progress(*line) for line in lines_of}
-        # On a cluster, tasks without progress wait for a processor.
-        shown = [line for line in lines_of if self.workers or progress[line]]
-        bars = self.longest + BAR + GAP <= self.room
-        table = Table.grid(padding=(0, GAP, 0, 0), expand=True)
-        table.add_column(no_wrap=True, overflow="ellipsis", ratio=1)
-        if bars:
-            table.add_column(width=BAR)
-        for width in NUMBERS:
-            table.add_column(no_wrap=True, justify="right", min_width=width)
-        height = max(1, self.console.height - 3)
-        for task, run in shown[:height]:
-            table.add_row(self._label(task, run), *self._row(task, progress[task, run], bars))
-        lines: list[Any] = [table]
-        if len(shown) > height:
-            lines.append(Text(f"and {len(shown) - height} more", style="dim"))
-        going = {run: progress[task, run] for task, run in shown if run}
-        self.live.update(Group(*lines, self._whole(going)))
-
-    def _label(self, task: Task, run: PlannedRun | None) -> str:
-        """The label of a run, or of a task without runs."""
-        return self.labels[run] if run else f"{task.kind} {task.label}"
-
-    def _progress(self, task: Task, run: PlannedRun | None) -> Mapping[str, Any] | None:
-        """The progress of a run, unless an earlier process wrote it."""
-        found = read_progress(self.out / run.run_id) if run else None
-        if found:
-            with contextlib.suppress(KeyError, TypeError, ValueError):
-                if datetime.fromisoformat(found["updated"]) >= self.begun[task][1] - SKEW:
-                    return found
-        return None
-
-    def _row(self, task: Task, progress: Mapping[str, Any] | None, bars: bool) -> list[Any]:
-        """The cells of a live line after its label."""
-        if not task.team:
-            elapsed = duration(time.monotonic() - self.begun[task][0])
-            return [*([""] if bars else []), "", "", "for", elapsed]
-        share = share_done(progress)
-        first = [ProgressBar(total=1.0, completed=share, width=BAR)] if bars else []
-        if progress is None:
-            return [*first, "", "", "starting", ""]
-        success = progress.get("success")
-        rate, left = progress.get("steps_per_second"), progress.get("seconds_left")
-        phase = progress.get("phase", "")
-        return [
-            *first,
-            f"{steps_done(progress):,}/{progress['budget']:,}",
-            "" if success is None else f"{success:.0%}",
-            f"{rate:,.0f} steps/s" if phase == "training" and rate else phase,
-            "" if left is None or share == 1 else duration(left),
+        if self.whole.disable:
+            return
+        lines: list[Line] = [
+            (task, run) for task in running for run in (task.runs if task.kind == "run" else [None])
         ]
-
-    def _whole(self, going: Mapping[PlannedRun, Mapping[str, Any] | None]) -> Text:
-        todo = [run for run in self.waiting if run not in going]
-        left = self.estimate.left(todo, going, self.workers or len(going))
-        words = [f"{self.counts['finished']} of {self.total} runs finished"]
-        if self.counts["failed"]:
-            words.append(f"{self.counts['failed']} failed")
+        for line in self.bars.keys() - set(lines):
+            self.bars.pop(line).close()
+        self.begun = {line: self.begun.get(line, datetime.now(UTC)) for line in lines}
+        for line in lines:
+            self._show(*line)
+        left = time_left(self.seen, self.workers or len(self.bars))
+        words = [f"{self.counts['finished']} of {self.whole.total} runs finished"]
+        words += [f"{self.counts['failed']} failed"] if self.counts["failed"] else []
         words.append("time left unknown" if left is None else f"about {duration(left)} left")
-        return Text(", ".join(words), style="bold", no_wrap=True, overflow="ellipsis")
+        self.whole.n = self.counts.total()
+        self.whole.set_description_str(", ".join(words))
+
+    def _show(self, task: Task, run: PlannedRun | None) -> None:
+        """Draw the bar of a task, or of one of its runs."""
+        line = (task, run)
+        if run is None:
+            bar = self.bars.get(line) or self.bars.setdefault(line, self._bar(task.label))
+            elapsed = duration((datetime.now(UTC) - self.begun[line]).total_seconds())
+            bar.set_description_str(f"{task.kind} {task.label}: for {elapsed}")
+            return
+        progress = read_progress(self.out / run.run_id)
+        with contextlib.suppress(KeyError, TypeError, ValueError):
+            # An earlier process may have written it.
+            if progress and datetime.fromisoformat(progress["updated"]) < self.begun[line] - SKEW:
+                progress = None
+        self.seen[run] = sighting = replace(self.seen[run], state="running", progress=progress)
+        # On a cluster, tasks without progress wait for a processor.
+        if self.workers or progress:
+            label = self.labels[run]
+            bar = self.bars.get(line) or self.bars.setdefault(line, self._bar(label, run.env_steps))
+            bar.n = round(sighting.share * run.env_steps)
+            bar.set_description_str(f"{label}: {sighting.doing()}")
+
+    def _bar(self, label: str, total: int | None = None) -> tqdm:
+        # None: none where the output is no terminal.
+        form = "{desc} {bar}" if total else "{desc}"
+        return tqdm(
+            desc=label, total=total, bar_format=form, disable=None, leave=False, dynamic_ncols=True
+        )
+
+
+def _short(runs: Sequence[PlannedRun]) -> dict[PlannedRun, str]:
+    """The agent, and the settings in which the runs differ."""
+    shared = {key for key in BASIC if len({run.keys[key] for run in runs}) == 1} - {"agent", "seed"}
+    labels = {}
+    for run in runs:
+        order = ("agent", "task", "embodiment", "variant")
+        words = [str(run.keys[key]) for key in order if key not in shared]
+        words += [f"{key.rpartition('.')[2]}={value}" for key, value in run.extra.items()]
+        labels[run] = f"{' '.join(words)} s{run.seed}"
+    return labels

@@ -1,4 +1,4 @@
-"""The plan of a sweep: its runs, and the manifest of them that ``symsteer status`` reads."""
+"""The plan of a sweep: its runs, and the file with their list that ``symsteer status`` reads."""
 
 from __future__ import annotations
 
@@ -62,24 +62,6 @@ class PlannedRun:
         return f"{self.task} {self.embodiment} {self.variant} {self.agent}{extra} seed {self.seed}"
 
 
-def short_labels(runs: Sequence[PlannedRun], everything: bool) -> dict[PlannedRun, str]:
-    """Short labels: only the settings in which the runs differ, agent first.
-
-    Args:
-        runs: of one sweep.
-        everything: show task and variant even if all runs share them.
-    """
-    shared = {key for key in BASIC if len({run.keys[key] for run in runs}) == 1}
-    shared -= {"agent", "seed"} | ({"task", "variant"} if everything else set())
-    labels = {}
-    for run in runs:
-        order = ("agent", "task", "embodiment", "variant")
-        words = [str(run.keys[key]) for key in order if key not in shared]
-        words += [f"{key.rpartition('.')[2]}={value}" for key, value in run.extra.items()]
-        labels[run] = f"{' '.join(words)} s{run.seed}"
-    return labels
-
-
 @dataclass(frozen=True)
 class Plan:
     """The runs of a suite, in its order, and the folder that they are written to."""
@@ -92,19 +74,14 @@ class Plan:
     """A service that shows the runs."""
 
     @property
-    def title(self) -> str:
-        """Name and description."""
-        return _title(self.name, self.description)
-
-    @property
     def runs(self) -> list[PlannedRun]:
         """The runs, in the order of the suite."""
         return list(self.configs)
 
 
 @dataclass(frozen=True)
-class Manifest:
-    """The list of runs of a sweep, ``OUT/sweeps/<suite>.json``."""
+class SweepFile:
+    """What is kept of a sweep in ``OUT/sweeps/SUITE.json``."""
 
     suite: str
     description: str
@@ -116,11 +93,6 @@ class Manifest:
     """Why runs failed in the last sweep, by run id. The record of a run whose process was killed
     cannot hold it."""
 
-    @property
-    def title(self) -> str:
-        """Name and description."""
-        return _title(self.suite, self.description)
-
 
 def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
     """Check every run of a suite before anything is built.
@@ -128,7 +100,8 @@ def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
     Args:
         suite: what to run.
         out: folder of the runs.
-        elsewhere: whether other machines run it; then the devices are not checked.
+        elsewhere: whether other machines run it: they need the full path of the folder, and the
+            devices are not checked here.
 
     Raises:
         UserError: if a run cannot be started, e.g. because its task does not exist.
@@ -144,7 +117,7 @@ def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
     runs = {
         PlannedRun.of(config.to_json(), run_id(config, {}), extra): config for config in suite.runs
     }
-    return Plan(suite.name, suite.description, out, runs)
+    return Plan(suite.name, suite.description, out.resolve() if elsewhere else out, runs)
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -173,35 +146,37 @@ def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def manifest_path(out: Path, suite: str) -> Path:
-    """The file with the list of a sweep's runs."""
+def sweep_path(out: Path, suite: str) -> Path:
+    """The file of a sweep."""
     return out / "sweeps" / f"{suite}.json"
 
 
-def write_manifest(plan: Plan, workers: int, failures: Mapping[str, str]) -> None:
-    """Write the list of a sweep's runs atomically.
+def write_sweep(plan: Plan, workers: int, failures: Mapping[str, str]) -> None:
+    """Write the file of a sweep atomically.
 
     Raises:
         UserError: if it cannot be written.
     """
-    now, runs = datetime.now(UTC).isoformat(timespec="seconds"), tuple(plan.runs)
-    manifest = Manifest(plan.name, plan.description, workers, now, runs, dict(failures))
-    write_json(manifest_path(plan.out, plan.name), asdict(manifest))
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    about = plan.name, plan.description, workers, now
+    file = SweepFile(*about, tuple(plan.configs), dict(failures))
+    write_json(sweep_path(plan.out, plan.name), asdict(file))
 
 
-def read_manifest(path: Path) -> Manifest:
-    """Read the list of a sweep's runs.
+def read_sweep(path: Path) -> SweepFile:
+    """Read the file of a sweep.
 
     Raises:
-        UserError: if the file is not such a list.
+        UserError: if it is none.
     """
     try:
-        return TypeAdapter(Manifest).validate_python(json.loads(path.read_text("utf-8-sig")))
+        return TypeAdapter(SweepFile).validate_python(json.loads(path.read_text("utf-8-sig")))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path} is not the list of a sweep; run the sweep again to replace it"
         ) from error
 
 
-def _title(name: str, description: str) -> str:
+def title(name: str, description: str) -> str:
+    """Name and description of a suite."""
     return f"{name}: {description}" if description else name

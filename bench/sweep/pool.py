@@ -7,20 +7,41 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
+from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.sim.shards.processes import signals_wait
 from symsteer.bench.sweep.work import Result, one_thread
 from symsteer.files import open_log
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+class Workers(Protocol):
+    """Executes tasks."""
+
+    capacity: int | None
+    """Number of tasks at the same time; None if it decides itself."""
+    patience: float
+    """Seconds to wait for a run that another process seems to hold."""
+
+    def submit(
+        self, function: Callable[..., list[Result]], configs: Sequence[RunConfig], *args: Any
+    ) -> Future:
+        """Start a task; fewer than ``capacity`` may be running."""
+
+    def result(self, future: Future) -> list[Result]:
+        """The results of a task that has ended: one if its process died."""
+
+    def stop(self) -> None:
+        """End all processes at once."""
 
 
 class LocalPool:
@@ -44,13 +65,14 @@ class LocalPool:
         self._idle: list[ProcessPool] = [self._start() for _ in range(workers)]
         self._busy: dict[Future, ProcessPool] = {}
 
-    def submit(self, function: Callable[..., Result], *args: Any) -> Future:
-        """Start a task; fewer than ``capacity`` may be running."""
+    def submit(
+        self, function: Callable[..., list[Result]], configs: Sequence[RunConfig], *args: Any
+    ) -> Future:
         pool = self._idle.pop()
         # Ctrl-C is for the sweep, which ends its processes itself. A process that is ended while it
         # starts complains, but not on the terminal.
         with signals_wait(signal.SIGINT, signal.SIGTERM), self._complaints_in_log():
-            future = pool.schedule(function, args)
+            future = pool.schedule(function, (configs, *args))
             self._busy[future] = pool
         return future
 
@@ -65,21 +87,19 @@ class LocalPool:
             os.dup2(terminal, 2)
             os.close(terminal)
 
-    def result(self, future: Future) -> Result:
-        """The result of a task; a process that died is replaced."""
+    def result(self, future: Future) -> list[Result]:
         pool = self._busy.pop(future)
         try:
-            result = future.result()
+            results = future.result()
         except (ProcessExpired, BrokenProcessPool) as error:
             pool.stop()
             pool.join()
             pool = self._start()
-            result = Result("failed", _death(getattr(error, "exitcode", None)))
+            results = [Result("failed", _death(getattr(error, "exitcode", None)))]
         self._idle.append(pool)
-        return result
+        return results
 
     def stop(self) -> None:
-        """End all processes at once."""
         pools = [*self._busy.values(), *self._idle]
         for pool in pools:
             pool.stop()

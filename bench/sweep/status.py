@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from symsteer.bench.runs.folder import CONFIG, read_config
-from symsteer.bench.sweep.estimate import Estimate, duration, steps_done
-from symsteer.bench.sweep.plan import BASIC, PlannedRun, manifest_path, read_manifest
-from symsteer.bench.sweep.survey import Sighting, look
+from symsteer.bench.sweep.plan import BASIC, PlannedRun, read_sweep, sweep_path, title
+from symsteer.bench.sweep.survey import Sighting, duration, look, time_left
 from symsteer.errors import UserError
 from symsteer.names import unknown
 from symsteer.terminal import to_paste
@@ -41,22 +40,12 @@ class Status:
         """The runs in a state."""
         return [run for run in self.runs if self.state(run) == state]
 
-    def seconds_left(self) -> float | None:
-        """Seconds until all runs are finished with the current number of workers; None: unknown."""
-        estimate = Estimate()
-        for run in self.in_state("finished"):
-            estimate.add(run, self.runs[run].seconds)
-        running = self.in_state("running")
-        todo = [run for run in self.runs if self.state(run) not in ("finished", "running")]
-        progress = {run: self.runs[run].progress for run in running}
-        return estimate.left(todo, progress, len(running) or self.workers or 1)
-
 
 @dataclass(frozen=True)
 class Overview:
     """The sweeps and runs below a folder, and the files that cannot be read."""
 
-    found: list[Status]
+    sweeps: list[Status] = field(default_factory=list)
     damage: list[UserError] = field(default_factory=list)
     """One for each file that cannot be read."""
 
@@ -75,46 +64,45 @@ def read_status(folder: Path, suite: str | None = None) -> Overview:
         raise UserError(f"there is no folder {folder}; name the --out of a sweep or a run")
     if (folder / CONFIG).is_file():
         return Overview([Status("run", _unlisted(folder))])
-    runs, manifests = _search(folder)
+    runs, files = _search(folder)
     if suite is not None:
-        named = [path for path in manifests if path.stem == suite]
+        named = [path for path in files if path.stem == suite]
+        if not files:
+            raise UserError(f"there is no sweep in {folder}; name the --out of a sweep")
         if not named:
-            names = dict.fromkeys(path.stem for path in manifests)
-            if not names:
-                raise UserError(f"there is no sweep in {folder}; name the --out of a sweep")
+            names = dict.fromkeys(path.stem for path in files)
             raise unknown("sweep of a suite", suite, names, str(folder))
         return Overview([_of_sweep(folder, path) for path in named])
-    found: list[Status] = []
-    damage: list[UserError] = []
-    for path in manifests:
+    overview = Overview()
+    for path in files:
         try:
-            found.append(_of_sweep(folder, path))
+            overview.sweeps.append(_of_sweep(folder, path))
         except UserError as error:
-            damage.append(error)
-    listed = {run.run_id for status in found for run in status.runs}
+            overview.damage.append(error)
+    listed = {run.run_id for status in overview.sweeps for run in status.runs}
     others: dict[PlannedRun, Sighting] = {}
     for path in runs:
         if path.name not in listed:
             try:
                 others |= _unlisted(path)
             except UserError as error:
-                damage.append(error)
+                overview.damage.append(error)
     if others:
-        found.append(Status("runs of no sweep" if found else "runs", others))
-    return Overview(found, damage)
+        overview.sweeps.append(Status("runs of no sweep" if overview.sweeps else "runs", others))
+    return overview
 
 
 def _search(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Folders of runs and manifests of sweeps below a folder; hidden folders are left out."""
-    runs, manifests = [], []
+    """Folders of runs and files of sweeps below a folder; hidden folders are left out."""
+    runs, sweeps = [], []
     for parent, names, files in os.walk(folder):
         names[:] = sorted(name for name in names if not name.startswith("."))
         path = Path(parent)
         if CONFIG in files:
             runs.append(path)
             names.clear()
-        manifests += sorted(manifest_path(path, "*").parent.glob("*.json"))
-    return runs, manifests
+        sweeps += sorted(sweep_path(path, "*").parent.glob("*.json"))
+    return runs, sweeps
 
 
 def _unlisted(folder: Path) -> dict[PlannedRun, Sighting]:
@@ -125,23 +113,24 @@ def _unlisted(folder: Path) -> dict[PlannedRun, Sighting]:
     return {}
 
 
-def to_text(found: list[Status], folder: Path) -> str:
-    """:attr:`Overview.found` as text."""
-    if not found:
+def _of_sweep(folder: Path, path: Path) -> Status:
+    """The sweep of a file. If it is not in ``folder`` itself, the title contains its path."""
+    sweep, out = read_sweep(path), path.parent.parent
+    name = title(sweep.suite, sweep.description)
+    return Status(
+        name if out == folder else f"{out.relative_to(folder)}: {name}",
+        {run: look(out / run.run_id) for run in sweep.runs},
+        sweep.failures,
+        sweep.workers,
+    )
+
+
+def to_text(sweeps: list[Status], folder: Path) -> str:
+    """:attr:`Overview.sweeps` as text."""
+    if not sweeps:
         start = to_paste("symsteer", "sweep", "SUITE", "--out", folder)
         return f"there are no runs in {folder} yet; start some: {start}"
-    return "\n\n".join(_text(status) for status in found)
-
-
-def _of_sweep(folder: Path, path: Path) -> Status:
-    """The sweep of a manifest. If it is not in ``folder`` itself, the title contains its path."""
-    manifest, out = read_manifest(path), path.parent.parent
-    return Status(
-        manifest.title if out == folder else f"{out.relative_to(folder)}: {manifest.title}",
-        {run: look(out / run.run_id) for run in manifest.runs},
-        manifest.failures,
-        manifest.workers,
-    )
+    return "\n\n".join(_text(status) for status in sweeps)
 
 
 def _text(status: Status) -> str:
@@ -153,8 +142,8 @@ def _text(status: Status) -> str:
             lines.append(f"{state}:")
             lines += [f"  {run.label}: {_detail(status, run)}" for run in runs]
     if counts["finished"] < len(status.runs):
-        left = status.seconds_left()
         workers = counts["running"] or status.workers or 1
+        left = time_left(status.runs, workers)
         lines.append(
             "time left: unknown, no similar run is finished yet"
             if left is None
@@ -166,22 +155,10 @@ def _text(status: Status) -> str:
 
 def _detail(status: Status, run: PlannedRun) -> str:
     """Details of a run that is not finished."""
-    seen = status.runs[run]
-    state = status.state(run)
+    sighting, state = status.runs[run], status.state(run)
     if state == "failed":
-        own = seen.record.failure if seen.record else None
-        return status.reasons.get(run.run_id) or own or "no reason is recorded"
+        return status.reasons.get(run.run_id) or sighting.failure or "no reason is recorded"
     if state == "interrupted":
-        done = min(seen.record.budget.env_steps, run.env_steps) if seen.record else 0
+        done = min(sighting.env_steps, run.env_steps)
         return f"after {done:,} of {run.env_steps:,} steps; it continues from its last checkpoint"
-    progress = seen.progress
-    if not progress:
-        return "starting"
-    words = [f"{steps_done(progress):,} of {progress['budget']:,} steps"]
-    if progress.get("success") is not None:
-        words.append(f"success {progress['success']:.0%}")
-    if progress.get("steps_per_second"):
-        words.append(f"{progress['steps_per_second']:,.0f} steps/s")
-    if progress.get("seconds_left") is not None:
-        words.append(f"about {duration(progress['seconds_left'])} left")
-    return ", ".join(words)
+    return sighting.doing()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -31,7 +31,7 @@ LONGEST_REASON = 500
 
 @dataclass(frozen=True)
 class Result:
-    """How a task ended."""
+    """How a task ended, or one of the runs that it executed."""
 
     status: Literal["done", "failed", "busy", "lost"]
     """``busy``: another process works on the run. ``lost``: the machine was lost; this is no
@@ -39,8 +39,6 @@ class Result:
     reason: str = ""
     trace: str = ""
     """The traceback of an unexpected error."""
-    parts: tuple[Result, ...] = ()
-    """Of each run, if the task executed several."""
 
     def __post_init__(self) -> None:
         # The message of any library becomes one line of limited length.
@@ -53,19 +51,19 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def build_demonstrations(config: RunConfig, out: Path) -> Result:
-    """Collect the demonstrations of a run, if they do not exist."""
-    return _guarded(lambda: demonstration_file(config, out, progress=False))
+def build_demonstrations(configs: Sequence[RunConfig], out: Path) -> list[Result]:
+    """Collect the demonstrations that runs share, if they do not exist."""
+    return [_guarded(lambda: demonstration_file(configs[0], out, progress=False))]
 
 
-def build_base(config: RunConfig, out: Path) -> Result:
-    """Train the base policy of a run, if it does not exist."""
-    return _guarded(lambda: prepare_base(config, out, progress=False))
+def build_base(configs: Sequence[RunConfig], out: Path) -> list[Result]:
+    """Train the base policy that runs share, if it does not exist."""
+    return [_guarded(lambda: prepare_base(configs[0], out, progress=False))]
 
 
 def play(
-    configs: tuple[RunConfig, ...], out: Path, patience: float, tracking: Tracking | None
-) -> Result:
+    configs: Sequence[RunConfig], out: Path, patience: float = 0.0, tracking: Tracking | None = None
+) -> list[Result]:
     """Execute runs, or continue them; several are trained together.
 
     Args:
@@ -79,31 +77,29 @@ def play(
     while any(find_base(c, out) is None for c in configs) and time.monotonic() < deadline:
         time.sleep(POLL_SECONDS)
     if len(configs) == 1:
-        return _play(configs[0], out, deadline, tracking)
+        return [_play(configs[0], out, deadline, tracking)]
     one_thread()
-    parts = []
-    for config, error in zip(configs, execute_together(configs, out, tracking), strict=True):
-        if isinstance(error, RunBusyError):
-            parts.append(_play(config, out, deadline, tracking))
-        else:
-            parts.append(_result(error))
+    errors = execute_together(configs, out, tracking)
+    results = [
+        _play(config, out, deadline, tracking)
+        if isinstance(error, RunBusyError)
+        else _result(error)
+        for config, error in zip(configs, errors, strict=True)
+    ]
     gc.collect()
-    return Result(
-        "done" if all(part.status == "done" for part in parts) else "failed", parts=tuple(parts)
-    )
+    return results
 
 
 def _play(config: RunConfig, out: Path, deadline: float, tracking: Tracking | None) -> Result:
     folder = out / run_id(config, {})
-    while True:
-        if is_finished(folder):
-            return Result("done")
+    while not is_finished(folder):
         try:
             return _guarded(lambda: execute(config, out, progress=False, tracking=tracking))
         except RunBusyError as error:
             if time.monotonic() > deadline:
                 return Result("busy", str(error))
         time.sleep(POLL_SECONDS)
+    return Result("done")
 
 
 def _guarded(action: Callable[[], object]) -> Result:
@@ -117,7 +113,7 @@ def _guarded(action: Callable[[], object]) -> Result:
     finally:
         # Free the simulations of a failed run: a process can hold only a few.
         gc.collect()
-    return _result(None)
+    return Result("done")
 
 
 def _result(error: Exception | None) -> Result:

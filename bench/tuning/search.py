@@ -12,28 +12,23 @@ from typing import Any
 
 import numpy as np
 import optuna
-from optuna.distributions import (
-    BaseDistribution,
-    CategoricalDistribution,
-    FloatDistribution,
-    IntDistribution,
-)
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.trial import Trial, TrialState
 
-from symsteer.bench.tuning.plan import LATER, Choices, Range, TuningPlan
+from symsteer.bench.tuning.plan import LATER, TuningPlan
+from symsteer.bench.tuning.trials import Chosen, Score, State, TrialResult, choose, mean_auc
 from symsteer.errors import UserError
 from symsteer.policies.files import DAMAGE
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
-ENDED = (TrialState.COMPLETE, TrialState.PRUNED, TrialState.FAIL)
-
-
-def storage_path(out: Path, name: str) -> Path:
-    """The journal of a tuning plan."""
-    return out / "tuning" / f"{name}.journal"
+STATES: Mapping[TrialState, State] = {
+    TrialState.COMPLETE: "complete",
+    TrialState.PRUNED: "pruned",
+    TrialState.FAIL: "failed",
+}
+"""Of the trials that have ended."""
 
 
 class Search:
@@ -50,7 +45,6 @@ class Search:
 
     def __init__(self, plan: TuningPlan, agent: str, storage: JournalStorage):
         self.plan, self.agent = plan, agent
-        self.space = {name: _distribution(values) for name, values in plan.spaces[agent].items()}
         self.study = optuna.create_study(
             storage=storage,
             study_name=f"{plan.name}-{agent}",
@@ -61,12 +55,32 @@ class Search:
         )
         if not self.study.get_trials(deepcopy=False):
             self.study.set_user_attr("plan", plan.digest)
-            self.study.enqueue_trial(plan.start(agent))
+            self.study.enqueue_trial(plan.first(agent))
         elif self.study.user_attrs.get("plan") != plan.digest:
             raise UserError(
-                f"{plan.source} is not as it was when its trials began; restore it (only "
+                f"{plan.name}.toml is not as it was when its trials began; restore it (only "
                 f"{', '.join(LATER)} may change), or name another folder with --out"
             )
+
+    @property
+    def results(self) -> list[TrialResult]:
+        """Trials that were completed, given up or failed, by number."""
+        ended = self.study.get_trials(deepcopy=False, states=tuple(STATES))
+        return [
+            TrialResult(
+                self.agent,
+                trial.number,
+                STATES[trial.state],
+                trial.params,
+                [Score(**score) for score in trial.user_attrs.get("scores", [])],
+            )
+            for trial in ended
+        ]
+
+    @property
+    def best(self) -> Chosen | None:
+        """The trial that is chosen; None if the first one failed."""
+        return choose(self.results)
 
     def enqueue(self, settings: Sequence[Mapping[str, Any]], begin: int, count: int) -> None:
         """Let the first trials from number ``begin`` on have these settings, but for those tried.
@@ -94,21 +108,32 @@ class Search:
         begun = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
         if begun:
             return [Trial(self.study, trial._trial_id) for trial in begun]
-        ended = len(self.study.get_trials(deepcopy=False, states=ENDED))
+        ended = len(self.study.get_trials(deepcopy=False, states=tuple(STATES)))
         trials = []
         for number in range(ended, min(ended + self.plan.batch, last)):
             # A continued search draws what an uninterrupted one would.
+            entropy = [self.plan.seed, number, *self.agent.encode()]
             self.study.sampler = optuna.samplers.TPESampler(
-                seed=_seed(self.plan.seed, self.agent, number),
+                seed=int(np.random.SeedSequence(entropy).generate_state(1)[0]),
                 n_startup_trials=max(self.plan.batch, self.plan.trials // 3),
             )
-            trials.append(self.study.ask(fixed_distributions=self.space))
+            trials.append(self.study.ask(dict(self.plan.spaces[self.agent])))
         return trials
 
-    @property
-    def ended(self) -> list[FrozenTrial]:
-        """Trials that were completed, given up or failed, by number."""
-        return self.study.get_trials(deepcopy=False, states=ENDED)
+    def gives_up(self, trial: Trial, scores: Sequence[Score]) -> bool:
+        """Whether the first cells of a trial are too bad to go on with it."""
+        if not self.study.trials[trial.number].intermediate_values:
+            trial.report(mean_auc(scores), len(scores))
+        return trial.should_prune()
+
+    def end(self, trial: Trial, state: TrialState, scores: Sequence[Score]) -> None:
+        """Store how a trial ended, and print it."""
+        trial.set_user_attr("scores", [vars(score) for score in scores])
+        value = mean_auc(scores) if state == TrialState.COMPLETE else None
+        self.study.tell(trial, value, state)
+        area = f"AUC {mean_auc(scores):.3f} over {len(scores)} cells" if scores else "no cell"
+        number = f"{trial.number + 1} of {self.plan.total}"
+        print(f"trial     {self.agent} {number}: {STATES[state]}, {area}", flush=True)
 
 
 def open_storage(path: Path) -> JournalStorage:
@@ -121,16 +146,3 @@ def open_storage(path: Path) -> JournalStorage:
             f"{path} is not a journal of trials ({type(error).__name__}: {error}); restore it, or "
             "delete it to begin the search again"
         ) from error
-
-
-def _distribution(values: Range | Choices) -> BaseDistribution:
-    if isinstance(values, Choices):
-        return CategoricalDistribution(values.values)
-    if isinstance(values.low, int) and isinstance(values.high, int):
-        return IntDistribution(values.low, values.high, log=values.log)
-    return FloatDistribution(values.low, values.high, log=values.log)
-
-
-def _seed(seed: int, agent: str, number: int) -> int:
-    entropy = [seed, number, *agent.encode()]
-    return int(np.random.SeedSequence(entropy).generate_state(1)[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ from symsteer.bench.runs.folder import RECORD, run_id
 from symsteer.errors import UserError, first_problem
 from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.records.curves import area_under_curve
+from symsteer.tables import aligned
 
 START = 0
 """Number of the trial with which each search begins."""
@@ -209,35 +211,24 @@ def to_text(trials: Sequence[TrialResult], chosen: Sequence[Chosen]) -> str:
     """A table with a row for each agent that has a chosen setting."""
     header = ["agent", "trials", "pruned", "failed", "chosen", "rank", "of start"]
     header += ["AUC", "of start", "fresh: start", "one option", "chosen", "by task"]
-    rows = [header]
+    lines = []
     for choice in chosen:
-        own = [trial for trial in trials if trial.agent == choice.agent]
-        states = [trial.state for trial in own]
-        by_number = {trial.number: trial for trial in own}
-        fresh = [
-            f"{mean_auc(choice.fresh[setting]):.3f}" if choice.fresh.get(setting) else "-"
-            for setting in get_args(Setting)
-        ]
-        rows.append(
+        results = {trial.number: trial for trial in trials if trial.agent == choice.agent}
+        states = [result.state for result in results.values()]
+        counts = len(results), states.count("pruned"), states.count("failed"), choice.trial
+        ranks = choice.rank, choice.start_rank
+        areas = results[choice.trial].auc, results[START].auc
+        fresh = [choice.fresh.get(setting) for setting in get_args(Setting)]
+        lines.append(
             [
                 choice.agent,
-                *(str(n) for n in (len(own), states.count("pruned"), states.count("failed"))),
-                str(choice.trial),
-                f"{choice.rank:.2f}",
-                f"{choice.start_rank:.2f}",
-                f"{by_number[choice.trial].auc:.3f}",
-                f"{by_number[START].auc:.3f}",
-                *fresh,
+                *map(str, counts),
+                *(f"{rank:.2f}" for rank in ranks),
+                *(f"{area:.3f}" for area in areas),
+                *(f"{mean_auc(scores):.3f}" if scores else "-" for scores in fresh),
             ]
         )
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(
-            text.rjust(width) if i else text.ljust(width)
-            for i, (text, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    )
+    return aligned(header, lines)
 
 
 def to_preset(chosen: Sequence[Chosen], comment: str) -> str:
@@ -245,13 +236,7 @@ def to_preset(chosen: Sequence[Chosen], comment: str) -> str:
     lines = [f"# {comment}"]
     for choice in chosen:
         lines += ["", f"[{choice.agent}]"]
-        lines += [f"{name} = {_toml(value)}" for name, value in choice.options.items()]
+        for name, value in choice.options.items():
+            number = float(f"{value:.4g}") if isinstance(value, float) else value
+            lines.append(f"{name} = {json.dumps(number)}")
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return f'"{value}"'
-    return str(float(f"{value:.4g}") if isinstance(value, float) else value)

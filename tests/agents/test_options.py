@@ -343,5 +343,5 @@ def test_the_page_names_every_agent_option_and_preset():
 def test_a_preset_that_is_not_made_of_tables_is_refused(tmp_path, text, words):
     path = tmp_path / "mine.toml"
     path.write_text(text)
-    with pytest.raises(UserError, match=rf"the preset {path} .*{words}.*; correct it"):
+    with pytest.raises(UserError, match=rf"the preset {path}.*{words}.*; correct it"):
         preset_options(str(path), "standard", AGENTS.get("standard").Options)

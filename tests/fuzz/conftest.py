@@ -14,7 +14,7 @@ from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.trainer import Trainer
-from symsteer.bench.sweep.plan import make_plan, write_manifest
+from symsteer.bench.sweep.plan import make_plan, write_sweep
 from symsteer.bench.sweep.suite import Suite
 from symsteer.leaderboard.records import dump_record, repeat_command
 from tests.bench.tiny_run import tiny_config
@@ -57,7 +57,7 @@ def workshop(tmp_path_factory) -> Workshop:
     write_bundle(contents_of_run(folder, "all"), out / "bundle.zip")
     state = load_checkpoint(folder)
     assert state is not None
-    write_manifest(make_plan(Suite("two", "", (CONFIG, OTHER)), out), 1, {other.name: "it broke"})
+    write_sweep(make_plan(Suite("two", "", (CONFIG, OTHER)), out), 1, {other.name: "it broke"})
     records = {
         "a": make_record(agent="standard"),
         "b": make_record(agent="equivariant", seed=1),

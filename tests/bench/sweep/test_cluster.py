@@ -103,7 +103,7 @@ def test_a_folder_that_is_not_shared_is_refused(cluster, tmp_path):
 def test_a_machine_dies_and_nothing_is_lost(cluster, undisturbed, tmp_path, capsys):
     out = tmp_path / "runs"
     other = tiny_config(agent="zero")
-    plan = make_plan(Suite("two", "", (LONG, other)), out)
+    plan = make_plan(Suite("two", "", (LONG, other)), out, elsewhere=True)
     run = out / plan.runs[0].run_id
 
     def kill() -> None:
@@ -121,10 +121,10 @@ def test_a_machine_dies_and_nothing_is_lost(cluster, undisturbed, tmp_path, caps
 
     killer = threading.Thread(target=kill)
     killer.start()
-    outcomes = run_plan(plan, ray=cluster.address)
+    ends = run_plan(plan, ray=cluster.address)
     killer.join()
     assert len(cluster.worker_nodes) == 1
-    assert [outcome.status for outcome in outcomes] == ["finished", "finished"]
+    assert [end.status for end in ends] == ["finished", "finished"]
     assert capsys.readouterr().out.count("finished  [") == 2
     assert read_record(run / "record.json").wall_clock.resumed == 1
     assert without_clock(run) == without_clock(undisturbed)

@@ -10,15 +10,15 @@ from datetime import UTC, datetime
 
 import pytest
 from filelock import FileLock
-from rich.console import Console
 
 from symsteer.bench.runs.folder import CONFIG, LOCK, PROGRESS, RECORD
-from symsteer.bench.sweep.display import Display, LiveDisplay
-from symsteer.bench.sweep.estimate import Estimate, duration
-from symsteer.bench.sweep.plan import PlannedRun, make_plan, manifest_path, write_manifest
-from symsteer.bench.sweep.schedule import Outcome, Task, tasks_of
+from symsteer.bench.sweep.command import look_at
+from symsteer.bench.sweep.display import Display
+from symsteer.bench.sweep.plan import PlannedRun, make_plan, sweep_path, write_sweep
+from symsteer.bench.sweep.schedule import EndedRun, Task, tasks_of
 from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite
+from symsteer.bench.sweep.survey import Sighting, duration, time_left
 from symsteer.bench.sweep.work import Result
 from symsteer.cli import main
 from symsteer.errors import UserError
@@ -30,32 +30,38 @@ from tests.bench.tiny_run import tiny_config
 AGENTS = ("equivariant", "standard", "augmented", "standard-matched", "zero")
 
 
-def planned(agent="equivariant", task="PickCube-v1", env_steps=1000, embodiment="floating"):
-    return PlannedRun("x", task, embodiment, "none", agent, 0, env_steps)
+def planned(agent="equivariant", task="PickCube-v1", env_steps=1000, seed=0):
+    return PlannedRun("x", task, "floating", "none", agent, seed, env_steps)
 
 
 def test_a_run_is_judged_by_the_most_similar_finished_ones():
-    estimate = Estimate()
-    assert estimate.left([planned()], {}, 1) is None
-    estimate.add(planned(), 100.0)
-    estimate.add(planned(), 300.0)
-    estimate.add(planned("standard"), 50.0)
-    estimate.add(planned("zero"), 1.0)
-    assert estimate.left([planned()] * 4, {}, 1) == pytest.approx(800)
-    assert estimate.left([planned()] * 4, {}, 2) == pytest.approx(400)
+    known = {
+        planned(): Sighting("finished", 100.0),
+        planned(seed=1): Sighting("finished", 300.0),
+        planned("standard"): Sighting("finished", 50.0),
+        planned("zero"): Sighting("finished", 1.0),
+    }
+
+    def left(*todo, workers=1, state=Sighting("missing")):  # noqa: B008
+        return time_left({**known, **dict.fromkeys(todo, state)}, workers)
+
+    four = [planned(seed=seed) for seed in range(2, 6)]
+    assert time_left({planned(): Sighting("missing")}, 1) is None
+    assert left(*four) == pytest.approx(800)
+    assert left(*four, workers=2) == pytest.approx(400)
     # Ten workers are as fast as the longest run.
-    assert estimate.left([planned()] * 4, {}, 10) == pytest.approx(200)
-    assert estimate.left([planned("standard", env_steps=4000)], {}, 1) == pytest.approx(200)
-    assert estimate.left([planned("standard", task="PushCube-v1")], {}, 1) == pytest.approx(50)
+    assert left(*four, workers=10) == pytest.approx(200)
+    assert left(planned("standard", env_steps=4000)) == pytest.approx(200)
+    assert left(planned("standard", task="PushCube-v1")) == pytest.approx(50)
     # Learners are alike; other agents are only compared with themselves.
-    assert estimate.left([planned("augmented")], {}, 1) == pytest.approx(100)
-    assert estimate.left([planned("golden-ticket")], {}, 1) is None
-    half = {"env_steps": 500, "budget": 1000, "steps_per_second": 10.0}
-    assert estimate.left([], {planned("standard"): half}, 1) == pytest.approx(25)
-    assert estimate.left([planned("foreign")], {}, 1) is None
+    assert left(planned("augmented")) == pytest.approx(100)
+    assert left(planned("golden-ticket")) is None
+    assert left(planned("foreign")) is None
+    progress = {"env_steps": 500, "budget": 1000, "steps_per_second": 10.0}
+    half = Sighting("running", progress=progress)
+    assert left(planned("standard", seed=1), state=half) == pytest.approx(25)
     # Running runs serve as long as none of the agent is finished.
-    ticket = planned("golden-ticket")
-    assert estimate.left([ticket], {ticket: half}, 1) == pytest.approx(150)
+    assert left(planned("golden-ticket"), state=half) == pytest.approx(50)
 
 
 def test_lengths_of_time():
@@ -91,13 +97,13 @@ def sweep(undisturbed, tmp_path):
     # What an earlier process left is not what the present one does.
     old = {**progress, "updated": "2026-01-01T00:00:00+00:00"}
     (folders[2] / PROGRESS).write_text(json.dumps(old))
-    write_manifest(plan, 2, {plan.runs[3].run_id: "its process was killed by SIGKILL"})
+    write_sweep(plan, 2, {plan.runs[3].run_id: "its process was killed by SIGKILL"})
     with FileLock(folders[1] / LOCK):
         yield plan
 
 
 def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
-    [status] = read_status(sweep.out).found
+    [status] = read_status(sweep.out).sweeps
     assert [status.state(one) for one in sweep.runs] == [
         "finished",
         "running",
@@ -119,9 +125,9 @@ def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
 def test_runs_of_no_sweep_are_reported_too(sweep, undisturbed, tmp_path):
     other = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0"
     shutil.copytree(undisturbed, other)
-    assert [len(status.runs) for status in read_status(tmp_path).found] == [5, 1]
-    manifest_path(tmp_path, "tiny").unlink()
-    [status] = read_status(tmp_path).found
+    assert [len(status.runs) for status in read_status(tmp_path).sweeps] == [5, 1]
+    sweep_path(tmp_path, "tiny").unlink()
+    [status] = read_status(tmp_path).sweeps
     # The two that never began have left nothing.
     assert len(status.runs) == 4
 
@@ -132,12 +138,12 @@ def test_runs_and_sweeps_are_found_at_any_depth(sweep, undisturbed, tmp_path_fac
     (top / "deep").mkdir()
     sweep.out.rename(top / "deep" / "demo")
     shutil.copytree(undisturbed, top / "single" / "PickCube-v1-floating-none-equivariant-s7-0")
-    listed, others = read_status(top).found
+    listed, others = read_status(top).sweeps
     assert listed.title == "deep/demo: tiny: five"
     assert [len(listed.in_state(state)) for state in ("finished", "missing")] == [1, 1]
     assert others.title == "runs of no sweep"
     assert [run.run_id for run in others.runs] == ["PickCube-v1-floating-none-equivariant-s7-0"]
-    [only] = read_status(top, "tiny").found
+    [only] = read_status(top, "tiny").sweeps
     assert only.title == listed.title
     (top / "deep" / "demo").rename(sweep.out)
 
@@ -146,7 +152,7 @@ def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, ca
     other = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0"
     shutil.copytree(undisturbed, other)
     (other / CONFIG).write_text("{")
-    manifest_path(tmp_path, "older").write_text("[]")
+    sweep_path(tmp_path, "older").write_text("[]")
     monkeypatch.setattr("sys.argv", ["symsteer", "status", str(tmp_path)])
     assert main() == 2
     out, errors = capsys.readouterr()
@@ -159,7 +165,7 @@ def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, ca
 
 
 def test_the_status_of_a_run_by_its_own_folder(undisturbed):
-    text = to_text(read_status(undisturbed).found, undisturbed)
+    text = to_text(read_status(undisturbed).sweeps, undisturbed)
     assert text.startswith("run (1 runs)")
     assert "finished         1" in text
 
@@ -169,7 +175,7 @@ def test_folders_of_something_else_are_left_alone(undisturbed, tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / CONFIG).write_text(data)
     overview = read_status(tmp_path)
-    assert overview.found == []
+    assert overview.sweeps == []
     assert len(overview.damage) == 1
     assert "not the configuration of a run" in str(overview.damage[0])
 
@@ -180,62 +186,71 @@ def test_mistakes_with_status(sweep, tmp_path):
     with pytest.raises(UserError, match=r"no sweep of a suite 'tin'; did you mean 'tiny'"):
         read_status(tmp_path, "tin")
     (tmp_path / "empty").mkdir()
-    assert to_text(read_status(tmp_path / "empty").found, tmp_path).startswith(
+    assert to_text(read_status(tmp_path / "empty").sweeps, tmp_path).startswith(
         "there are no runs in"
     )
-    path = manifest_path(tmp_path, "tiny")
+    path = sweep_path(tmp_path, "tiny")
     for damage in (path.read_text()[:-9], "[]", '{"suite": 3}', "\x00"):
         path.write_text(damage)
         with pytest.raises(UserError, match="run the sweep again to replace it"):
             read_status(tmp_path, "tiny")
 
 
-def screen(sweep, width: int) -> list[str]:
-    """The live lines of a sweep, as a terminal of this width shows them."""
-    console = Console(file=io.StringIO(), force_terminal=True, width=width, color_system=None)
-    todo = sweep.runs[1:]
-    display = LiveDisplay(sweep, todo, Estimate(), 3, console)
-    tasks = [task for task in tasks_of(sweep, todo) if task.team]
-    base = Task("base policy", "edp for PickCube-v1", print, ())
-    for task in (tasks[0], tasks[1], base):
-        display.started(task)
-    display.refresh([tasks[0], tasks[1], base])
-    console.print(display.live.get_renderable())
-    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+class Terminal(io.StringIO):
+    """A terminal that remembers what is written to it."""
+
+    def isatty(self):
+        return True
 
 
-def test_the_live_lines(sweep):
-    wide = screen(sweep, 120)
-    assert wide[0].startswith("standard PickCube-v1 none s0")
-    assert wide[0].split("━")[-1].split() == ["120/480", "25%", "12", "steps/s", "30", "s"]
-    assert wide[1].startswith("augmented PickCube-v1 none s0")
-    assert wide[1].endswith("starting")
-    assert wide[2].startswith("base policy edp for PickCube-v1")
-    assert wide[3] == "1 of 5 runs finished, time left unknown"
-    narrow = screen(sweep, 60)
-    assert narrow[0].split() == ["standard", "s0", "120/480", "25%", "12", "steps/s", "30", "s"]
-    assert len(narrow) == 4
-    assert max(len(line) for line in narrow) <= 60
+@pytest.fixture
+def display(sweep, monkeypatch):
+    """Opens the display of the sweep, on a terminal or in a pipe."""
+
+    def opened(terminal):
+        bars, lines = Terminal() if terminal else io.StringIO(), io.StringIO()
+        monkeypatch.setattr("sys.stderr", bars)
+        return Display(sweep, look_at(sweep), 3, lines), bars, lines
+
+    return opened
 
 
-def test_steps_beyond_the_budget_are_not_shown(sweep):
-    """A run stops after the first decision that reaches its budget, some steps beyond it."""
+def test_a_terminal_has_a_bar_for_each_running_run_and_one_for_all(sweep, display, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    # A run stops after the first decision that reaches its budget, some steps beyond it.
     path = sweep.out / sweep.runs[1].run_id / PROGRESS
     path.write_text(json.dumps({**json.loads(path.read_text()), "env_steps": 488}))
-    assert "480/480" in screen(sweep, 120)[0]
-    assert "standard seed 0: 480 of 480 steps" in to_text(read_status(sweep.out).found, sweep.out)
+    team = Task("run", "a team", list(sweep.runs[1:3]))
+    base = Task("base policy", "edp for PickCube-v1", list(sweep.runs[3:]))
+    shown, terminal, lines = display(terminal=True)
+    with shown:
+        shown.refresh([team, base])
+        written = terminal.getvalue()
+        shown.retried(team, Result("failed", "why"))
+        shown.ended(EndedRun(sweep.runs[1], "failed", "why"))
+        shown.refresh([])
+        assert not shown.bars
+    assert "standard s0: 480 of 480 steps, success 25%, 12 steps/s, about 30 s left" in written
+    # What an earlier process left is not what the present one does.
+    assert "augmented s0: starting" in written
+    assert "base policy edp for PickCube-v1: for 0 s" in written
+    assert "1 of 5 runs finished, time left unknown" in written
+    assert "1 of 5 runs finished, 1 failed" in terminal.getvalue()
+    again, failed = lines.getvalue().splitlines()
+    assert again == "again     run a team: why"
+    assert re.fullmatch(r"failed    \[2/5\] standard s0 +why", failed)
 
 
-def test_a_pipe_gets_one_plain_line_a_run_that_ended(sweep):
-    stream = io.StringIO()
-    one = Task("run", "c", print, (), tuple(sweep.runs[1:2]))
-    with Display(sweep, sweep.runs[1:], Estimate(), 2, Console(file=stream, width=20)) as display:
-        display.started(one)
-        display.refresh([one])
-        display.retried(one, Result("failed", "why"))
-        assert stream.getvalue() == ""
-        display.ended(Outcome(sweep.runs[1], "failed", "why " * 30))
-    assert stream.getvalue() == (
+def test_a_pipe_gets_one_plain_line_a_run_that_ended(sweep, display):
+    shown, bars, lines = display(terminal=False)
+    one = Task("run", "c", list(sweep.runs[1:2]))
+    with shown:
+        shown.refresh([one])
+        shown.retried(one, Result("failed", "why"))
+        assert lines.getvalue() == ""
+        shown.ended(EndedRun(sweep.runs[1], "failed", "why " * 30))
+    assert bars.getvalue() == ""
+    assert lines.getvalue() == (
         "failed    [2/5] PickCube-v1 floating none standard seed 0          " + "why " * 30 + "\n"
     )
 
@@ -244,9 +259,9 @@ def test_a_sweep_goes_on_when_nobody_reads_its_lines_any_more(sweep):
     reading, writing = os.pipe()
     os.close(reading)
     output = os.fdopen(writing, "w")
-    display = Display(sweep, sweep.runs, Estimate(), 2, Console(file=output))
-    display.ended(Outcome(sweep.runs[0], "finished"))
-    assert display.counts["finished"] == 1
+    with Display(sweep, look_at(sweep), 2, output) as shown:
+        shown.ended(EndedRun(sweep.runs[1], "failed", "why"))
+        assert shown.counts["failed"] == 1
     with pytest.raises(BrokenPipeError):
         output.close()
 
@@ -255,18 +270,6 @@ def test_a_reason_is_one_line_of_bounded_length():
     reason = Result("failed", "first\nsecond\x1b[2J " + "x" * 9999).reason
     assert reason.startswith("first second?[2J xxx")
     assert len(reason) == 500
-
-
-def test_a_team_has_a_live_line_for_each_of_its_runs(sweep):
-    console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
-    display = LiveDisplay(sweep, sweep.runs, Estimate(), 3, console)
-    team = Task("run", "c", print, (), tuple(sweep.runs[1:3]))
-    display.started(team)
-    display.refresh([team])
-    console.print(display.live.get_renderable())
-    first, second, *_ = console.file.getvalue().splitlines()
-    assert first.startswith("standard PickCube-v1 none s0")
-    assert second.startswith("augmented PickCube-v1 none s0")
 
 
 def test_learners_that_differ_in_seeds_and_variants_alone_are_a_team(tmp_path):
@@ -285,15 +288,15 @@ def test_learners_that_differ_in_seeds_and_variants_alone_are_a_team(tmp_path):
     plan = make_plan(Suite("teams", "", configs), tmp_path)
 
     def teams(together):
-        tasks = [task for task in tasks_of(plan, plan.runs, together=together) if task.team]
-        return [[plan.runs.index(run) for run in task.team] for task in tasks], tasks
+        tasks = [task for task in tasks_of(plan, plan.runs, together) if task.kind == "run"]
+        return [[plan.runs.index(run) for run in task.runs] for task in tasks], tasks
 
     assert teams(1)[0] == [[i] for i in range(10)]
     assert teams(3)[0] == [[0, 1, 2], [3], [4, 5], [6], [7], [8], [9]]
     found, tasks = teams(4)
     assert found == [[0, 1, 2, 3], [4, 5], [6], [7], [8], [9]]
     # Each seed has a base policy of its own; a team waits for all of them, each once.
-    assert [task.waits for task in tasks] == [3, 2, 1, 1, 1, 1]
+    assert [len(task.needs) for task in tasks] == [3, 2, 1, 1, 1, 1]
 
 
 def test_a_base_policy_of_several_tasks_is_built_once(tmp_path):
@@ -323,5 +326,5 @@ def test_equal_demonstrations_and_bases_are_built_once(tmp_path):
     assert [task.kind for task in tasks] == ["demonstrations"] * 2 + ["base policy"] * 3 + [
         "run"
     ] * 5
-    assert [task.waits for task in tasks] == [0] * 2 + [1] * 8
-    assert [len(task.then) for task in tasks[:5]] == [2, 1, 3, 1, 1]
+    assert [len(task.needs) for task in tasks] == [0] * 2 + [1] * 8
+    assert [len(task.runs) for task in tasks[:5]] == [4, 1, 3, 1, 1]

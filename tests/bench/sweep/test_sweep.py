@@ -18,7 +18,7 @@ from symsteer.bench.runs.config import DemonstrationConfig
 from symsteer.bench.runs.folder import CHECKPOINT, state_of
 from symsteer.bench.sweep.plan import Plan, make_plan
 from symsteer.bench.sweep.pool import LocalPool
-from symsteer.bench.sweep.schedule import Outcome, Task, execute_plan
+from symsteer.bench.sweep.schedule import EndedRun, Task, Watcher, execute_plan
 from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite, load_suite
 from symsteer.bench.sweep.work import Result
@@ -28,29 +28,31 @@ from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import tiny_config, without_clock, write_suite
 
 
-class Witness:
-    """Remembers what a sweep did."""
+class Witness(Watcher):
+    """Remembers what a sweep with one worker did."""
 
     def __init__(self):
         self.tasks: list[tuple[str, str]] = []
         self.again: list[tuple[str, str]] = []
+        self.running: list[Task] = []
 
-    def started(self, task: Task) -> None:
-        self.tasks.append((task.kind, " ".join(run.agent for run in task.team)))
+    def refresh(self, running: list[Task]) -> None:
+        if running and running != self.running:
+            [task] = running
+            agents = " ".join(run.agent for run in task.runs) if task.kind == "run" else ""
+            self.tasks.append((task.kind, agents))
+        self.running = running
 
     def retried(self, task: Task, result: Result) -> None:
         self.again.append((task.kind, result.reason))
-
-    def refresh(self, running: list[Task]) -> None:
-        pass
+        self.running = []
 
 
-def work(plan: Plan, tmp_path, witness: Witness) -> dict[str, Outcome]:
-    """Execute a plan with one worker; the outcomes by agent and variant."""
-    pool = LocalPool(1, tmp_path / "log")
+def work(plan: Plan, tmp_path, together=1) -> tuple[list[EndedRun], Witness]:
+    """Execute a plan with one worker."""
+    pool, witness = LocalPool(1, tmp_path / "log"), Witness()
     try:
-        found = execute_plan(plan, plan.runs, pool, witness)
-        return {f"{o.run.agent} {o.run.variant}": o for o in found}
+        return list(execute_plan(plan, plan.runs, pool, witness, together)), witness
     finally:
         pool.stop()
 
@@ -64,14 +66,10 @@ def test_of_a_team_only_the_run_that_fails_is_tried_again(tmp_path):
     configs = tuple(tiny_config("standard", seed=seed) for seed in (0, 1))
     plan = make_plan(Suite("team", "", configs), tmp_path / "runs")
     (plan.out / plan.runs[1].run_id / CHECKPOINT).mkdir(parents=True)
-    pool, witness = LocalPool(1, tmp_path / "log"), Witness()
-    try:
-        outcomes = list(execute_plan(plan, plan.runs, pool, witness, together=2))
-    finally:
-        pool.stop()
-    assert [(o.run.seed, o.status) for o in outcomes] == [(0, "finished"), (1, "failed")]
+    ends, witness = work(plan, tmp_path, together=2)
+    assert [(end.run.seed, end.status) for end in ends] == [(0, "finished"), (1, "failed")]
     assert witness.tasks[-2:] == [("run", "standard standard"), ("run", "standard")]
-    assert CHECKPOINT in outcomes[1].reason
+    assert CHECKPOINT in ends[1].reason
     record = read_record(plan.out / plan.runs[0].run_id / "record.json")
     assert (record.status, record.provenance.together) == ("finished", 2)
 
@@ -82,12 +80,8 @@ def test_a_team_goes_on_without_the_runs_whose_base_policy_failed(tmp_path):
     plan = make_plan(Suite("baseless", "", configs), tmp_path / "runs")
     for config in configs[:2]:
         demonstration_path(config, plan.out).mkdir(parents=True)
-    pool = LocalPool(1, tmp_path / "log")
-    try:
-        outcomes = list(execute_plan(plan, plan.runs, pool, Witness(), together=3))
-    finally:
-        pool.stop()
-    assert sorted((o.run.seed, o.status) for o in outcomes) == [
+    ends, _ = work(plan, tmp_path, together=3)
+    assert sorted((end.run.seed, end.status) for end in ends) == [
         (0, "failed"),
         (1, "failed"),
         (2, "finished"),
@@ -117,11 +111,11 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
 
     killer = threading.Thread(target=kill)
     killer.start()
-    witness = Witness()
-    outcomes = work(plan, tmp_path, witness)
+    ends, witness = work(plan, tmp_path)
     killer.join()
+    by_name = {f"{end.run.agent} {end.run.variant}": end for end in ends}
     assert len(killed) == 1
-    assert {key: outcome.status for key, outcome in outcomes.items()} == {
+    assert {name: end.status for name, end in by_name.items()} == {
         "equivariant none": "finished",
         "standard none": "failed",
         "zero none": "finished",
@@ -130,8 +124,8 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
     # The killed run continued from its checkpoint, and nobody can tell.
     assert read_record(folder / "record.json").wall_clock.resumed == 1
     assert without_clock(folder) == without_clock(undisturbed)
-    assert CHECKPOINT in outcomes["standard none"].reason
-    reason = outcomes["zero wind:1"].reason
+    assert CHECKPOINT in by_name["standard none"].reason
+    reason = by_name["zero wind:1"].reason
     assert reason.startswith("its demonstrations failed: ")
     assert obstacle.name in reason
     # What is shared was built once and first; what failed was tried once more, at the end.
@@ -183,7 +177,7 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
     try:
         wait_for(lambda: (folder / CHECKPOINT).is_file() or sweep.poll() is not None)
         assert state_of(folder) == "running"
-        [status] = read_status(out).found
+        [status] = read_status(out).sweeps
         assert [len(status.in_state(state)) for state in ("running", "missing")] == [1, 1]
         if end == signal.SIGINT:
             os.killpg(sweep.pid, end)
@@ -200,7 +194,7 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
             "the same command continues the sweep",
         ]
         assert output == ""
-    text = to_text(read_status(out).found, out)
+    text = to_text(read_status(out).sweeps, out)
     assert "interrupted      1" in text
     assert "missing          1" in text
 

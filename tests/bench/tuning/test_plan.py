@@ -2,45 +2,48 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from symsteer.agents import AGENTS
+from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.sweep.grid import read_suite, suite_names
 from symsteer.bench.tuning import plan_summaries
-from symsteer.bench.tuning.plan import Choices, Range, read_plan
+from symsteer.bench.tuning.plan import read_plan
 from symsteer.errors import UserError
 from tests.bench.tuning.tiny_plan import TEXT, write_plan
 
 
-def test_every_plan_of_symsteer_can_be_read():
-    for name in plan_summaries():
-        plan = read_plan(name)
-        assert plan.trials >= plan.batch
-        assert plan.description
-
-
 def test_agents_share_a_space_and_have_their_own_options(tmp_path):
     plan = read_plan(write_plan(tmp_path))
-    shared = {"lr": Range(1e-4, 1e-1, log=True), "batch_size": Choices((32, 64))}
+    shared = {
+        "lr": FloatDistribution(1e-4, 1e-1, log=True),
+        "batch_size": CategoricalDistribution((32, 64)),
+    }
     assert plan.spaces["standard"] == shared
-    assert plan.spaces["equivariant"] == {**shared, "critics": Range(2, 6)}
-    assert plan.start("equivariant") == {"lr": 6e-4, "batch_size": 64, "critics": 2}
+    assert plan.spaces["equivariant"] == {**shared, "critics": IntDistribution(2, 6)}
+    assert plan.first("equivariant") == {"lr": 6e-4, "batch_size": 64, "critics": 2}
     default = AGENTS.get("equivariant").Options().lr
     assert default != 6e-4
     plan = read_plan(write_plan(tmp_path, TEXT.replace("lr = 6e-4\n", "")))
-    assert plan.start("equivariant") == {"lr": default, "batch_size": 64, "critics": 2}
+    assert plan.first("equivariant") == {"lr": default, "batch_size": 64, "critics": 2}
     given = TEXT + "\n[[further]]\nlr = 1e-2\ncritics = 4\n"
     plan = read_plan(write_plan(tmp_path, given))
-    assert plan.further("standard") == [{"lr": 1e-2, "batch_size": 64}]
-    assert plan.further("equivariant") == [{"lr": 1e-2, "batch_size": 64, "critics": 4}]
+    assert plan.later("standard") == [{"lr": 1e-2, "batch_size": 64}]
+    assert plan.later("equivariant") == [{"lr": 1e-2, "batch_size": 64, "critics": 4}]
 
 
 def test_a_shared_option_is_for_those_who_have_it_and_can_be_taken_from_one(tmp_path):
     text = TEXT.replace('"standard", ', '"standard", "best-of-n-kernel", ')
     text += "[space.standard]\nbatch_size = []\n[space.best-of-n-kernel]\ncandidates = [4, 8]\n"
     plan = read_plan(write_plan(tmp_path, text))
-    assert list(plan.spaces["standard"]) == ["lr"]
-    assert list(plan.spaces["best-of-n-kernel"]) == ["candidates"]
-    assert list(plan.spaces["equivariant"]) == ["lr", "batch_size", "critics"]
+    assert {agent: list(space) for agent, space in plan.spaces.items()} == {
+        "standard": ["lr"],
+        "best-of-n-kernel": ["candidates"],
+        "equivariant": ["lr", "batch_size", "critics"],
+    }
 
 
 def test_cells_are_runs_with_the_options(tmp_path):
@@ -53,24 +56,20 @@ def test_cells_are_runs_with_the_options(tmp_path):
     assert [cell.seed for cell in plan.cells("standard", {}, "confirm")] == [2, 3]
 
 
-@pytest.mark.long
 def test_no_cell_of_a_plan_is_on_a_leaderboard():
     """Tuned settings would have an advantage there."""
-    from symsteer.bench.sweep.grid import suite_names
-    from symsteer.bench.sweep.suite import load_suite
-
-    def policies(configs):
-        return {(c.task, c.embodiment, c.policy_seed) for c in configs}
-
-    shown = set()
-    for suite in suite_names():
-        if suite not in ("full", "smoke"):
-            shown |= policies(load_suite(suite).runs)
-    for name in plan_summaries():
+    shown, defaults = set(), RunConfig().to_json()
+    for suite in set(suite_names()) - {"full", "smoke"}:
+        for table in itertools.chain(*read_suite(suite)[0].tables):
+            run = {**defaults, "policy_seed": table.get("seed", 0), **table}
+            shown.add((run["task"], run["embodiment"], run["policy_seed"]))
+    for name, description in plan_summaries().items():
         plan = read_plan(name)
-        for agent in plan.agents:
-            for grid in ("grid", "confirm"):
-                assert not shown & policies(plan.cells(agent, plan.start(agent), grid))
+        assert description == plan.description != ""
+        agent = plan.agents[0]
+        for grid in ("grid", "confirm"):
+            cells = plan.cells(agent, plan.first(agent), grid)
+            assert not shown & {(c.task, c.embodiment, c.policy_seed) for c in cells}
 
 
 @pytest.mark.parametrize(
@@ -91,23 +90,18 @@ def test_no_cell_of_a_plan_is_on_a_leaderboard():
         ("low = 1e-4, high = 1e-1", "low = 1e-1, high = 1e-4", "with low below high"),
         ("low = 1e-4", "low = 0.0", "above 0 with log"),
         ("low = 1e-4", "lowest = 1e-4", "space.lr must be a list of choices"),
-        ("low = 1e-4", "low = nan", "space.lr must be a list of choices"),
+        ("low = 1e-4", "low = nan", "lr is nan; it must be finite"),
         ("high = 1e-1", 'high = "1e-1"', "space.lr must be a list of choices"),
-        (
-            "lr = 6e-4",
-            "lr = [1]",
-            "space: agent_options.lr: Input should be a valid num",
-        ),
+        ("lr = 6e-4", "lr = [1]", "space: agent_options.lr: Input should be a valid num"),
         ("[32, 64]", "[32, 64.5]", "tiny.toml: space: agent_options.batch_size: Input should be"),
         (
             "[space.equivariant]\ncritics =",
             "equivariant = [1]\n#",
             "space.equivariant must be a table",
         ),
-        ("[start]", "agent = 1\n[start]", "run.agent: Input should be a valid dictionary"),
+        ("[start]", "agent = 1\n[start]", "run.agent.standard must be a table"),
         ("[start]", "agent.standard = 1\n[start]", "run.agent.standard must be a table"),
-        ('["standard", "equivariant"]', "1", "agents: Input should be a valid list"),
-        ("[start]", f"x{'.x' * 5000} = 1\n[start]", "nested more than 32 levels deep"),
+        ('["standard", "equivariant"]', "1", "agents: Input should be a valid tuple"),
         ("[32, 64]", "[-1, 64]", "batch_size"),
         ("probe = 1", "probe = 3", "probe is 3, but there are only 2 cells"),
         ('"none", ', '"noone", ', "noone"),
@@ -123,10 +117,6 @@ def test_no_cell_of_a_plan_is_on_a_leaderboard():
 def test_mistakes(tmp_path, old, new, message):
     assert old in TEXT
     path = write_plan(tmp_path, TEXT.replace(old, new))
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(UserError, match=message) as refused:
         read_plan(path)
-
-
-def test_an_unknown_plan_has_the_nearest_name():
-    with pytest.raises(UserError, match="no tuning plan 'cor'; did you mean 'core'"):
-        read_plan("cor")
+    assert "\n" not in str(refused.value)

@@ -14,17 +14,18 @@ from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.agents.presets import preset_options
 from symsteer.bench.runs.config import build_config
 from symsteer.bench.runs.folder import RECORD, run_id
-from symsteer.bench.sweep.schedule import Outcome
+from symsteer.bench.sweep.schedule import EndedRun
 from symsteer.bench.sweep.survey import look
-from symsteer.bench.tuning import command
+from symsteer.bench.tuning import command, plan_summaries
 from symsteer.bench.tuning.command import Tuner, preview
 from symsteer.bench.tuning.plan import read_plan
-from symsteer.bench.tuning.search import Search, open_storage, storage_path
+from symsteer.bench.tuning.search import Search, open_storage
 from symsteer.bench.tuning.trials import (
     Score,
     TrialResult,
     best_single,
     choose,
+    from_json,
     mean_auc,
     mean_ranks,
     score_of,
@@ -32,61 +33,44 @@ from symsteer.bench.tuning.trials import (
 )
 from symsteer.cli import main
 from symsteer.errors import UserError
+from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.records import write_record
-from tests.bench.tuning.tiny_plan import BEST, TEXT, KnownRuns, write_plan
+from tests.bench.tuning.conftest import play_plan
+from tests.bench.tuning.tiny_plan import BEST, TEXT, write_plan
 from tests.leaderboard.record_factory import make_evaluation, make_record
-
-
-@pytest.fixture
-def play(tmp_path, monkeypatch):
-    """Plays a plan in ``out`` with known runs; returns trials, choices and the runs."""
-
-    def run(out="runs", text=TEXT, **kwargs):
-        runs = KnownRuns(**kwargs)
-        monkeypatch.setattr(command, "run_plan", runs)
-        tuner = Tuner(read_plan(write_plan(tmp_path, text)), tmp_path / out)
-        return *tuner.play(), runs
-
-    return run
 
 
 def scores_of(*areas):
     return [Score(f"task-{i % 2} cell", area, area, 60.0) for i, area in enumerate(areas)]
 
 
-def test_agents_try_the_settings_of_the_others(play):
-    results, _, _ = play()
-    best = {a: choose([t for t in results if t.agent == a]).options for a in BEST}
-    further, chosen, _ = play("more", TEXT.replace("trials = 12", "trials = 12\nexchange = 2"))
-    assert further[:12] == results[:12]
+def trial(number, *areas, state="complete"):
+    return TrialResult("standard", number, state, {"lr": number}, scores_of(*areas))
+
+
+def test_agents_try_further_settings_and_then_those_of_the_others(whole, again):
+    """All that may change after the first trial is added to a search that had ended."""
+    more = TEXT.replace("trials = 12", "trials = 12\nexchange = 2") + "\n[[further]]\nlr = 0.011\n"
+    played = again(text=more)
+    best = {a: choose(played.of(a)[:13]).options for a in BEST}
     for agent, other in (("standard", "equivariant"), ("equivariant", "standard")):
-        own = [t for t in further if t.agent == agent]
-        assert [t.number for t in own] == list(range(14))
+        trials = played.of(agent)
+        assert trials[:12] == whole.of(agent)
+        assert [t.number for t in trials] == list(range(15))
+        assert trials[12].options == {**trials[0].options, "lr": 0.011}
         shared = {k: v for k, v in best[other].items() if k in best[agent]}
-        assert own[12].options == {**best[agent], **shared}
-        assert own[13].options not in [t.options for t in own[:13]]
+        assert trials[13].options == {**best[agent], **shared}
+        assert trials[14].options not in [t.options for t in trials[:14]]
     # Once: the same call finds nothing left.
-    again, same, runs = play("more", TEXT.replace("trials = 12", "trials = 12\nexchange = 2"))
-    assert (again, same) == (further, chosen)
-    assert runs.played == []
+    same = again(text=more)
+    assert same[:2] == played[:2]
+    assert same.runs.played == []
 
 
-def test_further_settings_come_before_the_exchange(play, tmp_path):
-    text = TEXT.replace("trials = 12", "trials = 12\nexchange = 1")
-    results, _, _ = play(text=text + "\n[[further]]\nlr = 0.011\n")
-    plan = read_plan(tmp_path / "tiny.toml")
-    for agent in BEST:
-        own = [t for t in results if t.agent == agent]
-        assert len(own) == 14
-        assert own[12].options == {**plan.start(agent), "lr": 0.011}
-        assert own[13].options["lr"] != 0.011
-
-
-def test_exchanged_settings_are_tried_once(play, tmp_path):
+def test_exchanged_settings_are_tried_once(whole, again, tmp_path):
     plan = read_plan(write_plan(tmp_path, TEXT.replace("trials = 12", "trials = 12\nexchange = 2")))
-    play()
-    search = Search(plan, "standard", open_storage(storage_path(tmp_path / "runs", plan.name)))
-    known = search.ended[0].params
+    search = Search(plan, "standard", open_storage(tmp_path / "runs/tuning/tiny.journal"))
+    known = search.results[0].options
     others = [{**known, "lr": lr} for lr in (0.011, 0.012, 0.013)]
     search.enqueue([known, others[0], others[0]], 12, 2)
     # A later call, with what was chosen meanwhile, changes nothing.
@@ -112,11 +96,6 @@ def test_a_score_says_whether_q_stayed_finite(tmp_path):
         assert look(folder).success == f"success   0% of 2{'' if finite else ', Q not finite'}"
 
 
-def trial(number, *areas, state="complete"):
-    scores = scores_of(*areas)
-    return TrialResult("standard", number, state, {"lr": number}, scores)
-
-
 def test_ranks_are_means_over_cells_and_ties_share_them():
     assert mean_ranks([scores_of(0.5, 0.9), scores_of(0.7, 0.9), scores_of(0.1, 0.2)]) == [
         pytest.approx(x) for x in ((2 + 1.5) / 2, (1 + 1.5) / 2, 3.0)
@@ -126,10 +105,10 @@ def test_ranks_are_means_over_cells_and_ties_share_them():
 def test_the_best_mean_rank_is_chosen_not_the_best_mean():
     """One cell in which areas vary much does not decide alone."""
     trials = [trial(0, 0.1, 0.50, 0.50), trial(1, 0.9, 0.48, 0.48), trial(2, 0.2, 0.51, 0.51)]
-    found = choose(trials)
+    choice = choose(trials)
     assert np.argmax([t.auc for t in trials]) == 1
-    assert (found.trial, found.rank) == (2, pytest.approx(4 / 3))
-    assert found.start_rank == pytest.approx((3 + 2 + 2) / 3)
+    assert (choice.trial, choice.rank) == (2, pytest.approx(4 / 3))
+    assert choice.start_rank == pytest.approx((3 + 2 + 2) / 3)
 
 
 def test_every_task_has_a_best_trial_of_its_own():
@@ -142,33 +121,35 @@ def test_every_task_has_a_best_trial_of_its_own():
 
 
 def test_the_best_single_option_may_be_none():
-    found = dataclasses.replace(
+    choice = dataclasses.replace(
         choose([trial(0, 0.5, 0.5)]),
         singles={"lr": scores_of(0.6, 0.4), "tau": scores_of(0.7, 0.6)},
     )
-    assert best_single(found, scores_of(0.5, 0.5)) == "tau"
-    assert best_single(found, scores_of(0.8, 0.8)) is None
+    assert best_single(choice, scores_of(0.5, 0.5)) == "tau"
+    assert best_single(choice, scores_of(0.8, 0.8)) is None
 
 
 def test_trials_that_were_given_up_are_not_chosen():
-    found = choose([trial(0, 0.5, 0.5), trial(1, 0.9, state="pruned"), trial(2, 0.4, 0.4)])
-    assert found.trial == 0
+    trials = [trial(0, 0.5, 0.5), trial(1, 0.9, state="pruned"), trial(2, 0.4, 0.4)]
+    assert choose(trials).trial == 0
     assert choose([trial(0, 0.5, state="failed"), trial(1, 0.4, 0.4)]) is None
 
 
-def test_every_agent_has_the_same_number_of_trials_and_begins_with_its_defaults(play):
-    trials, chosen, _ = play()
-    for agent in ("standard", "equivariant"):
-        own = [t for t in trials if t.agent == agent]
-        assert [t.number for t in own] == list(range(12))
-        assert own[0].options["lr"] == 6e-4
-        assert own[0].state == "complete"
-    assert [choice.agent for choice in chosen] == ["standard", "equivariant"]
+def test_agents_have_the_same_number_of_trials_and_bad_ones_are_given_up(whole):
+    for agent in BEST:
+        trials = whole.of(agent)
+        assert [t.number for t in trials] == list(range(12))
+        assert (trials[0].options["lr"], trials[0].state) == (6e-4, "complete")
+    assert [choice.agent for choice in whole.chosen] == ["standard", "equivariant"]
+    assert {t.state for t in whole.trials} == {"complete", "pruned"}
+    for t in whole.trials:
+        assert len(t.scores) == (1 if t.state == "pruned" else 2)
+    # Chosen settings and defaults on two fresh cells each, for two agents.
+    assert len(whole.runs.played) == sum(len(t.scores) for t in whole.trials) + 8
 
 
-def test_the_search_comes_closer_to_the_known_optimum_than_the_defaults(play):
-    _, chosen, _ = play()
-    for choice in chosen:
+def test_the_search_comes_closer_to_the_known_optimum_than_the_defaults(whole):
+    for choice in whole.chosen:
         best = BEST[choice.agent]
         assert abs(math.log(choice.options["lr"] / best)) < abs(math.log(6e-4 / best))
         fresh, default = ([s.auc for s in choice.fresh[x]] for x in ("chosen", "start"))
@@ -176,63 +157,49 @@ def test_the_search_comes_closer_to_the_known_optimum_than_the_defaults(play):
         assert min(fresh) > max(default)
 
 
-def test_bad_trials_are_given_up_after_the_probe(play):
-    trials, _, runs = play()
-    states = {t.state for t in trials}
-    assert states == {"complete", "pruned"}
-    for t in trials:
-        assert len(t.scores) == (1 if t.state == "pruned" else 2)
-    # Chosen settings and defaults on two fresh cells each, for two agents.
-    assert len(runs.played) == sum(len(t.scores) for t in trials) + 8
-
-
-def test_options_are_tried_by_themselves_where_the_plan_says_so(play):
+def test_options_are_tried_by_themselves_where_the_plan_says_so(again):
     """Success depends on lr alone, so lr alone is as good as the choice."""
-    trials, chosen, _ = play(
-        text=TEXT.replace("trials = 12", 'trials = 12\nsingles = ["standard"]')
-    )
-    standard, equivariant = chosen
+    played = again(text=TEXT.replace("trials = 12", 'trials = 12\nsingles = ["standard"]'))
+    standard, equivariant = played.chosen
     options = {"lr", "batch_size"} if standard.options["batch_size"] == 32 else {"lr"}
     assert set(standard.singles) == options
-    assert mean_auc(standard.singles["lr"]) > mean_auc(trials[0].scores)
+    assert mean_auc(standard.singles["lr"]) > mean_auc(played.trials[0].scores)
     assert equivariant.singles == {}
     areas = {setting: [s.auc for s in scores] for setting, scores in standard.fresh.items()}
     assert areas["one_option"] == areas["chosen"] > areas["start"]
     assert set(equivariant.fresh) == {"start", "chosen", "by_task"}
 
 
-@pytest.mark.long
-def test_a_search_that_was_killed_continues_with_the_same_trials(play):
-    whole, chosen, runs = play("undisturbed")
-    for stop in (1, 8, 25, len(runs.played) - 1):
-        out = f"stopped-{stop}"
-        with pytest.raises(KeyboardInterrupt):
-            play(out, stop_after=stop)
-        again, same, rest = play(out)
-        assert again == whole
-        assert same == chosen
-        assert len(rest.played) == len(runs.played) - stop
-
-
-def test_the_choice_is_written_before_it_is_compared(play, tmp_path):
-    _, chosen, runs = play()
+@pytest.mark.parametrize("stop", [1, pytest.param(25, marks=pytest.mark.long), -1])
+def test_a_search_that_was_killed_continues_with_the_same_trials(stop, whole, tmp_path):
+    stop %= len(whole.runs.played)
     with pytest.raises(KeyboardInterrupt):
-        play("stopped", stop_after=len(runs.played) - 1)
-    folders = [tmp_path / out / "tuning" for out in ("runs", "stopped")]
-    whole, stopped = (json.loads((folder / "tiny.json").read_text()) for folder in folders)
-    assert stopped["trials"] == whole["trials"]
-    assert [choice["trial"] for choice in stopped["chosen"]] == [choice.trial for choice in chosen]
-    assert all(choice["fresh"] == {} for choice in stopped["chosen"])
-    presets = [(folder / "tiny-preset.toml").read_text() for folder in folders]
-    assert presets[0] == presets[1]
+        play_plan(tmp_path, stop_after=stop)
+    if stop > 25:
+        # The choice is written before it is compared.
+        kept, stopped = (
+            json.loads((folder / "tiny.json").read_text())
+            for folder in (whole.folder, tmp_path / "runs" / "tuning")
+        )
+        assert stopped["trials"] == kept["trials"]
+        assert [c["trial"] for c in stopped["chosen"]] == [c.trial for c in whole.chosen]
+        assert all(choice["fresh"] == {} for choice in stopped["chosen"])
+    played = play_plan(tmp_path)
+    assert played[:2] == whole[:2]
+    assert len(played.runs.played) == len(whole.runs.played) - stop
 
 
-def test_more_trials_can_be_added_later(play):
-    first, _, _ = play()
-    more, _, runs = play(text=TEXT.replace("trials = 12", "trials = 14"))
-    assert [t for t in more if t.number < 12] == first
-    assert max(t.number for t in more) == 13
-    assert 4 <= len(runs.played) <= 16
+def test_a_search_goes_on_from_its_journal_and_scores_alone(whole, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        play_plan(tmp_path, stop_after=31)
+    for folder in (tmp_path / "runs").iterdir():
+        if folder.name != "tuning":
+            shutil.rmtree(folder)
+    kept = json.loads((tmp_path / "runs" / "tuning" / "tiny-scores.json").read_text())
+    assert 20 < len(kept) <= 31
+    moved = play_plan(tmp_path)
+    assert moved[:2] == whole[:2]
+    assert not set(moved.runs.played) & set(kept)
 
 
 @pytest.mark.parametrize(
@@ -244,87 +211,65 @@ def test_more_trials_can_be_added_later(play):
         ("tiny.journal", "nothing\n[]\n"),
     ],
 )
-def test_a_damaged_file_of_a_search_is_named(play, tmp_path, name, text):
-    play()
-    (tmp_path / "runs" / "tuning" / name).write_text(text)
+def test_a_damaged_file_of_a_search_is_named(tmp_path, name, text):
+    path = tmp_path / "runs" / "tuning" / name
+    path.parent.mkdir(parents=True)
+    path.write_text(text)
     with pytest.raises(UserError, match=rf"{name} is not a .*; (restore it, or )?delete it"):
-        play()
+        play_plan(tmp_path)
 
 
-def test_trials_of_another_plan_are_refused(play):
-    play()
+def test_trials_of_another_plan_are_refused(again):
     with pytest.raises(
         UserError, match=r"tiny.toml is not as it was .*only description, trials, further"
     ):
-        play(text=TEXT.replace("high = 1e-1", "high = 1e-2"))
+        again(text=TEXT.replace("high = 1e-1", "high = 1e-2"))
 
 
-def test_options_with_which_runs_fail_cost_their_trial(play, capsys):
-    trials, chosen, _ = play(failing=0.02)
-    failed = [t for t in trials if t.state == "failed"]
+def test_options_with_which_runs_fail_cost_their_trial(tmp_path, capsys):
+    played = play_plan(tmp_path, failing=0.02)
+    failed = [t for t in played.trials if t.state == "failed"]
     assert failed
     assert all(t.options["lr"] > 0.02 and not t.scores for t in failed)
-    assert len(trials) == 24
-    assert all(choice.options["lr"] <= 0.02 for choice in chosen)
+    assert len(played.trials) == 24
+    assert all(choice.options["lr"] <= 0.02 for choice in played.chosen)
     assert "Q is not finite" in capsys.readouterr().err
 
 
-def test_a_run_of_another_process_costs_no_trial(play, tmp_path, monkeypatch):
+def test_a_run_of_another_process_costs_no_trial(tmp_path, monkeypatch):
     def busy(plan, workers, ray, together):
-        return [Outcome(run, "elsewhere", "busy") for run in plan.runs]
+        return [EndedRun(run, "elsewhere", "busy") for run in plan.runs]
 
     monkeypatch.setattr(command, "run_plan", busy)
     tuner = Tuner(read_plan(write_plan(tmp_path)), tmp_path / "runs")
     with pytest.raises(UserError, match=r"another process works on PickCube"):
         tuner.play()
     assert tuner.results == []
-    trials, _, _ = play()
-    assert len(trials) == 24
-    assert trials[0].state == "complete"
+    assert [trial.number for trial in tuner.searches["standard"].batch(12)] == [0, 1, 2]
 
 
-def test_a_search_goes_on_from_its_journal_and_scores_alone(play, tmp_path):
-    trials, chosen, _ = play()
-    with pytest.raises(KeyboardInterrupt):
-        play("moved", stop_after=31)
-    for folder in (tmp_path / "moved").iterdir():
-        if folder.name != "tuning":
-            shutil.rmtree(folder)
-    kept = json.loads((tmp_path / "moved" / "tuning" / "tiny-scores.json").read_text())
-    assert 20 < len(kept) <= 31
-    moved, same, runs = play("moved")
-    assert (moved, same) == (trials, chosen)
-    assert not set(runs.played) & set(kept)
-    # All runs are known: nothing is left to do.
-    *_, runs = play("moved")
-    assert runs.played == []
-
-
-@pytest.mark.parametrize("text", ["{", "[1]", '{"a": {"auc": 1}}'])
-def test_a_file_that_has_no_scores_is_refused(play, tmp_path, text):
-    path = tmp_path / "runs" / "tuning" / "tiny-scores.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(text)
-    with pytest.raises(UserError, match=r"tiny-scores.json is not a file of scores"):
-        play()
-
-
-def test_what_is_written_can_be_read_again(play, tmp_path):
-    trials, chosen, _ = play()
-    folder = tmp_path / "runs" / "tuning"
-    data = json.loads((folder / "tiny.json").read_text())
-    assert [t["options"] for t in data["trials"]] == [dict(t.options) for t in trials]
-    assert data["chosen"][1]["fresh"]["chosen"][0]["auc"] == chosen[1].fresh["chosen"][0].auc
-    path = str(folder / "tiny-preset.toml")
-    found = preset_options(path, "equivariant", EquivariantAgent.Options)
-    assert found == {k: pytest.approx(v, rel=1e-3) for k, v in chosen[1].options.items()}
-
-
-def test_the_table_has_a_row_for_each_agent(play):
-    trials, chosen, _ = play()
-    header, *rows = to_text(trials, chosen).splitlines()
+def test_what_is_written_can_be_read_again(whole):
+    data = json.loads((whole.folder / "tiny.json").read_text())
+    assert [t["options"] for t in data["trials"]] == [dict(t.options) for t in whole.trials]
+    choice = whole.chosen[1]
+    assert data["chosen"][1]["fresh"]["chosen"][0]["auc"] == choice.fresh["chosen"][0].auc
+    path = str(whole.folder / "tiny-preset.toml")
+    preset = preset_options(path, "equivariant", EquivariantAgent.Options)
+    assert preset == {k: pytest.approx(v, rel=1e-3) for k, v in choice.options.items()}
+    header, *lines = to_text(whole.trials, whole.chosen).splitlines()
     assert header.split()[:4] == ["agent", "trials", "pruned", "failed"]
-    assert [row.split()[:2] for row in rows] == [["standard", "12"], ["equivariant", "12"]]
+    assert [line.split()[:2] for line in lines] == [["standard", "12"], ["equivariant", "12"]]
+
+
+@pytest.mark.parametrize("name", list(plan_summaries()))
+def test_the_committed_searches_can_be_gone_on_with(name, tmp_path):
+    for path in RESULTS.glob(f"tuning/{name}*"):
+        (tmp_path / "tuning").mkdir(exist_ok=True)
+        shutil.copy(path, tmp_path / "tuning")
+    tuner = Tuner(read_plan(name), tmp_path)
+    trials, chosen = from_json(json.loads((tmp_path / "tuning" / f"{name}.json").read_text()))
+    assert [dataclasses.asdict(t) for t in tuner.results] == [dataclasses.asdict(t) for t in trials]
+    assert [tuner.searches[c.agent].best.trial for c in chosen] == [c.trial for c in chosen]
 
 
 def test_the_preview_counts_the_runs(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 
 from symsteer.bench.runs.folder import RECORD, run_id
 from symsteer.bench.sweep.plan import Plan
-from symsteer.bench.sweep.schedule import Outcome
+from symsteer.bench.sweep.schedule import EndedRun
 from symsteer.leaderboard.records import write_record
 from tests.leaderboard.record_factory import make_evaluation, make_record
 
@@ -66,8 +66,8 @@ class KnownRuns:
         self.left, self.failing = stop_after, failing
         self.played: list[str] = []
 
-    def __call__(self, plan: Plan, workers: int, ray: str | None, together: int) -> list[Outcome]:
-        outcomes = []
+    def __call__(self, plan: Plan, workers: int, ray: str | None, together: int) -> list[EndedRun]:
+        ends = []
         for run, config in plan.configs.items():
             folder = plan.out / run_id(config, {})
             if (folder / RECORD).is_file():
@@ -76,7 +76,7 @@ class KnownRuns:
                 raise KeyboardInterrupt
             options = config.agent_options
             if options.lr > self.failing:
-                outcomes.append(Outcome(run, "failed", "Q is not finite"))
+                ends.append(EndedRun(run, "failed", "Q is not finite"))
                 continue
             distance = abs(math.log10(options.lr / BEST[config.agent]))
             rate = max(0.0, 0.9 - 0.3 * distance - 0.1 * (config.variant != "none"))
@@ -91,5 +91,5 @@ class KnownRuns:
             folder.mkdir(parents=True)
             write_record(record, folder / RECORD)
             self.played.append(folder.name)
-            outcomes.append(Outcome(run, "finished"))
-        return outcomes
+            ends.append(EndedRun(run, "finished"))
+        return ends
