@@ -8,10 +8,49 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from symsteer.lazy import lazily
 from symsteer.registry import Registry
 
 if TYPE_CHECKING:
-    from symsteer.agents.agent import Agent
+    from symsteer.agents.agent import Agent, AgentContext, AgentOptions, Budget
+    from symsteer.agents.diagnostics import actor_equivariance_error
+    from symsteer.agents.equivariant import EquivariantAgent
+    from symsteer.agents.options import SacOptions
+    from symsteer.agents.replay import Batch, Transition
+    from symsteer.agents.sac import SacAgent
+    from symsteer.agents.standard import StandardAgent
+
+__all__ = [
+    "AGENTS",
+    "Agent",
+    "AgentContext",
+    "AgentOptions",
+    "Batch",
+    "Budget",
+    "EquivariantAgent",
+    "SacAgent",
+    "SacOptions",
+    "StandardAgent",
+    "Transition",
+    "actor_equivariance_error",
+]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "Agent": "agent",
+        "AgentContext": "agent",
+        "AgentOptions": "agent",
+        "Batch": "replay",
+        "Budget": "agent",
+        "EquivariantAgent": "equivariant",
+        "SacAgent": "sac",
+        "SacOptions": "options",
+        "StandardAgent": "standard",
+        "Transition": "replay",
+        "actor_equivariance_error": "diagnostics",
+    },
+)
 
 AGENTS: Registry[type[Agent]] = Registry(
     "agent",

@@ -13,9 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from symsteer import UserError
-from symsteer.agents.equivariant import EquivariantAgent
-from symsteer.agents.options import SacOptions
-from symsteer.agents.replay import Batch
+from symsteer.agents import Batch, EquivariantAgent, SacOptions
 
 
 @dataclass(frozen=True)

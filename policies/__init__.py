@@ -1,19 +1,63 @@
 """Base policies: frozen decoders from observation and noise to a chunk of actions.
 
 ``POLICIES`` is the registry. A policy of one's own is a class that inherits from
-:class:`symsteer.policies.contract.ChunkPolicy` (docs/policies.md).
+:class:`ChunkPolicy` (docs/policies.md).
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from symsteer.lazy import lazily
 from symsteer.registry import Registry
 
 if TYPE_CHECKING:
-    from symsteer.policies.contract import ChunkPolicy
+    from symsteer.policies.contract import ChunkPolicy, Episode, PolicyOptions
+    from symsteer.policies.files import load_policy, save_policy
+    from symsteer.policies.geometry import Field, Group, Layout
+    from symsteer.policies.normalizer import Normalizer, clip_blocks
+    from symsteer.policies.training.demonstrations import make_chunks
+    from symsteer.policies.training.denoising import DiffusionPolicy
+    from symsteer.policies.training.gradient import GradientPolicy
+    from symsteer.policies.training.optimizer import GradientOptions
 
-__all__ = ["POLICIES"]
+__all__ = [
+    "POLICIES",
+    "ChunkPolicy",
+    "DiffusionPolicy",
+    "Episode",
+    "Field",
+    "GradientOptions",
+    "GradientPolicy",
+    "Group",
+    "Layout",
+    "Normalizer",
+    "PolicyOptions",
+    "clip_blocks",
+    "load_policy",
+    "make_chunks",
+    "save_policy",
+]
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "ChunkPolicy": "contract",
+        "DiffusionPolicy": "training.denoising",
+        "Episode": "contract",
+        "Field": "geometry",
+        "GradientOptions": "training.optimizer",
+        "GradientPolicy": "training.gradient",
+        "Group": "geometry",
+        "Layout": "geometry",
+        "Normalizer": "normalizer",
+        "PolicyOptions": "contract",
+        "clip_blocks": "normalizer",
+        "load_policy": "files",
+        "make_chunks": "training.demonstrations",
+        "save_policy": "files",
+    },
+)
 
 POLICIES: Registry[type[ChunkPolicy]] = Registry(
     "policy",

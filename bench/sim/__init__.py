@@ -10,8 +10,9 @@ Names are imported on first use: `capabilities` must also work where importing M
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from symsteer.lazy import lazily
 
 if TYPE_CHECKING:
     from symsteer.bench.sim.environment import BatchedCpuMixin, make_env_class
@@ -20,16 +21,13 @@ if TYPE_CHECKING:
 
 __all__ = ["BatchedCpuMixin", "create", "make_env_class", "prepare_headless", "rendering_works"]
 
-_HOME = {
-    "BatchedCpuMixin": "environment",
-    "create": "parallel",
-    "make_env_class": "environment",
-    "prepare_headless": "headless",
-    "rendering_works": "headless",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"symsteer.bench.sim.{_HOME[name]}"), name)
+__getattr__ = lazily(
+    __name__,
+    {
+        "BatchedCpuMixin": "environment",
+        "create": "parallel",
+        "make_env_class": "environment",
+        "prepare_headless": "headless",
+        "rendering_works": "headless",
+    },
+)

@@ -12,12 +12,12 @@ imported here.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 
+from symsteer.lazy import lazily
 from symsteer.names import unknown
 from symsteer.registry import NAME, Registry
 
@@ -68,13 +68,6 @@ EMBODIMENTS = {
 NAMESPACE = "SymSteer/"
 """Before a task's name in ids of gymnasium."""
 
-_HOME = {
-    "SymmetricTask": "base",
-    "make": "making",
-    "make_batched": "making",
-    "make_single": "making",
-}
-
 
 def check_embodiment(embodiment: str) -> None:
     """Raise `UserError` if there is no such embodiment."""
@@ -104,10 +97,15 @@ def task_class(task: str) -> type[SymmetricTask]:
     return TASKS.get(task_name(task))
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+__getattr__ = lazily(
+    __name__,
+    {
+        "SymmetricTask": "base",
+        "make": "making",
+        "make_batched": "making",
+        "make_single": "making",
+    },
+)
 
 
 class TaskSpec(EnvSpec):

@@ -15,10 +15,8 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
-import symsteer.bench.tasks as tasks
-from symsteer.bench.bundles.film import PIXELS, RENDERING
-from symsteer.bench.sim.headless import rendering_works
-from symsteer.policies.geometry import Layout
+from symsteer.bench import RENDERING, rendering_works, tasks
+from symsteer.policies import Layout
 
 TASK = "PickCube-v1"
 EMBODIMENT = "floating"
@@ -50,7 +48,8 @@ class LeRobotEnv(gym.Wrapper):
             "environment_state": spaces.Box(-np.inf, np.inf, (width - self.gripper,)),
         }
         if images:
-            parts["pixels"] = spaces.Box(0, 255, (PIXELS, PIXELS, 3), np.uint8)
+            size = RENDERING["human_render_camera_configs"]["width"]
+            parts["pixels"] = spaces.Box(0, 255, (size, size, 3), np.uint8)
         self.observation_space = spaces.Dict(parts)
 
     def reset(self, **options: Any) -> tuple[dict[str, np.ndarray], dict]:

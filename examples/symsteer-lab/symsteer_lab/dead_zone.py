@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from symsteer.bench.variants.base import Variant
+from symsteer.bench import Variant
 
 
 class DeadZone(Variant):

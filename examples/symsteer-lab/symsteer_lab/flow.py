@@ -14,10 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from symsteer.policies.geometry import Layout
-from symsteer.policies.normalizer import Normalizer, clip_blocks
-from symsteer.policies.training.gradient import GradientPolicy
-from symsteer.policies.training.optimizer import GradientOptions
+from symsteer.policies import GradientOptions, GradientPolicy, Layout, Normalizer, clip_blocks
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from symsteer import UserError
-from symsteer.agents.agent import Budget
-from symsteer.agents.equivariant import EquivariantAgent
-from symsteer.agents.options import SacOptions
-from symsteer.agents.replay import Batch
+from symsteer.agents import Batch, Budget, EquivariantAgent, SacOptions
 
 
 @dataclass(frozen=True)

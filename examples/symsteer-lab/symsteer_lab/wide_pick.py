@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from symsteer.bench.tasks.pick_cube import PickCube
-from symsteer.policies.geometry import Field
+from symsteer.bench import PickCube
+from symsteer.policies import Field
 
 
 class WidePick(PickCube):
