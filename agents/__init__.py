@@ -69,7 +69,6 @@ AGENTS: Registry[type[Agent]] = Registry(
         "displaced": "symsteer.agents.displaced:DisplacedAgent",
         "residual": "symsteer.agents.residual:ResidualAgent",
         "best-of-n": "symsteer.agents.best_of_n:BestOfNAgent",
-        "best-of-n-kernel": "symsteer.agents.best_of_n_kernel:KernelBestOfNAgent",
         "wrong-group": "symsteer.agents.wrong_group:WrongGroupAgent",
         "base": "symsteer.agents.references:BaseAgent",
         "zero": "symsteer.agents.references:ZeroAgent",

@@ -2,12 +2,10 @@
 
 The trainer's loop is the same for every agent::
 
-    agent.observe_demonstrations(decisions)        # if it wants them
     wanted = agent.prepare(make_env, budget)       # search or pre-training; 0: no training
     while steps < wanted:
-        noise = agent.act(obs)
-        step = env.step(noise)
-        agent.observe(step)
+        action = agent.act(obs)                    # noise, for most agents
+        agent.observe(env.step(action))            # plays agent.decode(obs, action)
         for batch in agent.batches():              # as many as are due
             scalars = agent.update(batch)
     agent.diagnostics(played)                      # at every evaluation
@@ -23,6 +21,7 @@ import torch
 
 from symsteer.agents.episodes import Played
 from symsteer.agents.generators import continue_stream
+from symsteer.agents.networks import Ensemble, count
 from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
@@ -32,7 +31,7 @@ Role = Literal["reference", "learner", "control"]
 """``reference``: every learner must beat it. ``control``: trained, but must not win."""
 
 Deterministic = Callable[[torch.Tensor], torch.Tensor]
-"""``obs [B, obs_dim] -> noise [B, Tp, Da]``."""
+"""``obs [B, obs_dim] -> action [B, rows, Da]``; see :class:`Agent`."""
 
 Decode = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 Normalize = Callable[[torch.Tensor], torch.Tensor]
@@ -122,8 +121,8 @@ class NoiseEnv(Protocol):
     def reset(self, seeds: list[int]) -> torch.Tensor:
         """Start episodes; observations ``[N, obs_dim]``."""
 
-    def step(self, noise: torch.Tensor) -> Any:
-        """Play noise ``[N, Tp, Da]``; a transition with ``episodes``, those that ended."""
+    def step(self, action: torch.Tensor, /) -> Any:
+        """Play actions ``[N, rows, Da]``; a transition with ``episodes``, those that ended."""
 
 
 MakeEnv = Callable[[bool], NoiseEnv]
@@ -136,15 +135,17 @@ class AgentOptions:
 
 
 class Agent:
-    """Chooses noise for the frozen policy. Subclasses override what they need.
+    """Steers the frozen policy. Subclasses override what they need.
 
-    What an agent plays is its *action* ``[rows, Da]``. Most agents play noise, with Tp rows.
+    What an agent chooses is its *action* ``[rows, Da]``. Most agents choose the noise of a chunk,
+    so that ``rows`` is Tp; :meth:`decode` says what an action does.
 
     Attributes:
         name: in configurations and records.
         role: see :data:`Role`; the record holds it.
         Options: a frozen dataclass. Its fields become ``--agent.X`` on the command line.
         generator: draws the agent's noise. An evaluation restores its state afterwards.
+        networks: all trained networks by name, ``actor`` first.
         replay: transitions, saved with each checkpoint; None for agents without a replay.
     """
 
@@ -159,6 +160,7 @@ class Agent:
         self.obs_layout, self.act_layout = context.obs_layout, context.act_layout
         self.rows = self.action_rows(context)
         self.generator = self._new_generator()
+        self.networks: dict[str, Ensemble] = {}
         self.replay: ReplayBuffer | None = None
 
     @staticmethod
@@ -174,14 +176,6 @@ class Agent:
             UserError: if they cannot work together; the message says what to change.
         """
 
-    @classmethod
-    def wants_demonstrations(cls, options: Any) -> bool:
-        """Whether the agent learns from the decisions of the base policy's demonstrations."""
-        return False
-
-    def observe_demonstrations(self, decisions: Transition) -> None:
-        """Receive these decisions, before training begins or continues; they have noise 0."""
-
     def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
         """Search or pre-train, with a part of the budget.
 
@@ -192,7 +186,7 @@ class Agent:
         return 0
 
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
-        """Noise ``[B, Tp, Da]`` for observations ``[B, obs_dim]``.
+        """Actions ``[B, rows, Da]`` for observations ``[B, obs_dim]``.
 
         Args:
             obs: in environment units.
@@ -224,8 +218,14 @@ class Agent:
         return {}
 
     def parameter_counts(self) -> dict[str, int]:
-        """Trainable parameters (``actor``, ``critic``: all critics, ``total``) and ``width``."""
-        return dict.fromkeys(("actor", "critic", "total", "width"), 0)
+        """Trainable parameters (``actor``; ``critic``: all others; ``total``) and ``width``."""
+        sizes = {name: count(network) for name, network in self.networks.items()}
+        total, actor = sum(sizes.values()), sizes.get("actor", 0)
+        widths = [network.width for network in self.networks.values()]
+        return {
+            **{"actor": actor, "critic": total - actor, "total": total},
+            "width": widths[0] if widths else 0,
+        }
 
     def description(self) -> dict[str, Any]:
         """Properties that a checkpoint must have in common with the agent."""
@@ -256,7 +256,7 @@ class Agent:
         continue_stream(self.generator, state["generator"])
 
     def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
-        """``count`` actions ``[count, rows, Da]`` of the base policy: noise from N(0, I)."""
+        """``count`` actions ``[count, rows, Da]`` with which it is the base policy: N(0, I)."""
         return torch.randn(
             count,
             self.rows,
@@ -265,13 +265,6 @@ class Agent:
             device=self.device,
             dtype=self.dtype,
         )
-
-    def _new_replay(self, capacity: int, **more: tuple[int, ...]) -> ReplayBuffer:
-        """An empty buffer of the agent's transitions, and of further fields with their shapes."""
-        obs, act = (self.obs_layout.dim,), self.act_layout.dim
-        shapes = {"obs": obs, "noise": (self.rows, act), "actions": (self.context.execute, act)}
-        shapes |= {"reward": (), "next_obs": obs, "terminal": (), "truncated": (), **more}
-        return ReplayBuffer(capacity, shapes, self.device, self.context.seed, self.dtype)
 
     def _new_generator(self, stream: int = 0) -> torch.Generator:
         """A generator from the agent's seed; other streams draw other numbers."""
@@ -285,7 +278,7 @@ class HasCritic(Protocol):
     """An agent with Q-values, which an evaluation compares with on-policy returns."""
 
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """A draw from the stochastic policy ``[B, Tp, Da]`` and its log-probability ``[B]``."""
+        """A drawn action ``[B, rows, Da]`` and its log-probability ``[B]``."""
 
-    def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+    def q_values(self, obs: torch.Tensor, action: torch.Tensor, /) -> torch.Tensor:
         """Every critic's value in the environment's reward units, ``[critics, B]``."""

@@ -14,17 +14,15 @@ below 1 / (2 penalty): 0 lets A go, infinity is the equivariant agent.
 
 from __future__ import annotations
 
-import abc
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import cast
+from typing import ClassVar, cast
 
 import torch
 from torch import nn
 
 from symsteer.agents.episodes import Played
-from symsteer.agents.equivariant import EquivariantAgent
+from symsteer.agents.equivariant import EquivariantAgent, equivariant_layers
 from symsteer.agents.networks import Dense, Ensemble, dense, shrink_
 from symsteer.agents.options import SacOptions
 from symsteer.policies.geometry import Layout
@@ -33,12 +31,9 @@ from symsteer.policies.networks.equivariant import EquivariantLayer
 Parameters = Mapping[str, torch.Tensor]
 """Parameters of a layer by name; those of several equal layers have one more dimension in front."""
 
-LayersOf = Callable[[], list[EquivariantLayer]]
-"""Makes new equivariant layers of a network."""
 
-
-class AsymmetricLayer(nn.Module, abc.ABC):
-    """An equivariant layer that may leave the symmetry.
+class AsymmetricLayer(nn.Module):
+    """An equivariant layer that may leave the symmetry, made of one or more equivariant ones.
 
     Attributes:
         strict: says which matrices are equivariant here.
@@ -46,9 +41,13 @@ class AsymmetricLayer(nn.Module, abc.ABC):
 
     strict: EquivariantLayer
 
-    @abc.abstractmethod
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Weight ``[out, in]`` and bias ``[out]``."""
+        raise NotImplementedError
+
+    def pull(self, parameters: Parameters, factor: float) -> None:
+        """Multiply the asymmetric part by a factor, in place."""
+        raise NotImplementedError
 
 
 class TwoPaths(AsymmetricLayer):
@@ -65,16 +64,18 @@ class TwoPaths(AsymmetricLayer):
 class AsymmetricAgent(EquivariantAgent):
     """Layers that may leave the symmetry; subclasses say which, and what holds them."""
 
-    def asymmetric_layers(self, make: LayersOf) -> list[nn.Module]:
-        """Layers that may leave the symmetry and equal equivariant ones at the start."""
-        raise NotImplementedError(f"{type(self).__name__} must say which layers it has")
+    Layer: ClassVar[type[AsymmetricLayer]]
 
-    def actor_layers(self) -> list[nn.Module]:
-        return self.asymmetric_layers(cast(LayersOf, super().actor_layers))
+    @property
+    def copies(self) -> int:
+        """Equivariant layers of which each layer is made."""
+        return 1
 
-    def critic_layers(self, inputs: Layout) -> list[nn.Module]:
-        make = functools.partial(super().critic_layers, inputs)
-        return self.asymmetric_layers(cast(LayersOf, make))
+    def layers(self, inputs: Layout, outputs: Layout, scale: float = 1.0) -> list[nn.Module]:
+        strict = [
+            equivariant_layers(inputs, outputs, self.options, scale) for _ in range(self.copies)
+        ]
+        return [self.Layer(*layers) for layers in zip(*strict, strict=True)]
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Also |A| / |W| of each network, over all layers."""
@@ -89,26 +90,10 @@ class PenaltyOptions(SacOptions):
     penalty: float = 1.0
     """The dial: weight of the squared asymmetric part, which keeps its numbers below
     1 / (2 penalty). 0: free; 1e8: strict to 1e-4."""
-    actor_penalty: float | None = None
-    """The same for the actor alone; default: `penalty`."""
-    critic_penalty: float | None = None
-    """The same for the critics alone; default: `penalty`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require(
-            "not be negative",
-            lambda value: value is None or value >= 0,
-            *("penalty", "actor_penalty", "critic_penalty"),
-        )
-
-
-class PulledLayer(AsymmetricLayer):
-    """A layer whose asymmetric part can be made smaller."""
-
-    @abc.abstractmethod
-    def pull(self, parameters: Parameters, factor: float) -> None:
-        """Multiply the asymmetric part by a factor, in place."""
+        self._require("not be negative", lambda value: value >= 0, "penalty")
 
 
 class PenaltyAgent(AsymmetricAgent):
@@ -119,11 +104,10 @@ class PenaltyAgent(AsymmetricAgent):
 
     def settle(self, name: str) -> None:
         """The proximal step."""
-        own = self.options.actor_penalty if name == "actor" else self.options.critic_penalty
-        penalty = self.options.penalty if own is None else own
-        if penalty > 0:
+        factor = 1 / (1 + 2 * self.options.lr * self.options.penalty)
+        if factor < 1:
             for layer, parameters in self.networks[name].layers():
-                cast(PulledLayer, layer).pull(parameters, 1 / (1 + 2 * self.options.lr * penalty))
+                cast(AsymmetricLayer, layer).pull(parameters, factor)
 
 
 @torch.no_grad()
@@ -131,8 +115,8 @@ def asymmetry(network: Ensemble) -> float:
     """|W - P(W)| / |W| over the matrices and biases of all layers (Frobenius norms)."""
     apart, whole = [], []
     for layer, _ in network.layers():
-        parts = dense(layer)
-        nearest = cast(AsymmetricLayer, layer).strict.nearest(*parts)
-        apart += [(part - near).norm() for part, near in zip(parts, nearest, strict=True)]
-        whole += [part.norm() for part in parts]
+        tensors = dense(layer)
+        nearest = cast(AsymmetricLayer, layer).strict.nearest(*tensors)
+        apart += [(tensor - near).norm() for tensor, near in zip(tensors, nearest, strict=True)]
+        whole += [tensor.norm() for tensor in tensors]
     return (torch.stack(apart).norm() / torch.stack(whole).norm()).item()

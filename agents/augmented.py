@@ -8,26 +8,11 @@ can leave the symmetry. Where the world breaks the symmetry, some rotated transi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent
 from symsteer.policies.geometry import Group
 from symsteer.policies.symmetry.augmented import Augmentation
-
-
-@dataclass(frozen=True)
-class AugmentedOptions(SacOptions):
-    """Options of the augmented agent."""
-
-    augmentation: str = "C8"
-    """Symmetries that turn the transitions of a batch: C_n, D_n or SO2 (any angle)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        Group.parse(self.augmentation)
 
 
 @tuned
@@ -36,12 +21,10 @@ class AugmentedAgent(StandardAgent):
 
     name = "augmented"
     in_teams = True
-    Options = AugmentedOptions
-    options: AugmentedOptions
 
     def augment(self, batch: Batch) -> Batch:
-        """Each row is rotated by a symmetry of its own."""
-        augmentation = Augmentation(Group.parse(self.options.augmentation))
+        """Each row is turned by an element of ``group`` of its own."""
+        augmentation = Augmentation(Group.parse(self.options.group))
         # The agent's own generator: its state is in the checkpoint, so a resumed run repeats.
         drawn = augmentation.draw(len(batch.obs), self.generator)
         turned = {

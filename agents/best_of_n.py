@@ -14,18 +14,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from symsteer.agents.agent import AgentContext
-from symsteer.agents.either import EitherAgent, EitherOptions
 from symsteer.agents.episodes import Played
-from symsteer.agents.networks import Ensemble, Weights
-from symsteer.agents.options import Critic, NoiseSource
+from symsteer.agents.networks import Ensemble
+from symsteer.agents.options import Critic, EitherOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import Drawn
-from symsteer.errors import UserError
+from symsteer.agents.standard import EitherAgent
 
 
 @dataclass(frozen=True)
@@ -37,21 +37,10 @@ class BestOfNOptions(EitherOptions):
     noise_bank: int = 8
     """n: chunks to choose from, in a decision and in the critics' target."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.critic != "sampler":
-            raise UserError(
-                f"best-of-n judges executed actions: its critic is sampler, not {self.critic}"
-            )
-        if self.noise_bank < 1:
-            raise UserError(f"best-of-n needs a noise_bank of at least 1, not {self.noise_bank}")
-        if self.soft_backup:
-            raise UserError("best-of-n has no entropy bonus: leave out soft_backup")
-        if self.n_step != 1:
-            raise UserError(
-                "best-of-n keeps the candidates of the next decision alone: n_step is 1 for it, "
-                f"not {self.n_step}"
-            )
+    agent = "best-of-n"
+    known_critics = ("sampler",)
+    least_bank = 1
+    entropy_bonus = False
 
 
 @tuned
@@ -60,6 +49,7 @@ class BestOfNAgent(EitherAgent):
 
     name = "best-of-n"
     in_teams = True
+    always_banks = True
     bank_at = "next_obs"
     Options = BestOfNOptions
     options: BestOfNOptions
@@ -68,27 +58,23 @@ class BestOfNAgent(EitherAgent):
         super().__init__(context, options)
         self.multipliers = {}
 
-    @property
-    def networks(self) -> dict[str, Ensemble]:
+    def _networks(self) -> dict[str, Ensemble]:
         """The critics."""
-        return {"critic": self.critic}
-
-    @property
-    def keeps_bank(self) -> bool:
-        """The candidates."""
-        return True
+        return {"critic": super()._networks()["critic"]}
 
     @property
     def alpha(self) -> torch.Tensor:
         """There is no entropy bonus."""
         return torch.zeros((), device=self.device, dtype=self.dtype)
 
+    def bank_noise(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """The candidates."""
+        return self.gaussian_noise(count, generator)
+
     @torch.no_grad()
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Noise ``[B, Tp, Da]``; candidates are random even if ``deterministic``."""
-        if not deterministic and self.decisions < self.options.warmup:
-            return super().act(obs)
-        return self.mode(obs)
+        return self.mode(obs) if deterministic else super().act(obs)
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -110,7 +96,7 @@ class BestOfNAgent(EitherAgent):
         """Nothing is drawn: the candidates are in the batch."""
         features = self._features(obs)
         nothing = features[..., :0]
-        return Drawn(features, nothing, nothing, nothing)
+        return Drawn(features, nothing, nothing, lambda: nothing)
 
     def critic_target(self, batch: Batch, following: Drawn) -> torch.Tensor:
         """The target with the best candidate, ``[B]``."""
@@ -120,12 +106,8 @@ class BestOfNAgent(EitherAgent):
         q = self.reduced(self._q(self.target, features.flatten(-3, -2), actions.flatten(-3, -2)))
         return self.backed_up(batch, q.unflatten(-1, (-1, size)).amax(-1))
 
-    def _improve(self, batch: Batch, obs: torch.Tensor, judge: Weights) -> dict[str, torch.Tensor]:
+    def _improve(self, *update: Any) -> dict[str, torch.Tensor]:
         return {}
-
-    @property
-    def _bank_source(self) -> NoiseSource:
-        return "gaussian"
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Those of the critics; an actor's are not measured."""

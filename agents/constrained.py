@@ -4,13 +4,13 @@ Every layer is W = W_eq + gamma W_neq with a number gamma that starts at 1, unde
 gamma = 0. Descent on the Lagrangian and ascent on its multiplier lambda alternate:
 
     equality:  L = J + sum lambda gamma,              lambda <- lambda + eta gamma,
-    elastic:   L = J + sum lambda (|gamma| - u) + rho/2 u^2,   u = lambda / rho,
+    elastic:   L = J + sum lambda (|gamma| - u) + u^2 / 2,   u = lambda,
                lambda <- max(lambda + eta (|gamma| - u), 0).
 
 ``elastic`` leaves a gamma where the constraint costs too much. These are the updates of the paper;
-those of its published code differ. Our choices: gamma is trained by Adam as all parameters are;
-W_neq starts at 0, so that the agent starts equivariant. The final evaluation also plays the actor
-with gamma = 0 (``success_truncated``).
+those of its published code differ. Our choices: the weight of u^2; gamma is trained by Adam as all
+parameters are; W_neq starts at 0, so that the agent starts equivariant. The final evaluation also
+plays the actor with gamma = 0 (``success_truncated``).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from symsteer.agents.agent import Deterministic
-from symsteer.agents.asymmetry import AsymmetricAgent, LayersOf, TwoPaths
+from symsteer.agents.asymmetry import AsymmetricAgent, TwoPaths
 from symsteer.agents.networks import dense
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
@@ -37,14 +37,11 @@ class ConstrainedOptions(SacOptions):
     dual_lr: float = 1e-3
     """Rate eta of the ascent on the multipliers; 0: no constraint."""
     elastic: bool = False
-    """Allow a slack u at the price rho/2 u^2."""
-    slack_price: float = 1.0
-    """rho: the price of the slack, with `elastic`."""
+    """Allow a slack u at the price u^2 / 2."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("not be negative", lambda value: value >= 0, "dual_lr")
-        self._require("be positive", lambda value: value > 0, "slack_price")
 
 
 class Constrained(TwoPaths):
@@ -69,9 +66,7 @@ class ConstrainedAgent(AsymmetricAgent):
     in_teams = True
     Options = ConstrainedOptions
     options: ConstrainedOptions
-
-    def asymmetric_layers(self, make: LayersOf) -> list[nn.Module]:
-        return [Constrained(layer) for layer in make()]
+    Layer = Constrained
 
     def penalty(self, name: str, batch: Batch) -> torch.Tensor | None:
         """The part of the Lagrangian that depends on gamma."""
@@ -83,14 +78,12 @@ class ConstrainedAgent(AsymmetricAgent):
 
     def settle(self, name: str) -> None:
         """One step of dual ascent."""
-        options = self.options
         for _, own in self.networks[name].layers():
             gamma, multiplier = own["gamma"], own["multiplier"]
-            if options.elastic:
-                slack = multiplier / options.slack_price
-                multiplier.add_(options.dual_lr * (gamma.abs() - slack)).clamp_(min=0)
+            if self.options.elastic:
+                multiplier.add_(self.options.dual_lr * (gamma.abs() - multiplier)).clamp_(min=0)
             else:
-                multiplier.add_(options.dual_lr * gamma)
+                multiplier.add_(self.options.dual_lr * gamma)
 
     def alternatives(self) -> dict[str, Deterministic]:
         """The actor with gamma = 0, which is equivariant."""
@@ -100,6 +93,6 @@ class ConstrainedAgent(AsymmetricAgent):
     def act_truncated(self, obs: torch.Tensor) -> torch.Tensor:
         """Noise ``[B, Tp, Da]`` of the deterministic actor with gamma = 0."""
         layers = [cast(Constrained, layer) for layer, _ in self.actor.layers()]
-        parts = [dense(layer.strict) for layer in layers]
-        weights = [(weight[None], bias[None, None]) for weight, bias in parts]
-        return self.chunk(self.distribution.mode(self._heads(weights, self._features(obs))[0]))
+        strict = [dense(layer.strict) for layer in layers]
+        weights = [(weight[None], bias[None, None]) for weight, bias in strict]
+        return self.chunk(self.distribution.squash(self._heads(weights, self._features(obs))[0]))

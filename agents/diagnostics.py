@@ -1,49 +1,25 @@
 """Diagnostics of a learner: errors of its critics, and errors of its symmetry.
 
-All values are in the environment's reward units, per decision. ``q`` arrays hold all critics,
-``[critics, B]``, as :meth:`symsteer.agents.sac.SacAgent.q_values` returns them.
+All values are in the environment's reward units, per decision; docs/metrics.md defines each of
+them. ``q`` arrays hold all critics, ``[critics, B]``.
 """
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import scipy.stats
 import torch
 
 from symsteer.agents.episodes import LongEpisodes, Played
-from symsteer.policies.geometry import Group, Layout, equivariance_error
+from symsteer.policies.geometry import Group, equivariance_error
 
 if TYPE_CHECKING:
-    from symsteer.agents.agent import Agent
     from symsteer.agents.sac import SacAgent
 
 Scalars = dict[str, float]
 Measures = dict[str, float | None]
 """None: not measured."""
-
-
-class HasValues(Protocol):
-    """What the errors of Q need of an agent."""
-
-    options: Any
-    obs_layout: Layout
-    act_layout: Layout
-
-    def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Every critic's value in reward units, ``[critics, B]``."""
-
-
-class HasPolicy(HasValues, Protocol):
-    """What the preference of the critics needs."""
-
-    def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
-        """Noise ``[B, Tp, Da]``."""
-
-    def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
-        """Noise of the base policy ``[count, Tp, Da]``."""
-
 
 SYMMETRY_STATES = 64
 """States on which equivariance errors are measured."""
@@ -56,19 +32,16 @@ SAME = 1e-6
 
 
 def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
-    """All diagnostics of a learner at one evaluation, by the names that the record uses.
-
-    docs/metrics.md defines them.
-    """
+    """All diagnostics of a learner at one evaluation, by the names that the record uses."""
     assert played.long is not None
     options, greedy = agent.options, played.greedy
     low, high = played.feasible
     obs, noise = greedy.obs[greedy.running], greedy.noise[greedy.running]
     statistics = policy_statistics(agent, obs)
-    alpha = statistics["alpha"] / options.reward_scale
-    allowance = 0.0
+    alpha, allowance = statistics["alpha"] / options.reward_scale, 0.0
     if options.soft_backup:
-        allowance = entropy_allowance(options.gamma, alpha, statistics["entropy"])
+        # Soft Q may exceed the hard bounds by the discounted entropy bonus of later decisions.
+        allowance = abs(alpha) * options.gamma / (1 - options.gamma) * abs(statistics["entropy"])
     q = agent.q_values(obs, noise)
     smallest = q.amin(0)
     # The critics estimate the soft return only with the soft backup.
@@ -76,9 +49,14 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
     few = torch.randperm(len(obs), generator=torch.Generator().manual_seed(0))[:SYMMETRY_STATES]
     few = few.to(obs.device)
     obs, noise = obs[few], noise[few]
-    group = Group.parse(options.group)
-    orbit = orbit_variance(agent, obs, noise, group)
-    size = agent.q_values(obs, noise).double().square().mean().sqrt().item()
+    group, layouts = Group.parse(options.group), (agent.obs_layout, agent.act_layout)
+    variance = orbit_variance(agent, obs, noise, group)
+    q_here, gap = agent.q_values(obs, noise), None
+    if options.critic == "aliased":
+        gap = (agent.noise_q_values(obs, noise) - q_here).abs().mean().item()
+    # What the critics gain by the actor; if the returns do not, it exploits errors of theirs.
+    own, random = agent.act(obs, True), agent.gaussian_noise(len(obs), played.generator)
+    preference = (agent.q_values(obs, own) - agent.q_values(obs, random)).mean().item()
     return {
         "q_mean": smallest.mean().item(),
         "q_min": smallest.min().item(),
@@ -88,30 +66,18 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
         "q_high": high,
         "q_allowance": allowance,
         **errors,
-        "alias_gap": alias_gap(agent, obs, noise),
-        "q_preference": critic_preference(agent, obs, played.generator)["critic_preference"],
-        "alpha": statistics["alpha"],
-        "entropy": statistics["entropy"],
-        "noise_norm": statistics["noise_norm"],
-        "mode_norm": statistics["mode_norm"],
-        "saturated": statistics["saturated_share"],
-        "orbit_variance": orbit["orbit_variance"],
+        "alias_gap": gap,
+        "q_preference": preference,
+        **statistics,
+        "orbit_variance": variance,
         "equivariance_actor": actor_equivariance_error(agent, obs, group),
-        "equivariance_critic": orbit["orbit_variance"] ** 0.5 / max(size, 1e-30),
-        "equivariance_decode": decode_equivariance_error(agent, obs, noise, group),
+        "equivariance_critic": (
+            variance**0.5 / max(q_here.double().square().mean().sqrt().item(), 1e-30)
+        ),
+        "equivariance_decode": equivariance_error(
+            agent.decode, (obs, noise), layouts, agent.act_layout, group
+        ),
     }
-
-
-def decode_equivariance_error(
-    agent: Agent, obs: torch.Tensor, noise: torch.Tensor, group: Group
-) -> float:
-    """Error of decoding: max over g of rms ||decode(gs, gw) - g decode(s, w)|| / rms ||decode||.
-
-    Args:
-        obs, noise: ``[B, obs_dim]``, ``[B, rows, Da]``.
-    """
-    layouts = (agent.obs_layout, agent.act_layout)
-    return equivariance_error(agent.decode, (obs, noise), layouts, agent.act_layout, group)
 
 
 def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -> float:
@@ -123,31 +89,34 @@ def actor_equivariance_error(agent: SacAgent, obs: torch.Tensor, group: Group) -
     return equivariance_error(agent.mode, (obs,), (agent.obs_layout,), agent.act_layout, group)
 
 
-@torch.no_grad()
-def alias_gap(agent: SacAgent, obs: torch.Tensor, noise: torch.Tensor) -> float | None:
-    """Error of the distilled noise critics: mean |Q_W(s, w) - Q(s, decode(s, w))|, reward units.
-
-    None for agents without distilled critics.
+def orbit_variance(agent: SacAgent, obs: torch.Tensor, noise: torch.Tensor, group: Group) -> float:
+    """Mean over states and critics of Var_g Q(gs, gw), g over the group: 0 for invariant critics.
 
     Args:
-        obs, noise: ``[B, obs_dim]``, ``[B, Tp, Da]``, the actor's own noise.
+        obs, noise: ``[B, obs_dim]``, ``[B, rows, Da]``.
     """
-    if agent.options.critic != "aliased":
-        return None
-    return (agent.noise_q_values(obs, noise) - agent.q_values(obs, noise)).abs().mean().item()
+    q = [
+        agent.q_values(agent.obs_layout.transform(obs, *g), agent.act_layout.transform(noise, *g))
+        for g in group.elements
+    ]
+    return torch.stack(q).double().var(dim=0, unbiased=False).mean().item()
 
 
-def entropy_allowance(gamma: float, alpha: float, log_prob_size: float) -> float:
-    """How far soft Q may exceed the hard bounds: ``alpha * gamma / (1 - gamma) * |log pi|``.
+def policy_statistics(agent: SacAgent, obs: torch.Tensor) -> Scalars:
+    """Temperature, entropy and noise norms of the stochastic policy, over one draw per state.
 
-    The first factor is gamma because Q(s, w) does not contain the entropy bonus of w itself.
-
-    Args:
-        gamma: discount per decision.
-        alpha: entropy weight.
-        log_prob_size: typical magnitude of log pi, e.g. its largest mean over evaluations.
+    ``mode_norm`` is that of the deterministic noise; ``saturated`` is the share of irrep blocks of
+    drawn noise with a norm above 0.95 of the bound.
     """
-    return abs(alpha) * gamma / (1 - gamma) * abs(log_prob_size)
+    action, log_prob = agent.sample(obs)
+    mode, noise = (x[:, -agent.drawn_rows :].flatten(1) for x in (agent.mode(obs), action))
+    return {
+        "alpha": agent.alpha.item(),
+        "entropy": -log_prob.mean().item(),
+        "noise_norm": noise.norm(dim=1).mean().item(),
+        "mode_norm": mode.norm(dim=1).mean().item(),
+        "saturated": agent.distribution.saturated(noise).double().mean().item(),
+    }
 
 
 def bound_violation(q: torch.Tensor, low: float, high: float) -> Scalars:
@@ -175,7 +144,7 @@ def bound_violation(q: torch.Tensor, low: float, high: float) -> Scalars:
 
 
 @torch.no_grad()
-def value_errors(agent: HasValues, played: LongEpisodes, alpha: float = 0.0) -> Measures:
+def value_errors(agent: SacAgent, played: LongEpisodes, alpha: float = 0.0) -> Measures:
     """Errors of Q over all decisions that count, successful or not: on-policy and off-policy.
 
     Q compares with :func:`discounted_returns`, the return that the critics are trained towards.
@@ -185,11 +154,10 @@ def value_errors(agent: HasValues, played: LongEpisodes, alpha: float = 0.0) -> 
 
         r + gamma (1 - d) (R Q(s', w') - alpha log pi(w'|s')) - mean_j Q_j(s, w),
 
-    w' being the noise of the next decision, and R the reduction of the targets; of random subsets,
-    the mean over them. It is the error over one decision, for any ``n_step``.
+    w' being the noise of the next decision, and R the reduction of the targets.
 
     Args:
-        agent: has ``q_values``, and of the options ``gamma``, ``reduce`` and ``subset``.
+        agent: has ``q_values``, and of the options ``gamma`` and ``reduce``.
         alpha: entropy weight in reward units; 0 with a hard backup.
     """
     gamma = agent.options.gamma
@@ -203,13 +171,14 @@ def value_errors(agent: HasValues, played: LongEpisodes, alpha: float = 0.0) -> 
     needed = played.on_policy | played.off_policy | follows
     values = agent.q_values(played.obs[needed], played.noise[needed]).double()
     mean, reduced = (torch.zeros_like(returns) for _ in range(2))
-    mean[needed], reduced[needed] = values.mean(0), _expected_reduction(values, agent.options)
+    mean[needed] = values.mean(0)
+    reduced[needed] = values.mean(0) if agent.options.reduce == "mean" else values.amin(0)
     after = (reduced + bonus).roll(-1, 0).where(~ends, 0)
     gap = (played.reward + gamma * after - mean)[counts]
     result: Measures = {"td_error": gap.square().mean().sqrt().item() if len(gap) else None}
     for kind, chosen in (("", played.on_policy), ("off_", played.off_policy)):
-        found = agreement(mean[chosen], returns[chosen])
-        result |= {f"q_{kind}{name}": value for name, value in found.items()}
+        measured = agreement(mean[chosen], returns[chosen])
+        result |= {f"q_{kind}{name}": value for name, value in measured.items()}
         mean_return, spread = _mean_and_std(returns[chosen])
         result |= {f"return_{kind}mean": mean_return, f"return_{kind}std": spread}
     return result
@@ -234,13 +203,13 @@ def discounted_returns(
         last: the column's last decision, where it does not succeed, ``[T, N]`` bool.
         gamma: discount per decision.
     """
-    found = torch.empty_like(reward, dtype=torch.float64)
-    after = torch.zeros_like(found[0])
-    for t in reversed(range(len(found))):
+    returns = torch.empty_like(reward, dtype=torch.float64)
+    after = torch.zeros_like(returns[0])
+    for t in reversed(range(len(returns))):
         after = torch.where(last[t], (reward[t] + bonus[t]) / (1 - gamma), after)
-        found[t] = reward[t] + gamma * torch.where(ends[t], 0.0, after)
-        after = found[t] + bonus[t]
-    return found
+        returns[t] = reward[t] + gamma * torch.where(ends[t], 0.0, after)
+        after = returns[t] + bonus[t]
+    return returns
 
 
 def agreement(q: torch.Tensor, returns: torch.Tensor) -> Measures:
@@ -272,79 +241,6 @@ def agreement(q: torch.Tensor, returns: torch.Tensor) -> Measures:
     }
 
 
-def _expected_reduction(q: torch.Tensor, options: Any) -> torch.Tensor:
-    """What a target takes of the critics' values ``[critics, B]``, in the mean over subsets."""
-    if options.reduce == "mean":
-        return q.mean(0)
-    if options.reduce == "min":
-        return q.amin(0)
-    size = options.subset
-    # The i-th smallest value is the smallest of a subset if all others of it are larger.
-    chances = [math.comb(len(q) - 1 - i, size - 1) / math.comb(len(q), size) for i in range(len(q))]
-    return q.new_tensor(chances) @ q.sort(0).values
-
-
 def _mean_and_std(x: torch.Tensor) -> tuple[float, float] | tuple[None, None]:
     """Mean and population standard deviation of numbers, if there are any."""
     return (x.mean().item(), x.std(unbiased=False).item()) if len(x) else (None, None)
-
-
-def critic_preference(agent: HasPolicy, obs: torch.Tensor, generator: torch.Generator) -> Scalars:
-    """By how much the critics prefer the actor to the base policy.
-
-    ``critic_preference`` = mean over states and critics of Q(s, deterministic actor) - Q(s, w),
-    w ~ N(0, I). Compare it with the true difference in return. If there is no true difference, the
-    actor exploits errors of the critics.
-
-    Args:
-        obs: ``[B, obs_dim]``.
-        generator: draws the random noise, on the agent's device.
-    """
-    own = agent.act(obs, deterministic=True)
-    random = agent.gaussian_noise(len(obs), generator)
-    gap = agent.q_values(obs, own) - agent.q_values(obs, random)
-    return {"critic_preference": gap.mean().item()}
-
-
-def policy_statistics(agent: SacAgent, obs: torch.Tensor) -> Scalars:
-    """Temperature, entropy and noise norms of the stochastic policy.
-
-    - ``alpha`` = exp(log alpha); ``entropy`` = mean of -log pi(w|s) over one draw per state;
-    - ``noise_norm`` = mean ||w||; ``mode_norm`` = mean ||deterministic w||;
-    - ``saturated_share`` = share of irrep blocks of drawn w with norm > 0.95 bound.
-    """
-    noise, log_prob = agent.sample(obs)
-    mode, noise = (agent.drawn_part(action) for action in (agent.mode(obs), noise))
-    return {
-        "alpha": agent.alpha.item(),
-        "entropy": -log_prob.mean().item(),
-        "noise_norm": noise.norm(dim=1).mean().item(),
-        "mode_norm": mode.norm(dim=1).mean().item(),
-        "saturated_share": agent.distribution.saturated(noise).double().mean().item(),
-    }
-
-
-@torch.no_grad()
-def orbit_variance(
-    agent: HasValues, obs: torch.Tensor, noise: torch.Tensor, group: Group
-) -> Scalars:
-    """Variance of Q over group orbits: 0 for invariant critics.
-
-    - ``orbit_variance`` = mean over states and critics of Var_g Q(gs, gw), g over the group;
-    - ``orbit_share`` = ``orbit_variance`` / variance of Q over the batch with all its group images.
-
-    Args:
-        obs, noise: ``[B, obs_dim]``, ``[B, Tp, Da]``.
-    """
-    q = torch.stack(
-        [
-            agent.q_values(
-                agent.obs_layout.transform(obs, angle, reflect),
-                agent.act_layout.transform(noise, angle, reflect),
-            )
-            for angle, reflect in group.elements
-        ]
-    ).double()
-    within = q.var(dim=0, unbiased=False).mean().item()
-    total = q.transpose(0, 1).flatten(1).var(dim=1, unbiased=False).mean().item()
-    return {"orbit_variance": within, "orbit_share": within / total if total > 0 else 0.0}

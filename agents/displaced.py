@@ -18,11 +18,9 @@ from dataclasses import dataclass
 import torch
 
 from symsteer.agents.agent import AgentContext, Deterministic
-from symsteer.agents.either import EitherAgent, EitherOptions
-from symsteer.agents.networks import Weights
-from symsteer.agents.options import NoiseSource
+from symsteer.agents.options import EitherOptions
 from symsteer.agents.presets import tuned
-from symsteer.errors import UserError
+from symsteer.agents.standard import EitherAgent
 
 
 @dataclass(frozen=True)
@@ -32,11 +30,12 @@ class DisplacedOptions(EitherOptions):
     displacement: float = 0.25
     """delta: mean squared displacement per number of the noise."""
 
+    agent = "the displaced agent"
+    entropy_bonus = False
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("be positive", lambda value: value > 0, "displacement")
-        if self.soft_backup:
-            raise UserError("the displaced agent has no entropy bonus: leave out soft_backup")
 
 
 @tuned
@@ -50,13 +49,12 @@ class DisplacedAgent(EitherAgent):
 
     def __init__(self, context: AgentContext, options: DisplacedOptions | None = None):
         super().__init__(context, options)
-        self.distribution.hard = False
         # What the learner calls log-probability is |Delta|^2 here, and its entropy -|Delta|^2.
         self.target_entropy = -self.options.displacement * self.noise_layout.dim
 
-    @property
-    def _bank_source(self) -> NoiseSource:
-        return "gaussian"
+    def bank_noise(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """That of the base policy."""
+        return self.gaussian_noise(count, generator)
 
     def alternatives(self) -> dict[str, Deterministic]:
         """The displacement alone."""
@@ -65,16 +63,14 @@ class DisplacedAgent(EitherAgent):
     @torch.no_grad()
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Noise ``[B, Tp, Da]``; it is random even if ``deterministic``."""
-        if deterministic:
-            return self.sample(obs)[0]
-        return super().act(obs)
+        return self.sample(obs)[0] if deterministic else super().act(obs)
 
-    def _heads(self, policy: Weights, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        mean, log_scale = super()._heads(policy, obs)
-        return mean, torch.zeros_like(log_scale)
+    @torch.no_grad()
+    def mode(self, obs: torch.Tensor) -> torch.Tensor:
+        """The displacement ``[B, Tp, Da]``."""
+        return self.chunk(self.moments(obs)[0])
 
     def _sample(
         self, mean: torch.Tensor, log_scale: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        noise, _ = super()._sample(mean, log_scale)
-        return noise, mean.square().sum(-1)
+        return mean + self._eps(mean), mean.square().sum(-1)

@@ -24,14 +24,16 @@ import torch.nn.functional as F
 from torch import nn
 
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Layout
+from symsteer.policies.geometry import Field, Layout
 
-# Below this |u|^2, functions of |u| are evaluated by their power series in |u|^2. The first dropped
-# terms are below 1e-14 there.
 SMALL = 1e-4
-
+"""Below this |u|^2, functions of |u| are evaluated by their power series in |u|^2, whose first
+dropped terms are below 1e-14."""
 
 LOG_SCALE_MIN, LOG_SCALE_MAX = -5.0, 1.0
+
+INITIAL_SCALE = 0.5
+"""The scale where an actor's output is 0."""
 
 
 class SquashedGaussian(nn.Module):
@@ -40,8 +42,6 @@ class SquashedGaussian(nn.Module):
     Args:
         layout: geometry of the flattened noise, ``dim`` numbers in ``blocks`` irrep blocks.
         bound: largest norm of a block, > 0.
-        hard: whether the bound is enforced by the squash. If not, w = u, a plain Gaussian, and
-            :meth:`excess` says by how much w is beyond the bound.
 
     Raises:
         UserError: if the bound is not positive.
@@ -51,16 +51,30 @@ class SquashedGaussian(nn.Module):
     sizes: torch.Tensor
     membership: torch.Tensor
 
-    def __init__(self, layout: Layout, bound: float, hard: bool = True):
+    def __init__(self, layout: Layout, bound: float):
         super().__init__()
         if not bound > 0:
             raise UserError(f"the noise bound must be positive, not {bound}")
-        self.layout, self.bound, self.hard = layout, bound, hard
+        self.bound = bound
         self.dim, self.blocks = layout.dim, len(layout.blocks)
+        # The means, then one invariant number per irrep block.
+        scales = Field("log_scales", 0, self.blocks)
+        self.parameter_layout = Layout([*layout.fields, scales])
         membership = F.one_hot(layout.block_index, self.blocks).to(torch.get_default_dtype())
         self.register_buffer("index", layout.block_index.clone(), persistent=False)
         self.register_buffer("membership", membership, persistent=False)  # [dim, blocks]
         self.register_buffer("sizes", membership.sum(0), persistent=False)
+
+    def parameters_of(self, output: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean ``[..., dim]`` and log-scale ``[..., blocks]`` from an actor's output.
+
+        The log-scale is a sigmoid, so that its gradient never vanishes at a clamp.
+        """
+        mean, raw = output.split([self.dim, self.blocks], dim=-1)
+        extent = LOG_SCALE_MAX - LOG_SCALE_MIN
+        share = (math.log(INITIAL_SCALE) - LOG_SCALE_MIN) / extent
+        start = math.log(share / (1 - share))
+        return mean, LOG_SCALE_MIN + extent * (raw + start).sigmoid()
 
     def sample(
         self, mean: torch.Tensor, log_scale: torch.Tensor, eps: torch.Tensor
@@ -75,38 +89,22 @@ class SquashedGaussian(nn.Module):
         Returns:
             Noise ``[..., dim]`` and log-probability ``[...]``, both differentiable.
         """
-        u = mean + self._spread(log_scale.exp()) * eps
-        log_prob = self._gaussian(eps, log_scale)
-        if not self.hard:
-            return u, log_prob
-        noise, log_volume = self._squash(u)
-        return noise, log_prob - log_volume
-
-    def mode(self, mean: torch.Tensor) -> torch.Tensor:
-        """The noise of the deterministic policy, ``[..., dim]``: the mean, squashed if ``hard``."""
-        return self.squash(mean) if self.hard else mean
+        noise, log_volume = self._squash(mean + self.spread(log_scale.exp()) * eps)
+        constant = 0.5 * self.dim * math.log(2 * math.pi)
+        gaussian = -0.5 * eps.square().sum(-1) - log_scale @ self.sizes - constant
+        return noise, gaussian - log_volume
 
     def squash(self, u: torch.Tensor) -> torch.Tensor:
         """``u [..., dim]`` with every block shortened into the ball of radius ``bound``."""
         return self._squash(u)[0]
 
-    def excess(self, noise: torch.Tensor) -> torch.Tensor:
-        """Squared excess of the blocks' norms over the bound, summed over blocks, ``[...]``."""
-        norms = (noise.square() @ self.membership + 1e-12).sqrt()
-        return (norms - self.bound).relu().square().sum(-1)
-
     def saturated(self, noise: torch.Tensor, share: float = 0.95) -> torch.Tensor:
         """Blocks with a norm above ``share`` of the bound, ``[..., blocks]`` bool."""
         return noise.square() @ self.membership > (share * self.bound) ** 2
 
-    def _spread(self, per_block: torch.Tensor) -> torch.Tensor:
+    def spread(self, per_block: torch.Tensor) -> torch.Tensor:
         """``[..., blocks]`` to ``[..., dim]``: each number gets its block's value."""
         return per_block.index_select(-1, self.index)
-
-    def _gaussian(self, eps: torch.Tensor, log_scale: torch.Tensor) -> torch.Tensor:
-        """Log-density of ``u`` under the unsquashed Gaussian, ``[...]``."""
-        constant = 0.5 * self.dim * math.log(2 * math.pi)
-        return -0.5 * eps.square().sum(-1) - log_scale @ self.sizes - constant
 
     def _squash(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """``w = bound tanh(|u|) u/|u|`` per block and the summed log-determinant."""

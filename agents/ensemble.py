@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import torch
 
-from symsteer.agents.agent import AgentContext
 from symsteer.agents.networks import Weights
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
@@ -53,62 +52,58 @@ class GroupEnsembleAgent(StandardAgent):
     Options = GroupEnsembleOptions
     options: GroupEnsembleOptions
 
-    def __init__(self, context: AgentContext, options: GroupEnsembleOptions | None = None):
-        super().__init__(context, options)
-        self.symmetry = Group.parse(self.options.group)
+    @property
+    def symmetry(self) -> Group:
+        """The group whose copies are averaged."""
+        return Group.parse(self.options.group)
 
     def penalty(self, name: str, batch: Batch) -> torch.Tensor | None:
         """The regularisers, at the states and actions of the batch."""
         obs = self._features(batch.obs)
         if name == "actor" and self.options.actor_regularizer:
-            outputs = self._actor_outputs(self.actor.weights(), obs)
+            outputs = self._copies_of_output(self.actor.weights(), obs)
             gap = self._divergence(outputs, outputs.detach().mean(-3, keepdim=True))
             return self.options.actor_regularizer * gap.mean((-2, -1))
         if name == "critic" and self.options.critic_regularizer:
-            stored = batch.noise if self.options.critic == "noise" else batch.actions
-            q = self._copies_of_q(self.critic.weights(), obs, stored.flatten(-2))
+            q = self._copies_of_q(self.critic.weights(), obs, self._stored(batch))
             gap = (q - q.detach().mean(-2, keepdim=True)).square().mean((-2, -1))
             return self.options.critic_regularizer * gap.sum(-1)
         return None
 
     def _actor_output(self, policy: Weights, obs: torch.Tensor) -> torch.Tensor:
-        return self._actor_outputs(policy, obs).mean(-3)
+        return self._copies_of_output(policy, obs).mean(-3)
 
     def _q(self, critics: Weights, obs: torch.Tensor, judged: torch.Tensor) -> torch.Tensor:
         return self._copies_of_q(critics, obs, judged).mean(-2)
 
-    def _actor_outputs(self, policy: Weights, obs: torch.Tensor) -> torch.Tensor:
+    def _copies_of_output(self, policy: Weights, obs: torch.Tensor) -> torch.Tensor:
         """What every copy of ``obs [B, obs_dim]`` gives, turned back, ``[|G|, B, dim]``."""
-        turned = self._turned(self.actor_inputs, obs)
+        turned = self._turned(self.obs_layout, obs)
         out = super()._actor_output(policy, turned.flatten(-3, -2))
-        rho = self._matrices(self.actor_layout)
+        rho = self.symmetry.representation(self.actor_layout, self.dtype, self.device)
         return torch.einsum("gij,...gbi->...gbj", rho, out.unflatten(-2, turned.shape[-3:-1]))
 
     def _copies_of_q(
         self, critics: Weights, obs: torch.Tensor, judged: torch.Tensor
     ) -> torch.Tensor:
         """Values of every copy, ``[critics, |G|, B]``."""
-        rows = judged.shape[-1] // self.act_layout.dim
-        copies = (
-            self._turned(self.obs_layout, obs),
-            self._turned(self.act_layout.repeat(rows), judged),
-        )
-        shape = copies[0].shape[-3:-1]
-        q = super()._q(critics, *(x.flatten(-3, -2) for x in copies))
-        return q.unflatten(-1, shape)
+        chunk = self.act_layout.repeat(judged.shape[-1] // self.act_layout.dim)
+        turned = self._turned(self.obs_layout, obs), self._turned(chunk, judged)
+        q = super()._q(critics, *(x.flatten(-3, -2) for x in turned))
+        return q.unflatten(-1, turned[0].shape[-3:-1])
 
     def _turned(self, layout: Layout, x: torch.Tensor) -> torch.Tensor:
         """Every turned copy of ``x [B, dim]``, ``[|G|, B, dim]``."""
-        return torch.einsum("gij,...bj->...gbi", self._matrices(layout), x)
-
-    def _matrices(self, layout: Layout) -> torch.Tensor:
-        return self.symmetry.representation(layout, self.dtype, self.device)
+        rho = self.symmetry.representation(layout, self.dtype, self.device)
+        return torch.einsum("gij,...bj->...gbi", rho, x)
 
     def _divergence(self, outputs: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
         """KL(p || q) + KL(q || p) of the Gaussians before the squash, sum over their numbers."""
-        (mean, log_scale), (other, other_log) = map(self._parameters, (outputs, others))
-        sizes = self.distribution.sizes
+        gaussian = self.distribution
+        mean, log_scale = gaussian.parameters_of(outputs)
+        other, other_log = gaussian.parameters_of(others)
         ratio = 2 * (log_scale - other_log)
         precision = (-2 * log_scale).exp() + (-2 * other_log).exp()
-        apart = (mean - other).square() @ self.distribution.membership
-        return 0.5 * (sizes * (ratio.exp() + (-ratio).exp() - 2) + apart * precision).sum(-1)
+        apart = (mean - other).square() @ gaussian.membership
+        spread = gaussian.sizes * (ratio.exp() + (-ratio).exp() - 2)
+        return 0.5 * (spread + apart * precision).sum(-1)

@@ -17,10 +17,8 @@ from symsteer.agents.networks import shrink_
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.sac import SacAgent
-from symsteer.policies.geometry import Field, Group, Layout
+from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
-
-VALUE = Layout([Field("value", 0)])
 
 
 class Pool(Project):
@@ -50,31 +48,23 @@ class EquivariantAgent(SacAgent):
     name = "equivariant"
     in_teams = True
 
-    def actor_layers(self) -> list[nn.Module]:
-        return equivariant_actor_layers(self)
-
-    def critic_layers(self, inputs: Layout) -> list[nn.Module]:
-        return equivariant_critic_layers(self, inputs)
+    def layers(self, inputs: Layout, outputs: Layout, scale: float = 1.0) -> list[nn.Module]:
+        return equivariant_layers(inputs, outputs, self.options, scale)
 
 
-def equivariant_actor_layers(agent: SacAgent) -> list[nn.Module]:
-    """Layers from observation to means and scales; small initial output."""
-    layers = equivariant_layers(agent.actor_inputs, agent.actor_layout, agent.options)
-    shrink_(layers[-1], agent.options.initial_output)
-    return layers
+def equivariant_layers(
+    inputs: Layout, outputs: Layout, options: SacOptions, scale: float = 1.0
+) -> list[nn.Module]:
+    """``depth`` hidden layers with width/|G| regular fields each, and an output layer.
 
-
-def equivariant_critic_layers(agent: SacAgent, inputs: Layout) -> list[nn.Module]:
-    """Layers from ``inputs`` to an invariant value."""
-    return equivariant_layers(inputs, VALUE, agent.options)
-
-
-def equivariant_layers(inputs: Layout, outputs: Layout, options: SacOptions) -> list[nn.Module]:
-    """``depth`` hidden layers with width/|G| regular fields each, and an output layer."""
+    The parameters of the output layer are multiplied by ``scale``.
+    """
     group = Group.parse(options.group)
     fields = max(1, round(options.width / group.order))
-    return [
+    layers: list[nn.Module] = [
         Lift(inputs, group, fields),
         *[RegularLinear(group, fields, fields) for _ in range(options.depth - 1)],
         Pool(group, fields, outputs),
     ]
+    shrink_(layers[-1], scale)
+    return layers

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 
 
@@ -27,3 +30,12 @@ def tensor_like(stored: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
     if stored.shape != own.shape:
         raise ValueError(f"a tensor has the shape {list(stored.shape)}, not {list(own.shape)}")
     return stored.to(own)
+
+
+def owned(tree: Any) -> Any:
+    """A copy with tensors in memory of their own: those of a team's member are views."""
+    if isinstance(tree, torch.Tensor):
+        return tree.detach().clone()
+    if isinstance(tree, Mapping):
+        return {key: owned(value) for key, value in tree.items()}
+    return [owned(value) for value in tree] if isinstance(tree, list) else tree

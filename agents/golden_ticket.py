@@ -63,18 +63,18 @@ class GoldenTicketAgent(Agent):
             starts = max(1, batches * env.num_envs // size)
             seeds = [seed for seed in env.training_seeds(number, starts) for _ in range(size)]
             played = play_constant(env, left.repeat(starts, 1, 1), seeds)
-            score = played["return"].double().view(starts, size).mean(0)
+            score, success = (
+                played[name].double().view(starts, size).mean(0)
+                for name in ("return", "success_once")
+            )
             order = score.argsort(descending=True, stable=True)
-            best = order[: max(1, size // 2)].sort().values
-            success = played["success_once"].double().view(starts, size).mean(0)[order[0]].item()
-            if len(best) > 1:
-                left = left[best]
-        self.ticket = left[order[0]]
-        self.searched = {
-            "ticket_success": success,
-            "ticket_episodes": float(starts),
-            "ticket_candidates": float(sizes[0]),
-        }
+            self.ticket = left[order[0]]
+            self.searched = {
+                "ticket_success": success[order[0]].item(),
+                "ticket_episodes": float(starts),
+                "ticket_candidates": float(sizes[0]),
+            }
+            left = left[order[: size // 2].sort().values]
         return 0
 
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
@@ -102,7 +102,7 @@ def play_constant(env: NoiseEnv, noise: torch.Tensor, seeds: list[int]) -> dict[
     Returns:
         ManiSkill's metrics of the episodes, each ``[M]``.
     """
-    parts = []
+    batches = []
     for start in range(0, len(seeds), env.num_envs):
         # If the last batch is not full, the other environments repeat a row and are dropped.
         rows = torch.arange(start, start + env.num_envs).clamp(max=len(seeds) - 1)
@@ -111,8 +111,8 @@ def play_constant(env: NoiseEnv, noise: torch.Tensor, seeds: list[int]) -> dict[
             step = env.step(noise[rows])
         # All episodes end with the last decision, so the rows are the environments in order.
         keep = min(env.num_envs, len(seeds) - start)
-        parts.append({name: value[:keep] for name, value in step.episodes.items()})
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        batches.append({name: value[:keep] for name, value in step.episodes.items()})
+    return {name: torch.cat([batch[name] for batch in batches]) for name in batches[0]}
 
 
 def rounds(budget: Budget, candidates: int) -> list[int]:

@@ -11,8 +11,8 @@ commute with permutations of the features, so regular fields stay regular fields
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Literal, Protocol, cast
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, Protocol, cast
 
 import torch
 import torch.nn.functional as F
@@ -20,8 +20,8 @@ from torch import nn
 
 Activation = Literal["relu", "tanh"]
 
-# Per layer the matrices [members, out, in] and biases [members, 1, out].
 Weights = list[tuple[torch.Tensor, torch.Tensor]]
+"""Per layer the matrices ``[members, out, in]`` and biases ``[members, 1, out]``."""
 
 
 class DenseLayer(Protocol):
@@ -83,8 +83,13 @@ class Ensemble(nn.Module):
                 yield layer, dict(layer.named_parameters())
 
     def changed(self) -> None:
-        """Drop the cache. Call this after every change of parameters (optimiser step, loading)."""
+        """Drop the cache. Call this after every change of parameters."""
         self._expanded = None
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
+        """As of any module; the cache is dropped."""
+        self.changed()
+        return super().load_state_dict(state_dict, *args, **kwargs)
 
     def _expand(self) -> Weights:
         stacked = []

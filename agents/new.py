@@ -22,18 +22,17 @@ ORIGINS = {
 }
 """Class and description of the agents that a new one can begin as."""
 
-IMPORTS = (
-    "from symsteer.agents.options import SacOptions",
-    "from symsteer.agents.replay import Batch",
-)
-
-SYMMETRY = """def test_it_turns_with_the_world():
+SYMMETRY = {
+    "diagnostics": "from symsteer.agents.diagnostics import actor_equivariance_error\n",
+    "Group": "Group, ",
+    "symmetry": """def test_it_turns_with_the_world():
     agent, obs = trained()
     assert actor_equivariance_error(agent, obs, Group.parse("C8")) < 1e-5
 
 
-"""
-"""What holds for equivariant agents alone."""
+""",
+}
+"""What the tests of equivariant agents alone have."""
 
 
 def new(
@@ -57,43 +56,34 @@ def new(
             f"{name!r} cannot be the name of an agent: use small letters, digits and hyphens, "
             "e.g. my-agent"
         )
-    module = name.replace("-", "_")
     if name in AGENTS:
         raise UserError(f"there is an agent {name!r} already; choose another name")
-    words = "".join(word.capitalize() for word in module.split("_"))
+    module = name.replace("-", "_")
+    title = "".join(word.capitalize() for word in module.split("_"))
+    origin, summary = ORIGINS[like]
+    line = f"from symsteer.agents.{like} import {origin}\n"  # imports are sorted
+    place = ("first", "last") if like == "equivariant" else ("last", "first")
     values = {
-        "name": name,
-        "module": module,
-        "Class": words if words.endswith("Agent") else f"{words}Agent",
-        "file": f"test_{module}.py",
-        "imports": "\n".join(
-            sorted([f"from symsteer.agents.{like} import {ORIGINS[like][0]}", *IMPORTS])
-        ),
-        "Origin": ORIGINS[like][0],
-        "summary": ORIGINS[like][1],
-        "Summary": ORIGINS[like][1].capitalize(),
-        "symmetry": SYMMETRY if like == "equivariant" else "",
+        **{"name": name, "module": module, "file": f"test_{module}.py"},
+        "Class": title if title.endswith("Agent") else f"{title}Agent",
+        **dict(zip(place, (line, ""), strict=True)),
+        **{"Origin": origin, "summary": summary, "Summary": summary.capitalize()},
+        **(SYMMETRY if like == "equivariant" else dict.fromkeys(SYMMETRY, "")),
     }
-    files = {out / f"{module}.py": "agent.txt", out / f"test_{module}.py": "test.txt"}
-    for path in files:
+    templates = {out / f"{module}.py": "agent.txt", out / f"test_{module}.py": "test.txt"}
+    for path in templates:
         if path.exists():
             raise UserError(f"{path} is there already; choose another name, or a folder with --out")
-    texts = {
-        path: Template((TEMPLATES / template).read_text()).substitute(values)
-        for path, template in files.items()
-    }
-    if like == "standard":
-        # Nothing of the group is tested.
-        unused = "from symsteer.agents.diagnostics import actor_equivariance_error\n"
-        test = out / f"test_{module}.py"
-        texts[test] = (
-            texts[test].replace(unused, "").replace("Field, Group, Layout", "Field, Layout")
-        )
-    write_together({path: text.encode() for path, text in texts.items()})
+    write_together(
+        {
+            path: Template((TEMPLATES / template).read_text()).substitute(values).encode()
+            for path, template in templates.items()
+        }
+    )
     where = "" if out == Path() else f"{to_paste('cd', out)}\n"
     target = f"{module}:{values['Class']}"
     print(
-        f"wrote {' and '.join(map(str, files))}\n\n"
+        f"wrote {' and '.join(map(str, templates))}\n\n"
         f"{where}python -m pytest test_{module}.py\n"
         f"{to_paste('symsteer', 'run', '--agent', target, '--env-steps', 10000)}\n"
         "symsteer site runs   # its page: site/index.html\n\n"

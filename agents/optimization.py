@@ -3,12 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
 
 from symsteer.agents.generators import tensor_like
+
+
+class Adam(torch.optim.Adam):
+    """The Adam of all parts of the learner."""
+
+    def __init__(self, parameters: Iterable[torch.Tensor], lr: float):
+        super().__init__(parameters, lr=lr, fused=True)
+
+    def descend(self, loss: torch.Tensor, penalty: torch.Tensor | None = None) -> None:
+        """One gradient step on a loss plus its regulariser; in a team on the sum over members."""
+        self.zero_grad()
+        (loss.sum() if penalty is None else loss.sum() + penalty.sum()).backward()
+        self.step()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue with stored moments; torch does not check that they fit the parameters."""
+        own = self.state_dict()["param_groups"]
+        parameters = dict(enumerate(p for group in self.param_groups for p in group["params"]))
+        for index, moments in state["state"].items():
+            for name in ("exp_avg", "exp_avg_sq"):
+                tensor_like(moments[name], parameters[index])
+            if moments.keys() != {"step", "exp_avg", "exp_avg_sq"} or not moments["step"] >= 1:
+                raise ValueError("an optimiser has other moments")
+        super().load_state_dict({"state": state["state"], "param_groups": own})
 
 
 class Multiplier:
@@ -20,7 +44,7 @@ class Multiplier:
 
     def __init__(self, initial: float, lr: float, device: torch.device, dtype: torch.dtype):
         self.log = torch.tensor(math.log(initial), dtype=dtype, device=device, requires_grad=True)
-        self.optimizer = adam([{"params": [self.log]}], lr)
+        self.optimizer = Adam([self.log], lr)
 
     @property
     def value(self) -> torch.Tensor:
@@ -30,7 +54,7 @@ class Multiplier:
     def step(self, gap: torch.Tensor) -> torch.Tensor:
         """One gradient step; returns the loss. In a team there is one number for each member."""
         loss = self.log * gap
-        descend(loss, self.optimizer)
+        self.optimizer.descend(loss)
         return loss.detach()
 
     def state_dict(self) -> dict[str, Any]:
@@ -39,32 +63,6 @@ class Multiplier:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        restore_adam(self.optimizer, state["optimizer"])
+        self.optimizer.load_state_dict(state["optimizer"])
         with torch.no_grad():
             self.log.copy_(tensor_like(state["log"], self.log))
-
-
-def adam(groups: list[dict[str, Any]], lr: float) -> torch.optim.Adam:
-    """The Adam of all parts of the learner."""
-    return torch.optim.Adam(groups, lr=lr, fused=True)
-
-
-def restore_adam(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> None:
-    """Continue with stored moments; torch does not check that they fit the parameters."""
-    own = optimizer.state_dict()["param_groups"]
-    parameters = dict(enumerate(p for group in optimizer.param_groups for p in group["params"]))
-    for index, moments in state["state"].items():
-        for name in ("exp_avg", "exp_avg_sq"):
-            tensor_like(moments[name], parameters[index])
-        if moments.keys() != {"step", "exp_avg", "exp_avg_sq"} or not moments["step"].item() >= 1:
-            raise ValueError("an optimiser has other moments")
-    optimizer.load_state_dict({"state": state["state"], "param_groups": own})
-
-
-def descend(
-    loss: torch.Tensor, optimizer: torch.optim.Optimizer, penalty: torch.Tensor | None = None
-) -> None:
-    """One gradient step on a loss plus its regulariser; in a team on the sum over members."""
-    optimizer.zero_grad()
-    (loss.sum() if penalty is None else loss.sum() + penalty.sum()).backward()
-    optimizer.step()

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 from symsteer.agents.agent import AgentOptions
-from symsteer.agents.distributions import LOG_SCALE_MAX, LOG_SCALE_MIN
 from symsteer.agents.networks import Activation
 from symsteer.errors import UserError
 from symsteer.names import check
 from symsteer.policies.geometry import Group
 
 Critic = Literal["noise", "aliased", "sampler"]
-Reduce = Literal["min", "mean", "subset"]
-NoiseSource = Literal["gaussian", "squashed"]
+Reduce = Literal["min", "mean"]
 Distill = Literal["gaussian", "squashed", "actor", "mixture"]
+Layers = Literal["plain", "equivariant"]
 
 
 @dataclass(frozen=True)
@@ -45,12 +43,7 @@ class SacOptions(AgentOptions):
     critics: int = 4
     """Number of critics."""
     reduce: Reduce = "mean"
-    """One value of several critics: the smallest, the mean, or the smallest of a random subset
-    (REDQ; the actor then follows the mean)."""
-    subset: int = 2
-    """Critics in a random subset."""
-    n_step: int = 1
-    """Decisions whose rewards a target sums before it bootstraps."""
+    """One value of several critics: the smallest, or the mean."""
     timeouts_terminal: bool = False
     """Do not bootstrap where the time limit ended an episode (as in the published code of DSRL)."""
     soft_backup: bool = False
@@ -61,9 +54,6 @@ class SacOptions(AgentOptions):
     """Entropy weight at the start."""
     noise_bound: float = 1.0
     """Largest norm of an irrep block of the noise."""
-    bound_penalty: float = 0.0
-    """0: the noise is squashed into the bound. Above 0: no squash; the actor pays this weight for
-    the squared excess over the bound, summed over blocks."""
     distill: Distill = "squashed"
     """Noise at which `aliased` distils: N(0, I), N(0, I) squashed into the bound, the actor's, or a
     mixture of squashed and actor's in equal parts."""
@@ -75,17 +65,10 @@ class SacOptions(AgentOptions):
     utd: float = 0.5
     """Updates per collected decision, for any number of environments."""
     warmup: int = 1280
-    """Decisions with random noise at the start."""
-    warmup_noise: NoiseSource = "gaussian"
-    """This noise: N(0, I), that is the base policy, or N(0, I) squashed into the bound."""
-    learning_starts: int | None = None
-    """Decisions before the first update; default: `warmup`. Fewer: updates during the warm-up."""
-    actor_delay: int = 0
-    """Updates of the critics alone before the first one of the actor."""
+    """Decisions at the start with noise from N(0, I), that is of the base policy, before the first
+    update."""
     replay_capacity: int = 200_000
     """Capacity of the replay buffer, in decisions."""
-    demonstration_share: float = 0.0
-    """Share of each batch that comes from the demonstrations; not with noise critics."""
     reward_scale: float = 0.25
     """Factor on rewards in training (0.25: one decision of four steps costs 1). Reported Q-values
     are in unscaled reward units."""
@@ -98,69 +81,56 @@ class SacOptions(AgentOptions):
     layer_norm: bool = True
     """Normalise hidden features; without it Q often diverges."""
     group: str = "C8"
-    """Symmetry group, C_n or D_n, of equivariant layers and of the measured equivariance errors."""
-    initial_scale: float = 0.5
-    """Standard deviation of the untrained policy before the squash."""
+    """Symmetry group, C_n or D_n, of equivariant layers, of turned batches and of the measured
+    equivariance errors."""
     initial_output: float = 0.01
     """Factor on the actor's output layer at initialisation; small means w starts around 0."""
 
+    agent: ClassVar[str] = "the agent"
+    """The agent in messages."""
+    known_critics: ClassVar[tuple[Critic, ...]] = get_args(Critic)
+    """The kinds of critics that the agent can have."""
+    least_bank: ClassVar[int] = 0
+    """The smallest ``noise_bank`` that the agent can have."""
+    entropy_bonus: ClassVar[bool] = True
+    """Whether ``soft_backup`` means something for the agent."""
+
     def __post_init__(self) -> None:
-        for name, choices in (
-            ("critic", Critic),
-            ("reduce", Reduce),
-            ("distill", Distill),
-            ("warmup_noise", NoiseSource),
-            ("activation", Activation),
-        ):
-            check(name, [getattr(self, name)], get_args(choices))
+        for name, kind in get_type_hints(type(self)).items():
+            if get_origin(kind) is Literal:
+                check(name, [getattr(self, name)], get_args(kind))
+        if self.critic not in self.known_critics:
+            known = " or ".join(self.known_critics)
+            raise UserError(f"{self.agent} judges executed actions: its critic is {known}")
+        if self.noise_bank < self.least_bank:
+            raise UserError(
+                f"{self.agent} needs a noise_bank of at least {self.least_bank}, not "
+                f"{self.noise_bank}"
+            )
+        if self.soft_backup and not self.entropy_bonus:
+            raise UserError(f"{self.agent} has no entropy bonus: leave out soft_backup")
         self._require(
             "be positive",
             lambda value: value > 0,
-            *("lr", "alpha_lr", "batch_size", "critics", "subset", "n_step", "width", "depth"),
-            *("noise_bound", "initial_alpha", "reward_scale", "replay_capacity", "utd"),
-            "distill_steps",
+            *("lr", "alpha_lr", "batch_size", "critics", "width", "depth", "noise_bound"),
+            *("initial_alpha", "reward_scale", "replay_capacity", "utd", "distill_steps"),
         )
         self._require(
-            "not be negative",
-            lambda value: value >= 0,
-            *("warmup", "initial_output", "bound_penalty", "noise_bank"),
-            "actor_delay",
+            "not be negative", lambda value: value >= 0, "warmup", "initial_output", "noise_bank"
         )
-        self._require("lie in [0, 1)", lambda value: 0 <= value < 1, "gamma", "demonstration_share")
+        self._require("lie in [0, 1)", lambda value: 0 <= value < 1, "gamma")
         self._require("lie in (0, 1]", lambda value: 0 < value <= 1, "tau")
-        low, high = math.exp(LOG_SCALE_MIN), math.exp(LOG_SCALE_MAX)
-        self._require(
-            f"lie between {low:.4f} and {high:.2f}", lambda v: low < v < high, "initial_scale"
-        )
-        if self.reduce == "subset" and self.subset > self.critics:
-            raise UserError(
-                f"agent option subset is {self.subset}, more than the {self.critics} critics"
-            )
-        if self.demonstration_share and self.critic == "noise":
-            raise UserError(
-                "agent option demonstration_share needs critics of actions, because demonstrations "
-                "have no noise; choose critic aliased or sampler"
-            )
-        if self.learning_starts is not None:
-            self._require("not be negative", lambda value: value >= 0, "learning_starts")
         _ = Group.parse(self.group).order
 
-    @property
-    def first_update(self) -> int:
-        """Decisions before the first update."""
-        return self.warmup if self.learning_starts is None else self.learning_starts
-
-    def _require(self, rule: str, holds: Any, *names: str) -> None:
+    def _require(self, rule: str, holds: Callable[[Any], bool], *names: str) -> None:
         for name in names:
             if not holds(getattr(self, name)):
                 raise UserError(f"agent option {name} must {rule}, not {getattr(self, name)}")
 
 
-def critics_of(options: type[SacOptions]) -> list[Critic]:
-    """The kinds of critics that an agent's options accept."""
-    found: list[Critic] = []
-    for critic in get_args(Critic):
-        with contextlib.suppress(UserError):
-            options(critic=critic)
-            found.append(critic)
-    return found
+@dataclass(frozen=True)
+class EitherOptions(SacOptions):
+    """Options of agents with plain or equivariant layers."""
+
+    layers: Layers = "plain"
+    """Layers of actor and critics: those of `standard`, or those of `equivariant`."""

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -36,20 +36,15 @@ from torch import nn
 
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.episodes import Played
-from symsteer.agents.equivariant import (
-    equivariant_actor_layers,
-    equivariant_critic_layers,
-    equivariant_layers,
-)
+from symsteer.agents.equivariant import equivariant_layers
 from symsteer.agents.generators import tensor_like
 from symsteer.agents.networks import Ensemble, Weights
-from symsteer.agents.optimization import adam
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
-from symsteer.agents.standard import StandardAgent, plain_layers
+from symsteer.agents.sac import VALUE
+from symsteer.agents.standard import StandardAgent
 from symsteer.errors import UserError
-from symsteer.names import check
 from symsteer.policies.geometry import Field, Group, Layout
 
 Gate = Literal["hard", "soft"]
@@ -70,23 +65,13 @@ class PartialOptions(SacOptions):
     fence: float = 1.5
     """Distance of the fence above the median, in units of that of the first quartile below it."""
 
+    agent = "the partial agent"
+    known_critics = ("aliased", "sampler")
+    least_bank = 1
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        check("gate", [self.gate], get_args(Gate))
         self._require("not be negative", lambda value: value >= 0, "fence")
-        if self.critic == "noise":
-            raise UserError(
-                "the partial agent judges executed actions: its critic is aliased or sampler"
-            )
-        if self.n_step != 1:
-            raise UserError(
-                f"the partial agent predicts the next decision: n_step is 1 for it, not "
-                f"{self.n_step}"
-            )
-        if self.noise_bank < 1:
-            raise UserError(
-                f"the partial agent needs a noise_bank of at least 1, not {self.noise_bank}"
-            )
 
 
 @tuned
@@ -94,49 +79,39 @@ class PartialAgent(StandardAgent):
     """Equivariant and plain networks, mixed by a gate that sees where the symmetry is broken."""
 
     name = "partial"
+    always_banks = True
     Options = PartialOptions
     options: PartialOptions
 
     def __init__(self, context: AgentContext, options: PartialOptions | None = None):
-        self.own: dict[str, Ensemble] = {}
         super().__init__(context, options)
         if self.options.critic == "aliased" and context.horizon == context.execute:
             raise UserError(
                 "the partial agent cannot tell noise from actions if a whole chunk is executed; "
                 "set critic to sampler, or execute less than the horizon"
             )
-        following = Layout([*self.obs_layout.fields, Field("reward", 0)])
-        depth, width = self.options.depth, self.options.width
-
-        def plain(inputs: Layout, outputs: int) -> list[nn.Module]:
-            return plain_layers(inputs.dim, width, depth, outputs)
-
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(context.seed + 1)
-            layers = {
-                "strict_predictor": equivariant_layers(self.action_inputs, following, self.options),
-                "plain_predictor": plain(self.action_inputs, following.dim),
-                "gate": plain(self.action_inputs, 1),
-                "state_gate": plain(self.obs_layout, 1),
-            }
-            self.own = {name: self._network([own]) for name, own in layers.items()}
-        for name, network in self.own.items():
-            self.optimizers[name] = adam(self.parameter_groups(network), self.options.lr)
+        following = self.following
         self.blocks = following.block_means.to(self.device, self.dtype)
         reflections = Group.parse(self.options.group).reflections
         self.invariant = following.invariant_mask(reflections).to(self.device, self.dtype)
-        ones = torch.ones(self.blocks.shape[1], device=self.device, dtype=self.dtype)
-        self.sizes = ones
+        self.sizes = torch.ones(self.blocks.shape[1], device=self.device, dtype=self.dtype)
 
     @property
-    def networks(self) -> dict[str, Ensemble]:
+    def following(self) -> Layout:
+        """What is predicted: the change of the observation, and the reward."""
+        return Layout([*self.obs_layout.fields, Field("reward", 0)])
+
+    def _networks(self) -> dict[str, Ensemble]:
         """Actor, critics, predictors and gates."""
-        return super().networks | self.own
-
-    @property
-    def keeps_bank(self) -> bool:
-        """The state's gate is trained on banked actions."""
-        return True
+        networks, predicted = super()._networks(), (self.action_inputs, self.following)
+        torch.manual_seed(self.context.seed + 1)
+        layers = {
+            "strict_predictor": equivariant_layers(*predicted, self.options),
+            "plain_predictor": self.layers(*predicted),
+            "gate": self.layers(self.action_inputs, VALUE),
+            "state_gate": self.layers(self.obs_layout, VALUE),
+        }
+        return networks | {name: self._network([own]) for name, own in layers.items()}
 
     # The mixtures.
 
@@ -153,24 +128,26 @@ class PartialAgent(StandardAgent):
 
     def _opening(self, name: str, inputs: torch.Tensor) -> torch.Tensor:
         """What a gate predicts, in (0, 1)."""
-        return (self.own[name](inputs)[..., 0, :, 0] + START).sigmoid()
+        return (self.networks[name](inputs)[..., 0, :, 0] + START).sigmoid()
 
     def _actors(self) -> list[list[nn.Module]]:
-        return [equivariant_actor_layers(self), self.actor_layers()]
+        how = (self.actor_inputs, self.actor_layout, self.options, self.options.initial_output)
+        return [equivariant_layers(*how), self.actor_layers()]
 
     def _critics(self, inputs: Layout) -> Ensemble:
         count = range(self.options.critics)
-        strict = [equivariant_critic_layers(self, inputs) for _ in count]
+        strict = [equivariant_layers(inputs, VALUE, self.options) for _ in count]
         return self._network([*strict, *(self.critic_layers(inputs) for _ in count)])
 
     def _heads(self, policy: Weights, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         outputs = self.actor.apply_weights(policy, obs).unbind(-3)
-        (strict, strict_log), (plain, plain_log) = map(self._parameters, outputs)
+        both = map(self.distribution.parameters_of, outputs)
+        (strict, strict_log), (plain, plain_log) = both
         share = self._share(obs, None).unsqueeze(-1)
         strict_precision = (1 - share) * (-2 * strict_log).exp()
         plain_precision = share * (-2 * plain_log).exp()
         precision = strict_precision + plain_precision
-        spread = self.distribution._spread
+        spread = self.distribution.spread
         mean = strict * spread(strict_precision / precision)
         mean = mean + plain * spread(plain_precision / precision)
         return mean, -0.5 * precision.log()
@@ -193,12 +170,12 @@ class PartialAgent(StandardAgent):
         share = 1 - MEMORY if self.updates > 1 else 1.0
         centred = wanted - wanted.mean(0) * self.invariant
         self.sizes.lerp_((centred.square() @ self.blocks).mean(0), share)
-        found = {}
+        predictions = []
         for name in ("strict_predictor", "plain_predictor"):
-            found[name] = self.own[name](inputs)[0]
-            self._descend(name, self._distance(found[name], wanted).mean(), batch)
-        strict, plain = (out.detach() for out in found.values())
-        disagreement = self._distance(strict, plain)
+            prediction = self.networks[name](inputs)[0]
+            self._descend(name, self._distance(prediction, wanted).mean(), batch)
+            predictions.append(prediction.detach())
+        disagreement = self._distance(*predictions)
         low, middle = torch.quantile(
             disagreement.log(), torch.tensor([0.25, 0.5], device=self.device, dtype=self.dtype)
         )

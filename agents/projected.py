@@ -10,27 +10,27 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from symsteer.agents.asymmetry import LayersOf, Parameters, PenaltyAgent, PulledLayer
+from symsteer.agents.asymmetry import AsymmetricLayer, Parameters, PenaltyAgent
 from symsteer.agents.networks import dense
 from symsteer.agents.presets import tuned
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
 
-class Projected(PulledLayer):
+class Projected(AsymmetricLayer):
     """A plain layer; its asymmetric part is what the projection removes."""
 
     def __init__(self, strict: EquivariantLayer):
         super().__init__()
-        self.weight, self.bias = (nn.Parameter(part.detach().clone()) for part in dense(strict))
+        self.weight, self.bias = (nn.Parameter(x.detach().clone()) for x in dense(strict))
         self.strict = strict.without_parameters()
 
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         return self.weight, self.bias
 
     def pull(self, parameters: Parameters, factor: float) -> None:
-        own = parameters["weight"], parameters["bias"]
-        for part, near in zip(own, self.strict.nearest(*own), strict=True):
-            part.lerp_(near, 1 - factor)
+        tensors = parameters["weight"], parameters["bias"]
+        for tensor, near in zip(tensors, self.strict.nearest(*tensors), strict=True):
+            tensor.lerp_(near, 1 - factor)
 
 
 @tuned
@@ -39,6 +39,4 @@ class ProjectedAgent(PenaltyAgent):
 
     name = "projected"
     in_teams = True
-
-    def asymmetric_layers(self, make: LayersOf) -> list[nn.Module]:
-        return [Projected(layer) for layer in make()]
+    Layer = Projected

@@ -15,19 +15,12 @@ Without a penalty a layer is no plain one: a plain layer has a filter for every 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import nn
 
-from symsteer.agents.asymmetry import (
-    LayersOf,
-    Parameters,
-    PenaltyAgent,
-    PenaltyOptions,
-    PulledLayer,
-)
+from symsteer.agents.asymmetry import AsymmetricLayer, Parameters, PenaltyAgent, PenaltyOptions
 from symsteer.agents.networks import dense, shrink_
 from symsteer.agents.presets import tuned
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift
@@ -45,14 +38,14 @@ class RelaxedOptions(PenaltyOptions):
         self._require("be at least 1", lambda value: value >= 1, "filters")
 
 
-class Relaxed(PulledLayer):
+class Relaxed(AsymmetricLayer):
     """A sum of equivariant layers of equal shape, each weighted by group element.
 
     Args:
         filters: the layers; they become smaller, so that the sum has the size of one.
     """
 
-    def __init__(self, filters: Sequence[EquivariantLayer]):
+    def __init__(self, *filters: EquivariantLayer):
         super().__init__()
         self.filters = nn.ModuleList(filters)
         shrink_(self.filters, 1 / math.sqrt(len(filters)))
@@ -81,7 +74,9 @@ class RelaxedAgent(PenaltyAgent):
     in_teams = True
     Options = RelaxedOptions
     options: RelaxedOptions
+    Layer = Relaxed
 
-    def asymmetric_layers(self, make: LayersOf) -> list[nn.Module]:
-        several = [make() for _ in range(self.options.filters)]
-        return [Relaxed(filters) for filters in zip(*several, strict=True)]
+    @property
+    def copies(self) -> int:
+        """The filters."""
+        return self.options.filters

@@ -11,8 +11,6 @@ import torch
 from symsteer.agents.generators import continue_stream
 from symsteer.errors import UserError
 
-FOLLOWED = ("reward", "next_obs", "terminal", "truncated")
-
 FIRST_ROWS = 4096
 """Rows allocated at the start. When they are full, the buffer doubles, up to its capacity."""
 
@@ -91,7 +89,6 @@ class ReplayBuffer:
         self.storage = {name: self._rows(name, 0) for name in shapes}
         self.position = 0
         self.size = 0
-        self.stride = 1  # rows between successive decisions of one environment
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
 
     def __len__(self) -> int:
@@ -115,23 +112,13 @@ class ReplayBuffer:
         for name, kept in self.storage.items():
             kept.index_copy_(0, rows, new[name].to(kept))
         self.position = (self.position + count) % self.capacity
-        self.stride = count
         self.size = min(self.size + count, self.capacity)
 
-    def sample(self, batch_size: int, gamma: float, n_step: int = 1) -> Batch:
+    def sample(self, batch_size: int, gamma: float) -> Batch:
         """Draw ``batch_size`` transitions uniformly, with replacement.
 
-        With ``n_step`` above 1, a transition is joined with those that follow it in its episode, up
-        to this number: ``reward`` is their discounted sum; ``next_obs``, ``terminal`` and
-        ``truncated`` are those of the last one.
-
-        Args:
-            batch_size: number of rows.
-            gamma: discount per decision.
-            n_step: decisions in a row.
-
         Returns:
-            The fields, and ``discount [B]``: gamma to the power of the decisions that were joined.
+            The fields, and ``discount [B]``: ``gamma``, per decision.
 
         Raises:
             UserError: if the buffer is empty.
@@ -141,35 +128,13 @@ class ReplayBuffer:
         rows = torch.randint(self.size, (batch_size,), generator=self.generator, device=self.device)
         batch = Batch({name: kept.index_select(0, rows) for name, kept in self.storage.items()})
         batch["discount"] = torch.full_like(batch.reward, gamma)
-        for _ in range(n_step - 1):
-            following = (rows + self.stride) % self.capacity
-            following = following.clamp(max=self.size - 1)
-            then = {name: self.storage[name][following] for name in FOLLOWED}
-            # A row continues another one if it is newer and starts where that one ended. This is
-            # never so across resets, fresh scenes, or the place where the ring is overwritten.
-            joined = (self.storage["obs"][following] == batch.next_obs).all(1)
-            joined &= (self.position - 1 - rows) % self.capacity >= self.stride
-            joined &= (batch.terminal + batch.truncated) == 0
-            batch["reward"] = batch.reward + joined * batch.discount * then["reward"]
-            batch["discount"] = torch.where(joined, gamma * batch.discount, batch.discount)
-            for name in ("next_obs", "terminal", "truncated"):
-                old = batch[name]
-                batch[name] = torch.where(joined.view(-1, *[1] * (old.ndim - 1)), then[name], old)
-            rows = torch.where(joined, following, rows)
         return batch
 
-    def in_order(self) -> dict[str, torch.Tensor]:
-        """All whole steps, oldest first; each has one row for each environment."""
-        count = self.size - self.size % self.stride
-        rows = torch.arange(self.position - count, self.position, device=self.device)
-        return {name: kept[rows % self.capacity] for name, kept in self.storage.items()}
-
     def state_dict(self) -> dict[str, Any]:
-        """The filled rows, the position, the stride and the generator."""
+        """The filled rows, the position and the generator."""
         return {
             "rows": {name: kept[: self.size].clone() for name, kept in self.storage.items()},
             "position": self.position,
-            "stride": self.stride,
             "generator": self.generator.get_state(),
         }
 
@@ -179,22 +144,21 @@ class ReplayBuffer:
         Raises:
             UserError: if the saved transitions have other fields or shapes, or do not fit.
         """
-        rows, position, stride = state["rows"], state["position"], state["stride"]
+        rows, position = state["rows"], state["position"]
         sizes = {len(kept) for kept in rows.values()}
-        found = {name: tuple(kept.shape[1:]) for name, kept in rows.items()}
+        shapes = {name: tuple(kept.shape[1:]) for name, kept in rows.items()}
         size = max(sizes, default=0)
         # Until the ring is full, its next row is the first free one.
         free = range(self.capacity) if size == self.capacity else range(size, self.capacity)[:1]
-        told = position in free and stride in range(1, max(size, 1) + 1)
-        if found != self.shapes or len(sizes) != 1 or not told:
+        if shapes != self.shapes or len(sizes) != 1 or position not in free:
             raise UserError(
-                f"the saved replay holds {size} transitions of {found}, this buffer up to "
+                f"the saved replay holds {size} transitions of {shapes}, this buffer up to "
                 f"{self.capacity} of {self.shapes}; resume with the run's own configuration"
             )
         self._grow(size)
         for name, kept in self.storage.items():
             kept[:size] = rows[name].to(kept)
-        self.size, self.position, self.stride = size, position, stride
+        self.size, self.position = size, position
         continue_stream(self.generator, state["generator"])
 
     def _rows(self, name: str, count: int) -> torch.Tensor:

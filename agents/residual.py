@@ -9,7 +9,7 @@ with |r| <= 1 for each irrep block, so that the bound is radial and commutes wit
 critics judge executed actions, as in Policy Decorator (arXiv 2412.13630). Our choices: its actor
 sees the observation alone, and it plays the correction with a probability that grows; here the
 bound grows (``ramp``). An action of this agent has the rows of the noise, then those of r:
-``[Tp + Ta, Da]``.
+``[Tp + Ta, Da]``. What the learner calls noise of the actor is r.
 """
 
 from __future__ import annotations
@@ -20,13 +20,11 @@ import torch
 
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.distributions import SquashedGaussian
-from symsteer.agents.either import EitherAgent, EitherOptions
-from symsteer.agents.networks import Weights
-from symsteer.agents.options import Critic, NoiseSource
+from symsteer.agents.options import Critic, EitherOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import Drawn
-from symsteer.errors import UserError
+from symsteer.agents.standard import EitherAgent
 from symsteer.policies.geometry import Layout
 from symsteer.policies.normalizer import clip_blocks
 
@@ -43,13 +41,11 @@ class ResidualOptions(EitherOptions):
     ramp: int = 0
     """Decisions over which the bound grows from 0."""
 
+    agent = "the residual agent"
+    known_critics = ("sampler",)
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.critic != "sampler":
-            raise UserError(
-                "the residual agent judges executed actions: its critic is sampler, not "
-                f"{self.critic}"
-            )
         self._require("lie in (0, 2]", lambda value: 0 < value <= 2, "residual_bound")
         self._require("not be negative", lambda value: value >= 0, "ramp")
 
@@ -60,6 +56,7 @@ class ResidualAgent(EitherAgent):
 
     name = "residual"
     in_teams = True
+    always_banks = True
     Options = ResidualOptions
     options: ResidualOptions
 
@@ -73,15 +70,6 @@ class ResidualAgent(EitherAgent):
         return context.horizon + context.execute
 
     @property
-    def keeps_bank(self) -> bool:
-        """The actor is trained at banked actions of the base policy."""
-        return True
-
-    @property
-    def _bank_source(self) -> NoiseSource:
-        return "gaussian"
-
-    @property
     def drawn_rows(self) -> int:
         """The correction."""
         return self.context.execute
@@ -90,10 +78,6 @@ class ResidualAgent(EitherAgent):
     def actor_inputs(self) -> Layout:
         """The observation and the executed part of the base policy's chunk."""
         return self.action_inputs
-
-    def drawn_part(self, action: torch.Tensor) -> torch.Tensor:
-        """The correction ``[B, Ta * Da]``."""
-        return action[:, self.context.horizon :].flatten(1)
 
     @property
     def bound(self) -> float:
@@ -105,10 +89,9 @@ class ResidualAgent(EitherAgent):
     def decode(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """The base policy's chunks with corrected executed actions, ``[B, Tp, Da]``."""
         chunk = self.context.decode(obs, action[..., : self.context.horizon, :])
-        first, rest = chunk.split(
-            [self.context.execute, self.context.horizon - self.context.execute], dim=-2
-        )
-        return torch.cat([self.corrected(first, action[..., self.context.horizon :, :]), rest], -2)
+        executed, rest = chunk.tensor_split([self.context.execute], dim=-2)
+        correction = action[..., self.context.horizon :, :]
+        return torch.cat([self.corrected(executed, correction), rest], -2)
 
     def corrected(self, actions: torch.Tensor, correction: torch.Tensor) -> torch.Tensor:
         """Actions ``[..., Ta, Da]`` plus a correction of the same shape, within norm 1."""
@@ -120,37 +103,40 @@ class ResidualAgent(EitherAgent):
         noise[:, self.context.horizon :] = 0
         return noise
 
-    def random_noise(
-        self, source: NoiseSource, count: int, generator: torch.Generator | None = None
-    ) -> torch.Tensor:
-        """The same; with ``squashed`` the correction is random, too."""
-        noise = super().gaussian_noise(count, generator)
-        squashed = self.distribution.squash(self.drawn_part(noise))
-        return self._with(noise, squashed if source == "squashed" else 0 * squashed)
+    def bank_noise(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """The actor is trained at banked actions of the base policy."""
+        return self.gaussian_noise(count, generator)
 
     # Acting.
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Actions ``[B, Tp + Ta, Da]``; their noise is random even if ``deterministic``."""
-        if not deterministic:
-            return super().act(obs)
-        action = self.gaussian_noise(len(obs))
-        return self._with(action, self.distribution.mode(self._moments(obs, action)[0]))
+        if deterministic:
+            return self._with_mean(obs, self.gaussian_noise(len(obs)))
+        return super().act(obs)
 
     @torch.no_grad()
     def mode(self, obs: torch.Tensor) -> torch.Tensor:
         """The correction of what noise 0 is decoded to, ``[B, Tp + Ta, Da]``."""
         shape = (len(obs), self.rows, self.act_layout.dim)
-        action = torch.zeros(shape, device=self.device, dtype=self.dtype)
-        return self._with(action, self.distribution.mode(self._moments(obs, action)[0]))
+        return self._with_mean(obs, torch.zeros(shape, device=self.device, dtype=self.dtype))
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Actions with a drawn correction, and the log-probability of the correction."""
         action = self.gaussian_noise(len(obs))
-        correction, log_prob = self._sample(*self._moments(obs, action))
-        return self._with(action, correction), log_prob
+        drawn = self._corrections(obs, self._base_actions(obs, action))
+        return self._with(action, drawn.noise), drawn.log_prob
+
+    def _with_mean(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        inputs = self._inputs(self._features(obs), self._base_actions(obs, action))
+        mean, _ = self._heads(self.actor.weights(), inputs)
+        return self._with(action, self.distribution.squash(mean))
+
+    def _with(self, action: torch.Tensor, correction: torch.Tensor) -> torch.Tensor:
+        action[:, self.context.horizon :] = self.chunk(correction)
+        return action
 
     # Learning.
 
@@ -158,37 +144,24 @@ class ResidualAgent(EitherAgent):
         """Corrections that the actor draws at observations in environment units."""
         count = obs.shape[-2]
         noise = self.random(lambda generator: self.gaussian_noise(count, generator))
-        return self._corrected(obs, self._base_actions(obs, noise))
+        return self._corrections(obs, self._base_actions(obs, noise))
 
-    def _improve(self, batch: Batch, obs: torch.Tensor, judge: Weights) -> dict[str, torch.Tensor]:
-        """One step of the actor at actions of the base policy that were decoded before."""
-        _, actions = self._random_pairs(batch)
-        drawn = self._corrected(batch.obs, self.chunk(actions))
-        values = self._q(judge, obs, drawn.judged)
-        return self._climb(values, drawn.noise, drawn.log_prob, batch)
+    def drawn_to_improve(self, batch: Batch) -> Drawn:
+        """Corrections of actions of the base policy that were decoded before."""
+        return self._corrections(batch.obs, self.chunk(self._random_pairs(batch)[1]))
 
-    def _corrected(self, obs: torch.Tensor, actions: torch.Tensor) -> Drawn:
+    def _corrections(self, obs: torch.Tensor, actions: torch.Tensor) -> Drawn:
         """The actor's corrections of actions ``[..., Ta, Da]``."""
         features = self._features(obs)
-        inputs = torch.cat([features, actions.flatten(-2)], -1)
-        correction, log_prob = self._sample(*self._heads(self.actor.weights(), inputs))
+        heads = self._heads(self.actor.weights(), self._inputs(features, actions))
+        correction, log_prob = self._sample(*heads)
         judged = self.corrected(actions, self.chunk(correction)).flatten(-2)
-        return Drawn(features, correction, log_prob, judged)
+        return Drawn(features, correction, log_prob, lambda: judged)
 
-    # Inner parts.
+    def _inputs(self, features: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        return torch.cat([features, actions.flatten(-2)], -1)
 
     def _base_actions(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """The executed actions ``[..., Ta, Da]`` that the noise of an action is decoded to."""
         chunk = self.context.decode(obs, action[..., : self.context.horizon, :])
         return chunk[..., : self.context.execute, :]
-
-    def _moments(
-        self, obs: torch.Tensor, action: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        actions = self._base_actions(obs, action).flatten(1)
-        inputs = torch.cat([self._features(obs), actions], -1)
-        return self._heads(self.actor.weights(), inputs)
-
-    def _with(self, action: torch.Tensor, correction: torch.Tensor) -> torch.Tensor:
-        action[:, self.context.horizon :] = self.chunk(correction)
-        return action

@@ -8,14 +8,13 @@ holds it.
 from __future__ import annotations
 
 import torch
-from torch import nn
 
-from symsteer.agents.asymmetry import LayersOf, Parameters, PenaltyAgent, PulledLayer, TwoPaths
+from symsteer.agents.asymmetry import Parameters, PenaltyAgent, TwoPaths
 from symsteer.agents.networks import dense
 from symsteer.agents.presets import tuned
 
 
-class ResidualPathway(TwoPaths, PulledLayer):
+class ResidualPathway(TwoPaths):
     """The sum of both paths."""
 
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -33,6 +32,4 @@ class ResidualPathwayAgent(PenaltyAgent):
 
     name = "residual-pathway"
     in_teams = True
-
-    def asymmetric_layers(self, make: LayersOf) -> list[nn.Module]:
-        return [ResidualPathway(layer) for layer in make()]
+    Layer = ResidualPathway

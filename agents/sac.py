@@ -11,35 +11,13 @@ The critics judge the noise or what it is decoded to (option ``critic``):
 - ``sampler``: Q(s, a) again; the actor climbs Q(s, decode(s, w)), its gradient passes through the
   sampler.
 
-Subclasses override only what they change:
-
-====================  ===============================================================
-``actor_layers``    layers of the actor
-``critic_layers``   layers of one critic
-``parameter_groups``  Adam's parameter groups of a network
-``critic_target``   target of the critics
-``critic_loss``     loss of the critics
-``actor_loss``      loss of the actor
-``augment``         changes a batch before the update
-``penalty``         a regulariser, added to the loss of a network
-``settle``          changes a network after each of its steps
-``constraints``     gaps of the trained multipliers; the temperature is one of them
-``after_update``    called after each update; returns more scalars
-====================  ===============================================================
-
-Deviations from the papers, numbered as in ``docs/agents.md``:
-
-1. the squash is radial, one scale per irrep block (``distributions.py``);
-2. the target has no entropy bonus (hard backup), except with ``soft_backup``;
-3. time-outs bootstrap, except with ``timeouts_terminal``;
-4. LayerNorm in actor and critics; the actor's output layer starts small;
-5. most of the noise to distil from is decoded once, when a decision is stored.
+Deviations from the papers are numbered in ``docs/agents.md``.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -48,19 +26,20 @@ from torch import nn
 
 from symsteer.agents.agent import Agent, AgentContext, Budget, MakeEnv, Role
 from symsteer.agents.diagnostics import critic_diagnostics
-from symsteer.agents.distributions import LOG_SCALE_MAX, LOG_SCALE_MIN, SquashedGaussian
+from symsteer.agents.distributions import SquashedGaussian
 from symsteer.agents.episodes import Played
-from symsteer.agents.generators import continue_stream, tensor_like
-from symsteer.agents.networks import Ensemble, Weights, count, detached
-from symsteer.agents.optimization import Multiplier, adam, descend, restore_adam
-from symsteer.agents.options import NoiseSource, SacOptions
+from symsteer.agents.generators import continue_stream, owned, tensor_like
+from symsteer.agents.networks import Ensemble, Weights, detached
+from symsteer.agents.optimization import Adam, Multiplier
+from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Layout
 
+VALUE = Layout([Field("value", 0)])
 BANK = ("bank_noise", "bank_actions")
-MOST_OWED = 1e6
 COUNTERS = ("decisions", "owed", "distillation_owed", "updates")
+MOST_OWED = 1e6
 
 
 @dataclass
@@ -71,82 +50,88 @@ class Drawn:
         obs: normalised observations, ``[B, obs_dim]``.
         noise: flat, ``[B, Tp * Da]``.
         log_prob: ``[B]``.
-        judged: what the critics see of the noise; see :meth:`SacAgent.judged`.
+        judge: computes :attr:`judged`.
     """
 
     obs: torch.Tensor
     noise: torch.Tensor
     log_prob: torch.Tensor
-    judged: torch.Tensor
+    judge: Callable[[], torch.Tensor]
+
+    @functools.cached_property
+    def judged(self) -> torch.Tensor:
+        """What the critics see of the noise; see :meth:`SacAgent.judged`."""
+        return self.judge()
 
 
 class SacAgent(Agent):
-    """Actor, critics, temperature and their updates; subclasses define the layers."""
+    """Actor, critics, temperature and their updates; subclasses define the layers.
+
+    Attributes:
+        optimizers: the Adam of each network.
+        target: the target critics, as dense matrices. Expansion is linear, so averaging the
+            matrices equals averaging the parameters, and the targets need no expansion.
+        multipliers: trained numbers by name; ``alpha`` is the entropy weight.
+        streams: draw the random numbers of an update; a team has those of its members.
+        stacked: whether tensors have one more dimension in front, the members of a team.
+        synchronize: called before the state is read; a team writes there what it keeps for its
+            members.
+    """
 
     role: ClassVar[Role] = "learner"
     Options = SacOptions
     options: SacOptions
+    replay: ReplayBuffer
 
     in_teams: ClassVar[bool] = False
-    """Whether the hooks of this very class work on the stacked tensors of a team, which have one
-    more dimension in front; subclasses say it anew."""
+    """Whether the hooks of this very class work on the stacked tensors of a team; subclasses say it
+    anew."""
+
+    always_banks: ClassVar[bool] = False
+    """Whether a bank of decoded noises is kept with all kinds of critics, not with `aliased` alone.
+    """
 
     bank_at: ClassVar[Literal["obs", "next_obs"]] = "obs"
     """The state of a decision at which its bank of noises is decoded."""
-
-    replay: ReplayBuffer
 
     def __init__(self, context: AgentContext, options: SacOptions | None = None):
         super().__init__(context, options)
         options = self.options
         self.noise_layout = self.act_layout.repeat(self.drawn_rows)
-        hard = options.bound_penalty == 0
-        self.distribution = SquashedGaussian(self.noise_layout, options.noise_bound, hard)
-        blocks = Field("log_scales", 0, self.distribution.blocks)
-        # Output of the actor: the means, then one invariant number per irrep block.
-        self.actor_layout = Layout([*self.noise_layout.fields, blocks])
+        self.distribution = SquashedGaussian(self.noise_layout, options.noise_bound)
+        self.actor_layout = self.distribution.parameter_layout
         self.noise_inputs = Layout.join(obs=self.obs_layout, noise=self.noise_layout)
         executed = self.act_layout.repeat(context.execute)
         self.action_inputs = Layout.join(obs=self.obs_layout, actions=executed)
         self.target_entropy = options.target_entropy * self.noise_layout.dim
         with torch.random.fork_rng(devices=[]):  # does not change the global generator
             torch.manual_seed(context.seed)
-            self.actor = self._network(self._actors())
-            judged = self.noise_inputs if options.critic == "noise" else self.action_inputs
-            self.critic = self._critics(judged)
-            self.noise_critic = self.critic
-            if options.critic == "aliased":
-                self.noise_critic = self._critics(self.noise_inputs)
+            self.networks = self._networks()
         self.distribution.to(self.device, self.dtype)
-        # The targets are stored as dense matrices. Expansion is linear, so averaging the matrices
-        # equals averaging the parameters, and the targets need no expansion.
         self.target = [(w.clone(), b.clone()) for w, b in detached(self.critic.weights())]
         self.optimizers = {
-            name: adam(self.parameter_groups(network), options.lr)
-            for name, network in self.networks.items()
+            name: Adam(network.parameters(), options.lr) for name, network in self.networks.items()
         }
         self.multipliers = {
             "alpha": Multiplier(options.initial_alpha, options.alpha_lr, self.device, self.dtype)
         }
-        self.warm_up_generator = self._new_generator()
-        self.bank_generator = self._new_generator(1)
-        self.replay = self._new_replay(options.replay_capacity)
-        self.demonstrations = self._new_replay(options.replay_capacity)
-        self.decisions = 0
+        self.generators = {"warm_up": self._new_generator(), "bank": self._new_generator(1)}
+        self.streams: Sequence[torch.Generator] = [self.generator]
+        self.stacked = False
+        self.replay = self._new_replay()
+        self.decisions = self.updates = 0
         self.owed = self.distillation_owed = 0.0
-        self.updates = 0
         self.synchronize: Callable[[], None] = lambda: None
-        """Called before the state is read; a team writes there what it keeps for its members."""
 
     @classmethod
     def check(cls, options: SacOptions, budget: Budget) -> None:
         """Check that training begins within the budget, and that the replay is large enough."""
-        warm_up = max(options.warmup, options.first_update) * budget.execute
+        warm_up = options.warmup * budget.execute
         if budget.env_steps <= warm_up:
             raise UserError(
                 f"env_steps is {budget.env_steps}, which ends within the warm-up of {warm_up} "
                 "environment steps, so that nothing would be learned; raise env_steps or lower "
-                "agent.warmup and agent.learning_starts"
+                "agent.warmup"
             )
         if options.replay_capacity < budget.num_envs:
             raise UserError(
@@ -155,26 +140,28 @@ class SacAgent(Agent):
             )
 
     @property
-    def networks(self) -> dict[str, Ensemble]:
-        """All trained networks by name."""
-        found = {"actor": self.actor, "critic": self.critic}
-        if self.noise_critic is not self.critic:
-            found["noise_critic"] = self.noise_critic
-        return found
+    def actor(self) -> Ensemble:
+        """The network of the policy."""
+        return self.networks["actor"]
+
+    @property
+    def critic(self) -> Ensemble:
+        """The critics."""
+        return self.networks["critic"]
 
     # What agents change.
 
+    def layers(self, inputs: Layout, outputs: Layout, scale: float = 1.0) -> list[nn.Module]:
+        """Layers of a network; the parameters of the last one are multiplied by ``scale``."""
+        raise NotImplementedError(f"{type(self).__name__} must give its layers")
+
     def actor_layers(self) -> list[nn.Module]:
-        """Layers from an observation to ``actor_layout``."""
-        raise NotImplementedError(f"{type(self).__name__} must give the layers of its actor")
+        """Layers from what the actor sees to ``actor_layout``."""
+        return self.layers(self.actor_inputs, self.actor_layout, self.options.initial_output)
 
     def critic_layers(self, inputs: Layout) -> list[nn.Module]:
         """Layers from ``inputs`` (observation, and noise or actions) to one value."""
-        raise NotImplementedError(f"{type(self).__name__} must give the layers of a critic")
-
-    def parameter_groups(self, network: nn.Module) -> list[dict[str, Any]]:
-        """Adam's parameter groups of the actor or the critics."""
-        return [{"params": list(network.parameters())}]
+        return self.layers(inputs, VALUE)
 
     def critic_target(self, batch: Batch, following: Drawn) -> torch.Tensor:
         """Target of every critic, ``[B]``, in scaled rewards; called without gradients.
@@ -202,7 +189,7 @@ class SacAgent(Agent):
     def actor_loss(
         self, q: torch.Tensor, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
     ) -> torch.Tensor:
-        """Mean of alpha log pi - Q, and the price of noise beyond a soft bound.
+        """Mean of alpha log pi - Q.
 
         Args:
             q: values of ``noise``, ``[critics, B]``; differentiable with respect to ``noise``.
@@ -210,12 +197,7 @@ class SacAgent(Agent):
             log_prob: ``[B]``.
             batch: transitions.
         """
-        # A random subset makes targets pessimistic; the actor follows the mean (REDQ).
-        value = q.mean(-2) if self.options.reduce == "subset" else self.reduced(q)
-        cost = self.alpha.unsqueeze(-1) * log_prob - value
-        if not self.distribution.hard:
-            cost = cost + self.options.bound_penalty * self.distribution.excess(noise)
-        return cost.mean(-1)
+        return (self.alpha.unsqueeze(-1) * log_prob - self.reduced(q)).mean(-1)
 
     def augment(self, batch: Batch) -> Batch:
         """Change a batch before the update."""
@@ -225,12 +207,6 @@ class SacAgent(Agent):
         """A regulariser, added to the loss of a network; None: no regulariser."""
         return None
 
-    def constraints(
-        self, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
-    ) -> dict[str, torch.Tensor]:
-        """Gap of each constraint in ``multipliers``, a scalar; negative: the multiplier grows."""
-        return {"alpha": -log_prob.mean(-1) - self.target_entropy}
-
     def settle(self, name: str) -> None:
         """Called after each step of a network; may change its parameters, in place."""
 
@@ -238,15 +214,32 @@ class SacAgent(Agent):
         """Called after each update; returns more scalars."""
         return {}
 
+    def bank_noise(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Random noise to bank and to distil at, ``[count, Tp, Da]``."""
+        noise = self.gaussian_noise(count, generator)
+        if self.options.distill == "gaussian":
+            return noise
+        return self.chunk(self.distribution.squash(noise.flatten(1)))
+
+    @property
+    def drawn_rows(self) -> int:
+        """The last rows of an action, which the actor draws: all of them."""
+        return self.rows
+
+    @property
+    def actor_inputs(self) -> Layout:
+        """What the actor sees: the observation."""
+        return self.obs_layout
+
     # Acting.
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
-        """Noise ``[B, Tp, Da]``; random during the warm-up, if not ``deterministic``."""
+        """Noise ``[B, Tp, Da]``; during the warm-up N(0, I), if not ``deterministic``."""
         if deterministic:
             return self.mode(obs)
         if self.decisions < self.options.warmup:
-            return self.random_noise(self.options.warmup_noise, len(obs), self.warm_up_generator)
+            return self.gaussian_noise(len(obs), self.generators["warm_up"])
         return self.sample(obs)[0]
 
     @torch.no_grad()
@@ -255,7 +248,7 @@ class SacAgent(Agent):
 
         Diagnostics of symmetry measure it.
         """
-        return self.chunk(self.distribution.mode(self.moments(obs)[0]))
+        return self.chunk(self.distribution.squash(self.moments(obs)[0]))
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -272,15 +265,17 @@ class SacAgent(Agent):
     def q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Every critic's value of ``noise [B, Tp, Da]`` in reward units, ``[critics, B]``."""
         judged = self.judged(obs, noise.to(self.dtype).flatten(1))
-        return self._q(self.critic.weights(), self._features(obs), judged) / self.reward_scale
+        q = self._q(self.critic.weights(), self._features(obs), judged)
+        return q / self.options.reward_scale
 
     @torch.no_grad()
     def noise_q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """The same by the critics that the actor climbs (with ``aliased``: the distilled ones)."""
-        if self.options.critic == "sampler":
+        if self.options.critic != "aliased":
             return self.q_values(obs, noise)
-        weights, flat = self.noise_critic.weights(), noise.to(self.dtype).flatten(1)
-        return self._q(weights, self._features(obs), flat) / self.reward_scale
+        weights = self.networks["noise_critic"].weights()
+        q = self._q(weights, self._features(obs), noise.to(self.dtype).flatten(1))
+        return q / self.options.reward_scale
 
     def judged(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """What the critics see of flat noise ``[B, Tp * Da]``: itself, or the executed actions.
@@ -299,53 +294,12 @@ class SacAgent(Agent):
 
     def reduced(self, q: torch.Tensor) -> torch.Tensor:
         """One value per state, ``[B]``, of all critics' values ``[critics, B]``."""
-        if self.options.reduce == "mean":
-            return q.mean(-2)
-        if self.options.reduce == "subset":
-            order = self.random(
-                lambda generator: torch.randperm(
-                    q.shape[-2], generator=generator, device=self.device
-                )
-            )
-            q = q.take_along_dim(order[..., : self.options.subset, None], -2)
-        return q.amin(-2)
+        return q.mean(-2) if self.options.reduce == "mean" else q.amin(-2)
 
     def random(self, draw: Callable[[torch.Generator], torch.Tensor]) -> torch.Tensor:
         """A draw by the agent's generator; in a team a draw by each member's, stacked."""
-        return draw(self.generator)
-
-    def random_noise(
-        self, source: NoiseSource, count: int, generator: torch.Generator | None = None
-    ) -> torch.Tensor:
-        """``count`` chunks ``[count, Tp, Da]`` from N(0, I), squashed into the bound if wanted."""
-        noise = self.gaussian_noise(count, generator)
-        if source == "gaussian":
-            return noise
-        return self.chunk(self.distribution.squash(noise.flatten(1)))
-
-    @property
-    def keeps_bank(self) -> bool:
-        """Whether random noises are decoded when a decision is stored."""
-        return self.options.critic == "aliased"
-
-    @property
-    def drawn_rows(self) -> int:
-        """Rows of an action that the actor draws: all of them."""
-        return self.rows
-
-    @property
-    def actor_inputs(self) -> Layout:
-        """What the actor sees: the observation."""
-        return self.obs_layout
-
-    def drawn_part(self, action: torch.Tensor) -> torch.Tensor:
-        """The part of actions ``[B, rows, Da]`` that the actor draws, flat."""
-        return action.flatten(1)
-
-    @property
-    def reward_scale(self) -> float:
-        """Factor on rewards in training."""
-        return self.options.reward_scale
+        drawn = [draw(generator) for generator in self.streams]
+        return torch.stack(drawn) if self.stacked else drawn[0]
 
     @property
     def alpha(self) -> torch.Tensor:
@@ -358,43 +312,23 @@ class SacAgent(Agent):
 
     # Learning.
 
-    @classmethod
-    def wants_demonstrations(cls, options: SacOptions) -> bool:
-        """Only if they have a share in the batches."""
-        return options.demonstration_share > 0
-
-    def observe_demonstrations(self, decisions: Transition) -> None:
-        """Keep the decisions beside the replay; they are not part of checkpoints."""
-        banked = self._banked(getattr(decisions, self.bank_at), self._new_generator(2))
-        noise = decisions.noise.new_zeros(len(decisions.noise), self.rows, self.act_layout.dim)
-        self.demonstrations.add({**vars(decisions), "noise": noise, **banked})
-        # One row begins at every control step.
-        self.demonstrations.stride = self.context.execute
-
     def prepare(self, make_env: MakeEnv, budget: Budget) -> int:
         """Train for the whole budget."""
         return budget.env_steps
 
     def observe(self, transition: Transition) -> None:
-        """Store the decisions; each one after ``learning_starts`` adds ``utd`` due updates."""
-        banked = self._banked(getattr(transition, self.bank_at), self.bank_generator)
-        self.replay.add({**vars(transition), **banked})
-        if self.decisions >= self.options.first_update:
+        """Store the decisions; each one after the warm-up adds ``utd`` due updates."""
+        fields = vars(transition)
+        self.replay.add({**fields, **self._banked(fields[self.bank_at])})
+        if self.decisions >= self.options.warmup:
             self.owed += len(transition.reward) * self.options.utd
         self.decisions += len(transition.reward)
 
     def batches(self) -> Iterator[Batch]:
         """One batch for each update that is due."""
-        options = self.options
-        shown = round(options.demonstration_share * options.batch_size)
         while self.owed >= 1:
             self.owed -= 1
-            count = options.batch_size - shown
-            batch = self.replay.sample(count, options.gamma, options.n_step)
-            if shown:
-                more = self.demonstrations.sample(shown, options.gamma, options.n_step)
-                batch = Batch({name: torch.cat([x, more[name]]) for name, x in batch.items()})
-            yield batch
+            yield self.replay.sample(self.options.batch_size, self.options.gamma)
 
     def update(self, batch: Batch) -> dict[str, torch.Tensor]:
         """One step of critics, actor, multipliers and target critics.
@@ -402,7 +336,8 @@ class SacAgent(Agent):
         Returns:
             Scalars as tensors on the device; reading them waits for the device.
         """
-        return self.learn(self.augment(batch))
+        batch = self.augment(batch)
+        return {**self.learn(batch), **self.after_update(batch)}
 
     def learn(self, batch: Batch) -> dict[str, torch.Tensor]:
         """The same, with the batch as it is; in a team the batches of all members, stacked."""
@@ -410,8 +345,7 @@ class SacAgent(Agent):
         with torch.no_grad():
             following = self.drawn(batch.next_obs)
             target = self.critic_target(batch, following)
-        stored = batch.noise if self.options.critic == "noise" else batch.actions
-        q = self._q(self.critic.weights(), obs, stored.flatten(-2))
+        q = self._q(self.critic.weights(), obs, self._stored(batch))
         critic_loss = self.critic_loss(q, target, batch)
         self._descend("critic", critic_loss, batch)
         scalars = {"losses/critic": critic_loss.detach()}
@@ -423,51 +357,46 @@ class SacAgent(Agent):
                 self.distillation_owed -= 1
                 scalars["losses/distillation"] = self._distil(batch, obs, following, judge)
 
-        if self.updates >= self.options.actor_delay:
-            scalars |= self._improve(batch, obs, judge)
+        scalars |= self._improve(batch, obs, judge)
 
         with torch.no_grad():
             torch._foreach_lerp_(_flat(self.target), _flat(judge), self.options.tau)
         self.updates += 1
-        q = q.detach() / self.reward_scale
+        q = q.detach() / self.options.reward_scale
         return {
             **scalars,
             "train/q_mean": q.mean((-2, -1)),
             "train/q_max_abs": q.abs().amax((-2, -1)),
-            "train/target_mean": target.mean(-1) / self.reward_scale,
-            **self.after_update(batch),
+            "train/target_mean": target.mean(-1) / self.options.reward_scale,
         }
 
     def _improve(self, batch: Batch, obs: torch.Tensor, judge: Weights) -> dict[str, torch.Tensor]:
-        """One step of the actor and the multipliers; returns scalars."""
-        noise, log_prob = self._sample(*self._heads(self.actor.weights(), obs))
+        """One step of the actor and the temperature; returns scalars."""
+        drawn, alpha = self.drawn_to_improve(batch), self.alpha
         if self.options.critic == "aliased":
-            values = self._q(detached(self.noise_critic.weights()), obs, noise)
+            climbed = detached(self.networks["noise_critic"].weights())
+            values = self._q(climbed, obs, drawn.noise)
         else:
-            values = self._q(judge, obs, self.judged(batch.obs, noise))
-        return self._climb(values, noise, log_prob, batch)
-
-    def _climb(
-        self, values: torch.Tensor, noise: torch.Tensor, log_prob: torch.Tensor, batch: Batch
-    ) -> dict[str, torch.Tensor]:
-        """The step, for what the actor drew and its values ``[critics, B]``."""
-        alpha = self.alpha
-        actor_loss = self.actor_loss(values, noise, log_prob, batch)
+            values = self._q(judge, obs, drawn.judged)
+        actor_loss = self.actor_loss(values, drawn.noise, drawn.log_prob, batch)
         self._descend("actor", actor_loss, batch)
-        log_prob = log_prob.detach()
-        gaps = self.constraints(noise.detach(), log_prob, batch)
+        entropy = -drawn.log_prob.detach().mean(-1)
         return {
             "losses/actor": actor_loss.detach(),
-            **{f"losses/{name}": self.multipliers[name].step(gap) for name, gap in gaps.items()},
+            "losses/alpha": self.multipliers["alpha"].step(entropy - self.target_entropy),
             "train/alpha": alpha,
-            "train/entropy": -log_prob.mean(-1),
+            "train/entropy": entropy,
         }
 
     def drawn(self, obs: torch.Tensor) -> Drawn:
         """Noise that the actor draws at observations in environment units."""
         features = self._features(obs)
         noise, log_prob = self._sample(*self._heads(self.actor.weights(), features))
-        return Drawn(features, noise, log_prob, self.judged(obs, noise))
+        return Drawn(features, noise, log_prob, lambda: self.judged(obs, noise))
+
+    def drawn_to_improve(self, batch: Batch) -> Drawn:
+        """Noise that the actor draws at the states of a batch, to be improved."""
+        return self.drawn(batch.obs)
 
     def _distil(
         self, batch: Batch, obs: torch.Tensor, following: Drawn, judge: Weights
@@ -476,48 +405,47 @@ class SacAgent(Agent):
 
         The actor's noise is that of the next observations, which the target has decoded already.
         """
-        source, pairs = self.options.distill, []
+        source, points = self.options.distill, []
         if source != "actor":
-            pairs.append((obs, *self._random_pairs(batch)))
+            points.append((obs, *self._random_pairs(batch)))
         if source in ("actor", "mixture"):
-            pairs.append((following.obs, following.noise, following.judged))
-        features, noise, actions = (torch.cat(parts, -2) for parts in zip(*pairs, strict=True))
+            points.append((following.obs, following.noise, following.judged))
+        features, noise, actions = (torch.cat(x, -2) for x in zip(*points, strict=True))
         with torch.no_grad():
             wanted = self._q(judge, features, actions)
-        found = self._q(self.noise_critic.weights(), features, noise)
-        loss = (found - wanted).square().mean(-1).sum(-1)
+        q = self._q(self.networks["noise_critic"].weights(), features, noise)
+        loss = (q - wanted).square().mean(-1).sum(-1)
         self._descend("noise_critic", loss, batch)
         return loss.detach()
 
     def _random_pairs(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
         """Random noise for each row and the actions that it is decoded to, both flat."""
-        count, bank = batch.obs.shape[-2], self.options.noise_bank
-        if not bank:
-            noise = self.random(
-                lambda generator: self.random_noise(self._bank_source, count, generator)
-            )
+        count, size = batch.obs.shape[-2], self.options.noise_bank
+        if not size:
+            noise = self.random(lambda generator: self.bank_noise(count, generator))
             return noise.flatten(-2), self.executed(batch.obs, noise).flatten(-2)
         picked = self.random(
-            lambda generator: torch.randint(bank, (count,), generator=generator, device=self.device)
+            lambda generator: torch.randint(size, (count,), generator=generator, device=self.device)
         )
         banks = (batch[name].flatten(-2) for name in BANK)
         noise, actions = (x.take_along_dim(picked[..., None, None], -2).squeeze(-2) for x in banks)
         return noise, actions
 
+    @property
+    def _bank_size(self) -> int:
+        """Random noises that are decoded when a decision is stored."""
+        banks = self.always_banks or self.options.critic == "aliased"
+        return self.options.noise_bank if banks else 0
+
     @torch.no_grad()
-    def _banked(self, obs: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
+    def _banked(self, obs: torch.Tensor) -> dict[str, torch.Tensor]:
         """Random noises for each stored decision and what they are decoded to."""
-        size = self.options.noise_bank
-        if not self.keeps_bank or not size:
+        if not (size := self._bank_size):
             return {}
-        noise = self.random_noise(self._bank_source, size * len(obs), generator)
+        noise = self.bank_noise(size * len(obs), self.generators["bank"])
         actions = self.executed(obs.repeat_interleave(size, 0), noise)
         both = (noise, actions)
         return {name: x.unflatten(0, (len(obs), size)) for name, x in zip(BANK, both, strict=True)}
-
-    @property
-    def _bank_source(self) -> NoiseSource:
-        return "gaussian" if self.options.distill == "gaussian" else "squashed"
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Errors of Q, equivariance errors, temperature (docs/metrics.md)."""
@@ -527,23 +455,21 @@ class SacAgent(Agent):
 
     def description(self) -> dict[str, Any]:
         """Agent, geometry and sizes; a checkpoint must have the same."""
-        keys = (
-            *("critic", "group", "width", "depth", "critics", "layer_norm", "activation"),
-            *("noise_bound", "bound_penalty"),
-        )
-        return {**super().description(), **{key: getattr(self.options, key) for key in keys}}
+        keys = ("critic", "group", "width", "depth", "critics", "layer_norm", "activation")
+        own = {key: getattr(self.options, key) for key in (*keys, "noise_bound")}
+        return {**super().description(), **own}
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimisers, multipliers, generators; loads with ``weights_only=True``."""
         self.synchronize()
-        return _copied(
+        return owned(
             {
                 **super().state_dict(),
                 "networks": {k: network.state_dict() for k, network in self.networks.items()},
                 "optimizers": {k: adam.state_dict() for k, adam in self.optimizers.items()},
                 "target": _flat(self.target),
                 "multipliers": {k: m.state_dict() for k, m in self.multipliers.items()},
-                "generators": {k: g.get_state() for k, g in self._generators.items()},
+                "generators": {k: g.get_state() for k, g in self.generators.items()},
                 **{name: getattr(self, name) for name in COUNTERS},
             }
         )
@@ -555,42 +481,27 @@ class SacAgent(Agent):
             UserError: if the checkpoint is of another agent, layout or size.
         """
         super().load_state_dict(state)
-        for name, network in self.networks.items():
-            network.load_state_dict(state["networks"][name])
-            network.changed()
-            restore_adam(self.optimizers[name], state["optimizers"][name])
-        for name, multiplier in self.multipliers.items():
-            multiplier.load_state_dict(state["multipliers"][name])
+        for kind in ("networks", "optimizers", "multipliers"):
+            for name, loadable in getattr(self, kind).items():
+                loadable.load_state_dict(state[kind][name])
         with torch.no_grad():
             for own, stored in zip(_flat(self.target), state["target"], strict=True):
                 own.copy_(tensor_like(stored, own))
-        for name, generator in self._generators.items():
+        for name, generator in self.generators.items():
             continue_stream(generator, state["generators"][name])
         for name in COUNTERS:
             setattr(self, name, type(getattr(self, name))(state[name]))
         if not 0 <= max(self.owed, self.distillation_owed) < MOST_OWED:
             raise ValueError(f"{self.owed} and {self.distillation_owed} updates are due")
 
-    def parameter_counts(self) -> dict[str, int]:
-        """Numbers of trainable parameters (without target critics), and the hidden width."""
-        sizes = {name: count(network) for name, network in self.networks.items()}
-        total, actor = sum(sizes.values()), sizes.get("actor", 0)
-        return {
-            "actor": actor,
-            "critic": total - actor,
-            "total": total,
-            "width": next(iter(self.networks.values())).width,
-        }
-
     # Inner parts.
 
-    @property
-    def _generators(self) -> dict[str, torch.Generator]:
-        return {
-            "warm_up": self.warm_up_generator,
-            "bank": self.bank_generator,
-            "demonstrations": self.demonstrations.generator,
-        }
+    def _networks(self) -> dict[str, Ensemble]:
+        """New networks, untrained."""
+        aliased = self.options.critic == "aliased"
+        judged = self.noise_inputs if self.options.critic == "noise" else self.action_inputs
+        networks = {"actor": self._network(self._actors()), "critic": self._critics(judged)}
+        return networks | ({"noise_critic": self._critics(self.noise_inputs)} if aliased else {})
 
     def _network(self, members: list[list[nn.Module]]) -> Ensemble:
         network = Ensemble(members, self.options.layer_norm, self.options.activation)
@@ -603,7 +514,7 @@ class SacAgent(Agent):
         return self._network([self.critic_layers(inputs) for _ in range(self.options.critics)])
 
     def _descend(self, name: str, loss: torch.Tensor, batch: Batch) -> None:
-        descend(loss, self.optimizers[name], self.penalty(name, batch))
+        self.optimizers[name].descend(loss, self.penalty(name, batch))
         with torch.no_grad():
             self.settle(name)
         self.networks[name].changed()
@@ -614,31 +525,31 @@ class SacAgent(Agent):
         states = dict.fromkeys(("obs", "next_obs"), self.obs_layout)
         return {**states, **dict.fromkeys(("noise", "actions", *BANK), self.act_layout)}
 
-    def _new_replay(self, capacity: int, **more: tuple[int, ...]) -> ReplayBuffer:
-        if self.keeps_bank and (size := self.options.noise_bank):
-            rows = self.rows, self.context.execute
-            more |= {k: (size, n, self.act_layout.dim) for k, n in zip(BANK, rows, strict=True)}
-        return super()._new_replay(capacity, **more)
+    def _new_replay(self) -> ReplayBuffer:
+        act, obs = self.act_layout.dim, (self.obs_layout.dim,)
+        noise, actions = (self.rows, act), (self.context.execute, act)
+        shapes = {"obs": obs, "noise": noise, "actions": actions, "reward": (), "next_obs": obs}
+        shapes |= {"terminal": (), "truncated": ()}
+        if size := self._bank_size:
+            shapes |= {BANK[0]: (size, *noise), BANK[1]: (size, *actions)}
+        capacity, seed = self.options.replay_capacity, self.context.seed
+        return ReplayBuffer(capacity, shapes, self.device, seed, self.dtype)
+
+    def _stored(self, batch: Batch) -> torch.Tensor:
+        """What the critics see of a stored decision, flat."""
+        return (batch.noise if self.options.critic == "noise" else batch.actions).flatten(-2)
 
     def _features(self, obs: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
             return self.context.normalize_obs(obs).to(self.dtype)
 
     def _heads(self, policy: Weights, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return self._parameters(self._actor_output(policy, obs))
+        """Mean and log-scale of what the actor draws where it sees ``obs``."""
+        return self.distribution.parameters_of(self._actor_output(policy, obs))
 
     def _actor_output(self, policy: Weights, obs: torch.Tensor) -> torch.Tensor:
         """``[B, dim]`` of ``actor_layout``."""
         return self.actor.apply_weights(policy, obs).select(-3, 0)
-
-    def _parameters(self, out: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and log-scale before the squash."""
-        mean, raw = out.split([self.distribution.dim, self.distribution.blocks], dim=-1)
-        share = (math.log(self.options.initial_scale) - LOG_SCALE_MIN) / (
-            LOG_SCALE_MAX - LOG_SCALE_MIN
-        )
-        start = math.log(share / (1 - share))
-        return mean, LOG_SCALE_MIN + (LOG_SCALE_MAX - LOG_SCALE_MIN) * (raw + start).sigmoid()
 
     def _q(self, critics: Weights, obs: torch.Tensor, judged: torch.Tensor) -> torch.Tensor:
         """Values ``[critics, B]`` of normalised observations, and flat noise or actions."""
@@ -647,22 +558,14 @@ class SacAgent(Agent):
     def _sample(
         self, mean: torch.Tensor, log_scale: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        shape = mean.shape[-2:]
-        eps = self.random(
-            lambda generator: torch.randn(
-                shape, generator=generator, device=self.device, dtype=self.dtype
-            )
+        return self.distribution.sample(mean, log_scale, self._eps(mean))
+
+    def _eps(self, mean: torch.Tensor) -> torch.Tensor:
+        """N(0, I) in the shape of the mean."""
+        shape, device, dtype = mean.shape[-2:], self.device, self.dtype
+        return self.random(
+            lambda generator: torch.randn(shape, generator=generator, device=device, dtype=dtype)
         )
-        return self.distribution.sample(mean, log_scale, eps)
-
-
-def _copied(tree: Any) -> Any:
-    """A copy with tensors in memory of their own: those of a team's member are views."""
-    if isinstance(tree, torch.Tensor):
-        return tree.detach().clone()
-    if isinstance(tree, Mapping):
-        return {key: _copied(value) for key, value in tree.items()}
-    return [_copied(value) for value in tree] if isinstance(tree, list) else tree
 
 
 def _flat(weights: Weights) -> list[torch.Tensor]:

@@ -6,8 +6,9 @@ import itertools
 
 from torch import nn
 
-from symsteer.agents.equivariant import equivariant_actor_layers, equivariant_critic_layers
+from symsteer.agents.equivariant import equivariant_layers
 from symsteer.agents.networks import Dense, count, shrink_
+from symsteer.agents.options import EitherOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.sac import SacAgent
 from symsteer.policies.geometry import Layout
@@ -20,22 +21,14 @@ class StandardAgent(SacAgent):
     name = "standard"
     in_teams = True
 
-    def actor_layers(self) -> list[nn.Module]:
-        layers = plain_layers(
-            self.actor_inputs.dim, self.actor_width(), self.options.depth, self.actor_layout.dim
-        )
-        shrink_(layers[-1], self.options.initial_output)
+    def layers(self, inputs: Layout, outputs: Layout, scale: float = 1.0) -> list[nn.Module]:
+        width = self.width_of(inputs, outputs)
+        layers = plain_layers(inputs.dim, width, self.options.depth, outputs.dim)
+        shrink_(layers[-1], scale)
         return layers
 
-    def critic_layers(self, inputs: Layout) -> list[nn.Module]:
-        return plain_layers(inputs.dim, self.critic_width(inputs), self.options.depth, 1)
-
-    def actor_width(self) -> int:
-        """Hidden features of the actor."""
-        return self.options.width
-
-    def critic_width(self, inputs: Layout) -> int:
-        """Hidden features of each critic of ``inputs``."""
+    def width_of(self, inputs: Layout, outputs: Layout) -> int:
+        """Hidden features of a network."""
         return self.options.width
 
 
@@ -51,31 +44,34 @@ class MatchedStandardAgent(StandardAgent):
     name = "standard-matched"
     in_teams = True
 
-    def actor_width(self) -> int:
-        rival = nn.ModuleList(equivariant_actor_layers(self))
-        return matched_width(
-            count(rival), self.actor_inputs.dim, self.options.depth, self.actor_layout.dim
-        )
+    def width_of(self, inputs: Layout, outputs: Layout) -> int:
+        """That with which plain layers have about as many parameters as equivariant ones."""
+        wanted = count(nn.ModuleList(equivariant_layers(inputs, outputs, self.options)))
+        depth = self.options.depth
 
-    def critic_width(self, inputs: Layout) -> int:
-        rival = nn.ModuleList(equivariant_critic_layers(self, inputs))
-        return matched_width(count(rival), inputs.dim, self.options.depth, 1)
+        def size(width: int) -> int:
+            hidden = (depth - 1) * (width + 1) * width
+            return (inputs.dim + 1) * width + hidden + (width + 1) * outputs.dim
+
+        width = 1
+        while size(width + 1) <= wanted:
+            width += 1
+        return min(width, width + 1, key=lambda w: abs(size(w) - wanted))
+
+
+class EitherAgent(StandardAgent):
+    """Plain or equivariant layers, as the options say: what is added to them works with both."""
+
+    Options = EitherOptions
+    options: EitherOptions
+
+    def layers(self, inputs: Layout, outputs: Layout, scale: float = 1.0) -> list[nn.Module]:
+        if self.options.layers == "equivariant":
+            return equivariant_layers(inputs, outputs, self.options, scale)
+        return super().layers(inputs, outputs, scale)
 
 
 def plain_layers(inputs: int, width: int, depth: int, outputs: int) -> list[nn.Module]:
     """``depth`` hidden layers of ``width`` and an output layer."""
     sizes = [inputs, *[width] * depth, outputs]
     return [Dense(a, b) for a, b in itertools.pairwise(sizes)]
-
-
-def matched_width(parameters: int, inputs: int, depth: int, outputs: int) -> int:
-    """The width with which ``plain_layers`` has about the given number of parameters."""
-
-    def size(width: int) -> int:
-        hidden = (depth - 1) * (width + 1) * width
-        return (inputs + 1) * width + hidden + (width + 1) * outputs
-
-    width = 1
-    while size(width + 1) <= parameters:
-        width += 1
-    return min(width, width + 1, key=lambda w: abs(size(w) - parameters))

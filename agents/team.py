@@ -11,20 +11,16 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, cast
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
 from torch import nn
 from torch.func import functional_call
 
 from symsteer.agents.networks import Dense, Ensemble, Weights, dense
-from symsteer.agents.optimization import Multiplier, adam
+from symsteer.agents.optimization import Adam
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import SacAgent
-
-Owner = tuple[torch.optim.Optimizer, torch.Tensor]
-"""A parameter of a member, and the optimiser of the member that it belongs to."""
 
 
 def can_join(agent_class: type) -> bool:
@@ -38,6 +34,9 @@ class Team:
     Args:
         members: of one class, with equal options and layouts.
 
+    Attributes:
+        core: an agent of the same class, whose tensors have the members in front.
+
     Raises:
         ValueError: if they have not made equally many updates; their optimisers would not fit.
     """
@@ -46,24 +45,40 @@ class Team:
         if len({member.updates for member in members}) > 1:
             raise ValueError("the members of a team must have made equally many updates")
         self.members = list(members)
-        self._stacks: list[_Stack] = []
         first = self.members[0]
-        # An agent of the same class, whose tensors have the members in front.
-        self.core = core = cast(Any, copy.copy(first))
-        core.random = self._random
-        core.after_update = lambda batch: {}  # called for each member
+        self.core = core = copy.copy(first)
+        core.streams, core.stacked = [member.generator for member in members], True
         core.context = dataclasses.replace(
             first.context,
             decode=_each([member.context.decode for member in members]),
             normalize_obs=_each([member.context.normalize_obs for member in members]),
         )
-        networks = {name: self._network(name) for name in first.networks}
-        core.actor, core.critic = networks.get("actor"), networks["critic"]
-        core.noise_critic = networks.get("noise_critic", networks["critic"])
-        core.optimizers = {name: self._optimizer(name, networks[name]) for name in networks}
-        core.multipliers = {name: self._multiplier(name) for name in first.multipliers}
-        core.target = self._target()
-        for member in self.members:
+        stacked = {
+            name: StackedEnsemble([member.networks[name] for member in members])
+            for name in first.networks
+        }
+        core.networks = dict(stacked)
+        stacks = {
+            name: _Stack(network.owners, [member.optimizers[name] for member in members])
+            for name, network in stacked.items()
+        }
+        core.optimizers = {name: stack.optimizer for name, stack in stacks.items()}
+        self._stacks = list(stacks.values())
+        core.multipliers = dict(first.multipliers)
+        for name in first.multipliers:
+            each = [member.multipliers[name] for member in members]
+            core.multipliers[name] = multiplier = copy.copy(each[0])
+            multiplier.log = torch.stack([m.log.detach() for m in each]).requires_grad_()
+            stack = _Stack({multiplier.log: [m.log for m in each]}, [m.optimizer for m in each])
+            multiplier.optimizer = stack.optimizer
+            self._stacks.append(stack)
+        count, layers = len(members), zip(*(member.target for member in members), strict=True)
+        core.target = [
+            (torch.cat([w for w, _ in layer]), torch.cat([b for _, b in layer])) for layer in layers
+        ]
+        for i, member in enumerate(members):
+            # Each sees its part of the stacked target critics.
+            member.target = [(w.chunk(count)[i], b.chunk(count)[i]) for w, b in core.target]
             member.synchronize = self.synchronize
 
     def update(self, batches: Sequence[Batch]) -> list[dict[str, torch.Tensor]]:
@@ -72,13 +87,13 @@ class Team:
         stacked = Batch({name: torch.stack([b[name] for b in turned]) for name in turned[0]})
         self.core.decisions = self.members[0].decisions
         scalars = self.core.learn(stacked)
-        found = []
-        for index, (member, batch) in enumerate(zip(self.members, turned, strict=True)):
+        for member in self.members:
             member.updates = self.core.updates
             member.distillation_owed = self.core.distillation_owed
-            own = {name: value[index] for name, value in scalars.items()}
-            found.append(own | member.after_update(batch))
-        return found
+        return [
+            {name: value[i] for name, value in scalars.items()} | member.after_update(batch)
+            for i, (member, batch) in enumerate(zip(self.members, turned, strict=True))
+        ]
 
     def synchronize(self) -> None:
         """Write the optimisers' state to the members; all else they share with the team."""
@@ -96,51 +111,6 @@ class Team:
             for network in member.networks.values():
                 network.changed()
 
-    def _random(self, draw: Callable[[torch.Generator], torch.Tensor]) -> torch.Tensor:
-        return torch.stack([draw(member.generator) for member in self.members])
-
-    def _network(self, name: str) -> StackedEnsemble:
-        return StackedEnsemble([member.networks[name] for member in self.members])
-
-    def _optimizer(self, name: str, network: StackedEnsemble) -> torch.optim.Adam:
-        """The optimiser of a stacked network, with the groups and the state of the members'."""
-        first = self.members[0]
-        leaf_of = {id(p): leaf for leaf, own in network.owners.items() for p in own}
-        groups = [
-            {**group, "params": list(dict.fromkeys(leaf_of[id(p)] for p in group["params"]))}
-            for group in first.parameter_groups(first.networks[name])
-        ]
-        optimizer = adam(groups, first.options.lr)
-        each = [member.optimizers[name] for member in self.members]
-        rows: dict[torch.Tensor, list[Owner]] = {
-            leaf: [(each[row * len(each) // len(own)], p) for row, p in enumerate(own)]
-            for leaf, own in network.owners.items()
-        }
-        self._stacks.append(_Stack(optimizer, rows))
-        return optimizer
-
-    def _multiplier(self, name: str) -> Multiplier:
-        own = [member.multipliers[name] for member in self.members]
-        stacked = copy.copy(own[0])
-        stacked.log = torch.stack([m.log.detach() for m in own]).requires_grad_()
-        stacked.optimizer = adam([{"params": [stacked.log]}], self.members[0].options.alpha_lr)
-        self._stacks.append(
-            _Stack(stacked.optimizer, {stacked.log: [(m.optimizer, m.log) for m in own]})
-        )
-        return stacked
-
-    def _target(self) -> Weights:
-        """The target critics of all members, who see their part of them."""
-        layers = zip(*(member.target for member in self.members), strict=True)
-        stacked = [
-            (torch.cat([w for w, _ in layer]), torch.cat([b for _, b in layer])) for layer in layers
-        ]
-        count = len(self.members)
-        parts = [zip(w.chunk(count), b.chunk(count), strict=True) for w, b in stacked]
-        for member, own in zip(self.members, zip(*parts, strict=True), strict=True):
-            member.target = list(own)
-        return stacked
-
 
 class StackedEnsemble(Ensemble):
     """The ensembles of a team's members as one.
@@ -154,20 +124,19 @@ class StackedEnsemble(Ensemble):
 
     def __init__(self, ensembles: Sequence[Ensemble]):
         nn.Module.__init__(self)
-        first = ensembles[0]
-        self.width, self.layer_norm = first.width, first.layer_norm
-        self.activation = first.activation
+        self.width, self.layer_norm = ensembles[0].width, ensembles[0].layer_norm
+        self.activation = ensembles[0].activation
         self._expanded: Weights | None = None
         self._ensembles = list(ensembles)
         self._stacked: list[tuple[_DenseOf, dict[str, torch.Tensor]]] = []
-        self.owners: dict[torch.Tensor, list[nn.Parameter]] = {}
+        self.owners: dict[torch.Tensor, list[torch.Tensor]] = {}
         members = [member for ensemble in ensembles for member in ensemble.members]
         for layers in zip(*members, strict=True):
             leaves: dict[str, torch.Tensor] = {}
             for name, _ in layers[0].named_parameters():
-                own = [layer.get_parameter(name) for layer in layers]
-                leaves[name] = leaf = nn.Parameter(torch.stack([p.detach() for p in own]))
-                self.owners[leaf] = own
+                each = [layer.get_parameter(name) for layer in layers]
+                leaves[name] = leaf = nn.Parameter(torch.stack([p.detach() for p in each]))
+                self.owners[leaf] = each
             self._stacked.append((_DenseOf(layers[0]), leaves))
 
     def changed(self) -> None:
@@ -187,14 +156,14 @@ class StackedEnsemble(Ensemble):
         return self.propagate(weights, inputs).unflatten(0, (runs, size))
 
     def _expand(self) -> Weights:
-        found: Weights = []
+        expanded: Weights = []
         for layer, leaves in self._stacked:
             if isinstance(layer.layer, Dense):
                 matrix, bias = leaves["weight"], leaves["bias"]
             else:
                 matrix, bias = torch.vmap(layer.expand)(leaves)
-            found.append((matrix, bias.unsqueeze(1)))
-        return found
+            expanded.append((matrix, bias.unsqueeze(1)))
+        return expanded
 
 
 class _DenseOf(nn.Module):
@@ -215,18 +184,25 @@ class _Stack:
     """Stacked parameters with their optimiser, and the members' parameters that they hold.
 
     Args:
-        optimizer: of the stacked parameters.
-        owners: of each stacked parameter, row by row.
+        owners: the members' parameters in each stacked one, row by row.
+        optimizers: of the members.
     """
 
-    def __init__(self, optimizer: torch.optim.Optimizer, owners: dict[torch.Tensor, list[Owner]]):
-        self.optimizer, self.owners = optimizer, owners
-        for leaf, rows in owners.items():
-            for row, (_, parameter) in enumerate(rows):
+    def __init__(
+        self, owners: Mapping[torch.Tensor, Sequence[torch.Tensor]], optimizers: Sequence[Adam]
+    ):
+        self.optimizer = Adam(owners, optimizers[0].defaults["lr"])
+        # Of each row the member's parameter and its optimiser.
+        self.rows = {
+            leaf: [(p, optimizers[i * len(optimizers) // len(each)]) for i, p in enumerate(each)]
+            for leaf, each in owners.items()
+        }
+        for leaf, rows in self.rows.items():
+            for row, (parameter, _) in enumerate(rows):
                 parameter.data = leaf.data[row]
-            states = [own.state[parameter] for own, parameter in rows if parameter in own.state]
+            states = [adam.state[parameter] for parameter, adam in rows if parameter in adam.state]
             if states:
-                optimizer.state[leaf] = {
+                self.optimizer.state[leaf] = {
                     name: value.clone()
                     if name == "step"
                     else torch.stack([state[name] for state in states])
@@ -235,18 +211,17 @@ class _Stack:
 
     def scatter(self) -> None:
         """Write the state of the optimiser to those of the members."""
-        for leaf, rows in self.owners.items():
-            state = self.optimizer.state.get(leaf, {})
-            for row, (own, parameter) in enumerate(rows):
-                own.state[parameter] = {
+        for leaf, state in self.optimizer.state.items():
+            for row, (parameter, adam) in enumerate(self.rows[leaf]):
+                adam.state[parameter] = {
                     name: (value if name == "step" else value[row]).clone()
                     for name, value in state.items()
                 }
 
     def separate(self) -> None:
         """Give the members' parameters memory of their own."""
-        for rows in self.owners.values():
-            for _, parameter in rows:
+        for rows in self.rows.values():
+            for parameter, _ in rows:
                 parameter.data = parameter.data.clone()
 
 
@@ -254,7 +229,7 @@ def _each(functions: Sequence[Callable[..., torch.Tensor]]) -> Callable[..., tor
     """Apply each function to its part of the stacked arguments, and stack the results."""
 
     def call(*arguments: torch.Tensor) -> torch.Tensor:
-        parts = zip(*arguments, strict=True)
-        return torch.stack([f(*part) for f, part in zip(functions, parts, strict=True)])
+        each = zip(functions, *arguments, strict=True)
+        return torch.stack([function(*parts) for function, *parts in each])
 
     return call

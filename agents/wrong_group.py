@@ -25,14 +25,13 @@ class WrongGroupAgent(EquivariantAgent):
 
     def actor_layers(self) -> list[nn.Module]:
         *layers, last = super().actor_layers()
-        return [*layers, Mirrored(last, outputs=mirror(self.actor_layout))]
+        return [*layers, Mirrored(last, mirror(self.actor_layout), outputs=True)]
 
     def critic_layers(self, inputs: Layout) -> list[nn.Module]:
         first, *layers = super().critic_layers(inputs)
-        matrix = mirror(inputs)
-        seen = self.obs_layout.dim
+        matrix, seen = mirror(inputs), self.obs_layout.dim
         matrix[:seen, :seen] = torch.eye(seen)  # the observation stays as it is
-        return [Mirrored(first, inputs=matrix), *layers]
+        return [Mirrored(first, matrix, outputs=False), *layers]
 
 
 def mirror(layout: Layout) -> torch.Tensor:
@@ -43,25 +42,16 @@ def mirror(layout: Layout) -> torch.Tensor:
 class Mirrored(nn.Module):
     """A layer whose inputs or outputs are multiplied by a fixed matrix."""
 
-    inputs: torch.Tensor | None
-    outputs: torch.Tensor | None
+    matrix: torch.Tensor
 
-    def __init__(
-        self,
-        layer: nn.Module,
-        inputs: torch.Tensor | None = None,
-        outputs: torch.Tensor | None = None,
-    ):
+    def __init__(self, layer: nn.Module, matrix: torch.Tensor, outputs: bool):
         super().__init__()
-        self.layer = layer
-        self.register_buffer("inputs", inputs, persistent=False)
-        self.register_buffer("outputs", outputs, persistent=False)
+        self.layer, self.outputs = layer, outputs
+        self.register_buffer("matrix", matrix, persistent=False)
 
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Weight ``[out, in]`` and bias ``[out]``."""
         weight, bias = dense(self.layer)
-        if self.inputs is not None:
-            weight = weight @ self.inputs
-        if self.outputs is not None:
-            weight, bias = self.outputs @ weight, self.outputs @ bias
-        return weight, bias
+        if self.outputs:
+            return self.matrix @ weight, self.matrix @ bias
+        return weight @ self.matrix, bias

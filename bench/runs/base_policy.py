@@ -12,9 +12,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from symsteer.agents.replay import Transition
 from symsteer.bench.demos import FORMAT, MODES, Demonstrations, collect, load
-from symsteer.bench.demos.decisions import decisions
 from symsteer.bench.runs.config import RunConfig, build_config, content_key
 from symsteer.bench.steering.evaluation import DRAWS, Steerability, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
@@ -196,20 +194,6 @@ def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> P
 
         how = (wanted.count, wanted.mode, wanted.seed, path)
         return collect(config.task, config.embodiment, *how, progress=advance)
-
-
-def demonstrated_decisions(
-    config: RunConfig, out: Path, demonstrations: Path | None, progress: bool = True
-) -> Transition:
-    """The decisions of the demonstrations that a run's base policy was trained on.
-
-    Args:
-        config, out, demonstrations, progress: as for :func:`prepare_base`.
-    """
-    path = demonstrations or demonstration_file(config, out, progress)
-    demos = load(path, config.task, config.embodiment, config.demonstrations.count)
-    policy = config.policy
-    return decisions(demos, policy.execute, policy.horizon, policy.hold)
 
 
 def describe_base(policy: ChunkPolicy) -> BasePolicy:

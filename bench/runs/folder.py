@@ -23,7 +23,6 @@ from symsteer.variant import file_name
 
 State = Literal["missing", "running", "interrupted", "failed", "finished"]
 
-DEMONSTRATIONS = "demonstrations.safetensors"
 CONFIG, RECORD, CHECKPOINT = "config.json", "record.json", "checkpoint.pt"
 PROGRESS, LOCK = "progress.json", ".lock"
 

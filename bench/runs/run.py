@@ -13,17 +13,15 @@ import torch
 
 from symsteer.agents import AGENTS
 from symsteer.bench.runs.base_policy import (
-    demonstrated_decisions,
     origin,
     prepare_base,
     with_policy_of,
 )
-from symsteer.bench.runs.checkpoint import fitting, load_checkpoint
+from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.evaluator import Evaluator, check_room
 from symsteer.bench.runs.folder import (
     CONFIG,
-    DEMONSTRATIONS,
     RECORD,
     claimed,
     discard_empty,
@@ -34,12 +32,9 @@ from symsteer.bench.runs.folder import (
 )
 from symsteer.bench.runs.observers import ProgressFile, observers_of
 from symsteer.bench.runs.stored import (
-    RENEW,
     named,
     restored,
-    store_demonstrations,
     stored_config,
-    stored_demonstrations,
     stored_policy,
 )
 from symsteer.bench.runs.tracking import Tracking
@@ -318,28 +313,12 @@ def _opened(
                 ProgressFile(folder, config.env_steps).write("base policy", 0)
                 base = prepare_base(config, out, demonstrations, policy, progress, workers)
                 save_policy(base, folder)
-            decisions = None
-            if AGENTS.get(config.agent).wants_demonstrations(config.agent_options):
-                decisions = stored_demonstrations(folder)
-                if decisions is None:
-                    check_files()
-                    if policy is not None:
-                        raise UserError(
-                            f"the agent {config.agent!r} learns from demonstrations, which a base "
-                            "policy of yours does not have; set agent.demonstration_share to 0 or "
-                            "name no base policy"
-                        )
-                    decisions = demonstrated_decisions(config, out, demonstrations, progress)
-                    store_demonstrations(decisions, folder)
         except BaseException:
             discard_empty(folder)
             raise
         observers = observers_of(config, resolved, progress, tracking)
         checkpoint = load_checkpoint(folder)
         trainer = Trainer(config, folder, base, checkpoint, observers, workers, together)
-        if decisions is not None:
-            with fitting(folder / DEMONSTRATIONS, RENEW):
-                trainer.agent.observe_demonstrations(decisions)
         try:
             yield trainer
         except BaseException as error:

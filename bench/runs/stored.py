@@ -9,32 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load as deserialize
-from safetensors.torch import save as serialize
 
 from symsteer.agents.agent import Agent
-from symsteer.agents.replay import Transition
 from symsteer.bench.runs.checkpoint import fitting, load_checkpoint
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.runs.extensions import require_extensions
-from symsteer.bench.runs.folder import (
-    CHECKPOINT,
-    CONFIG,
-    DEMONSTRATIONS,
-    RECORD,
-    read_config,
-    run_id,
-)
+from symsteer.bench.runs.folder import CHECKPOINT, CONFIG, RECORD, read_config, run_id
 from symsteer.bench.runs.trainer import new_agent
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
-from symsteer.files import write_atomically
 from symsteer.leaderboard.records import DERIVED, flat
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path
-
-RENEW = "delete it, and it is written again"
-"""What helps against a damaged file of demonstrations."""
 
 
 @dataclass(frozen=True)
@@ -146,21 +132,3 @@ def stored_policy(folder: Path, config: RunConfig) -> ChunkPolicy | None:
     task = task_class(config.task)
     base = load_policy(folder, task.observation_layout, task.action_layout)
     return base.to(config.device)
-
-
-def store_demonstrations(decisions: Transition, folder: Path) -> None:
-    """Write the decisions of the demonstrations to a run's folder."""
-    write_atomically(folder / DEMONSTRATIONS, serialize(vars(decisions)))
-
-
-def stored_demonstrations(folder: Path) -> Transition | None:
-    """The decisions of the demonstrations in a run's folder; None if they are not there.
-
-    Raises:
-        UserError: if the file is damaged.
-    """
-    path = folder / DEMONSTRATIONS
-    if not path.is_file():
-        return None
-    with fitting(path, RENEW):
-        return Transition(**deserialize(path.read_bytes()))

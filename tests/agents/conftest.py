@@ -1,6 +1,7 @@
-"""Layouts with every kind of irrep, random transitions, and a bandit with a known best noise."""
+"""Layouts with every kind of irrep, random transitions, and how equivariant an agent is."""
 
 import dataclasses
+import functools
 from dataclasses import fields
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.replay import Batch, ReplayBuffer, Transition
-from symsteer.policies.geometry import Field, Layout
+from symsteer.policies.geometry import Field, Group, Layout
 from symsteer.policies.normalizer import clip_blocks
 
 OBS = Layout(
@@ -119,6 +120,67 @@ class Problem:
         return buffer
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def problem():
     return Problem()
+
+
+DOUBLE = {"dtype": torch.float64, "initial_output": 1.0}
+"""Options with which errors of symmetry are seen."""
+
+
+def learn(problem, agent, updates=20):
+    for seed in range(updates):
+        agent.update(problem.batch(32, seed, agent.dtype, rows=agent.rows))
+    return agent
+
+
+@functools.cache
+def trained(name, updates=20, dtype=torch.float64, **options):
+    """An agent after some updates, the same one for all tests: do not change it."""
+    problem = Problem()
+    return learn(problem, problem.agent(name, dtype=dtype, initial_output=1.0, **options), updates)
+
+
+def errors(agent, problem, name="C8", size=64, sense=1):
+    """Relative errors over the group: mean, deterministic w, samples, log-probability, both Q.
+
+    The true layouts are those of ``problem``; the agent may have other ones. Noise turns by
+    ``sense`` times the angle of the scene.
+    """
+    batch = problem.batch(size, seed=5, dtype=agent.dtype)
+    chunk = problem.act_layout.repeat(problem.horizon)
+    generator = torch.Generator().manual_seed(6)
+    eps = torch.randn(size, chunk.dim, generator=generator, dtype=torch.float64).to(agent.dtype)
+    noise = 0.4 * batch.noise
+
+    def quantities(obs, noise, eps):
+        mean, log_scale = agent.moments(obs)
+        sample, log_prob = agent.distribution.sample(mean, log_scale, eps)
+        return {
+            "mean": mean,
+            "deterministic": agent.mode(obs).flatten(1),
+            "sample": sample,
+            "sample_log_prob": log_prob,
+            "q": agent.q_values(obs, noise),
+            "noise_q": agent.noise_q_values(obs, noise),
+        }
+
+    own = quantities(batch.obs, noise, eps)
+    # A constant quantity would pass.
+    assert own["mean"].norm(dim=1).min() > 1e-2
+    assert min(own[key].std(dim=1).min() for key in ("q", "noise_q")) > 1e-3
+    worst = dict.fromkeys(own, 0.0)
+    for angle, reflect in Group.parse(name).elements:
+        turn = (sense * angle, reflect)
+        moved = quantities(
+            problem.obs_layout.transform(batch.obs, angle, reflect),
+            problem.act_layout.transform(noise, *turn),
+            chunk.transform(eps, *turn),
+        )
+        for key, value in own.items():
+            turns = key in ("mean", "deterministic", "sample")
+            expected = chunk.transform(value, *turn) if turns else value
+            error = (moved[key] - expected).abs().max() / value.abs().max()
+            worst[key] = max(worst[key], error.item())
+    return worst

@@ -6,15 +6,11 @@ import math
 import pytest
 import torch
 
-from symsteer.agents.agent import AgentContext
 from symsteer.agents.asymmetry import asymmetry
-from symsteer.agents.constrained import ConstrainedAgent, ConstrainedOptions
 from symsteer.agents.networks import dense
-from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
-from tests.agents.conftest import ACT, OBS
-from tests.agents.test_equivariance import errors, trained
+from tests.agents.conftest import ACT, DOUBLE, OBS, errors, learn, trained
 from tests.agents.test_sac import solve
 from tests.marks import slow_except
 
@@ -64,34 +60,22 @@ def test_the_nearest_map_is_the_mean_over_the_group(name, kind):
 
 @pytest.mark.parametrize("name", ALL)
 def test_they_start_where_the_strict_agent_starts_and_leave_it(problem, name):
-    options = {"dtype": torch.float64, "initial_output": 1.0, **FREE[name]}
-    agent = problem.agent(name, **options)
+    agent = trained(name, 0, **FREE[name])
     # Layers are made in single precision.
-    assert max(errors(agent, problem, "C8", torch.float64).values()) < 1e-6
+    assert max(errors(agent, problem).values()) < 1e-6
     assert asymmetry(agent.actor) < 1e-7
-    trained(problem, agent, torch.float64)
-    worst = errors(agent, problem, "C8", torch.float64)
+    agent = trained(name, **FREE[name])
+    worst = errors(agent, problem)
     assert min(worst.values()) > 1e-4, worst
     assert min(asymmetry(network) for network in agent.networks.values()) > 1e-4
 
 
-@pytest.mark.parametrize("name", WITH_DIAL)
-def test_a_large_penalty_gives_a_strict_agent(problem, name):
-    agent = problem.agent(name, dtype=torch.float64, initial_output=1.0, penalty=math.inf)
-    trained(problem, agent, torch.float64)
-    assert max(errors(agent, problem, "C8", torch.float64).values()) < 1e-10
-    large = problem.agent(name, dtype=torch.float64, initial_output=1.0, penalty=1e8)
-    trained(problem, large, torch.float64)
-    assert max(errors(large, problem, "C8", torch.float64).values()) < 1e-4
-
-
 def test_with_a_large_penalty_the_residual_pathway_is_the_equivariant_agent(problem):
-    options = {"dtype": torch.float64, "initial_output": 1.0}
-    strict = trained(problem, problem.agent("equivariant", **options), torch.float64)
-    agent = problem.agent("residual-pathway", penalty=math.inf, **options)
+    strict = trained("equivariant")
+    agent = problem.agent("residual-pathway", penalty=math.inf, **DOUBLE)
     # The plain paths draw numbers when they are made.
-    agent.load_state_dict(with_strict_layers(agent, problem.agent("equivariant", **options)))
-    trained(problem, agent, torch.float64)
+    agent.load_state_dict(with_strict_layers(agent, trained("equivariant", 0)))
+    learn(problem, agent)
     batch = problem.batch(seed=9, dtype=torch.float64)
     for mine, theirs in zip(agent.moments(batch.obs), strict.moments(batch.obs), strict=True):
         torch.testing.assert_close(mine, theirs)
@@ -129,12 +113,11 @@ def test_with_a_large_penalty_they_do_not(problem, name):
 
 
 @pytest.mark.parametrize("name", WITH_DIAL)
-def test_the_dial_orders_them(problem, name):
-    sizes = []
-    for penalty in (0.0, 10.0, 1000.0):
-        agent = problem.agent(name, dtype=torch.float64, penalty=penalty)
-        trained(problem, agent, torch.float64)
-        sizes.append([asymmetry(network) for network in agent.networks.values()])
+def test_the_dial_orders_them(name):
+    sizes = [
+        [asymmetry(network) for network in trained(name, penalty=penalty).networks.values()]
+        for penalty in (0.0, 10.0, 1000.0)
+    ]
     for free, held, strict in zip(*sizes, strict=True):
         assert free > 1.05 * held > 2 * strict
 
@@ -150,16 +133,6 @@ def test_the_penalty_limits_the_asymmetric_numbers(problem):
             agent.settle("actor")
     for weight in numbers:
         torch.testing.assert_close(weight, torch.full_like(weight, 0.1), rtol=1e-3, atol=0)
-
-
-def test_actor_and_critics_may_have_penalties_of_their_own(problem):
-    agent = problem.agent("projected", dtype=torch.float64, penalty=0.0, actor_penalty=1e9)
-    trained(problem, agent, torch.float64)
-    assert asymmetry(agent.actor) < 1e-7 < asymmetry(agent.critic)
-    agent = problem.agent("projected", dtype=torch.float64, penalty=0.0, critic_penalty=1e9)
-    trained(problem, agent, torch.float64)
-    assert max(asymmetry(agent.critic), asymmetry(agent.noise_critic)) < 1e-7
-    assert asymmetry(agent.actor) > 1e-4
 
 
 @pytest.mark.long
@@ -197,19 +170,9 @@ def test_in_a_symmetric_problem_the_measured_error_falls(problem, name, monkeypa
     assert error < 0.3
 
 
-def test_multipliers_follow_the_paper():
-    context = AgentContext(OBS, ACT, 3, 2, lambda obs, noise: noise.tanh(), lambda obs: obs)
-    agent = ConstrainedAgent(context, ConstrainedOptions(width=32, dual_lr=0.5))
-    layers = [parameters for _, parameters in agent.actor.layers()]
-    with torch.no_grad():
-        layers[1]["gamma"].fill_(-2.0)
-        agent.settle("actor")
-        agent.settle("actor")
-    assert [layer["multiplier"].item() for layer in layers] == [1.0, -2.0, 1.0]
-    assert agent.penalty("actor", None).item() == pytest.approx(1 + 4 + 1)
-    agent = ConstrainedAgent(
-        context, ConstrainedOptions(width=32, dual_lr=0.5, elastic=True, slack_price=2.0)
-    )
+@pytest.mark.parametrize("elastic", [False, True])
+def test_multipliers_follow_the_paper(problem, elastic):
+    agent = problem.agent("constrained", dual_lr=0.5, elastic=elastic)
     layers = [parameters for _, parameters in agent.actor.layers()]
     with torch.no_grad():
         layers[1]["gamma"].fill_(-2.0)
@@ -217,26 +180,14 @@ def test_multipliers_follow_the_paper():
         layers[2]["multiplier"].fill_(0.4)
         agent.settle("actor")
         agent.settle("actor")
-    # lambda + 0.5 (|gamma| - lambda / 2), twice.
-    found = [layer["multiplier"].item() for layer in layers]
-    assert found == pytest.approx([0.875, 1.75, 0.4 * 0.75**2])
+    # lambda + 0.5 gamma, twice; with slack lambda + 0.5 (|gamma| - lambda).
+    wanted = [0.75, 1.5, 0.1] if elastic else [1.0, -2.0, 0.4]
+    assert [layer["multiplier"].item() for layer in layers] == pytest.approx(wanted)
+    assert agent.penalty("actor", None).item() == pytest.approx(wanted[0] + 2 * abs(wanted[1]))
 
 
 def test_the_truncated_actor_is_equivariant(problem):
-    agent = problem.agent("constrained", dtype=torch.float64, initial_output=1.0, dual_lr=0.0)
-    trained(problem, agent, torch.float64)
-    truncated = copy.copy(agent)
-    truncated.act = lambda obs, deterministic: agent.alternatives()["truncated"](obs)
-    found = errors(truncated, problem, "C8", torch.float64)
-    assert found["deterministic"] < 1e-10 < 1e-4 < found["mean"]
-
-
-def test_bad_options_are_refused(problem):
-    for name, options, words in (
-        ("relaxed", {"filters": 0}, "filters must be at least 1"),
-        ("projected", {"actor_penalty": -1.0}, "actor_penalty must not be negative"),
-        ("constrained", {"dual_lr": -1.0}, "dual_lr must not be negative"),
-        ("constrained", {"slack_price": 0.0}, "slack_price must be positive"),
-    ):
-        with pytest.raises(UserError, match=words):
-            problem.agent(name, **options)
+    agent = copy.copy(trained("constrained", dual_lr=0.0))
+    assert errors(agent, problem)["deterministic"] > 1e-4
+    agent.mode = lambda obs: agent.alternatives()["truncated"](obs)
+    assert errors(agent, problem)["deterministic"] < 1e-10

@@ -1,11 +1,8 @@
 """Best of n: what it plays, what its critics learn, and what it does not do."""
 
-import dataclasses
-
 import pytest
 import torch
 
-from symsteer.errors import UserError
 from tests.agents.conftest import EXECUTE
 from tests.agents.test_known_values import GAMMA, best, play, reach, states, step
 
@@ -73,40 +70,3 @@ def test_its_critics_learn_the_values_of_the_best_of_few():
     q = agent.q_values(obs, noise).mean(0)
     assert abs((q - returns).mean()) < 0.15
     assert torch.corrcoef(torch.stack([q, returns]))[0, 1] > 0.8
-
-
-def test_it_learns_from_demonstrations_and_continues_from_a_checkpoint(problem):
-    agents = []
-    for seed in (0, 5):
-        agent = problem.agent("best-of-n", seed=seed, demonstration_share=0.5, **DOUBLE)
-        shown = problem.transition(64, 1)
-        agent.observe_demonstrations(
-            dataclasses.replace(shown, noise=torch.zeros_like(shown.noise))
-        )
-        agent.observe(problem.transition(64, 2))
-        agents.append(agent)
-    first, second = agents
-    assert "actor" not in first.state_dict()["networks"]
-    assert first.parameter_counts()["actor"] == 0
-    first.owed = 2.0
-    for batch in first.batches():
-        scalars = first.update(batch)
-    assert "losses/critic" in scalars
-    assert "losses/actor" not in scalars
-    second.load_state_dict(first.state_dict())
-    obs = problem.batch(dtype=torch.float64).obs
-    assert torch.equal(first.act(obs, True), second.act(obs, True))
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"critic": "aliased"}, "its critic is sampler"),
-        ({"noise_bank": 0}, "noise_bank of at least 1"),
-        ({"soft_backup": True}, "no entropy bonus"),
-        ({"n_step": 3}, "n_step is 1"),
-    ],
-)
-def test_bad_options_are_refused(problem, options, words):
-    with pytest.raises(UserError, match=words):
-        problem.agent("best-of-n", **options)

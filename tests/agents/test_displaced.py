@@ -3,8 +3,6 @@
 import pytest
 import torch
 
-from symsteer.errors import UserError
-from tests.agents.test_equivariance import errors, trained
 from tests.agents.test_known_values import best, play, reach, states
 from tests.marks import slow_except
 
@@ -26,12 +24,7 @@ def test_it_starts_as_the_base_policy(problem):
 @pytest.mark.parametrize("displacement", slow_except([0.05, 0.5], 0.5))
 def test_the_multiplier_keeps_the_mean_displacement(displacement):
     """A plain climb of Q would go farther: see the next test."""
-    agent = reach(
-        "displaced",
-        displacement=displacement,
-        initial_alpha=0.1,
-        alpha_lr=0.03,
-    )
+    agent = reach("displaced", displacement=displacement, initial_alpha=0.1, alpha_lr=0.03)
     obs = states(1024, torch.Generator().manual_seed(2))
     size = agent.mode(obs).square().mean().item()
     assert size == pytest.approx(displacement, rel=0.4)
@@ -43,24 +36,3 @@ def test_with_a_large_displacement_its_mean_is_almost_the_best():
     obs = states(1024, torch.Generator().manual_seed(2))
     way = play(obs, lambda obs: agent.executed(obs, agent.alternatives()["mean"](obs)))
     assert way.mean() > best(obs).mean() - 0.15
-
-
-def test_with_equivariant_layers_it_keeps_the_symmetry(problem):
-    agent = problem.agent(
-        "displaced", layers="equivariant", dtype=torch.float64, initial_output=1.0
-    )
-    trained(problem, agent, torch.float64)
-    agent.act = lambda obs, deterministic: agent.mode(obs)
-    assert max(errors(agent, problem, "C8", torch.float64).values()) < 1e-10
-    plain = problem.agent("displaced", dtype=torch.float64, initial_output=1.0)
-    worst = errors(plain, problem, "C8", torch.float64)
-    assert min(worst[key] for key in ("mean", "q", "noise_q")) > 1e-2
-
-
-def test_bad_options_are_refused(problem):
-    with pytest.raises(UserError, match="displacement must be positive"):
-        problem.agent("displaced", displacement=0.0)
-    with pytest.raises(UserError, match="no entropy bonus"):
-        problem.agent("displaced", soft_backup=True)
-    with pytest.raises(UserError, match="layers"):
-        problem.agent("displaced", layers="convolutional")

@@ -63,7 +63,7 @@ def rotated(layout, name, dtype, gaussian):
     """Largest error over the group of noise, mode and log-density, relative to their size."""
     mean, log_scale, eps = parameters(32, dtype)
     noise, log_prob = gaussian.sample(mean, log_scale, eps)
-    mode = gaussian.mode(mean)
+    mode = gaussian.squash(mean)
     errors = []
     for angle, reflect in Group.parse(name).elements:
 
@@ -74,7 +74,7 @@ def rotated(layout, name, dtype, gaussian):
         errors += [
             (noise_g - turn(noise)).norm() / noise.norm(),
             (log_prob_g - log_prob).norm() / log_prob.norm(),
-            (gaussian.mode(turn(mean)) - turn(mode)).norm() / mode.norm(),
+            (gaussian.squash(turn(mean)) - turn(mode)).norm() / mode.norm(),
         ]
     return max(error.item() for error in errors)
 

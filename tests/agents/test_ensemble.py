@@ -4,30 +4,13 @@ import pytest
 import torch
 from torch.distributions import Normal, kl_divergence
 
-from symsteer.errors import UserError
 from symsteer.policies.geometry import Group, equivariance_error, group_average
-from tests.agents.conftest import ACT, OBS
-from tests.agents.test_equivariance import errors, trained
-
-DOUBLE = {"dtype": torch.float64, "initial_output": 1.0}
-
-
-@pytest.mark.parametrize("critic", ["aliased", "noise", "sampler"])
-@pytest.mark.parametrize("group", ["C8", "C4", "D4"])
-def test_it_is_equivariant_before_and_after_training(problem, group, critic):
-    agent = problem.agent("ensemble", group=group, critic=critic, **DOUBLE)
-    for _ in range(2):
-        assert max(errors(agent, problem, group, torch.float64).values()) < 1e-10
-        trained(problem, agent, torch.float64, updates=5)
+from tests.agents.conftest import ACT, DOUBLE, OBS, trained
 
 
 def test_with_the_trivial_group_it_is_the_standard_agent(problem):
-    agents = [
-        problem.agent(name, **options, **DOUBLE)
-        for name, options in (("standard", {}), ("ensemble", {"group": "C1"}))
-    ]
-    standard, ensemble = (trained(problem, agent, torch.float64) for agent in agents)
     obs = problem.batch(dtype=torch.float64).obs
+    standard, ensemble = trained("standard"), trained("ensemble", group="C1")
     torch.testing.assert_close(standard.mode(obs), ensemble.mode(obs))
 
 
@@ -39,8 +22,8 @@ def test_the_divergence_is_that_of_gaussians(problem):
     )
     found = agent._divergence(outputs, others)
     first, second = (
-        Normal(mean, agent.distribution._spread(log_scale.exp()))
-        for mean, log_scale in map(agent._parameters, (outputs, others))
+        Normal(mean, agent.distribution.spread(log_scale.exp()))
+        for mean, log_scale in map(agent.distribution.parameters_of, (outputs, others))
     )
     expected = kl_divergence(first, second) + kl_divergence(second, first)
     torch.testing.assert_close(found, expected.sum(-1))
@@ -57,8 +40,7 @@ def test_the_regularisers_make_the_copies_agree(problem, name):
             "critic_regularizer": 0.0,
             f"{name}_regularizer": weight,
         }
-        agent = problem.agent("ensemble", **options, **DOUBLE)
-        trained(problem, agent, torch.float64, updates=60)
+        agent = trained("ensemble", 60, **options)
         measured = problem.agent("ensemble", **{**options, f"{name}_regularizer": 1.0}, **DOUBLE)
         measured.load_state_dict(agent.state_dict())
         sizes.append(measured.penalty(name, batch).item())
@@ -80,9 +62,3 @@ def test_any_function_can_be_averaged():
 
         assert equivariance_error(network, (obs,), (OBS,), ACT, group) > 1e-2
         assert equivariance_error(averaged, (obs,), (OBS,), ACT, group) < 1e-10
-
-
-def test_bad_options_are_refused(problem):
-    for name in ("actor_regularizer", "critic_regularizer"):
-        with pytest.raises(UserError, match=f"{name} must not be negative"):
-            problem.agent("ensemble", **{name: -1.0})

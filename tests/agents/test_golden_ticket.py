@@ -91,5 +91,3 @@ def test_a_budget_for_less_than_two_candidates_is_refused(problem):
     agent = problem.agent("golden-ticket")
     with pytest.raises(UserError, match=f"at least {ENVS * LIMIT}"):
         agent.check(agent.options, Budget(ENVS * LIMIT - 1, ENVS, EXECUTE, LIMIT))
-    with pytest.raises(UserError, match="candidates"):
-        problem.agent("golden-ticket", candidates=1)

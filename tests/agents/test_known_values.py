@@ -183,9 +183,11 @@ def reach(name, **options):
     }
     agent = built(name, context, **{**settings, **options})
     generator = torch.Generator().manual_seed(1)
-    for source in 4 * ["gaussian", "squashed"]:
-        obs = states(512, generator)
-        noise = agent.random_noise(source, 512)
+    for squashed in 4 * [False, True]:
+        obs, noise = states(512, generator), agent.gaussian_noise(512)
+        if squashed:
+            drawn = torch.randn(512, agent.noise_layout.dim, generator=generator)
+            noise[:, -agent.drawn_rows :] = agent.chunk(agent.distribution.squash(drawn))
         cost, actions = torch.full((512,), -1.0), agent.executed(obs, noise)
         after, close = step(obs, actions)
         agent.observe(Transition(obs, noise, actions, cost, after, close, torch.zeros(512)))
@@ -201,7 +203,7 @@ RANDOM = ("displaced", "best-of-n")
 def test_values_and_steps_are_almost_the_best(name, critic):
     agent = reach(name, critic=critic)
     generator = torch.Generator().manual_seed(2)
-    obs, noise = states(1024, generator), agent.random_noise("gaussian", 1024, generator)
+    obs, noise = states(1024, generator), agent.gaussian_noise(1024, generator)
     truth = best_q(obs, agent.executed(obs, noise))
     assert truth.std() > 0.3
     for values in (agent.q_values, agent.noise_q_values):

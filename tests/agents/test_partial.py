@@ -9,28 +9,26 @@ from symsteer.agents.partial import START, PartialAgent, PartialOptions
 from symsteer.agents.replay import Transition
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Layout
-from tests.agents.test_equivariance import errors, trained
+from tests.agents.conftest import DOUBLE, errors, learn
 from tests.marks import slow_except
-
-DOUBLE = {"dtype": torch.float64, "initial_output": 1.0}
 
 
 def set_gates(agent, logit):
     """Gates that say the same everywhere."""
     for name in ("gate", "state_gate"):
         with torch.no_grad():
-            for parameter in agent.own[name].members[0][-1].parameters():
+            for parameter in agent.networks[name].members[0][-1].parameters():
                 parameter.zero_()
-            agent.own[name].members[0][-1].bias.fill_(logit - START)
-        agent.own[name].changed()
+            agent.networks[name].members[0][-1].bias.fill_(logit - START)
+        agent.networks[name].changed()
 
 
 @pytest.mark.parametrize("critic", ["aliased", "sampler"])
 def test_it_starts_equivariant(problem, critic):
     agent = problem.agent("partial", critic=critic, **DOUBLE)
-    assert max(errors(agent, problem, "C8", torch.float64).values()) < 1e-10
+    assert max(errors(agent, problem).values()) < 1e-10
     set_gates(agent, 10.0)
-    assert min(errors(agent, problem, "C8", torch.float64).values()) > 1e-2
+    assert min(errors(agent, problem).values()) > 1e-2
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
@@ -39,14 +37,14 @@ def test_mixtures_by_hand(problem, share):
     set_gates(agent, torch.logit(torch.tensor(share), eps=1e-12).item())
     batch = problem.batch(8, dtype=torch.float64)
     outputs = agent.actor(batch.obs)
-    (strict, strict_log), (plain, plain_log) = map(agent._parameters, outputs)
+    (strict, strict_log), (plain, plain_log) = map(agent.distribution.parameters_of, outputs)
     mean, log_scale = agent.moments(batch.obs)
     # log pi_E^(1 - lambda) pi_N^lambda is quadratic: compare it with the mixture's, but for a
     # constant.
     points = torch.randn(5, *mean.shape, generator=torch.Generator().manual_seed(0)).double()
 
     def exponent(mean, log_scale):
-        scale = agent.distribution._spread(log_scale.exp())
+        scale = agent.distribution.spread(log_scale.exp())
         return -0.5 * ((points - mean) / scale).square().sum(-1)
 
     parts = (1 - share) * exponent(strict, strict_log) + share * exponent(plain, plain_log)
@@ -57,15 +55,15 @@ def test_mixtures_by_hand(problem, share):
     inputs = torch.cat([batch.obs, agent.judged(batch.obs, batch.noise.flatten(1))], -1)
     both = agent.critic(inputs)[..., 0]
     expected = (1 - share) * both[:2] + share * both[2:]
-    torch.testing.assert_close(q, expected / agent.reward_scale, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(q, expected / agent.options.reward_scale, rtol=1e-5, atol=1e-5)
 
 
 def test_actor_and_critics_have_no_gradient_in_the_gates(problem):
     agent = problem.agent("partial", gate="soft", **DOUBLE)
     agent.after_update = lambda batch: {}
-    trained(problem, agent, torch.float64, updates=2)
-    for network in agent.own.values():
-        assert all(p.grad is None for p in network.parameters())
+    learn(problem, agent, 2)
+    for name in ("strict_predictor", "plain_predictor", "gate", "state_gate"):
+        assert all(p.grad is None for p in agent.networks[name].parameters())
 
 
 # A point that moves by its action; where x is large, the wind carries it away.
@@ -127,34 +125,6 @@ def test_in_a_symmetric_world_they_stay_closed():
     share = agent._share(agent._features(seen.obs), None)
     assert share.mean() < 0.35
     assert auroc(agent.share(seen.obs, seen.actions), windy) < 0.75
-
-
-def test_a_checkpoint_continues(problem):
-    agents = [problem.agent("partial", seed=seed, **DOUBLE) for seed in (0, 0, 5)]
-    for agent in agents:
-        agent.observe(problem.transition(64))
-    first, same, other = (trained(problem, agent, torch.float64, 3) for agent in agents)
-    other.load_state_dict(first.state_dict())
-    obs = problem.batch(dtype=torch.float64).obs
-    for agent in (first, same, other):
-        trained(problem, agent, torch.float64, 2)
-        assert torch.equal(agent.sizes, first.sizes)
-        assert torch.equal(agent.mode(obs), first.mode(obs))
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"critic": "noise"}, "aliased or sampler"),
-        ({"gate": "open"}, "gate"),
-        ({"fence": -1.0}, "fence must not be negative"),
-        ({"n_step": 3}, "n_step is 1"),
-        ({"noise_bank": 0}, "noise_bank of at least 1"),
-    ],
-)
-def test_bad_options_are_refused(problem, options, words):
-    with pytest.raises(UserError, match=words):
-        problem.agent("partial", **options)
 
 
 def test_noise_and_actions_must_differ():

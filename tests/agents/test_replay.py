@@ -10,6 +10,9 @@ from symsteer.errors import UserError
 SHAPES = {"obs": (2,), "noise": (3, 2), "reward": (), "next_obs": (2,), "terminal": ()}
 
 
+GAMMA = 0.5
+
+
 def numbered(start, count):
     n = torch.arange(start, start + count, dtype=torch.float32)
     return {
@@ -44,6 +47,7 @@ def test_rows_stay_together():
         buffer.add(numbered(start, 4))
     batch = buffer.sample(100, GAMMA)
     assert set(batch) == {*SHAPES, "discount"}
+    assert batch.discount.eq(GAMMA).all()
     for name in SHAPES:
         tensor = batch[name]
         assert torch.equal(tensor.flatten(1).mean(1) if tensor.ndim > 1 else tensor, batch.reward)
@@ -102,114 +106,3 @@ def test_mistakes_are_named():
     other = ReplayBuffer(4, {**SHAPES, "obs": (3,)})
     with pytest.raises(UserError, match="configuration"):
         other.load_state_dict(ReplayBuffer(4, SHAPES).state_dict())
-
-
-# Joined decisions: the next observation of one is the observation of the next.
-
-JOINED = {
-    "obs": (1,),
-    "noise": (1,),
-    "reward": (),
-    "next_obs": (1,),
-    "terminal": (),
-    "truncated": (),
-}
-GAMMA = 0.5
-
-
-def decisions(obs, next_obs, reward, terminal=(), truncated=()):
-    """One decision of each environment; the last two name environments."""
-    obs, next_obs, reward = (torch.tensor(x, dtype=torch.float32) for x in (obs, next_obs, reward))
-    ends = [
-        torch.tensor([float(i in which) for i in range(len(obs))])
-        for which in (terminal, truncated)
-    ]
-    columns = {"obs": obs[:, None], "noise": 100 + obs[:, None], "next_obs": next_obs[:, None]}
-    return {**columns, "reward": reward, "terminal": ends[0], "truncated": ends[1]}
-
-
-def joined(buffer, n_step):
-    """What each stored decision becomes: (reward, discount, next_obs, terminal, truncated)."""
-    batch = buffer.sample(2000, GAMMA, n_step)
-    assert torch.equal(batch.noise, 100 + batch.obs)  # the noise is that of the first decision
-    names = ("reward", "discount", "next_obs", "terminal", "truncated")
-    rows = zip(
-        batch.obs.flatten().tolist(), *(batch[n].flatten().tolist() for n in names), strict=True
-    )
-    found = {}
-    for obs, *row in rows:
-        assert found.setdefault(obs, tuple(row)) == tuple(row)
-    return found
-
-
-def test_one_step_is_what_was_stored():
-    buffer = ReplayBuffer(10, JOINED)
-    buffer.add(decisions([0], [1], [-1]))
-    buffer.add(decisions([1], [2], [-2], terminal=[0]))
-    assert joined(buffer, 1) == {0: (-1, 0.5, 1, 0, 0), 1: (-2, 0.5, 2, 1, 0)}
-
-
-def test_decisions_of_two_environments_are_joined_up_to_their_ends():
-    """Environment 0 succeeds after three decisions, environment 1 reaches the time limit.
-
-    Both begin anew; as it happens, in the state in which they ended.
-    """
-    buffer = ReplayBuffer(100, JOINED)
-    buffer.add(decisions([0, 10], [1, 11], [-1, -16]))
-    buffer.add(decisions([1, 11], [2, 12], [-2, -32], truncated=[1]))
-    buffer.add(decisions([2, 12], [3, 13], [-4, -64], terminal=[0]))
-    buffer.add(decisions([3, 13], [4, 14], [-8, -128]))
-    two = {
-        0: (-1 - 1, 0.25, 2, 0, 0),
-        1: (-2 - 2, 0.25, 3, 1, 0),
-        2: (-4, 0.5, 3, 1, 0),
-        3: (-8, 0.5, 4, 0, 0),
-        10: (-16 - 16, 0.25, 12, 0, 1),
-        11: (-32, 0.5, 12, 0, 1),
-        12: (-64 - 64, 0.25, 14, 0, 0),
-        13: (-128, 0.5, 14, 0, 0),  # the newest decision of its environment
-    }
-    assert joined(buffer, 2) == two
-    assert joined(buffer, 5) == {**two, 0: (-1 - 1 - 1, 0.125, 3, 1, 0)}
-
-
-def test_what_begins_elsewhere_is_not_joined():
-    """Fresh scenes: an episode stops without an end, the next decision is of another one."""
-    buffer = ReplayBuffer(100, JOINED)
-    buffer.add(decisions([0, 10], [1, 11], [-1, -1]))
-    buffer.add(decisions([50, 60], [51, 61], [-2, -2]))
-    assert joined(buffer, 3) == {
-        0: (-1, 0.5, 1, 0, 0),
-        10: (-1, 0.5, 11, 0, 0),
-        50: (-2, 0.5, 51, 0, 0),
-        60: (-2, 0.5, 61, 0, 0),
-    }
-
-
-@pytest.mark.parametrize("capacity", [6, 7, 8])
-def test_joining_goes_around_the_end_of_the_ring_and_stops_at_its_newest_row(capacity):
-    buffer = ReplayBuffer(capacity, JOINED)
-    steps = 11
-    for t in range(steps):
-        buffer.add(decisions([t, 100 + t], [t + 1, 101 + t], [-1, -1]))
-    last = joined(buffer, 3)
-    assert len(last) == capacity
-    for obs, row in last.items():
-        left = min(3, steps - obs % 100)  # decisions of this environment from here on
-        assert row == (-2 + 2 * 0.5**left, 0.5**left, obs + left, 0, 0)
-
-
-def test_a_state_that_stays_the_same_is_not_joined_with_itself():
-    buffer = ReplayBuffer(8, JOINED)
-    buffer.add(decisions([7], [7], [-1]))
-    assert joined(buffer, 4) == {7: (-1, 0.5, 7, 0, 0)}
-
-
-def test_joining_goes_on_after_loading():
-    buffer = ReplayBuffer(8, JOINED)
-    for t in range(2):
-        buffer.add(decisions([t, 100 + t], [t + 1, 101 + t], [-1, -1]))
-    other = ReplayBuffer(8, JOINED)
-    other.load_state_dict(buffer.state_dict())
-    assert joined(other, 2) == joined(buffer, 2)
-    assert joined(other, 2)[0] == (-1.5, 0.25, 2, 0, 0)

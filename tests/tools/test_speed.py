@@ -11,7 +11,6 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from symsteer.agents import AGENTS
-from symsteer.agents.options import critics_of
 from tests.bench.tiny_run import tiny_config
 from tools.speed import decode, learner, runs, simulation
 from tools.speed.simulation import Replay, Row, Turn
@@ -132,7 +131,7 @@ def test_learners_are_timed_alone_and_in_a_team_with_every_kind_of_critic():
     kinds = {(row["agent"], row["members"], row["critic"]) for row in rows}
     assert all(0 < row["min"] <= row["median"] <= row["max"] for row in rows)
     for name in agents[:3]:
-        for critic in critics_of(AGENTS.get(name).Options):
+        for critic in AGENTS.get(name).Options.known_critics:
             assert (name, 1, critic) in kinds
             assert ((name, 5, critic) in kinds) == (name != "partial")
     assert {kind[0] for kind in kinds} - set(agents[:3]) == {"stable-baselines3"}

@@ -17,7 +17,7 @@ import torch
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext
-from symsteer.agents.options import SacOptions, critics_of
+from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.team import Team, can_join
@@ -134,7 +134,7 @@ def _contenders(task: str, agents: Sequence[str], device: str) -> list[Contender
         agent_class = AGENTS.get(name)
         if not issubclass(agent_class, SacAgent):
             continue
-        for critic in critics_of(agent_class.Options):
+        for critic in agent_class.Options.known_critics:
             alone = _learner(task, name, critic, 0, device)
             sizes = (alone.parameter_counts()["total"], alone.options.batch_size)
             update = functools.partial(_update, alone)
@@ -185,8 +185,7 @@ def _decisions(context: AgentContext, rows: int, count: int) -> Transition:
 
 
 def _batch(agent: SacAgent) -> Any:
-    options = agent.options
-    return agent.replay.sample(options.batch_size, options.gamma, options.n_step)
+    return agent.replay.sample(agent.options.batch_size, agent.options.gamma)
 
 
 def _update(agent: SacAgent) -> None:

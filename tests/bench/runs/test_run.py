@@ -10,15 +10,13 @@ import shutil
 import pytest
 import torch
 
-from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
-from symsteer.bench.runs import evaluator, run, trainer
+from symsteer.bench.runs import evaluator, trainer
 from symsteer.bench.runs.base_policy import prepare_base
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
-from symsteer.bench.runs.folder import DEMONSTRATIONS, is_finished, run_id, state_of
+from symsteer.bench.runs.folder import is_finished, run_id, state_of
 from symsteer.bench.runs.run import check_all, evaluate, execute, resume
-from symsteer.bench.runs.stored import stored_demonstrations
 from symsteer.bench.sim import environment
 from symsteer.bench.steering import evaluation
 from symsteer.bench.steering.seeds import HELD_OUT_SEED, held_out_seeds
@@ -362,51 +360,3 @@ def test_steerability_stays_below_the_held_out_seeds(monkeypatch):
     assert min(seen) >= HELD_OUT_SEED // 2
     assert max(seen) < HELD_OUT_SEED
     assert seen[0] == HELD_OUT_SEED // 2
-
-
-@pytest.mark.slow
-def test_demonstrations_have_a_share_in_the_batches_and_a_stopped_run_repeats(
-    tmp_path, monkeypatch
-):
-    options = {"demonstration_share": 0.25, "n_step": 2}
-    config = tiny_config("equivariant", options=options, checkpoint_every=40)
-    seen = []
-    update = SacAgent.update
-
-    def watched(self, batch):
-        seen.append(int((batch.noise.flatten(1) == 0).all(1).sum()))
-        if len(seen) == 60:
-            raise KeyboardInterrupt
-        return update(self, batch)
-
-    monkeypatch.setattr(SacAgent, "update", watched)
-    with pytest.raises(KeyboardInterrupt):
-        execute(config, tmp_path, progress=False)
-    folder = tmp_path / run_id(config, {})
-    assert set(seen) == {4}  # a quarter of 16
-    assert load_checkpoint(folder)["updates"] > 0
-    resume(folder, progress=False)
-    stopped = without_clock(folder)
-    shutil.rmtree(folder)
-    seen[:] = [0] * 100
-    assert without_clock(execute(config, tmp_path, progress=False)) == stopped
-
-
-def test_a_policy_without_demonstrations_cannot_be_learned_from_them(finished, tmp_path):
-    _, folder = finished
-    config = tiny_config("equivariant", options={"demonstration_share": 0.25})
-    with pytest.raises(UserError, match="demonstration_share to 0"):
-        execute(config, tmp_path, policy=folder / "policy.safetensors", progress=False)
-
-
-def test_a_damaged_file_of_demonstrations_is_named(tmp_path, finished, monkeypatch):
-    (tmp_path / DEMONSTRATIONS).write_bytes(b"nothing")
-    with pytest.raises(UserError, match="delete it, and it is written again"):
-        stored_demonstrations(tmp_path)
-    config = tiny_config("equivariant", options={"demonstration_share": 0.25})
-    decisions = Transition(*(torch.zeros(3, 2) for _ in range(7)))
-    shutil.copytree(finished[1].parent / "base", tmp_path / "base")
-    monkeypatch.setattr(run, "demonstrated_decisions", lambda *_: decisions)
-    with pytest.raises(UserError, match="delete it, and it is written again") as error:
-        execute(config, tmp_path, progress=False)
-    assert DEMONSTRATIONS in str(error.value)

@@ -36,12 +36,12 @@ def test_agents_share_a_space_and_have_their_own_options(tmp_path):
 
 
 def test_a_shared_option_is_for_those_who_have_it_and_can_be_taken_from_one(tmp_path):
-    text = TEXT.replace('"standard", ', '"standard", "best-of-n-kernel", ')
-    text += "[space.standard]\nbatch_size = []\n[space.best-of-n-kernel]\ncandidates = [4, 8]\n"
+    text = TEXT.replace('"standard", ', '"standard", "best-of-n", ')
+    text += "[space.standard]\nbatch_size = []\n[space.best-of-n]\nlr = []\nnoise_bank = [8, 16]\n"
     plan = read_plan(write_plan(tmp_path, text))
     assert {agent: list(space) for agent, space in plan.spaces.items()} == {
         "standard": ["lr"],
-        "best-of-n-kernel": ["candidates"],
+        "best-of-n": ["batch_size", "noise_bank"],
         "equivariant": ["lr", "batch_size", "critics"],
     }
 
