@@ -30,7 +30,6 @@ from symsteer.leaderboard.records import (
     DERIVED,
     HELD_OUT_SEED,
     Evaluation,
-    Provenance,
     RunRecord,
     canonical_json,
     file_hash,
@@ -131,17 +130,10 @@ class Judged:
         self.run_id = "-".join([*names, digest.hexdigest()[:12]])
         self.seeds = {"run": c.seed, "policy": c.policy_seed, "first_held_out": HELD_OUT_SEED}
         self.seeds["demonstrations"] = s.demonstrations.seed
-        self.names: list[tuple[str, str, Iterable[str]]] = [
-            ("task", s.task, catalogue.TASKS),
-            ("embodiment", s.embodiment, catalogue.EMBODIMENTS),
-            ("agent", s.agent, catalogue.AGENTS),
-            ("policy", c.policy, catalogue.POLICIES),
-            *(("variant", spec.name, catalogue.VARIANTS) for spec in self.specs),
-        ]
 
 
 @dataclass
-class Verdict:
+class Admission:
     """Problems and notes of one record file."""
 
     path: Path
@@ -153,7 +145,7 @@ class Verdict:
         return not self.problems
 
 
-def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
+def check(paths: Iterable[Path], committed: Path) -> list[Admission]:
     """Judge the records that `paths` name, among those in the folder `committed`.
 
     Args:
@@ -171,7 +163,7 @@ def check(paths: Iterable[Path], committed: Path) -> list[Verdict]:
                 known.add(file, read_record(file), committed=True)
     verdicts, records, own = [], {}, all_listed()
     for file in files:
-        verdicts.append(verdict := Verdict(file))
+        verdicts.append(verdict := Admission(file))
         try:
             records[file] = record = read_record(file)
         except UserError as error:
@@ -204,22 +196,21 @@ def _problems(file: Path, record: RunRecord, own: bool) -> Iterator[str]:
             "record as it was written"
         )
         return
-    found = [("the run", rule, broken(judged)) for rule, broken in RULES.items()]
-    for rule, broken in EVALUATION_RULES.items():
-        whys = ((e.env_steps, broken(judged, e)) for e in record.evaluations)
-        step, why = next((one for one in whys if one[1]), (0, None))
-        found.append((f"the evaluation at step {step}", rule, why))
-    for where, rule, why in found:
-        if why:
-            detail = "" if why is True else f" ({why})"
-            yield f"{where}{detail} breaks the rule that {rule.partition(' | ')[0]}: {MEND}"
+    broken = [("the run", rule, why) for rule, breaks in RULES.items() if (why := breaks(judged))]
+    for rule, breaks in EVALUATION_RULES.items():
+        whys = ((e.env_steps, breaks(judged, e)) for e in record.evaluations)
+        broken += [(f"the evaluation at step {step}", rule, why) for step, why in whys if why][:1]
+    for where, rule, why in broken:
+        detail = "" if why is True else f" ({why})"
+        yield f"{where}{detail} breaks the rule that {rule.partition(' | ')[0]}: {MEND}"
 
 
 def _unknown_code(j: Judged) -> str:
     found = []
     for number, part in enumerate(j.parts, 1):
         of = f"part {number}: " * (number > 1)
-        if part.commit is None and not _is_released(part):
+        released = part.sha256 is not None and RELEASE.fullmatch(part.version or "")
+        if part.commit is None and not released:
             found.append(f"{of}it names neither a commit nor a released version; use a git clone")
         if part.commit is not None and part.dirty is not False:
             found.append(
@@ -235,11 +226,18 @@ def _unknown_code(j: Judged) -> str:
 
 
 def _unknown_name(j: Judged) -> str | None:
+    names: list[tuple[str, str, Iterable[str]]] = [
+        ("task", j.settings.task, catalogue.TASKS),
+        ("embodiment", j.settings.embodiment, catalogue.EMBODIMENTS),
+        ("agent", j.settings.agent, catalogue.AGENTS),
+        ("policy", j.config.policy, catalogue.POLICIES),
+        *(("variant", spec.name, catalogue.VARIANTS) for spec in j.specs),
+    ]
     outside = {(extension.kind, extension.name) for extension in j.extensions}
-    for kind, name, known in j.names:
+    for kind, name, known in names:
         if (name in known) == ((kind, name) in outside):
             return f"the {kind} {name!r}"
-    unused = outside - {(kind, name) for kind, name, _ in j.names}
+    unused = outside - {(kind, name) for kind, name, _ in names}
     return f"no setting names the extension {min(unused)[1]!r}" if unused else None
 
 
@@ -442,20 +440,18 @@ class _Known:
 
     def __init__(self) -> None:
         self._runs: dict[tuple[RowKey, str, str], tuple[Path, RunRecord]] = {}
-        self._seeds: dict[RowKey, set[int]] = defaultdict(set)
+        self._finished: dict[Key, list[RunRecord]] = defaultdict(list)
         self._committed: dict[Key, list[RunRecord]] = defaultdict(list)
-        self._agents: dict[tuple[Key, str], set[str]] = defaultdict(set)
         self._facts: dict[tuple[str, ...], tuple[Path, list[float]]] = {}
         self._finals: dict[tuple[str, ...], dict[Path, list[float]]] = defaultdict(dict)
 
     def add(self, file: Path, record: RunRecord, committed: bool = False) -> None:
-        row = row_key(record)
+        table = Key.of(record)
         self._runs.setdefault(_identity(record), (file, record))
-        self._committed[row[0]] += [record] * committed
+        self._committed[table] += [record] * committed
         if record.status != "finished":
             return
-        self._seeds[row].add(record.settings.seed)
-        self._agents[row[0], record.base_policy.content_hash].add(record.settings.agent)
+        self._finished[table].append(record)
         for fact, values in _facts(record).items():
             if values:
                 self._facts.setdefault(fact, (file, values))
@@ -497,24 +493,25 @@ class _Known:
                 yield f"its {fact[0]} are not those of {file}: {MEND}"
 
     def notes(self, record: RunRecord) -> Iterator[str]:
-        row = row_key(record)
-        if record.role == "learner" and (number := len(self._seeds[row])) < MIN_SEEDS:
+        table, row = Key.of(record), row_key(record)
+        finished, committed = self._finished[table], self._committed[table]
+        seeds = {other.settings.seed for other in finished if row_key(other) == row}
+        if record.role == "learner" and len(seeds) < MIN_SEEDS:
             yield (
-                f"shown, not ranked: its row has {number} of the {MIN_SEEDS} finished seeds that a "
-                "ranking needs"
+                f"shown, not ranked: its row has {len(seeds)} of the {MIN_SEEDS} finished seeds "
+                "that a ranking needs"
             )
-        committed, seed = self._committed[row[0]], record.settings.seed
         usual = sorted({other.settings.seed for other in committed})
-        if usual and seed not in usual:
+        if usual and record.settings.seed not in usual:
             yield (
-                f"its seed {seed} is none of those of the committed runs of its table "
-                f"({', '.join(map(str, usual))}): agents are compared on equal seeds"
+                f"its seed {record.settings.seed} is none of those of the committed runs of its "
+                f"table ({', '.join(map(str, usual))}): agents are compared on equal seeds"
             )
         policy = record.base_policy.content_hash
         if committed and all(other.base_policy.content_hash != policy for other in committed):
+            there = {r.settings.agent for r in finished if r.base_policy.content_hash == policy}
             references = {r.settings.agent for r in committed if r.role == "reference"}
-            lacking = references - self._agents[row[0], policy]
-            names = sorted(lacking, key=lambda name: row_place(name, "reference"))
+            names = sorted(references - there, key=lambda name: row_place(name, "reference"))
             wanted = f"; submit {', '.join(names)} on it as well" if names else ""
             yield (
                 f"its base policy {policy[:12]} is not that of the committed runs of its table: it "
@@ -570,11 +567,6 @@ def _code_from_elsewhere(record: RunRecord) -> Iterator[str]:
     for kind, name, distribution, version, sha256 in sorted(used, key=str):
         known = "" if here.get(str(distribution)) == version else ", unresolved: not installed here"
         yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}{known}"
-
-
-def _is_released(provenance: Provenance) -> bool:
-    version, sha256 = provenance.version, provenance.sha256
-    return sha256 is not None and version is not None and RELEASE.fullmatch(version) is not None
 
 
 def _texts(data: Any) -> Iterator[str]:

@@ -156,18 +156,18 @@ def _show_differences(result: Verification) -> int:
 def _show_verdicts(paths: Sequence[Path]) -> int:
     from symsteer.leaderboard import admission
 
-    verdicts = admission.check(paths, RECORDS)
-    for verdict in verdicts:
-        if verdict.is_admissible and not verdict.notes and len(verdicts) > FEW:
+    admissions = admission.check(paths, RECORDS)
+    for one in admissions:
+        if one.is_admissible and not one.notes and len(admissions) > FEW:
             continue
-        _say(f"{verdict.path}: {'admissible' if verdict.is_admissible else 'NOT ADMISSIBLE'}")
-        for problem in verdict.problems:
+        _say(f"{one.path}: {'admissible' if one.is_admissible else 'NOT ADMISSIBLE'}")
+        for problem in one.problems:
             _say(f"  problem: {problem}")
-        for note in verdict.notes:
+        for note in one.notes:
             _say(f"  note: {note}")
-    admitted = sum(verdict.is_admissible for verdict in verdicts)
-    _say(f"{admitted} of {len(verdicts)} records are admissible")
-    return 0 if admitted == len(verdicts) else 2
+    admitted = sum(one.is_admissible for one in admissions)
+    _say(f"{admitted} of {len(admissions)} records are admissible")
+    return 0 if admitted == len(admissions) else 2
 
 
 def _say(text: str, stream: TextIO | None = None) -> None:

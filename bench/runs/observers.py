@@ -34,12 +34,12 @@ from symsteer.bench.steering.seeds import HELD_OUT_SEED
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
 from symsteer.leaderboard.records import (
-    Budget,
     Evaluation,
     FeasibleQ,
     Parameters,
     Provenance,
     RunRecord,
+    UsedBudget,
     WallClock,
     config_hash,
     read_record,
@@ -121,7 +121,7 @@ class RecordWriter(Observer):
 
     def evaluated(self, run: Trainer, evaluation: Evaluation) -> None:
         self.record.evaluations.append(evaluation)
-        self.record.budget = Budget(
+        self.record.budget = UsedBudget(
             env_steps=run.env_steps, decisions=run.decisions, updates=run.updates
         )
         self.record.wall_clock = WallClock(**run.seconds, resumed=self.record.wall_clock.resumed)

@@ -32,7 +32,6 @@ from symsteer.leaderboard.records.schema import (
     MAX_OVERSHOOT,
     ROLES,
     BasePolicy,
-    Budget,
     Divergence,
     Episodes,
     Evaluation,
@@ -40,6 +39,7 @@ from symsteer.leaderboard.records.schema import (
     Parameters,
     Role,
     RunRecord,
+    UsedBudget,
     WallClock,
 )
 from symsteer.leaderboard.records.values import canonical_json, config_hash, flat, portable
@@ -56,7 +56,6 @@ __all__ = [
     "ROLES",
     "VERDICTS",
     "BasePolicy",
-    "Budget",
     "Divergence",
     "Episodes",
     "Evaluation",
@@ -67,6 +66,7 @@ __all__ = [
     "Reproduction",
     "Role",
     "RunRecord",
+    "UsedBudget",
     "WallClock",
     "canonical_json",
     "check_reproduction",

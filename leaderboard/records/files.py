@@ -8,11 +8,9 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from symsteer.errors import UserError, first_problem
 from symsteer.files import write_atomically
-from symsteer.leaderboard.records.migrations import MIGRATIONS
+from symsteer.leaderboard.records.migrations import migrated
 from symsteer.leaderboard.records.schema import SCHEMA_VERSION, RunRecord
 from symsteer.leaderboard.records.values import canonical_json
 
@@ -42,7 +40,7 @@ def write_record(record: RunRecord, path: Path | str) -> None:
     path = Path(path)
     try:
         text = dump_record(_validated(record.model_dump(by_alias=True)))
-    except (ValidationError, ValueError) as error:
+    except ValueError as error:
         raise UserError(f"{path}: the record is not written: {first_problem(error)}") from error
     if path.exists():
         old = read_record(path)
@@ -58,32 +56,27 @@ def write_record(record: RunRecord, path: Path | str) -> None:
 def read_record(path: Path | str) -> RunRecord:
     """Read and validate the record at `path`; raises UserError with one sentence if it is bad."""
     path = Path(path)
+    again = "restore it or run the cell again"
+    name = "not a run record; name records or run folders only"
     try:
         about = path.stat()
         if about.st_size > MAX_BYTES or stat.S_ISFIFO(about.st_mode):
             raise UserError(f"{path} is a pipe or larger than {MAX_BYTES >> 20} MiB: not a record")
         text = path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(
-            f"{path} is not UTF-8 text: not a run record; name records or run folders only"
-        ) from error
-    try:
         data = json.loads(
             text, parse_constant=_refuse, parse_float=_finite, object_pairs_hook=_unique_keys
         )
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not UTF-8 text: {name}") from error
     except (ValueError, RecursionError) as error:
         problem = error.msg if isinstance(error, json.JSONDecodeError) else str(error)
         raise UserError(
-            f"{path} is not strict JSON ({problem[:120]}): truncated or edited; "
-            "restore it or run the cell again"
+            f"{path} is not strict JSON ({problem[:120]}): truncated or edited; {again}"
         ) from error
     if not isinstance(data, dict) or "schema_version" not in data:
-        raise UserError(
-            f"{path} is JSON but has no schema_version: not a run record; "
-            "name records or run folders only"
-        )
+        raise UserError(f"{path} is JSON but has no schema_version: {name}")
     version = data["schema_version"]
     if type(version) is not int or not 1 <= version <= SCHEMA_VERSION:
         raise UserError(
@@ -91,17 +84,12 @@ def read_record(path: Path | str) -> RunRecord:
             f"this program reads 1 to {SCHEMA_VERSION}: "
             "use the version of symsteer that wrote it or run the cell again"
         )
-    if "config_hash" not in data:
-        raise UserError(f"{path} is not a valid record: config_hash is missing; run it again")
     try:
-        for old in range(version, SCHEMA_VERSION):
-            data = MIGRATIONS[old](data)
-        return _validated(data)
-    except (ValidationError, ValueError) as error:
-        raise UserError(
-            f"{path} is not a valid record: {first_problem(error)}; "
-            "restore it or run the cell again"
-        ) from error
+        if "config_hash" not in data:
+            raise ValueError("config_hash is missing")
+        return _validated({**migrated(data), "schema_version": SCHEMA_VERSION})
+    except ValueError as error:
+        raise UserError(f"{path} is not a valid record: {first_problem(error)}; {again}") from error
 
 
 def _validated(data: dict[str, Any]) -> RunRecord:

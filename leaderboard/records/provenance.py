@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from symsteer import registry
-from symsteer.leaderboard.records.values import Block, Count, Name, Sha256
+from symsteer.leaderboard.records.values import Count, Name, RecordBlock, Sha256
 
 CODE = ("agents", "bench", "leaderboard", "policies", "symsteer")
 """Folders of a checkout that hold code; those in `symsteer/` are links to the others."""
@@ -29,7 +29,7 @@ NUMBERED = {"family": "cpu family", "model": "model"}
 """What a processor's kind is numbered by: a name such as "AMD EPYC" may stand for many."""
 
 
-class RecordedExtension(Block):
+class RecordedExtension(RecordBlock):
     """Code from outside SymSteer that a run used (`symsteer.registry.Extension`).
 
     `distribution` and `version` are null for code that was not installed.
@@ -43,7 +43,7 @@ class RecordedExtension(Block):
     sha256: Sha256
 
 
-class Provenance(Block):
+class Provenance(RecordBlock):
     """The code and the machine that the numbers come from.
 
     `version` is SymSteer's (null in records before schema version 4). In a git checkout of the

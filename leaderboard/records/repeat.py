@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from symsteer.leaderboard.records.retired import SAC_OPTION, without_retired
 from symsteer.leaderboard.records.values import flat
 from symsteer.terminal import option_words, to_paste
 
@@ -32,8 +33,9 @@ VALUE = re.compile(r"(-?\d[\w.+-]*|\w[\w.:+,=@/-]*)?", re.ASCII)
 def repeat_command(config: Mapping[str, Any]) -> str | None:
     """Every option of a run as a command that `symsteer run` reads back to the same configuration.
 
-    All options are given, so that it does not depend on defaults. Of a run that started from files,
-    these have placeholders: a record knows their contents' hashes alone.
+    All options are given, so that it does not depend on defaults; those that agents have no more
+    are left out. Of a run that started from files, these have placeholders: a record knows their
+    contents' hashes alone.
 
     Returns:
         The command, or None where there is none: for configurations of other versions, such as 0.1,
@@ -43,6 +45,8 @@ def repeat_command(config: Mapping[str, Any]) -> str | None:
     own = {key: value for key, value in config.items() if key not in DERIVED}
     if not own.keys() <= KEYS or not all(isinstance(table, Mapping) for table in tables):
         return None
+    if SAC_OPTION in own["agent_options"]:
+        own["agent_options"] = without_retired(own["agent_options"], ())
     words = ["symsteer", "run"]
     for key, value in flat(own).items():
         name = key.replace("agent_options.", "agent.", 1)

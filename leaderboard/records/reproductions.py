@@ -25,11 +25,11 @@ from symsteer.leaderboard.records.retired import with_retired
 from symsteer.leaderboard.records.schema import Evaluation, RunRecord
 from symsteer.leaderboard.records.shares import newcombe
 from symsteer.leaderboard.records.values import (
-    Block,
     Count,
     Finite,
     Moment,
     Name,
+    RecordBlock,
     RunId,
     Sha256,
     Share,
@@ -62,7 +62,7 @@ OF_EVALUATIONS: tuple[Part, ...] = ("episodes", "diagnostics")
 IGNORED = {"base_policy": {"training_seconds"}}
 
 
-class Original(Block):
+class Original(RecordBlock):
     """The record that was repeated: `sha256` is that of its file."""
 
     run_id: RunId
@@ -71,7 +71,7 @@ class Original(Block):
     commit: Name | None
 
 
-class Repeated(Block):
+class Repeated(RecordBlock):
     """The run that repeated it: when, with which code, on what machine."""
 
     sha256: Sha256
@@ -80,7 +80,7 @@ class Repeated(Block):
     provenance: Provenance
 
 
-class Difference(Block):
+class Difference(RecordBlock):
     """Values of one part that differ.
 
     `first` is the step of the first evaluation with one (null outside of evaluations), `largest`
@@ -96,7 +96,7 @@ class Difference(Block):
     example: Text
 
 
-class Success(Block):
+class Success(RecordBlock):
     """Share of the final episodes with success, and the 95 % interval of `repeated - recorded`.
 
     Both are samples: it combines their two Wilson intervals (Newcombe 1998, method 10).
@@ -108,14 +108,14 @@ class Success(Block):
     high: Finite
 
 
-class Area(Block):
+class Area(RecordBlock):
     """Area under the success curve as a share of the budget's maximum."""
 
     recorded: Finite
     repeated: Finite
 
 
-class Reproduction(Block):
+class Reproduction(RecordBlock):
     """What a repeated run says about a record. `conditions` are what differed beforehand."""
 
     schema_version: Literal[1] = 1

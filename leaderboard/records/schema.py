@@ -20,14 +20,14 @@ from symsteer.errors import first_problem
 from symsteer.leaderboard.records.provenance import Provenance
 from symsteer.leaderboard.records.values import (
     MAX_TEXT,
-    Block,
     Count,
     Finite,
     Flags,
-    Measured,
+    MeasuredBlock,
     MetricName,
     Moment,
     Name,
+    RecordBlock,
     RunId,
     Seconds,
     Sha256,
@@ -62,7 +62,7 @@ ROLES: tuple[Role, ...] = ("reference", "learner", "control")
 References are evaluated once; learners and controls use the whole budget."""
 
 
-class Demonstrations(BaseModel):
+class DemonstrationSettings(BaseModel):
     """The demonstrations of the base policy, as named in the configuration."""
 
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
@@ -81,10 +81,10 @@ class RunSettings(BaseModel):
     agent: Name
     seed: Count
     env_steps: Annotated[Count, Field(gt=0)]
-    demonstrations: Demonstrations
+    demonstrations: DemonstrationSettings
 
 
-class Parameters(Block):
+class Parameters(RecordBlock):
     """Trainable parameters: the networks that act (`actor`), all critics, and their sum.
 
     `width` is the hidden width in channels (null for agents without networks).
@@ -96,7 +96,7 @@ class Parameters(Block):
     width: Count | None = None
 
 
-class WallClock(Block):
+class WallClock(RecordBlock):
     """Seconds spent; `total` also holds what the five named parts do not.
 
     `evaluate` is for the held-out episodes, `diagnose` for the long episodes and all diagnostics;
@@ -114,7 +114,7 @@ class WallClock(Block):
     resumed: Count = 0
 
 
-class Budget(Block):
+class UsedBudget(RecordBlock):
     """What was used: environment control steps, decisions (chunks), gradient updates."""
 
     env_steps: Count = 0
@@ -122,7 +122,7 @@ class Budget(Block):
     updates: Count = 0
 
 
-class BasePolicy(Measured):
+class BasePolicy(MeasuredBlock):
     """The frozen base policy and its steerability report.
 
     `base_success`: success_once with Gaussian noise; `action_std`: standard deviation of normalised
@@ -147,7 +147,7 @@ class BasePolicy(Measured):
     warning: Text | None = None
 
 
-class FeasibleQ(Block):
+class FeasibleQ(RecordBlock):
     """Bounds of the discounted return that the task's reward allows, per decision.
 
     A soft critic may exceed them on either side by the diagnostic `q_allowance`.
@@ -163,7 +163,7 @@ class FeasibleQ(Block):
         return self
 
 
-class Episodes(Measured):
+class Episodes(MeasuredBlock):
     """Evaluation episodes as columns of equal length; ManiSkill's metric names.
 
     `direction` is the angle, in radians, from the object to its goal in the first observation; null
@@ -190,7 +190,7 @@ class Episodes(Measured):
         return self
 
 
-class Evaluation(Measured):
+class Evaluation(MeasuredBlock):
     """One evaluation: where in the run it was, its episodes, its diagnostics.
 
     `wall_clock` is seconds since the start of the run. `final` marks the evaluation of the last
@@ -237,7 +237,7 @@ class Divergence:
     diverged: bool
 
 
-class RunRecord(Block):
+class RunRecord(RecordBlock):
     """Everything the leaderboard may know about one run."""
 
     schema_version: Literal[6] = SCHEMA_VERSION
@@ -255,7 +255,7 @@ class RunRecord(Block):
     failure: Text | None = None
     parameters: Parameters
     wall_clock: WallClock = Field(default_factory=WallClock)
-    budget: Budget = Field(default_factory=Budget)
+    budget: UsedBudget = Field(default_factory=UsedBudget)
     base_policy: BasePolicy
     feasible_q: FeasibleQ | None
     evaluations: list[Evaluation] = Field(default_factory=list)

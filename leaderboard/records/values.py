@@ -84,7 +84,7 @@ RunId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+=:,@-]{0,199}$")
 MetricName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,63}(/[a-z0-9_]{1,63})*$")]
 
 
-class Block(BaseModel):
+class RecordBlock(BaseModel):
     """Common rules: unknown keys are errors, strings are not numbers, arrays become lists."""
 
     model_config = ConfigDict(
@@ -113,7 +113,7 @@ class Block(BaseModel):
         return {**data, **{key: plain(data[key]) for key in cls._own(data)}}
 
 
-class Measured(Block):
+class MeasuredBlock(RecordBlock):
     """A block of measured numbers: non-finite ones become null and are named in `nonfinite`."""
 
     nonfinite: dict[str, Literal["nan", "inf", "-inf"]] = Field(default_factory=dict)

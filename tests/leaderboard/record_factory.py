@@ -12,13 +12,13 @@ import numpy as np
 
 from symsteer.leaderboard.records import (
     BasePolicy,
-    Budget,
     Episodes,
     Evaluation,
     FeasibleQ,
     Parameters,
     Provenance,
     RunRecord,
+    UsedBudget,
     WallClock,
 )
 
@@ -80,9 +80,9 @@ def make_record(
         evaluations = [make_evaluation([1, 0, 1, 0, 1])]
     if status != "finished":
         evaluations = [e.model_copy(update={"final": False}) for e in evaluations]
-    budget = Budget(env_steps=config["env_steps"], decisions=6_250, updates=6_250 * learns)
+    budget = UsedBudget(env_steps=config["env_steps"], decisions=6_250, updates=6_250 * learns)
     if agent in ("base", "zero"):
-        budget = Budget(env_steps=0, decisions=0, updates=0)
+        budget = UsedBudget(env_steps=0, decisions=0, updates=0)
     return RunRecord(
         run_id=re.sub(r"[^\w.=-]", "=", f"run-{config['variant']}-{agent}-{seed}", flags=re.ASCII),
         config=config,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 import subprocess
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from symsteer.errors import UserError
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import write_record
 from symsteer.leaderboard.records.files import MAX_BYTES
@@ -55,12 +53,10 @@ def test_each_file_counts_once(good: Path, tmp_path: Path) -> None:
     (tmp_path / "folder").symlink_to(good)
     paths = [good, file, tmp_path / "link.json", tmp_path / "folder", good / ".." / "good"]
     assert record_files(paths) == [file]
-
-
-def test_links_to_folders_are_not_followed(good: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # Links to folders inside of one are not followed.
     (good / "loop").symlink_to(good)
     (good / "root").symlink_to("/")
-    assert len(record_files([good])) == 1
+    assert record_files([good]) == [file]
 
 
 def test_paths_that_are_no_records(
@@ -79,9 +75,8 @@ def test_paths_that_are_no_records(
         next(good.iterdir()) / "below": "cannot be read",
     }
     for path, words in cases.items():
-        for verb in ("--verify", "--check"):
-            assert words in refused(capsys, path, verb)
-        assert words in refused(capsys, path, "--out", tmp_path / "out")
+        for verb in (["--verify"], ["--check"], ["--out", tmp_path / "out"]):
+            assert words in refused(capsys, path, *verb)
     assert not (tmp_path / "out").exists()
 
 
@@ -98,16 +93,6 @@ def test_a_folder_with_something_else_called_json(
     write_record(make_record(), good / "run" / "record.json")
     if name == "pipe.json":
         assert len(record_files([good])) == 2
-
-
-def test_a_folder_full_of_other_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for number, text in enumerate(["[]", "{}", "3", '"x"', "null", '{"schema_version": {}}', ""]):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        (folder / "a.json").write_text(text)
-        assert str(folder / "a.json") in refused(capsys, folder, "--out", tmp_path / "out")
-    assert main(["--check", str(tmp_path)]) == 2
-    assert capsys.readouterr().out.count("NOT ADMISSIBLE") == 7
 
 
 def test_a_huge_file_is_not_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -139,22 +124,19 @@ def snapshot(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_an_output_that_is_no_folder(
-    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    for out in ("file", "file/below", "loop", "x" * 300):
-        for verb in ([], ["--verify"]):
-            refused(capsys, good, "--out", tmp_path / out, *verb)
-    assert (tmp_path / "file").read_text() == "x"
-
-
 def test_what_cannot_be_replaced_leaves_the_rest_alone(
     good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Files that are links are replaced, not written through."""
+    (tmp_path / "file").write_text("mine")
     out = tmp_path / "out"
+    out.mkdir()
+    (out / "leaderboard.csv").symlink_to(tmp_path / "file")
     generate([good], out)
+    assert not (out / "leaderboard.csv").is_symlink()
+    for place in ("file", "file/below"):
+        refused(capsys, good, "--out", tmp_path / place)
+    assert (tmp_path / "file").read_text() == "mine"
     write_record(make_record(agent="zero"), good / "another.json")
     (out / "LEADERBOARD.md").unlink()
     (out / "LEADERBOARD.md").mkdir()
@@ -162,27 +144,6 @@ def test_what_cannot_be_replaced_leaves_the_rest_alone(
     stale.write_text("")
     before = snapshot(out)
     assert "LEADERBOARD.md is a folder; remove it" in refused(capsys, good, "--out", out)
-    assert snapshot(out) == before
-
-
-def test_a_full_disk_leaves_everything_as_it_was(
-    good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    generate([good], out)
-    write_record(make_record(agent="zero"), good / "another.json")
-    before = snapshot(out)
-    real, calls = os.fsync, []
-
-    def full(descriptor: int) -> None:
-        calls.append(descriptor)
-        if len(calls) == 3:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(descriptor)
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(UserError, match=r"No space left on device; free space"):
-        generate([good], out)
     assert snapshot(out) == before
 
 
@@ -199,16 +160,6 @@ def test_figures_are_not_written_through_a_link(
     (tmp_path / "linked").symlink_to(elsewhere)
     assert main([str(good), "--out", str(tmp_path / "linked")]) == 0
     assert (elsewhere / "LEADERBOARD.md").exists()
-
-
-def test_files_are_replaced_not_written_through_links(good: Path, tmp_path: Path) -> None:
-    precious = tmp_path / "precious"
-    precious.write_text("mine")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "leaderboard.csv").symlink_to(precious)
-    generate([good], tmp_path / "out")
-    assert precious.read_text() == "mine"
-    assert not (tmp_path / "out" / "leaderboard.csv").is_symlink()
 
 
 def test_folders_without_permission(

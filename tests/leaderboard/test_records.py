@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import random
 import subprocess
 import sys
 from datetime import datetime, timedelta, timezone
@@ -18,7 +17,6 @@ from pydantic import ValidationError
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import (
     Evaluation,
-    FeasibleQ,
     RunRecord,
     config_hash,
     dump_record,
@@ -44,6 +42,8 @@ def test_round_trip_keeps_everything(tmp_path: Path) -> None:
     write_record(record, path)
     assert read_record(path) == record
     assert dump_record(read_record(path)) == path.read_text()
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert read_record(path) == record
     assert sorted(p.name for p in path.parent.iterdir()) == ["record.json"]
 
 
@@ -76,11 +76,14 @@ def older(tmp_path: Path, version: int) -> tuple[RunRecord, Path, dict[str, Any]
 def test_records_without_a_role_are_read_as_new_ones(tmp_path: Path, version: int) -> None:
     record, path, data = older(tmp_path, version)
     assert read_record(path) == record
+    if version == 3:
+        data["continued"] = [data["provenance"] | {"device": "another"}]
     for agent, role in (("zero", "reference"), ("golden-ticket", "reference"), ("my", "learner")):
         data["config"]["agent"] = agent
         data["config_hash"] = config_hash(data["config"])
         path.write_text(json.dumps(data))
         assert read_record(path).role == role
+        assert all(part.extensions == [] for part in read_record(path).continued)
 
 
 def test_conditional_biases_of_version_4_are_never_read_as_those_of_version_5(
@@ -113,15 +116,11 @@ def test_conditional_biases_of_version_4_are_never_read_as_those_of_version_5(
 
 
 def test_records_of_version_5_lack_the_symmetry_of_the_base_policy(tmp_path: Path) -> None:
-    record, path, data = older(tmp_path, 5)
+    record, path, _ = older(tmp_path, 5)
     assert read_record(path) == record
-    for name in ("equivariance_error", "jump"):
-        path.write_text(json.dumps(data | {"base_policy": data["base_policy"] | {name: 0.5}}))
-        with pytest.raises(UserError, match=f"{name} does not belong to schema_version 5"):
-            read_record(path)
 
 
-@pytest.mark.parametrize("value", [None, "5", {}, 10**400])
+@pytest.mark.parametrize("value", [None, "5", 10**400])
 def test_what_is_no_number_of_a_measurement_is_not_divided(tmp_path: Path, value: Any) -> None:
     _, path, data = older(tmp_path, 4)
     values = {"q_mean": -5.0, "q_min": -24.0, "q_max": 1.0, "q_abs_max": value}
@@ -134,29 +133,16 @@ def test_what_is_no_number_of_a_measurement_is_not_divided(tmp_path: Path, value
         read_record(path)
 
 
-def test_parts_of_an_older_continued_run_are_read(tmp_path: Path) -> None:
-    _, path, data = older(tmp_path, 3)
-    data["continued"] = [data["provenance"] | {"device": "another"}]
-    path.write_text(json.dumps(data))
-    assert read_record(path).continued[0].extensions == []
-    data["continued"] = [data["provenance"] | {"sha256": None}]
-    path.write_text(json.dumps(data))
-    with pytest.raises(UserError, match="sha256 does not belong to schema_version 3"):
-        read_record(path)
-
-
 @pytest.mark.parametrize(
     ("version", "where", "value", "words"),
     [
         (1, "continued", [], "continued does not belong"),
-        (1, "wall_clock/resumed", 0, "resumed does not belong"),
         (2, "training", {"env_steps": [], "columns": {}}, "training must be null"),
         (2, "feasible_q/entropy_allowance", 1.0, "entropy_allowance must be 0"),
-        (3, "training", None, "training"),
-        (3, "feasible_q/entropy_allowance", 0.0, "entropy_allowance"),
         (3, "role", "learner", "role does not belong"),
         (3, "provenance/extensions", [], "extensions does not belong"),
         (4, "wall_clock/diagnose", 0.0, "diagnose does not belong"),
+        (5, "base_policy/jump", 0.5, "jump does not belong"),
         (4, "evaluations/0/diagnostics/q_magnitude", 0.5, "q_magnitude does not belong"),
         (4, "evaluations/0/diagnostics/q_bias_successful", 0.5, "does not belong"),
     ],
@@ -198,7 +184,7 @@ def test_arrays_and_tensors_are_stored_as_numbers(tmp_path: Path) -> None:
 
 
 def test_numbers_that_are_not_finite_become_flagged_nulls(tmp_path: Path) -> None:
-    evaluation = make_evaluation([1, 0], q_mean=math.nan, q_abs_max=math.inf, alpha=None)
+    evaluation = make_evaluation([1, 0], q_mean=math.nan, q_abs_max=1e300, alpha=None)
     data = evaluation.model_dump(by_alias=True)
     data["episodes"]["return"] = [-math.inf, 1.0]
     record = make_record([Evaluation.model_validate(data)])
@@ -211,12 +197,6 @@ def test_numbers_that_are_not_finite_become_flagged_nulls(tmp_path: Path) -> Non
     assert stored["episodes"]["return"] == [None, 1.0]
     assert stored["episodes"]["nonfinite"] == {"return/0": "-inf"}
     assert read_record(path) == record
-
-
-def test_numbers_beyond_single_precision_are_infinite() -> None:
-    evaluation = make_evaluation([1], q_mean=1e300, q_min=-1e300, q_max=3.4e38)
-    assert evaluation.diagnostics == {"q_mean": None, "q_min": None, "q_max": 3.4e38}
-    assert evaluation.nonfinite == {"diagnostics/q_mean": "inf", "diagnostics/q_min": "-inf"}
 
 
 def test_a_flag_without_its_null_is_refused() -> None:
@@ -273,12 +253,6 @@ def test_a_failed_write_leaves_the_old_record(
     assert [p.name for p in tmp_path.iterdir()] == ["record.json"]
 
 
-def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot be written"):
-        write_record(make_record(), tmp_path / "file" / "record.json")
-
-
 def test_configurations_are_checked() -> None:
     for key in ("task", "embodiment", "variant", "agent", "seed", "env_steps", "demonstrations"):
         config = make_config()
@@ -287,16 +261,10 @@ def test_configurations_are_checked() -> None:
         del data["config_hash"]
         with pytest.raises(ValidationError, match=key):
             RunRecord.model_validate(data)
+    assert config_hash(make_config()) == config_hash(dict(reversed(make_config().items())))
     for change in ({"seed": "0"}, {"seed": -1}, {"env_steps": 0}, {"lr": math.nan}, {"lr": {1}}):
         with pytest.raises(ValidationError):
             make_record(**change)
-
-
-def test_hash_ignores_the_order_of_keys_and_nothing_else() -> None:
-    config = make_config()
-    backwards = dict(reversed(list(config.items())))
-    assert config_hash(config) == config_hash(backwards)
-    assert config_hash(config) != config_hash(config | {"learning_rate": 3.1e-4})
 
 
 def test_times_become_utc() -> None:
@@ -316,11 +284,6 @@ def test_failures_name_no_folder_of_the_machine() -> None:
     record.failure = "cannot read /data/private/demo.h5 " + "x" * 5000
     assert record.failure.startswith("cannot read demo.h5 x")
     assert len(record.failure) == 2000
-
-
-def test_feasible_bounds_are_ordered() -> None:
-    with pytest.raises(ValidationError, match="low"):
-        FeasibleQ(low=1.0, high=0.0)
 
 
 def q_curve(*points: tuple[float, float]) -> list[Evaluation]:
@@ -422,39 +385,31 @@ def change(data: dict[str, Any], where: str, value: Any) -> None:
 EDITS: list[tuple[str, Any, str]] = [
     ("schema_version", 7, "schema_version"),
     ("schema_version", 0, "schema_version"),
-    ("schema_version", "1", "schema_version"),
     ("schema_version", True, "schema_version"),
     ("run_id", "../../etc/passwd", "run_id"),
-    ("run_id", "", "run_id"),
     ("extra", 1, "extra"),
     ("config/env_steps", 60_000, "config_hash"),
     ("config_hash", "0" * 64, "config_hash"),
     ("status", "done", "status"),
     ("role", "champion", "role"),
     ("provenance/extensions", [{"kind": "agent"}], "extensions"),
-    ("provenance/sha256", "abc", "sha256"),
     ("status", "running", "ended"),
     ("started", "yesterday", "started"),
     ("started", "2026-01-31T12:00:00", "zone"),
     ("ended", "2020-01-01T00:00:00+00:00", "before"),
     ("provenance/commit", "<script>", "commit"),
-    ("provenance/secret", 1, "secret"),
     ("parameters/actor", "many", "actor"),
-    ("parameters/actor", -1, "actor"),
-    ("parameters/actor", 10**400, "actor"),
     ("budget/env_steps", 2**53 + 1, "env_steps"),
     ("seeds/run", -1, "seeds"),
     ("wall_clock/total", 1e300, "total"),
     ("feasible_q/high", 1e300, "high"),
-    ("wall_clock/total", -1.0, "total"),
     ("base_policy/base_success", 1.5, "base_success"),
     ("base_policy/content_hash", "abc", "content_hash"),
     ("feasible_q/low", None, "low"),
+    ("feasible_q/low", 1.0, "low"),
     ("evaluations", [], "final evaluation"),
-    ("evaluations/0/final", False, "final evaluation"),
     ("evaluations/0/env_steps", -5, "env_steps"),
     ("evaluations/0/episodes/success_once", [1, 0, 2], "0 and 1"),
-    ("evaluations/0/episodes/success_once", [1, 0, "1"], "0 and 1"),
     ("evaluations/0/episodes/success_once", [1, 0], "equally long"),
     ("evaluations/0/episodes/success_once", [0, 0, 1], "without having had success"),
     ("evaluations/0/episodes/seed", [1, 1, 2], "twice"),
@@ -479,14 +434,11 @@ def test_edited_records_are_refused(tmp_path: Path, where: str, value: Any, word
 
 TEXTS: list[tuple[bytes, str]] = [
     (b"", "strict JSON"),
-    (b"null", "not a run record"),
-    (b"[1, 2]", "not a run record"),
     (b"{}", "not a run record"),
     (b'{"schema_version": NaN}', "NaN"),
     (b'{"schema_version": 1e999}', "too large"),
     (b'{"schema_version": 1, "schema_version": 1}', "twice"),
     (b'{"schema_version": 1}', "config_hash"),
-    (b'{"schema_version": 1, "config_hash": "0"}', "not a valid record"),
     (b"\xff\xfe\x00", "UTF-8"),
     (b"[" * 200_000, "strict JSON"),
     (b'{"schema_version": ' + b"9" * 10_000 + b"}", "strict JSON"),
@@ -499,61 +451,6 @@ def test_foreign_files_are_refused(tmp_path: Path, text: bytes, word: str) -> No
     path.write_bytes(text)
     with pytest.raises(UserError, match=word):
         read_record(path)
-
-
-def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
-    path, _ = stored(tmp_path)
-    before = read_record(path)
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert read_record(path) == before
-
-
-def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(UserError, match="cannot be read"):
-            read_record(path)
-
-
-def test_every_truncation_is_refused(tmp_path: Path) -> None:
-    path, _ = stored(tmp_path)
-    data = path.read_bytes()
-    for length in range(0, len(data) - 2, 37):
-        path.write_bytes(data[:length])
-        with pytest.raises(UserError):
-            read_record(path)
-
-
-def test_random_damage_gives_a_record_error_or_a_valid_record(tmp_path: Path) -> None:
-    path, data = stored(tmp_path)
-    generator = random.Random(0)
-    junk: list[Any] = [None, True, -1, 10**30, 0.5, "x", "\u0000", [], {}, [None], {"a": []}]
-
-    def places(value: Any, trail: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        items: list[tuple[Any, Any]] = []
-        if isinstance(value, dict):
-            items = list(value.items())
-        elif isinstance(value, list):
-            items = list(enumerate(value))
-        return [trail, *(p for key, item in items for p in places(item, (*trail, key)))]
-
-    trails = places(data)[1:]
-    refused = 0
-    for _ in range(400):
-        copy = json.loads(json.dumps(data))
-        *parents, last = generator.choice(trails)
-        target = copy
-        for key in parents:
-            target = target[key]
-        if generator.random() < 0.2:
-            del target[last]
-        else:
-            target[last] = generator.choice(junk)
-        path.write_text(json.dumps(copy))
-        try:
-            read_record(path)
-        except UserError:
-            refused += 1
-    assert refused > 300
 
 
 def test_of_an_option_that_is_no_more_one_value_means_the_same() -> None:

@@ -80,67 +80,51 @@ def test_both_runs_are_samples(count: int, verdict: str, tmp_path: Path) -> None
     assert found.success.high == pytest.approx(wanted.high)
 
 
-def flip(record: RunRecord) -> None:
-    record.evaluations[1].episodes.success_once[1] = True
-
-
-def shift(record: RunRecord) -> None:
-    record.evaluations[2].diagnostics["q_mean"] = -2.5
-
-
-def unmeasure(record: RunRecord) -> None:
-    del record.evaluations[0].diagnostics["q_mean"]
-
-
 def diverge(record: RunRecord) -> None:
     evaluation = record.evaluations[1]
     evaluation.diagnostics["td_error"] = None
     evaluation.nonfinite["diagnostics/td_error"] = "nan"
 
 
-def measure(record: RunRecord) -> None:
-    """What the record has as not measured."""
-    record.evaluations[2].diagnostics["q_correlation"] = 0.5
-
-
-def shorten(record: RunRecord) -> None:
-    del record.evaluations[1]
-
-
-def lengthen(record: RunRecord) -> None:
-    record.evaluations.append(make_evaluation([1, 0], 60_000))
-
-
 def play_more(record: RunRecord) -> None:
     record.evaluations[1].episodes = make_evaluation([1, 0, 1, 0, 1]).episodes
 
 
-def grow(record: RunRecord) -> None:
-    record.parameters.actor += 1
+def put(name: str, value: Any, *place: Any) -> Callable[[RunRecord], None]:
+    """Give what is at a place in the record another value."""
+
+    def change(record: Any) -> None:
+        for key in place:
+            record = record[key] if isinstance(key, int) else getattr(record, key)
+        record.__setitem__(name, value) if isinstance(record, dict) else setattr(
+            record, name, value
+        )
+
+    return change
 
 
-def retrain(record: RunRecord) -> None:
-    record.base_policy.content_hash = "f" * 64
-
-
-def update_less(record: RunRecord) -> None:
-    record.budget.updates -= 1
+FLIPPED = [True, True, True, False]
+DIAGNOSTICS = ("evaluations", 2, "diagnostics")
 
 
 @pytest.mark.parametrize(
     ("change", "part", "first", "differ"),
     [
-        (flip, "episodes", 25_000, 1),
-        (shift, "diagnostics", 50_000, 1),
-        (unmeasure, "diagnostics", 0, 1),
+        (put("success_once", FLIPPED, "evaluations", 1, "episodes"), "episodes", 25_000, 1),
+        (put("q_mean", -2.5, *DIAGNOSTICS), "diagnostics", 50_000, 1),
+        (lambda record: record.evaluations[0].diagnostics.pop("q_mean"), "diagnostics", 0, 1),
         (diverge, "diagnostics", 25_000, 1),
-        (measure, "diagnostics", 50_000, 1),
-        (lengthen, "episodes", 60_000, 1),
+        # What the record has as not measured.
+        (put("q_correlation", 0.5, *DIAGNOSTICS), "diagnostics", 50_000, 1),
+        (
+            lambda record: record.evaluations.append(make_evaluation([1, 0], 60_000)),
+            *("episodes", 60_000, 1),
+        ),
         (play_more, "episodes", 25_000, None),
-        (shorten, "episodes", 25_000, None),
-        (grow, "parameters", None, 1),
-        (retrain, "base policy", None, 1),
-        (update_less, "budget", None, 1),
+        (lambda record: record.evaluations.pop(1), "episodes", 25_000, None),
+        (put("actor", 1, "parameters"), "parameters", None, 1),
+        (put("content_hash", "f" * 64, "base_policy"), "base policy", None, 1),
+        (put("updates", 1, "budget"), "budget", None, 1),
     ],
 )
 def test_every_difference_is_found(
@@ -312,9 +296,7 @@ OTHER_NUMBERS: list[dict[str, Any]] = [
     {"verdict": "exact", "differences": []},
     {"success": {"repeated": 1.0, "low": -0.1, "high": 0.4}},
     {"success": {"recorded": 0.9}},
-    {"success": {"low": -0.5}},
     {"area": {"recorded": 0.9}},
-    {"record": {"commit": None}},
     {"record": {"run_id": "run-none-equivariant-4"}},
     {"repeated": {"sha256": "ab" * 32}},
     {"repeated": {"started": "2020-01-01T00:00:00+00:00"}},
@@ -373,7 +355,7 @@ def test_without_the_repeated_record_the_list_decides(
     assert len(load_runs([results / "records"], results / "marks")) == 15
     mark = {one.verdict: p for p, one in marks_of(results).items()}["alike"]
     text = mark.read_bytes()
-    for changes in [OTHER_NUMBERS[n] for n in (0, 3, 5, 6, 7)]:
+    for changes in [OTHER_NUMBERS[n] for n in (0, 3, 4, 5)]:
         edited(mark, **changes)
         vouched = {*map(file_hash, own), *map(file_hash, marks_of(results))}
         with pytest.raises(UserError, match="says something else"):
@@ -409,6 +391,8 @@ def tables_of(results: Path, *listed: Path) -> Table:
 
 @pytest.mark.long
 def test_submitted_rows_are_marked_last_and_change_nothing(submitted: Path) -> None:
+    runs = load_runs([submitted / "records"], submitted / "marks")
+    assert not any(row.marked for row in summarize(runs).tables[0].rows)  # without a list
     own = own_files(submitted)
     study_file = str(lists(submitted, *own))
     both = {
@@ -472,14 +456,7 @@ def test_a_maintainers_reproduction_of_one_run_takes_the_mark_of_its_row(submitt
     assert tables_of(submitted, *own, mark).row_of("wonder") is None
 
 
-def test_nothing_is_marked_without_a_list(submitted: Path) -> None:
-    runs = load_runs([submitted / "records"], submitted / "marks")
-    (table,) = summarize(runs).tables
-    assert not any(row.marked for row in table.rows)
-    assert table.row_of("wonder").rank == 1
-
-
-@pytest.mark.parametrize("line", ["", "0" * 64, "x" * 64 + "  name.json", "0" * 63 + "  name"])
+@pytest.mark.parametrize("line", ["", "x" * 64 + "  name.json"])
 def test_a_bad_list_is_one_sentence(line: str, results: Path) -> None:
     path = lists(results)
     path.with_suffix(".sha256").write_text(f"{'0' * 64}  name\n{line}\n")
