@@ -23,7 +23,7 @@ ORIGINS = {
 """Class and description of the agents that a new one can begin as."""
 
 SYMMETRY = {
-    "diagnostics": "from symsteer.agents.diagnostics import actor_equivariance_error\n",
+    "diagnostics": ", actor_equivariance_error",
     "Group": "Group, ",
     "symmetry": """def test_it_turns_with_the_world():
     agent, obs = trained()
@@ -61,12 +61,10 @@ def new(
     module = name.replace("-", "_")
     title = "".join(word.capitalize() for word in module.split("_"))
     origin, summary = ORIGINS[like]
-    line = f"from symsteer.agents.{like} import {origin}\n"  # imports are sorted
-    place = ("first", "last") if like == "equivariant" else ("last", "first")
     values = {
         **{"name": name, "module": module, "file": f"test_{module}.py"},
         "Class": title if title.endswith("Agent") else f"{title}Agent",
-        **dict(zip(place, (line, ""), strict=True)),
+        "imports": ", ".join(sorted(["Batch", "SacOptions", origin])),
         **{"Origin": origin, "summary": summary, "Summary": summary.capitalize()},
         **(SYMMETRY if like == "equivariant" else dict.fromkeys(SYMMETRY, "")),
     }

@@ -31,7 +31,7 @@ Trust = Annotated[
 
 
 def run(arguments: list[str]) -> int:
-    """Steer a base policy with one agent on one task; parses its own arguments.
+    """Steer a base policy with one agent on one task.
 
     Its options depend on the agent and the policy that they name.
     """

@@ -21,6 +21,7 @@ from pathlib import Path
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
 from symsteer.names import unknown
+from symsteer.registry import summary_of
 from symsteer.terminal import BOARD, careful_output, complain, folded, to_paste
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
@@ -33,66 +34,58 @@ class Verb:
     """A verb of the command line.
 
     Attributes:
-        target: ``module:function``; the function returns the exit code.
-        summary: one line for the list of verbs.
+        target: ``module:function``; the function returns the exit code, and the first line of its
+            docstring says in the list of verbs what it does.
         computes: whether it uses torch; then the number of threads is set.
         parses: whether the function parses the list of arguments itself. For all others, tyro
             parses them from the function's signature.
     """
 
     target: str
-    summary: str
     computes: bool = True
     parses: bool = False
 
 
 BENCH = "symsteer.bench.cli"
 
-VERBS = {
-    "run": Verb(f"{BENCH}:run", "Steer a base policy with one agent on one task.", parses=True),
-    "resume": Verb(f"{BENCH}:resume", "Continue a run that was stopped."),
-    "evaluate": Verb(f"{BENCH}:evaluate", "Play held-out episodes with the checkpoint of a run."),
-    "reproduce": Verb(f"{BENCH}:reproduce", "Make a run again from its record, and compare."),
-    "film": Verb(f"{BENCH}:film", "Film episodes with the checkpoint of a run."),
-    "sweep": Verb(f"{BENCH}:sweep", "Run all runs of a suite that are not finished."),
-    "tune": Verb(f"{BENCH}:tune", "Search for settings, with equal trials for every agent."),
-    "status": Verb(f"{BENCH}:status", "Show how far the runs of a folder are.", computes=False),
-    "demo": Verb("symsteer.cli:demo", "Run a small suite and write its leaderboard, in minutes."),
-    "report": Verb(
-        "symsteer.leaderboard.command:report",
-        "Write the leaderboard from run records, or check records.",
-        computes=False,
-    ),
-    "compare": Verb(
-        "symsteer.leaderboard.command:compare",
-        "Compare two sets of runs in pairs; fail if the second is clearly worse.",
-        computes=False,
-    ),
-    "site": Verb(
-        "symsteer.leaderboard.site.command:site",
-        "Write results and documentation as a folder of static pages.",
-        computes=False,
-    ),
-    "list": Verb(
-        f"{BENCH}:list_names",
-        "Name the tasks, embodiments, variants, agents, policies, suites and plans.",
-        computes=False,
-    ),
-    "demos": Verb(f"{BENCH}:demos", "Write demonstrations of the scripted expert."),
-    "base": Verb(f"{BENCH}:base", "Train base policies and compare their success."),
-    "export": Verb(f"{BENCH}:export", "Write a base policy and demonstrations to one file."),
-    "fetch-bundle": Verb(
-        f"{BENCH}:fetch_bundle", "Check such a file and unpack it.", computes=False
-    ),
-    "audit": Verb(f"{BENCH}:audit", "Measure how broken the symmetry of a task is."),
-    "audit-episodes": Verb(
-        f"{BENCH}:audit_episodes", "Compare whole episodes with their turned copies."
-    ),
-    "advise": Verb("symsteer.advise:advise", "Say which agent to take in a world, and how sure."),
-    "new": Verb("symsteer.agents.new:new", "Write a new agent and its tests.", computes=False),
-    "throughput": Verb(f"{BENCH}:throughput", "Measure how fast this machine steers."),
-    "doctor": Verb(f"{BENCH}:doctor", "Show what this machine can do.", computes=False),
+GROUPS = {
+    "run experiments": {
+        "demo": Verb("symsteer.cli:demo"),
+        "run": Verb(f"{BENCH}:run", parses=True),
+        "resume": Verb(f"{BENCH}:resume"),
+        "sweep": Verb(f"{BENCH}:sweep"),
+        "status": Verb(f"{BENCH}:status", computes=False),
+        "tune": Verb(f"{BENCH}:tune"),
+    },
+    "look at results": {
+        "report": Verb("symsteer.leaderboard.command:report", computes=False),
+        "site": Verb("symsteer.leaderboard.site.command:site", computes=False),
+        "compare": Verb("symsteer.leaderboard.command:compare", computes=False),
+        "evaluate": Verb(f"{BENCH}:evaluate"),
+        "film": Verb(f"{BENCH}:film"),
+        "reproduce": Verb(f"{BENCH}:reproduce"),
+    },
+    "demonstrations and base policies": {
+        "demos": Verb(f"{BENCH}:demos"),
+        "base": Verb(f"{BENCH}:base"),
+        "export": Verb(f"{BENCH}:export"),
+        "fetch-bundle": Verb(f"{BENCH}:fetch_bundle", computes=False),
+    },
+    "broken symmetry, and agents": {
+        "audit": Verb(f"{BENCH}:audit"),
+        "audit-episodes": Verb(f"{BENCH}:audit_episodes"),
+        "advise": Verb("symsteer.advise:advise"),
+        "new": Verb("symsteer.agents.new:new", computes=False),
+    },
+    "what there is": {
+        "list": Verb(f"{BENCH}:list_names", computes=False),
+        "doctor": Verb(f"{BENCH}:doctor", computes=False),
+        "throughput": Verb(f"{BENCH}:throughput"),
+    },
 }
+"""The verbs by what one wants to do."""
+
+VERBS = {name: verb for verbs in GROUPS.values() for name, verb in verbs.items()}
 
 
 def main() -> int:
@@ -132,7 +125,7 @@ def main() -> int:
 
 
 def demo(out: Path = Path("runs/demo")) -> int:
-    """Run the suite ``demo`` and write its leaderboard: minutes on a CPU.
+    """Run a small suite and write its leaderboard: minutes on a CPU.
 
     Demonstrations, base policy, five agents, leaderboard.
 
@@ -188,8 +181,10 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _overview() -> str:
     """The help text of ``symsteer``."""
-    lines = ["usage: symsteer VERB [OPTIONS]", "", folded("", ABOUT), "", "verbs:"]
-    lines += [folded(f"  {name:14s} ", verb.summary) for name, verb in VERBS.items()]
+    lines = ["usage: symsteer VERB [OPTIONS]", "", folded("", ABOUT)]
+    for title, verbs in GROUPS.items():
+        lines += ["", f"{title}:"]
+        lines += [folded(f"  {name:14s} ", summary_of(verb.target)) for name, verb in verbs.items()]
     lines += ["", "symsteer VERB --help: the options of a verb; symsteer --version: the version"]
     return "\n".join(lines)
 

@@ -210,7 +210,7 @@ class Registry(Generic[T]):
 
     def summary(self, name: str) -> str:
         """First line of the docstring of a name's class, read without importing it."""
-        return _first_line(self.target(name))
+        return summary_of(self.target(name))
 
     def extension(self, name: str) -> Extension | None:
         """The entry of a record for a name from outside SymSteer; None for SymSteer's own names.
@@ -350,15 +350,19 @@ def _file_of(module: str) -> str | None:
     return spec.origin if spec else None
 
 
-def _first_line(target: str) -> str:
-    """First line of a class's docstring, from its source."""
+def summary_of(target: str) -> str:
+    """First line of the docstring of ``module:Class`` or ``module:function``, from its source."""
     module, _, attribute = target.partition(":")
-    path = _file_of(module)
-    try:
-        tree = ast.parse(Path(str(path)).read_bytes())
-    except (OSError, SyntaxError, ValueError):
-        return ""
-    for node in tree.body:
-        if isinstance(node, ast.ClassDef) and node.name == attribute:
-            return (ast.get_docstring(node) or "").partition("\n")[0].replace("``", "")
+    for node in _definitions(_file_of(module)):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == attribute:
+            line = (ast.get_docstring(node) or "").partition("\n")[0].replace("``", "")
+            return re.sub(r" \(docs/[\w.]+\)", "", line)
     return ""
+
+
+@functools.cache
+def _definitions(path: str | None) -> list[ast.stmt]:
+    try:
+        return ast.parse(Path(str(path)).read_bytes()).body
+    except (OSError, SyntaxError, ValueError):
+        return []

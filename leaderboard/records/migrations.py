@@ -12,7 +12,7 @@ Data = dict[str, Any]
 REFERENCES_BEFORE_4 = ("base", "zero", "golden-ticket")
 """The agents that did not learn before a record named the agent's role."""
 
-CODE = {"version": None, "sha256": None, "extensions": []}
+CODE: Data = {"version": None, "sha256": None, "extensions": []}
 """What the provenance of each part says since version 4."""
 
 CONDITIONAL_BEFORE_5 = {

@@ -15,7 +15,6 @@ import termios
 from importlib.metadata import version
 from pathlib import Path
 
-import h5py
 import pytest
 import torch
 
@@ -25,7 +24,7 @@ from symsteer.bench import cli
 from symsteer.bench.demos import collect
 from symsteer.bench.sweep.survey import look
 from symsteer.bench.tasks import task_class
-from symsteer.cli import VERBS, _threads, main
+from symsteer.cli import GROUPS, VERBS, _threads, main
 from symsteer.leaderboard.records import Episodes, write_record
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
@@ -61,7 +60,6 @@ def sentence(capsys) -> str:
         (["--embodiment", "hand"], "floating, panda"),
         (["--variant", "gravity:1"], "gravity_tilt"),
         (["--variant", "action_gain:2"], "[0, 1]"),
-        (["--variant", "action_gain:much"], "action_gain:0.5"),
         (["--agent", "ppo"], "equivariant"),
         (["--agent.group", "E8"], "C8"),
         (["--agent.preset", "frist"], "did you mean 'first'"),
@@ -69,9 +67,6 @@ def sentence(capsys) -> str:
         (["--env-steps", "0"], "between 1 and"),
         (["--seed", str(2**32)], "seed is"),
         (["--agent", "residual-pathway", "--agent.penalty", "inf"], "penalty is inf"),
-        (["--variant", "action_gain:0.5,wind:0.5"], "joined with +"),
-        (["--demos", "nowhere.h5"], "nowhere.h5"),
-        (["--base-policy", "nowhere.safetensors"], "nowhere.safetensors"),
     ],
 )
 def test_mistakes_in_a_run(arguments, words, monkeypatch, capsys, tmp_path):
@@ -95,26 +90,6 @@ def test_demonstrations_of_another_task(demos, monkeypatch, capsys, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def test_truncated_demonstrations(demos, monkeypatch, capsys, tmp_path):
-    cut = tmp_path / "cut.h5"
-    cut.write_bytes(demos.read_bytes()[: demos.stat().st_size // 3])
-    cut.with_suffix(".json").write_bytes(demos.with_suffix(".json").read_bytes())
-    arguments = ("run", "--quiet", "--demos", cut, "--out", tmp_path / "runs")
-    assert symsteer(monkeypatch, *arguments, "--demonstrations.count", 2) == 2
-    assert "truncated" in sentence(capsys)
-
-
-def test_demonstrations_with_nan(demos, monkeypatch, capsys, tmp_path):
-    bad = tmp_path / "nan.h5"
-    bad.write_bytes(demos.read_bytes())
-    bad.with_suffix(".json").write_bytes(demos.with_suffix(".json").read_bytes())
-    with h5py.File(bad, "r+") as file:
-        file["traj_0/actions"][0, 0] = float("nan")
-    arguments = ("run", "--quiet", "--demos", bad, "--out", tmp_path / "runs")
-    assert symsteer(monkeypatch, *arguments, "--demonstrations.count", 2) == 2
-    assert str(bad) in sentence(capsys)
-
-
 def test_a_checkpoint_of_another_layout(monkeypatch, capsys, tmp_path):
     task = task_class("PushCube-v1")
     options = EquivariantOptions(channels=8, width=16, depth=1)
@@ -123,12 +98,6 @@ def test_a_checkpoint_of_another_layout(monkeypatch, capsys, tmp_path):
     arguments = ("run", "--quiet", "--base-policy", path, "--out", tmp_path / "runs")
     assert symsteer(monkeypatch, *arguments) == 2
     assert "observation layout" in sentence(capsys)
-
-
-def test_records_that_are_none(monkeypatch, capsys, tmp_path):
-    (tmp_path / "record.json").write_text(json.dumps({"hello": 1}))
-    assert symsteer(monkeypatch, "report", tmp_path, "--out", tmp_path / "page") == 2
-    assert "record.json" in sentence(capsys)
 
 
 def test_report_checks_and_verifies_from_any_folder(monkeypatch, capsys, tmp_path):
@@ -146,31 +115,6 @@ def test_report_checks_and_verifies_from_any_folder(monkeypatch, capsys, tmp_pat
     assert "LEADERBOARD.md: missing" in capsys.readouterr().out
     assert symsteer(monkeypatch, "report", "--verify", "--check") == 2
     assert {path.name for path in tmp_path.iterdir()} == {"a.json", "--odd"}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["/proc/nowhere/a.h5"], "/proc/nowhere cannot be written"),
-        (["a.h5", "--seed", "-1"], "seed"),
-        (["a.txt"], ".h5"),
-        (["a.h5", "--count", "0"], "at least 1"),
-    ],
-)
-def test_mistakes_in_demos(arguments, words, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    assert symsteer(monkeypatch, "demos", *arguments) == 2
-    assert words in sentence(capsys)
-
-
-def test_a_folder_that_cannot_be_written(monkeypatch, capsys):
-    assert symsteer(monkeypatch, "sweep", "smoke", "--out", "/proc/nowhere") == 2
-    assert "/proc/nowhere" in sentence(capsys)
-
-
-def test_an_unknown_suite(monkeypatch, capsys, tmp_path):
-    assert symsteer(monkeypatch, "sweep", "dmeo", "--out", tmp_path) == 2
-    assert "demo" in sentence(capsys)
 
 
 def test_list_names_everything(monkeypatch, capsys):
@@ -193,18 +137,15 @@ def test_the_overview_names_every_verb(monkeypatch, capsys):
     for arguments in ((), ("--help",)):
         assert symsteer(monkeypatch, *arguments) == 0
         out = capsys.readouterr().out
-        assert all(f"\n  {verb} " in out for verb in VERBS)
+        titles = re.findall(r"^(\w.*):$", out, re.MULTILINE)
+        assert titles == list(GROUPS)
+        assert re.findall(r"^  ([\w-]+) ", out, re.MULTILINE) == list(VERBS)
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "run"])
 def test_every_verb_has_help(verb, monkeypatch, capsys):
     assert symsteer(monkeypatch, verb, "--help") == 0
     assert f"usage: symsteer {verb} " in capsys.readouterr().out
-
-
-def test_an_unknown_verb_is_told_the_nearest(monkeypatch, capsys):
-    assert symsteer(monkeypatch, "swep", "smoke") == 2
-    assert "did you mean 'sweep'" in sentence(capsys)
 
 
 def test_the_version(monkeypatch, capsys):
@@ -308,12 +249,7 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     assert (done.returncode, done.stderr) == (141, "")
 
 
-STATUS = pytest.param(["status", "."], marks=pytest.mark.long)
-
-
-@pytest.mark.parametrize(
-    "arguments", [["list"], ["--version"], ["--help"], ["status", "--help"], STATUS, ["x"]]
-)
+@pytest.mark.parametrize("arguments", [["list"], ["status", "--help"], ["x"]])
 @pytest.mark.parametrize("full", ["stdout", "stderr", "both"])
 def test_a_full_device_is_one_sentence(arguments, full, tmp_path):
     with open("/dev/full", "wb") as device:
@@ -328,8 +264,9 @@ def test_a_full_device_is_one_sentence(arguments, full, tmp_path):
         assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["film", "--help"], ["list"]])
-@pytest.mark.parametrize("columns", ["variable", "terminal"])
+@pytest.mark.parametrize(
+    ("arguments", "columns"), [(["--help"], "terminal"), (["film", "--help"], "variable")]
+)
 def test_a_narrow_terminal_has_help(arguments, columns, tmp_path):
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 1, 1, 0, 0))
