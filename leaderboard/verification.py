@@ -13,9 +13,6 @@ DRAWN_WITH = ("matplotlib", "numpy", "pandas", "scipy")
 
 REQUIREMENTS = Path(__file__).resolve().parents[1] / "requirements.txt"
 
-SHOWN = 30
-"""Characters shown from the first difference on."""
-
 
 @dataclass(frozen=True)
 class Verification:
@@ -39,14 +36,14 @@ def differences(files: Mapping[str, bytes], stale: list[str], out: Path) -> list
         try:
             with open(path, "rb") as file:
                 # One byte more than wanted tells a longer file, however large it is.
-                found = file.read(len(wanted) + 1)
+                written = file.read(len(wanted) + 1)
         except FileNotFoundError:
             lines.append(f"{path}: missing")
         except OSError as error:
             lines.append(f"{path}: cannot be read ({error.strerror})")
         else:
-            if found != wanted:
-                lines.append(f"{path}: {_first_difference(found, wanted)}")
+            if written != wanted:
+                lines.append(f"{path}: {_first_difference(written, wanted)}")
     return lines + [f"{out / name}: no record gives this file" for name in stale]
 
 
@@ -63,19 +60,8 @@ def other_versions() -> list[str]:
     ]
 
 
-def _first_difference(found: bytes, wanted: bytes) -> str:
-    length = min(len(found), len(wanted))
-    index = next((i for i in range(length) if found[i] != wanted[i]), length)
+def _first_difference(written: bytes, wanted: bytes) -> str:
+    length = min(len(written), len(wanted))
+    index = next((i for i in range(length) if written[i] != wanted[i]), length)
     line = wanted[:index].count(b"\n") + 1
-    column = index - wanted.rfind(b"\n", 0, index)
-    return (
-        f"differs from line {line}, column {column} on: "
-        f"{_excerpt(found, index)}, but the records give {_excerpt(wanted, index)}"
-    )
-
-
-def _excerpt(data: bytes, index: int) -> str:
-    if index == len(data):
-        return "the file ends"
-    text = data[index : index + 4 * SHOWN].decode(errors="replace")
-    return ascii(text.partition("\n")[0][:SHOWN] or text[:1])
+    return f"differs from line {line} on"

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar, get_args
 
 from symsteer.errors import UserError
-from symsteer.names import nearest, unknown
+from symsteer.names import unknown
 
 if TYPE_CHECKING:  # slow to import
     from pydantic import BaseModel, ValidationError
@@ -41,12 +41,7 @@ def read_toml(name_or_path: str, kind: str, folder: Path) -> tuple[dict[str, Any
         return shallow(tomllib.loads(path.read_text("utf-8-sig"))), path
     except FileNotFoundError as error:
         names = sorted(path.stem for path in folder.glob("*.toml"))
-        close = nearest(path.stem, names)
-        hint = f"did you mean {close!r}? " if close else ""
-        raise UserError(
-            f"there is no {kind} {name_or_path!r}; {hint}use one of {', '.join(names)} or "
-            "the path of a .toml file"
-        ) from error
+        raise unknown(kind, name_or_path, [*names, "or the path of a .toml file"]) from error
     except OSError as error:
         raise UserError(
             f"the {kind} {path} cannot be read: {error.strerror}; name another file"

@@ -11,11 +11,6 @@ LONGEST_NAME = 80
 """Characters of a wrong name that are quoted."""
 
 
-def nearest(name: str, valid: Iterable[str]) -> str | None:
-    """The valid name that is most similar to ``name``; None if none is similar."""
-    return next(iter(difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)), None)
-
-
 def check(kind: str, names: Iterable[str], valid: Iterable[str], where: str = "") -> None:
     """Raise the error of :func:`unknown` for the first of the names that is not valid."""
     valid = list(valid)
@@ -35,7 +30,7 @@ def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> User
     """
     valid = list(valid)
     name = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..."
-    close = nearest(name, valid)
-    hint = f"did you mean {close!r}? " if close else ""
+    close = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    hint = f"did you mean {close[0]!r}? " if close else ""
     start = f"{where}: " if where else ""
     return UserError(f"{start}there is no {kind} {name!r}; {hint}valid: {', '.join(valid)}")

@@ -24,7 +24,6 @@ from symsteer.leaderboard.statistics import (
 from symsteer.leaderboard.summary import MIN_SEEDS, Key, Run, area_difference
 
 Measure = Literal["success", "auc", "q_bias"]
-Verdict = Literal["identical", "none", "worse", "better", "not worse"]
 
 DECISIVE: tuple[Measure, ...] = ("success", "auc")
 """The measures that the verdict follows from."""
@@ -149,7 +148,7 @@ class Changes:
         return {name: change.difference for name, change in changes.items() if change.counts}
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Literal["identical", "none", "worse", "better", "not worse"]:
         """Whether B is clearly worse than A, by more than the margin, in success or in AUC.
 
         `identical`: all episodes of all pairs agree. `none`: no cell has enough pairs.

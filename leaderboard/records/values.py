@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
@@ -96,21 +96,19 @@ class RecordBlock(BaseModel):
     )
 
     @classmethod
-    def _own(cls, data: Mapping[str, Any]) -> list[str]:
-        """The keys of `data` that are not blocks themselves: those look after their own values."""
-        blocks = {
+    def _own(cls, data: Mapping[str, Any]) -> dict[str, Any]:
+        """Plain values of the keys that are not blocks themselves: those prepare their own."""
+        blocks = {"evaluations"} | {
             name
             for name, field in cls.model_fields.items()
             if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
         }
-        return [key for key in data if key not in blocks and key != "evaluations"]
+        return {key: plain(item) for key, item in data.items() if key not in blocks}
 
     @model_validator(mode="before")
     @classmethod
-    def _toplain(cls, data: Any) -> Any:
-        if not isinstance(data, Mapping):
-            return data
-        return {**data, **{key: plain(data[key]) for key in cls._own(data)}}
+    def _to_plain(cls, data: Any) -> Any:
+        return {**data, **cls._own(data)} if isinstance(data, Mapping) else data
 
 
 class MeasuredBlock(RecordBlock):
@@ -133,30 +131,30 @@ class MeasuredBlock(RecordBlock):
                 if all(_nonfinite(item) is None for item in value):
                     return value
                 return [clean(item, f"{path}/{index}") for index, item in enumerate(value)]
-            kind = _nonfinite(value)
-            if kind is None:
+            if (kind := _nonfinite(value)) is None:
                 return value
             flags[path] = kind
             return None
 
-        own = {key: clean(plain(data[key]), key) for key in cls._own(data) if key != "nonfinite"}
+        own = {k: clean(item, k) for k, item in cls._own(data).items() if k != "nonfinite"}
         return {**data, **own, "nonfinite": flags}
 
     @model_validator(mode="after")
     def _flags_point_at_null(self) -> Self:
-        data = self.model_dump(by_alias=True) if self.nonfinite else {}
+        values = dict(_leaves(self.model_dump(by_alias=True))) if self.nonfinite else {}
         for path in self.nonfinite:
-            value: Any = data
-            for key in path.split("/"):
-                if isinstance(value, list) and key.isdigit() and int(key) < len(value):
-                    value = value[int(key)]
-                elif isinstance(value, dict) and key in value:
-                    value = value[key]
-                else:
-                    raise ValueError(f"nonfinite names {path!r}, which does not exist")
-            if value is not None:
-                raise ValueError(f"nonfinite names {path!r}, whose value is not null")
+            if values.get(path, 0) is not None:
+                raise ValueError(f"nonfinite names {path!r}, which is no null of this block")
         return self
+
+
+def _leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value of nested data that holds no others, and its place."""
+    if isinstance(data, dict | list):
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+            yield from _leaves(value, f"{path}/{key}" if path else str(key))
+    else:
+        yield path, data
 
 
 def canonical_json(data: Any) -> str:

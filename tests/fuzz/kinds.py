@@ -277,18 +277,6 @@ def beside(way: Way) -> Way:
     return lambda path, random: way(path.with_suffix(".json"), random)
 
 
-def make_foreign(path: Path, random: Random) -> None:
-    """As if ManiSkill had written it: states, no observations, no section or checksum of ours."""
-    data = json.loads(path.with_suffix(".json").read_text())
-    del data["symsteer"]
-    path.with_suffix(".json").write_text(json.dumps(data))
-    with h5py.File(path, "r+") as file:
-        file.attrs.clear()
-        for group in file.values():
-            del group["obs"]
-    edit_arrays(path, random)
-
-
 def edit_description(path: Path, random: Random) -> None:
     data = json.loads(path.read_text())
     episode, kwargs = random.choice(data["episodes"]), data["env_info"]["env_kwargs"]
@@ -331,14 +319,13 @@ def edit_arrays(path: Path, random: Random) -> None:
 
 def same_arrays(workshop: Workshop, path: Path, ending: Ending) -> None:
     (demos,) = ending.found[1].values()
-    foreign = "symsteer" not in json.loads(path.with_suffix(".json").read_text())
     with h5py.File(io.BytesIO(workshop.demos[0])) as file:
         for index, (obs, actions) in enumerate(demos.episodes):
             require(bool(obs.isfinite().all() and actions.isfinite().all()), "NaN was accepted")
             require(len(obs) == len(actions) + 1, "a wrong shape was accepted")
             for name, array in (("obs", obs), ("actions", actions)):
                 same = np.array_equal(np.asarray(file[f"traj_{index}/{name}"]), array.numpy())
-                require(foreign or same, "damaged arrays were accepted")
+                require(same, "damaged arrays were accepted")
 
 
 # Base policies.
@@ -579,7 +566,7 @@ KINDS: dict[str, Kind] = {
     "status": Kind(display, (damage_any,) * 4, [lambda w, path: ["status", path.parents[1]]]),
     "demonstrations": Kind(
         demonstrations,
-        (*BYTES, *map(beside, JSON[1:]), beside(edit_description), edit_arrays, make_foreign),
+        (*BYTES, *map(beside, JSON[1:]), beside(edit_description), edit_arrays),
         [
             lambda workshop, path, count=count: [
                 *new_run(workshop, "--demos", path),

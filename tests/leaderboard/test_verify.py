@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -96,13 +95,10 @@ def test_each_file_that_differs_has_its_line(
     assert len(lines) == 5
     shown = dict(line.split(": ", 1) for line in lines)
     number = page.read_text().splitlines().index("## Detail") + 1
-    assert re.fullmatch(
-        rf"differs from line {number}, column 10 on: '\\n', but the records give 's'",
-        shown[str(page)],
-    )
-    assert "'\\r'" in shown[str(table)]
+    assert shown[str(page)] == f"differs from line {number} on"
+    assert shown[str(table)] == "differs from line 1 on"
     assert shown[str(first)] == "missing"
-    assert "'\\n', but the records give the file ends" in shown[str(second)]
+    assert shown[str(second)].startswith("differs from line ")
     assert shown[str(stale)] == "no record gives this file"
 
 

@@ -14,16 +14,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 
-SOURCES = (
-    "pyproject.toml",
-    "README.md",
-    "LICENSE",
-    "symsteer",
-    "agents",
-    "bench",
-    "leaderboard",
-    "policies",
-)
+FOLDERS = ("symsteer", "agents", "bench", "leaderboard", "policies")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", *FOLDERS)
 """What a build reads."""
 
 
@@ -40,13 +32,7 @@ class Installed:
         self.bin, self.site = Path(paths["scripts"]), Path(paths["purelib"])
 
     def run(self, cwd: Path, *command: str, path: Path | None = None) -> str:
-        """Run a console script of this environment; returns stdout.
-
-        Args:
-            cwd: folder to run in.
-            command: name of the script, then its arguments.
-            path: one more folder on the import path, before all others.
-        """
+        """Run a console script in a folder, with one more folder on its import path; stdout."""
         return call(str(self.bin / command[0]), *command[1:], cwd=cwd, path=path)
 
 

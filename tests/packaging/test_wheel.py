@@ -4,7 +4,7 @@ import tomllib
 import zipfile
 from pathlib import PurePosixPath
 
-from tests.packaging.conftest import ROOT, build_wheel, python
+from tests.packaging.conftest import FOLDERS, ROOT, build_wheel, python
 
 AUDIT = "leaderboard/results/audit/summary.json"
 """What `report` needs for the map of advantage against measured defect."""
@@ -19,7 +19,7 @@ def contents(wheel):
 def test_the_wheel_is_complete_and_installs_one_name(wheel, source):
     names = {name for name in contents(wheel) if ".dist-info/" not in name}
     wanted = {f"symsteer/{AUDIT}", "symsteer/py.typed"}
-    for folder in ("symsteer", "agents", "bench", "leaderboard", "policies"):
+    for folder in FOLDERS:
         inside = "" if folder == "symsteer" else "symsteer/"
         for suffix in ("py", "toml"):
             found = (source / folder).rglob(f"*.{suffix}")

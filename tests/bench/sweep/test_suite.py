@@ -300,7 +300,7 @@ def test_every_kind_of_toml_file_is_read_alike(kind, tmp_path):
         with pytest.raises(UserError, match=f"the {kind} {path} cannot be read as TOML: .*correct"):
             read(str(path))
     path.unlink()
-    with pytest.raises(UserError, match=f"there is no {kind} '{path}'; .*use one of .*{path.stem}"):
+    with pytest.raises(UserError, match=f"there is no {kind} '{path}'; .*valid: .*{path.stem}"):
         read(str(path))
     path.mkdir()
     with pytest.raises(
