@@ -1,41 +1,50 @@
-"""The figures as deterministic SVG: the map, profiles, comparisons; learning curves and Q-values.
+"""What each figure shows: those of the leaderboard's page, and those that the site alone has.
 
-The colours are those of Okabe and Ito, which people with colour blindness can tell apart; agents
-differ by marker as well. Text is drawn as outlines of matplotlib's own font, so that the same
-records give the same bytes on every machine.
+Each function returns a description (`plots`); `svg` and `site.charts` draw it. The colours are
+those of Okabe and Ito, which people with colour blindness can tell apart; agents differ by marker
+as well.
 """
 
 from __future__ import annotations
 
-import io
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from textwrap import wrap
 from typing import Any
 
 import numpy as np
-from matplotlib import style as mpl_style
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from symsteer.leaderboard.answer import Gain
 from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
-from symsteer.leaderboard.curves import mean_series, series, success_curve
-from symsteer.leaderboard.defects import MEASURES, DefectMap, Fit, Panel
+from symsteer.leaderboard.curves import (
+    Curve,
+    direction_curve,
+    mean_series,
+    series,
+    success_curve,
+)
+from symsteer.leaderboard.defects import MEASURES, Defect, DefectMap, Fit, Point
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.paper import BASE, STANDARD
-from symsteer.leaderboard.statistics import Interval
-from symsteer.leaderboard.summary import MIN_SEEDS, Row, Summary, Table
+from symsteer.leaderboard.plots import (
+    FEASIBLE,
+    GREY,
+    Axis,
+    Dash,
+    Dot,
+    Figure,
+    Look,
+    Plot,
+    Rule,
+    Trace,
+    cut,
+)
+from symsteer.leaderboard.summary import MIN_SEEDS, Row, Run, Summary, Table
 from symsteer.leaderboard.tables import beside_variant
-from symsteer.leaderboard.text import SPACE, ends
+from symsteer.leaderboard.text import MARKS, SPACE, ends, interval
 
-Style = tuple[str, str, Any]
-"""Color, marker and line style of an agent."""
-
-STYLES: dict[str, Style] = {
+STYLES: dict[str, tuple[str, str, Dash]] = {
     "base": ("#555555", "", (0, (5, 2))),
     "zero": ("#555555", "", (0, (1, 1.5))),
     "golden-ticket": ("#A8860B", "", (0, (5, 1.5, 1, 1.5))),
@@ -56,417 +65,262 @@ STYLES: dict[str, Style] = {
     "best-of-n-kernel": ("#EE3377", "X", (0, (3, 1.5))),
     "wrong-group": ("#000000", "X", (0, (3, 1.5))),
 }
-OTHERS: tuple[Style, ...] = (("#56B4E9", "P", "-"), ("#882255", "<", "-"), ("#332288", "h", "-"))
-FEASIBLE, FEASIBLE_EDGE, FEASIBLE_TEXT = "#DDE7D0", "#7A9A50", "#4F6B2A"
-PLACE_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*")
-"""Markers of the map, one for each task."""
+"""Colour, marker and line style of an agent, the same in every figure."""
+
+OTHERS: tuple[tuple[str, str, Dash], ...] = (
+    ("#56B4E9", "P", "-"),
+    ("#882255", "<", "-"),
+    ("#332288", "h", "-"),
+)
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*")
+COLORS = tuple(color for color, marker, _ in STYLES.values() if marker)
+"""Markers and colours of tasks."""
 
 PARTS = {"tool": "#0072B2", "object": "#D55E00", "cost": "#CC79A7", "observation": "#009E73"}
 """Colours of the map: which part of a decision the defect is of."""
 FIT = "#444444"
+WITHIN = "within base policies, 95 %"
 
 MEASURE_NAMES = {"auc": "area under the curve", "success": "final success"}
 
 COLUMNS = 3
 TITLE_WIDTH = 36
-"""Characters of a panel's title."""
-WIDEST = 13.3
-"""Characters of a line of the legend, per inch."""
-HANDLE = 7
-"""Characters as wide as the line and the space of one entry."""
-
-MAX_MARKERS = 15
+"""Characters of a plot's title."""
 
 MANY = 8
-"""With so many learners a panel has no bands of learners, and no single finished runs."""
+"""With so many learners a plot has no bands of learners, and no single finished runs."""
 
-RC: dict[str, Any] = {
-    "svg.hashsalt": "symsteer",
-    "svg.fonttype": "path",
-    "font.family": "DejaVu Sans",
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "axes.titlesize": 9.5,
-    "figure.facecolor": "white",
-    "axes.facecolor": "white",
-    "path.simplify": False,
-}
-SHEETS: Any = ["default", RC]
-"""matplotlib's own defaults first, because a user's matplotlibrc would change the bytes."""
+SHARE = (-0.02, 1.02)
+"""Ends of an axis of shares."""
+
+FRESH = "fresh return"
+
+Q_AXIS = Axis("Q-value (discounted return)")
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """A figure, what it shows, and where it belongs: (task, embodiment), (embodiment,) or ()."""
-
-    kind: str
-    place: tuple[str, ...]
-    text: str
-    figure: Figure
+def look_of(agent: str, **more: Any) -> Look:
+    """Colour, marker and line style of an agent, with other parts of the look."""
+    color, marker, dash = STYLES.get(agent) or OTHERS[sum(map(ord, agent)) % len(OTHERS)]
+    return Look(color, marker, dash, **more)
 
 
-def render_figures(summary: Summary, findings: Findings) -> list[Drawing]:
+def overall_figures(findings: Findings) -> list[Figure]:
+    """Those over all cells, in the order of the page; figures without data are left out."""
+    compared = findings.comparisons
+    figures = [gained(findings.gains)] if findings.gains else []
+    figures += [advantage_map(findings.map, e) for e in findings.map.embodiments]
+    figures += [performance_profiles(compared)] if any(compared.profiles.values()) else []
+    return figures + ([improvement(compared)] if any(compared.improvements.values()) else [])
+
+
+def render_figures(summary: Summary, findings: Findings) -> list[Figure]:
     """All figures in the order of the page; figures without data are left out."""
-    drawings = []
+    figures = overall_figures(findings)
     places: dict[tuple[str, str], list[Table]] = {}
     for table in summary.tables:
         if table.runs:
             places.setdefault((table.key.task, table.key.embodiment), []).append(table)
-    with mpl_style.context(SHEETS):
-        if findings.gains:
-            text = "Advantage of symmetry over the standard agent, by kind of break"
-            drawings.append(Drawing("answer", (), text, answer_chart(findings.gains)))
-        for embodiment in findings.map.embodiments:
-            text = "Advantage of symmetry against the audited defect"
-            figure = advantage_map(findings.map, embodiment)
-            drawings.append(Drawing("map", (embodiment,), text, figure))
-        if any(findings.comparisons.profiles.values()):
-            figure = performance_profiles(findings.comparisons)
-            drawings.append(Drawing("profiles", (), "Performance profiles", figure))
-        if any(findings.comparisons.improvements.values()):
-            figure = improvement_chart(findings.comparisons)
-            drawings.append(Drawing("improvement", (), "Probability of improvement", figure))
-        for place, tables in places.items():
-            text = "Learning curves"
-            drawings.append(Drawing("success", place, text, learning_curves(tables)))
-            if any(run.record.has_critic for table in tables for run in table.runs):
-                text = "Q-values and their feasible band"
-                drawings.append(Drawing("q", place, text, q_values(tables)))
-    return drawings
-
-
-def to_svg(figure: Figure) -> bytes:
-    """SVG without dates or versions; the same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    with mpl_style.context(SHEETS):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return buffer.getvalue()
+    for tables in places.values():
+        figures.append(learning_curves(tables))
+        if any(run.record.has_critic for table in tables for run in table.runs):
+            figures.append(q_values(tables))
+    return figures
 
 
 def learning_curves(tables: Sequence[Table]) -> Figure:
-    """Success over environment steps: one panel a table, the IQM over seeds with its 95 % band.
+    """Success over environment steps: one plot a table, the IQM over seeds with its 95 % band.
 
     Thin lines are single seeds, drawn while these are few; those of unfinished runs are dotted and
-    end in a cross. References that were evaluated once are horizontal lines. Panels with `MANY`
+    end in a cross. References that were evaluated once are horizontal lines. Plots with `MANY`
     learners have no bands of these.
     """
-    figure, axes = _panels(tables, "success_once on held-out episodes")
-    handles: dict[str, Line2D] = {}
-    for ax, table in zip(axes, tables, strict=True):
-        ax.set_ylim(-0.02, 1.02)
-        for row in table.rows:
-            if not row.runs:
-                continue
-            _draw_success(ax, row, table.key.env_steps, len(table.learners) < MANY)
-            handles.setdefault(plain(row.label), _entry(row.agent, markersize=5))
-    _legend(figure, handles)
-    return figure
+    axis = Axis("success_once on held-out episodes", SHARE)
+    plots = [
+        _over_steps(table, tables, axis, [trace for row in table.rows for trace in _success(row)])
+        for table in tables
+    ]
+    agents = {cut(row.label): row.agent for table in tables for row in table.rows if row.runs}
+    return _of_cells("success", "Learning curves", tables, plots, _entries(agents), same_y=True)
 
 
-def _entry(agent: str, **more: Any) -> Line2D:
-    """An agent in the legend."""
-    color, marker, line = style_of(agent)
-    return Line2D([], [], color=color, marker=marker, linestyle=line, **more)
+def _entries(agents: Mapping[str, str]) -> dict[str, Look]:
+    """Entries of a legend, by name."""
+    return {name: look_of(agent, size=5) for name, agent in agents.items()}
 
 
-def _draw_success(ax: Axes, row: Row, budget: int, band: bool) -> None:
-    color, marker, line = style_of(row.agent)
-    for run in row.runs:
-        values = [evaluation.success_once for evaluation in run.curve.values()]
-        if run.finished and (row.is_reference or not 1 < len(row.finished) < MIN_SEEDS):
-            continue
-        dotted: dict[str, Any] = {} if run.finished else {"linestyle": ":"}
-        ax.plot(list(run.curve), values, color=color, linewidth=0.7, alpha=0.35, **dotted)
-        if not run.finished and values:
-            ax.plot(list(run.curve)[-1], values[-1], "x", color=color, markersize=5)
+def _success(row: Row) -> list[Trace]:
+    """Single runs of a row, and what they have in common."""
+    name, few = cut(row.label), 1 < len(row.finished) < MIN_SEEDS
+    shown = [run for run in row.runs if not (run.finished and row.is_reference)]
+    traces = [_single_success(name, run, detail=run.finished and not few) for run in shown]
     curve = success_curve(row)
-    if not curve.steps:
-        return
     if len(curve.steps) == 1 and row.is_reference:
         # From where the search ended; a reference without a search starts at 0.
-        start = min(row.search_steps or 0, budget)
-        value = curve.values[0]
-        ax.hlines(value, start, budget, color=color, linestyle=line, linewidth=1.4, zorder=1.5)
-        if row.agent == BASE:
-            ax.axhspan(curve.low[0], curve.high[0], color=color, alpha=0.10, linewidth=0)
-        return
-    if band:
-        ax.fill_between(curve.steps, curve.low, curve.high, color=color, alpha=0.14, linewidth=0)
-    marks: dict[str, Any] = {"marker": marker, "markersize": 4}
-    marks["markevery"] = max(1, len(curve.steps) // MAX_MARKERS)
-    ax.plot(curve.steps, curve.values, color=color, linestyle=line, linewidth=1.7, **marks)
+        budget = row.runs[0].record.settings.env_steps
+        x = [min(row.search_steps or 0, budget), budget]
+        y, low, high = curve.values * 2, curve.low * 2, curve.high * 2
+        band, look = 0.10 if row.agent == BASE else 0, look_of(row.agent, width=1.4)
+        traces.append(Trace(name, x, y, look, low, high, band, flat=True))
+    elif curve.steps:
+        traces.append(_with_band(name, curve, look_of(row.agent, width=1.7, size=4)))
+    return traces
+
+
+def _single_success(name: str, run: Run, detail: bool = False) -> Trace:
+    values = [evaluation.success_once for evaluation in run.curve.values()]
+    thin = Look(look_of(run.agent).color, "", "-" if run.finished else ":", 0.7, alpha=0.35)
+    cross = 0 if run.finished else 5
+    more: dict[str, Any] = {"label": _run_name(run), "single": True, "detail": detail}
+    return Trace(name, list(run.curve), values, thin, cross=cross, **more)
+
+
+def _with_band(name: str, curve: Curve, look: Look) -> Trace:
+    return Trace(name, curve.steps, curve.values, look, curve.low, curve.high, band=0.14)
+
+
+def _run_name(run: Run) -> str:
+    return f"seed {run.seed}" + ("" if run.finished else f", {run.record.status}")
 
 
 def q_values(tables: Sequence[Table]) -> Figure:
     """Mean Q at the actor's own noise against the feasible band of the task's reward.
 
     Thin lines are single seeds (with `MANY` learners those whose Q is not finite, only), the thick
-    line is their mean; hollow markers are the fresh discounted returns that Q should predict. Seeds
-    whose Q is not finite end in a cross. The axis turns logarithmic far outside the band.
+    line is their mean; hollow markers are the fresh discounted returns that Q should predict. Runs
+    that broke off, or whose Q is not finite, end in a cross. The axis turns logarithmic far outside
+    the band.
     """
-    figure, axes = _panels(tables, "Q-value (discounted return)")
-    handles: dict[str, Line2D | Patch] = {}
-    explained: dict[str, Line2D | Patch] = {}
-    for ax, table in zip(axes, tables, strict=True):
-        extremes: list[float] = []
-        for row in table.rows:
-            runs = [run for run in row.runs if run.record.has_critic]
-            if not runs:
-                continue
-            color, marker, line = style_of(row.agent)
-            for run in runs:
-                steps, values = series(run, "q_mean")
-                if len(table.learners) < MANY or run.record.nonfinite_q:
-                    ax.plot(steps, values, color=color, linewidth=0.8, alpha=0.5)
-                extremes += values
-                if run.record.nonfinite_q:
-                    ax.plot(steps[-1:], values[-1:], "x", color=color, markersize=7)
-            places, means = mean_series(runs, "q_mean")
-            style: dict[str, Any] = {"color": color, "marker": marker, "markersize": 4}
-            style["markevery"] = max(1, len(places) // MAX_MARKERS)
-            ax.plot(places, means, linestyle=line, linewidth=1.7, **style)
-            returns = mean_series(runs, "return_mean")
-            ax.plot(*returns, linestyle="none", markerfacecolor="white", **style)
-            extremes += returns[1]
-            handles.setdefault(plain(row.label), _entry(row.agent, markersize=5))
-            if returns[1]:
-                hollow: dict[str, Any] = {"marker": "o", "markerfacecolor": "white"}
-                hollow["linestyle"] = "none"
-                explained["fresh return"] = Line2D([], [], color="#555555", markersize=5, **hollow)
-        if table.feasible:
-            _feasible_band(ax, *table.feasible, extremes)
-            explained["feasible"] = Patch(facecolor=FEASIBLE, edgecolor=FEASIBLE_EDGE)
-        if not extremes:
-            ax.text(0.5, 0.5, "no Q-values", transform=ax.transAxes, ha="center", color="#777777")
-    _legend(figure, handles | explained)
-    return figure
+    plots: list[Plot] = []
+    agents: dict[str, str] = {}
+    for table in tables:
+        rows = [row for row in table.rows if any(run.record.has_critic for run in row.runs)]
+        agents |= {cut(row.label): row.agent for row in rows}
+        traces = [trace for row in rows for trace in _q(row, is_crowded(table))]
+        plots.append(_q_plot(_over_steps(table, tables, Q_AXIS, traces), table.feasible))
+    legend = _entries(agents)
+    if any(trace.label == FRESH and trace.x for plot in plots for trace in plot.traces):
+        legend[FRESH] = Look(GREY, "o", "none", size=5, hollow=True)
+    if any(plot.feasible for plot in plots):
+        legend["feasible"] = FEASIBLE
+    return _of_cells("q", "Q-values and their feasible band", tables, plots, legend)
 
 
-def _feasible_band(ax: Axes, low: float, high: float, values: Sequence[float]) -> None:
-    """Shade the feasible band and choose the axis so that both values and bounds can be read."""
-    ax.axhspan(low, high, color=FEASIBLE, alpha=0.6, linewidth=0, zorder=0)
-    for bound in (low, high):
-        ax.axhline(bound, color=FEASIBLE_EDGE, linewidth=0.9, zorder=1)
+def is_crowded(table: Table) -> bool:
+    """Whether it has so many learners that bands and single runs hide more than they show."""
+    return len(table.learners) >= MANY
+
+
+def _q(row: Row, many: bool) -> list[Trace]:
+    """Q of single runs, its mean and that of fresh returns."""
+    name, look = cut(row.label), look_of(row.agent, width=1.7, size=4)
+    runs = [run for run in row.runs if run.record.has_critic]
+    traces = [_single_q(name, run, many and not run.record.nonfinite_q) for run in runs]
+    traces.append(Trace(name, *mean_series(runs, "q_mean"), look))
+    fresh = replace(look, dash="none", hollow=True)
+    return [*traces, Trace(name, *mean_series(runs, "return_mean"), fresh, label=FRESH)]
+
+
+def _single_q(name: str, run: Run, detail: bool = False) -> Trace:
+    lost = bool(run.record.nonfinite_q)
+    label = _run_name(run) + (", Q not finite" if lost else "")
+    cross = 7 if lost or not run.finished else 0
+    thin = Look(look_of(run.agent).color, width=0.8, alpha=0.5)
+    more: dict[str, Any] = {"label": label, "single": True, "detail": detail}
+    return Trace(name, *series(run, "q_mean"), thin, cross=cross, **more)
+
+
+def _q_plot(plot: Plot, feasible: tuple[float, float] | None) -> Plot:
+    """The plot with the feasible band, and an axis on which both it and the values can be read."""
+    plot = replace(plot, feasible=feasible, empty="no Q-values")
+    if feasible is None:
+        return plot
+    # The mean of runs lies between them.
+    values = [y for trace in plot.traces if trace.label for y in trace.y]
+    low, high = feasible
     span = max(high - low, 1e-6)
     bottom, top = min([high, *values]), max([high, *values])
     if top > high + 4 * span or bottom < low - 4 * span:
-        ax.set_yscale("symlog", linthresh=span)
-        return
+        return replace(plot, y=replace(plot.y, scale="symlog", linear_to=span))
     if values and bottom - low > 2 * (top - bottom):
         # The lower bound is so far away that showing it would flatten the curves.
-        corner: dict[str, Any] = {"transform": ax.transAxes, "ha": "right", "va": "bottom"}
-        text = f"feasible down to {low:.4g}"
-        ax.text(0.98, 0.02, text, color=FEASIBLE_TEXT, fontsize=8, **corner)
+        plot = replace(plot, note=f"feasible down to {low:.4g}")
         margin = 0.18 * (top - bottom)
     else:
         bottom = min(bottom, low)
         margin = 0.06 * (top - bottom)
-    ax.set_ylim(bottom - margin, top + margin)
+    return replace(plot, y=replace(plot.y, ends=(bottom - margin, top + margin)))
 
 
-def advantage_map(found: DefectMap, embodiment: str) -> Figure:
-    """Advantage over the standard agent against the audited defect: agents by measures.
-
-    The colour says which part of a decision the defect is of, the marker the task; bars are 95 %
-    intervals, hollow points have few runs. A line per task has the slope within base policies and
-    goes through the task's mean; the fan around it has the slopes of the 95 % interval.
-    """
-    agents = found.agents(embodiment)
-    figure = Figure(figsize=(9.0, 1.4 + 2.75 * len(agents)), layout="constrained")
-    shape = len(agents), len(MEASURES)
-    grid = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
-    panels = [[found.panel(embodiment, a, m) for m in MEASURES] for a in agents]
-    points = [point for row in panels for panel in row for point in panel.points]
-    tasks = sorted({point.table.key.task for point in points})
-    markers = {task: PLACE_MARKERS[i % len(PLACE_MARKERS)] for i, task in enumerate(tasks)}
-    right = 1.04 * max(point.defect.interval.high for point in points)
-    for axes, row in zip(grid, panels, strict=True):
-        for ax, panel in zip(axes, row, strict=True):
-            ax.set_xlim(-0.02 * right, right)
-            _draw_panel(ax, panel, markers)
-            ax.set_title(f"{panel.agent}, {MEASURE_NAMES[panel.measure]}")
-        axes[0].set_ylabel(f"advantage over {STANDARD}")
-    for ax in grid[-1]:
-        ax.set_xlabel(f"audited defect of a decision, {plain(embodiment, 26)}")
-    handles: dict[str, Line2D | Patch] = {
-        plain(task, 26): Line2D([], [], color="#555555", marker=marker, linestyle="none")
-        for task, marker in markers.items()
-    }
-    parts = {point.defect.part for point in points}
-    handles |= {part: Patch(color=color) for part, color in PARTS.items() if part in parts}
-    if any(panel.fit for row in panels for panel in row):
-        handles["within base policies, 95 %"] = Line2D([], [], color=FIT)
-    _legend(figure, handles, columns=4)
-    return figure
+def run_curves(run: Run) -> Figure:
+    """Success of one run, and Q with its feasible band where it has a critic."""
+    name, look = cut(run.agent), look_of(run.agent, width=1.7, size=4)
+    look = replace(look, marker=look.marker or "o")
+    alone: dict[str, Any] = {"look": look, "single": False}
+    steps, share = _steps(run.record.settings.env_steps), Axis("success_once", SHARE)
+    plots = [Plot(steps, share, [replace(_single_success(name, run), **alone)], title="Success")]
+    if run.diagnostics("q_mean"):
+        fresh = replace(look, dash="none", hollow=True)
+        traces = [replace(_single_q(name, run), **alone)]
+        traces.append(Trace(name, *series(run, "return_mean"), fresh, label=FRESH))
+        plots.append(_q_plot(Plot(steps, Q_AXIS, traces, title="Q-values"), run.feasible))
+    return Figure(plots, columns=2, text="Learning curves")
 
 
-def _draw_panel(ax: Axes, panel: Panel, markers: Mapping[str, str]) -> None:
-    ax.axhline(0, color="#333333", linewidth=0.9, zorder=1)
-    if panel.fit:
-        _draw_fit(ax, panel.fit)
-    for point in panel.points:
-        defect, gain = point.defect.interval, point.advantage
-        color = PARTS[point.defect.part]
-        look: dict[str, Any] = {"color": color, "elinewidth": 0.8, "alpha": 0.85, "markersize": 6}
-        look["marker"] = markers[point.table.key.task]
-        look["markerfacecolor"] = color if point.counts else "white"
-        ax.errorbar(defect.value, gain.value, xerr=_arms(defect), yerr=_arms(gain), **look)
-    if not panel.points:
-        ax.text(0.5, 0.5, "no paired runs", transform=ax.transAxes, ha="center", color="#777777")
+def equivariance_errors(table: Table) -> Figure:
+    """Equivariance errors of actors and critics, and of the decoder, on a logarithmic axis."""
+    decoders = [run for run in table.runs if run.record.final]
+    grey = Look(GREY, "o", (0, (5, 1.5, 1, 1.5)), 1.7, 4, hollow=True)
+    measured = {"base policy's decoder": ("equivariance_decode", decoders, grey)}
+    for row in table.rows:
+        if row.runs and not row.is_reference:
+            for part, dash in (("actor", "-"), ("critic", ":")):
+                look = replace(look_of(row.agent, width=1.7, size=4), dash=dash)
+                runs = row.finished or row.runs
+                measured[f"{cut(row.label)}, {part}"] = f"equivariance_{part}", runs, look
+    traces = []
+    for name, (diagnostic, runs, look) in measured.items():
+        points = zip(*mean_series(runs, diagnostic), strict=True)
+        if shown := [(x, y) for x, y in points if y > 0 and math.isfinite(y)]:
+            traces.append(Trace(name, [x for x, _ in shown], [y for _, y in shown], look))
+    axis = Axis("relative equivariance error", scale="log")
+    plot = _over_steps(table, [table], axis, traces)
+    return Figure([plot], text="Relative equivariance error")
 
 
-def _arms(interval: Interval) -> list[list[float]]:
-    """Lengths of the error bar below and above the value, not negative by rounding."""
-    low, high = interval.value - interval.low, interval.high - interval.value
-    return [[max(0.0, low)], [max(0.0, high)]]
+def success_by_direction(table: Table) -> Figure:
+    """Success at the end of the budget by the direction in which an episode has to go."""
+    traces = [
+        _with_band(cut(row.label), curve, look_of(row.agent, width=1.7, size=4))
+        for row in table.rows
+        if row.finished and (curve := direction_curve(row))
+    ]
+    x = Axis("direction (degrees)", (-190, 190), every=45)
+    y = Axis("success at the end of the budget", SHARE)
+    return Figure([Plot(x, y, traces)], text="Success by direction")
 
 
-def _draw_fit(ax: Axes, fit: Fit) -> None:
-    slope = fit.slope.interval()
-    for line in fit.lines:
-        (x, y), ends = line.centre, np.array(line.span)
-        grid = np.array([ends[0], x, ends[1]])
-        heights = [y + s * (grid - x) for s in (slope.value, slope.low, slope.high)]
-        ax.plot(grid, heights[0], color=FIT, linewidth=1.4)
-        low, high = np.minimum(*heights[1:]), np.maximum(*heights[1:])
-        ax.fill_between(grid, low, high, color=FIT, alpha=0.1, linewidth=0)
+def _steps(budget: int) -> Axis:
+    return Axis("environment steps", (-0.02 * budget, 1.02 * budget), in_steps=True)
 
 
-def answer_chart(found: Sequence[Gain]) -> Figure:
-    """Advantage over the standard agent by kind of break, with 95 % intervals; hollow: few runs.
-
-    In brackets stand the smallest and the largest audited defect of a kind's cells.
-    """
-    defects = {gain.kind: gain.defects for gain in found}
-    kinds = list(defects)
-    agents = list(dict.fromkeys(gain.agent for gain in found))
-    figure = Figure(figsize=(9.0, 0.9 + 0.28 * len(kinds)), layout="constrained")
-    axes = figure.subplots(1, len(MEASURES), sharey=True)
-    for ax, measure in zip(axes, MEASURES, strict=True):
-        ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
-        for gain in found:
-            if gain.measure != measure:
-                continue
-            color, marker, _ = style_of(gain.agent)
-            shift = agents.index(gain.agent) - (len(agents) - 1) / 2
-            height = kinds.index(gain.kind) + 0.24 * shift
-            look: dict[str, Any] = {"color": color, "elinewidth": 1.2, "markersize": 5}
-            look |= {"marker": marker, "markerfacecolor": color if gain.enough else "white"}
-            ax.errorbar(gain.effect.value, height, xerr=_arms(gain.effect), **look)
-        ax.set_title(f"advantage over {STANDARD}: {MEASURE_NAMES[measure]}")
-        ax.grid(axis="y", visible=False)
-    labels = [_with_defects(kind, own) for kind, own in defects.items()]
-    axes[0].set_yticks(range(len(kinds)), labels)
-    axes[0].set_ylim(len(kinds) - 0.5, -0.5)
-    _legend(figure, {plain(agent, 26): _entry(agent) for agent in agents})
-    return figure
+def _over_steps(table: Table, tables: Sequence[Table], y: Axis, traces: Sequence[Trace]) -> Plot:
+    x, title = _steps(table.key.env_steps), _title(table, tables)
+    return Plot(x, y, traces, title=title, is_crowded=is_crowded(table))
 
 
-def _with_defects(kind: str, defects: tuple[float, float] | None) -> str:
-    """A kind of break without its marks of code, and the audited defects of its cells."""
-    text = plain(kind.replace("`", ""), 44)
-    return f"{text} ({ends(defects)})" if defects else text
-
-
-def performance_profiles(found: Comparisons) -> Figure:
-    """Share of runs that close at least a share of the gap to certain success, with 95 % bands."""
-    groups = [group for group, profiles in found.profiles.items() if profiles]
-    figure, axes = _side_by_side(groups, found.cells, 3.3)
-    handles: dict[str, Line2D | Patch] = {}
-    for ax, group in zip(axes, groups, strict=True):
-        ax.axvline(0, color="#333333", linewidth=0.9, zorder=1)
-        learners = sum(profile.role != "reference" for profile in found.profiles[group])
-        for profile in found.profiles[group]:
-            color, _, line = style_of(profile.agent)
-            if profile.role != "reference" and learners < MANY:
-                band: dict[str, Any] = {"color": color, "alpha": 0.13, "linewidth": 0}
-                ax.fill_between(THRESHOLDS, profile.low, profile.high, **band)
-            ax.plot(THRESHOLDS, profile.share, color=color, linestyle=line, linewidth=1.7)
-            if profile.cells < found.cells[group]:
-                ax.plot([], [], " ", label=f"{plain(profile.agent)}: {_coverage(profile.cells)}")
-            handles.setdefault(
-                plain(profile.agent), Line2D([], [], color=color, linestyle=line, linewidth=1.7)
-            )
-        if ax.get_legend_handles_labels()[1]:
-            ax.legend(loc="lower left", fontsize=7.5, frameon=False, handlelength=0)
-        ax.set_xlim(_start(found.profiles[group]), THRESHOLDS[-1])
-        ax.set_ylim(-0.02, 1.02)
-        ax.set_xlabel("share of the gap from the base to certain success")
-    axes[0].set_ylabel("share of runs at or above")
-    _legend(figure, handles)
-    return figure
-
-
-def _start(profiles: Sequence[Profile]) -> float:
-    """Left end of the axis: a little left of 0, or of the largest share that all runs reach."""
-    all_in = np.min([profile.share for profile in profiles], axis=0) == 1
-    return float(min(THRESHOLDS[all_in].max(initial=THRESHOLDS[0]), 0.0) - 0.03)
-
-
-def _coverage(cells: int) -> str:
-    return f"{cells} cell{'s' if cells > 1 else ''} only"
-
-
-def improvement_chart(found: Comparisons) -> Figure:
-    """P(X > Y) of every pair of learning agents with its 95 % interval; 0.5 is no difference."""
-    groups = [group for group, pairs in found.improvements.items() if pairs]
-    rows = list(dict.fromkeys((p.first, p.second) for g in groups for p in found.improvements[g]))
-    figure, axes = _side_by_side(groups, found.cells, 1.1 + 0.3 * len(rows))
-    for ax, group in zip(axes, groups, strict=True):
-        ax.axvline(0.5, color="#333333", linewidth=0.9, zorder=1)
-        for pair in found.improvements[group]:
-            height, p = rows.index((pair.first, pair.second)), pair.probability
-            color = style_of(pair.first)[0]
-            bar: dict[str, Any] = {"linewidth": 6, "alpha": 0.35, "solid_capstyle": "butt"}
-            ax.plot([p.low, p.high], [height] * 2, color=color, **bar)
-            ax.plot(p.value, height, "o", color=color, markersize=5, clip_on=False)
-            if pair.cells < found.cells[group]:
-                beside: dict[str, Any] = {"ha": "left", "va": "bottom", "fontsize": 7.5}
-                ax.text(0.0, height - 0.1, _coverage(pair.cells), color="#555555", **beside)
-        ax.set_xlim(-0.02, 1.02)
-        ax.set_xlabel("P(X > Y)")
-    axes[0].set_yticks(range(len(rows)), [f"{plain(x, 24)} > {plain(y, 24)}" for x, y in rows])
-    axes[0].set_ylim(len(rows) - 0.5, -0.5)
-    return figure
-
-
-def _side_by_side(
-    groups: Sequence[str], cells: Mapping[str, int], height: float
-) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(9.0 if len(groups) > 1 else 5.6, height), layout="constrained")
-    axes = list(figure.subplots(1, len(groups), squeeze=False, sharey=True).flat)
-    for ax, group in zip(axes, groups, strict=True):
-        plural = "s" if cells[group] > 1 else ""
-        ax.set_title(f"{group} symmetry, {cells[group]} cell{plural}")
-    return figure, axes
-
-
-def _panels(tables: Sequence[Table], ylabel: str) -> tuple[Figure, list[Axes]]:
-    columns = min(COLUMNS, len(tables))
-    rows = -(-len(tables) // columns)
-    width = 9.0 if columns > 1 else 5.6
-    figure = Figure(figsize=(width, 0.75 + 2.75 * rows), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=ylabel.startswith("success"))
-    flat = list(grid.flat)
-    for ax in flat[len(tables) :]:
-        ax.set_visible(False)
-    for index, (ax, table) in enumerate(zip(flat, tables, strict=False)):
-        key = table.key
-        ax.set_title(_title(table, tables))
-        ax.set_xlim(-0.02 * key.env_steps, 1.02 * key.env_steps)
-        ax.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-        ax.xaxis.set_major_formatter(FuncFormatter(_thousands))
-        ax.set_xlabel("environment steps")
-        if index % columns == 0:
-            ax.set_ylabel(ylabel)
-    key = tables[0].key
-    figure.suptitle(plain(f"{key.task}, {key.embodiment}"), fontsize=11, fontweight="bold")
-    return figure, flat[: len(tables)]
+def _of_cells(
+    kind: str,
+    text: str,
+    tables: Sequence[Table],
+    plots: Sequence[Plot],
+    legend: Mapping[str, Look],
+    same_y: bool = False,
+) -> Figure:
+    """The plots of the cells of a task and embodiment."""
+    place, columns = (tables[0].key.task, tables[0].key.embodiment), min(COLUMNS, len(tables))
+    height = 0.75 + 2.75 * -(-len(plots) // columns)
+    more: dict[str, Any] = {"columns": columns, "same_y": same_y, "kind": kind, "text": text}
+    return Figure(plots, legend, cut(", ".join(place)), height, place=place, **more)
 
 
 def _title(table: Table, tables: Sequence[Table]) -> str:
@@ -482,41 +336,192 @@ def _title(table: Table, tables: Sequence[Table]) -> str:
         # Lines break between the parts, not within them.
         text = ", ".join(word.replace(" ", SPACE) for word in words)
         lines += wrap(text, TITLE_WIDTH, max_lines=3, placeholder="...")
-    return "\n".join(plain(line) for line in lines)
+    return "\n".join(lines)
 
 
-def _legend(figure: Figure, handles: Mapping[str, Line2D | Patch], columns: int = 7) -> None:
-    """Entries below the panels, in as many columns as fit."""
-    if not handles:
-        return
-    names, room = list(handles), WIDEST * figure.get_figwidth()
-    columns = min(columns, len(names))
-    while columns > 1 and _legend_width(names, columns) > room:
-        columns -= 1
-    figure.legend(
-        list(handles.values()), names, loc="outside lower center", ncols=columns, frameon=False
+def advantage_map(found: DefectMap, embodiment: str) -> Figure:
+    """Advantage over the standard agent against the audited defect: agents by measures.
+
+    The colour says which part of a decision the defect is of, the marker the task; bars are 95 %
+    intervals, hollow points have few runs. A line per task has the slope within base policies and
+    goes through the task's mean; the fan around it has the slopes of the 95 % interval.
+    """
+    agents = found.agents(embodiment)
+    panels = [found.panel(embodiment, a, m) for a in agents for m in MEASURES]
+    points = [point for panel in panels for point in panel.points]
+    tasks = sorted({point.table.key.task for point in points})
+    markers = {task: MARKERS[i % len(MARKERS)] for i, task in enumerate(tasks)}
+    right = 1.04 * max(point.defect.interval.high for point in points)
+    x = Axis(f"audited defect of a decision, {cut(embodiment, 26)}", (-0.02 * right, right))
+    y, zero = Axis(f"advantage over {STANDARD}"), [Rule(0)]
+    plots = []
+    for panel in panels:
+        traces = _fit(panel.fit) if panel.fit else []
+        dots = [_point(point, markers) for point in panel.points]
+        title = f"{panel.agent}, {MEASURE_NAMES[panel.measure]}"
+        plots.append(Plot(x, y, traces, dots, zero, title, empty="no paired runs"))
+    legend = {cut(task): Look(GREY, marker, "none") for task, marker in markers.items()}
+    parts = {point.defect.part for point in points}
+    legend |= {part: Look(c, edge=c) for part, c in PARTS.items() if part in parts}
+    if any(panel.fit for panel in panels):
+        legend[WITHIN] = Look(FIT)
+    return Figure(
+        plots,
+        legend,
+        height=1.4 + 2.75 * len(agents),
+        columns=len(MEASURES),
+        same_x=True,
+        same_y=True,
+        legend_columns=4,
+        kind="map",
+        place=(embodiment,),
+        text="Advantage of symmetry against the audited defect",
     )
 
 
-def _legend_width(names: Sequence[str], columns: int) -> int:
-    """In characters; matplotlib fills column after column, the first ones with one entry more."""
-    parts = np.array_split([len(name) for name in names], columns)
-    return sum(int(part.max()) + HANDLE for part in parts)
+def _point(point: Point, markers: Mapping[str, str]) -> Dot:
+    key, part, gain = point.table.key, point.defect.part, point.advantage
+    look = Look(PARTS[part], markers[key.task], width=0.8, alpha=0.85, hollow=not point.counts)
+    text = (
+        f"{', '.join(key.broken_by) or 'unbroken'}, {key.base} {key.group}; {part}; advantage "
+        f"{interval(gain, sign=True)}{MARKS[gain.sign]}; {len(point.pairs)} pairs of runs"
+    )
+    return Dot(cut(key.task), point.defect.interval, gain, look, text)
 
 
-def style_of(agent: str) -> Style:
-    """Colour, marker and line style of an agent, the same in every figure."""
-    return STYLES.get(agent) or OTHERS[sum(map(ord, agent)) % len(OTHERS)]
+def _fit(fit: Fit) -> list[Trace]:
+    slope, traces = fit.slope.interval(), []
+    for line in fit.lines:
+        x, y = line.centre
+        grid = np.array([line.span[0], x, line.span[1]])
+        middle, *fan = (y + s * (grid - x) for s in (slope.value, slope.low, slope.high))
+        low, high = np.minimum(*fan), np.maximum(*fan)
+        traces.append(Trace(WITHIN, grid, middle, Look(FIT, width=1.4), low, high, band=0.1))
+    return traces
 
 
-def _thousands(value: float, _position: int | None = None) -> str:
-    if abs(value) >= 1e6:
-        return f"{value / 1e6:g}M"
-    return f"{value / 1e3:g}k" if abs(value) >= 1e3 else f"{value:g}"
+def gained(found: Sequence[Gain]) -> Figure:
+    """Advantage over the standard agent by kind of break, with 95 % intervals; hollow: few runs.
+
+    In brackets stand the smallest and the largest audited defect of a kind's cells.
+    """
+    agents = list(dict.fromkeys(gain.agent for gain in found))
+    defects = {gain.kind: gain.defects for gain in found}
+    kinds = list(defects)
+    columns: dict[str, list[Dot]] = {name: [] for name in MEASURE_NAMES.values()}
+    for gain in found:
+        shift = agents.index(gain.agent) - (len(agents) - 1) / 2
+        look = look_of(gain.agent, width=1.2, size=5, hollow=not gain.enough)
+        text = f"{gain.cells} cells, {gain.pairs} pairs of runs"
+        dot = Dot(gain.agent, gain.effect, kinds.index(gain.kind) + 0.24 * shift, look, text)
+        columns[MEASURE_NAMES[gain.measure]].append(dot)
+    columns = {f"advantage over {STANDARD}: {name}": dots for name, dots in columns.items()}
+    # A kind's marks of code are for markdown.
+    names = [cut(kind.replace("`", ""), 44) for kind in kinds]
+    brackets = [f" ({ends(between)})" if between else "" for between in defects.values()]
+    labels = [name + bracket for name, bracket in zip(names, brackets, strict=True)]
+    more: dict[str, Any] = {"kind": "answer", "height": 0.9 + 0.28 * len(kinds)}
+    more["text"] = "Advantage of symmetry over the standard agent, by kind of break"
+    more["legend"] = {agent: look_of(agent) for agent in agents}
+    return by_rows(labels, columns, Axis(), [Rule(0, is_vertical=True)], grid=False, **more)
 
 
-def plain(text: str, limit: int = 40) -> str:
-    """Text for a figure: printable ASCII, no `$` (matplotlib would read it as mathematics)."""
-    text = text.replace(SPACE, " ")
-    clean = "".join(c if c.isascii() and c.isprintable() and c != "$" else "?" for c in text)
-    return clean if len(clean) <= limit else clean[: limit - 3] + "..."
+def by_rows(
+    labels: Sequence[str],
+    columns: Mapping[str, Sequence[Dot]],
+    x: Axis,
+    rules: Sequence[Rule] = (),
+    grid: bool = True,
+    **more: Any,
+) -> Figure:
+    """Intervals in named rows, from top to bottom; plots by their titles stand side by side."""
+    y = Axis(labels=labels, grid=grid)
+    plots = [Plot(x, y, [], dots, rules, title) for title, dots in columns.items()]
+    return Figure(plots, columns=len(plots), same_y=True, **more)
+
+
+def performance_profiles(found: Comparisons) -> Figure:
+    """Share of runs that close at least a share of the gap to certain success, with 95 % bands."""
+    title, legend, plots = "share of the gap from the base to certain success", {}, []
+    for group, profiles in found.profiles.items():
+        traces = []
+        for profile in profiles:
+            name, is_reference = cut(profile.agent), profile.role == "reference"
+            legend[name] = replace(look_of(profile.agent, width=1.7), marker="")
+            some = profile.cells < found.cells[group]
+            remark = f"{_cells(profile.cells)} only" if some else ""
+            band = () if is_reference else (profile.low, profile.high, 0.13)
+            trace = Trace(name, THRESHOLDS, profile.share, legend[name], *band)
+            traces.append(replace(trace, remark=remark))
+        if traces:
+            x, y = Axis(title, _from_start(profiles)), Axis("share of runs at or above", SHARE)
+            plot = Plot(x, y, traces, [], [Rule(0, is_vertical=True)], _group(group, found))
+            plots.append(replace(plot, is_crowded=sum(bool(t.band) for t in traces) >= MANY))
+    named: dict[str, Any] = {"kind": "profiles", "text": "Performance profiles"}
+    return Figure(plots, legend, height=3.3, columns=len(plots), same_y=True, **named)
+
+
+def _from_start(profiles: Sequence[Profile]) -> tuple[float, float]:
+    """From a little left of 0, or of the largest share that all runs reach."""
+    all_in = np.min([profile.share for profile in profiles], axis=0) == 1
+    start = min(THRESHOLDS[all_in].max(initial=THRESHOLDS[0]), 0.0)
+    return float(start - 0.03), float(THRESHOLDS[-1])
+
+
+def _cells(number: int) -> str:
+    return f"{number} cell{'s' if number > 1 else ''}"
+
+
+def _group(group: str, found: Comparisons) -> str:
+    return f"{group} symmetry, {_cells(found.cells[group])}"
+
+
+def improvement(found: Comparisons) -> Figure:
+    """P(X > Y) of every pair of learning agents with its 95 % interval; 0.5 is no difference."""
+    every = [pair for pairs in found.improvements.values() for pair in pairs]
+    names = list(dict.fromkeys((pair.first, pair.second) for pair in every))
+    columns: dict[str, list[Dot]] = {}
+    for group, pairs in found.improvements.items():
+        for pair in pairs:
+            remark = f"{_cells(pair.cells)} only" if pair.cells < found.cells[group] else ""
+            look = Look(look_of(pair.first).color, "o", size=5)
+            place = names.index((pair.first, pair.second))
+            dot = Dot("", pair.probability, place, look, remark=remark, thick=True)
+            columns.setdefault(_group(group, found), []).append(dot)
+    labels = [f"{cut(first, 24)} > {cut(second, 24)}" for first, second in names]
+    more: dict[str, Any] = {"kind": "improvement", "text": "Probability of improvement"}
+    rules, height = [Rule(0.5, is_vertical=True)], 1.1 + 0.3 * len(names)
+    return by_rows(labels, columns, Axis("P(X > Y)", SHARE), rules, height=height, **more)
+
+
+def standing(rows: Mapping[str, tuple[Row, Row | None]]) -> Figure:
+    """Success of an agent in each cell, by its name, beside that of the best reference."""
+    dots = []
+    for index, (own, reference) in enumerate(rows.values()):
+        best = Look(GREY, "D", "none", width=0.8, hollow=True)
+        look = replace(look_of(own.agent, width=1.7), dash="none")
+        if own.success:
+            dots.append(Dot(cut(own.agent), own.success, index, look))
+        if reference and reference.success:
+            dots.append(Dot("best reference", reference.success, index + 0.2, best))
+    labels, axis = [cut(name, 60) for name in rows], Axis("success in the final window", SHARE)
+    return by_rows(labels, {"": dots}, axis, text="Success in each cell")
+
+
+def audited_defects(cells: Sequence[tuple[str, str, str, float, Defect]]) -> Figure:
+    """Defect of a decision over the strength of one variant, with 95 % bands.
+
+    Args:
+        cells: task, embodiment, group, strength and defect, by rising strength; strength 0 is the
+            unbroken task.
+    """
+    traces = []
+    for index, place in enumerate(sorted({cell[:3] for cell in cells})):
+        found = [(strength, d.interval) for *at, strength, d in cells if tuple(at) == place]
+        ends = [[d.value for _, d in found], [d.low for _, d in found], [d.high for _, d in found]]
+        color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
+        look = Look(color, marker, width=1.7, size=4)
+        curve = Curve([strength for strength, _ in found], *ends)
+        traces.append(_with_band(cut(", ".join(place)), curve, look))
+    x, y = Axis("strength", (-0.04, 1.04)), Axis("audited defect of a decision")
+    return Figure([Plot(x, y, traces)], text="Defect of a decision over the strength")

@@ -13,13 +13,14 @@ from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.claims_page import PAPER_TITLE, paper_page
 from symsteer.leaderboard.defects import Audit, read_audit
-from symsteer.leaderboard.figures import render_figures, to_svg
+from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.listing import render_records
 from symsteer.leaderboard.page import render_page
 from symsteer.leaderboard.paths import reproductions_for
 from symsteer.leaderboard.study import PAPER, Study, read_study
 from symsteer.leaderboard.summary import Run, load_runs, summarize
+from symsteer.leaderboard.svg import to_svg
 from symsteer.leaderboard.tables import render_csv
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
@@ -98,7 +99,7 @@ def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[s
     for drawing in render_figures(summary, findings):
         stem = "-".join([drawing.kind, *([slug(*drawing.place)] if drawing.place else [])])
         name = f"figures/{stem}.svg"
-        files[name] = to_svg(drawing.figure)
+        files[name] = to_svg(drawing)
         shown.setdefault(drawing.place, {})[drawing.kind] = (drawing.text, name)
     links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
     files["records.csv"] = render_records(summary, links).encode()

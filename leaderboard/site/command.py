@@ -44,8 +44,9 @@ def site(
     from symsteer.leaderboard.study import PAPER
 
     study = study or (PAPER if records else STUDY)
-    written = generate(paths, out, study, audit, docs, reproductions)
-    print(printable(f"wrote {written.index}: {written.pages} pages of {written.records} records"))
-    if docs and not written.docs:
+    results = generate(paths, out, study, audit, docs, reproductions)
+    index = out.resolve() / "index.html"
+    print(printable(f"wrote {index}: the pages of {len(results.runs)} records"))
+    if docs and not results.docs.is_built:
         print("without the documentation, which only a checkout of the repository has")
     return 0

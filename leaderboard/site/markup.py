@@ -1,18 +1,18 @@
 """Templates, and markdown as HTML: nothing that a record or a file name brings becomes markup.
 
 Templates escape every value. Markdown comes from the leaderboard's own page, where text of records
-stands in code spans alone, from a study's notice and from the documentation; HTML in it is escaped.
+stands in code spans alone, and from a study's notice; HTML in it is escaped.
 """
 
 from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from symsteer.leaderboard.site.charts import numbers
+from symsteer.leaderboard.site.charts import Chart, numbers
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -28,8 +28,11 @@ TEMPLATES = Path(__file__).resolve().parent / "templates"
 SPACES = "\n\t\u00a0\u202f"
 """Characters that are not printable in Python's sense, and do no harm."""
 
-FOLDED = re.compile(r"<details>\n<summary>(.*?)</summary>\n\n(.*)\n\n</details>", re.DOTALL)
-"""A block of the leaderboard's page that is folded."""
+FOLDED = re.compile(r"<details>\n<summary>(.*?)</summary>")
+"""The beginning of what a reader of the leaderboard's page unfolds."""
+
+IMAGE = re.compile(r"!\[[^\]]*\]\(([^)]+)\)")
+"""A figure of the leaderboard's page."""
 
 
 def shown(value: Any) -> Any:
@@ -59,36 +62,33 @@ def environment() -> Environment:
     return found
 
 
-def html(blocks: str | Sequence[str], link: Link = lambda href: None) -> Markup:
-    """Blocks of markdown as HTML; tables scroll within their box.
+def html(
+    blocks: Sequence[str],
+    link: Link = lambda href: None,
+    charts: Mapping[str, Sequence[Chart]] | None = None,
+) -> Markup:
+    """Blocks of the leaderboard's page as HTML; tables scroll within their box.
 
     Args:
-        blocks: as the leaderboard's page has them.
-        link: where relative links lead; by default they are shown as text.
+        blocks: markdown.
+        link: where links lead; by default they are shown as text.
+        charts: what stands in the place of figures, by their address.
     """
     from markupsafe import Markup, escape
 
-    parts = []
-    for block in [blocks] if isinstance(blocks, str) else blocks:
-        if folded := FOLDED.fullmatch(block):
-            inside = html(folded[2], link)
-            parts.append(f"<details><summary>{escape(folded[1])}</summary>{inside}</details>")
+    parts: list[str] = []
+    for block in "\n\n".join(blocks).split("\n\n"):
+        image = IMAGE.fullmatch(block)
+        if begun := FOLDED.fullmatch(block):
+            parts.append(f"<details><summary>{escape(begun[1])}</summary>")
+        elif block == "</details>":
+            parts.append(block)
+        elif image and charts and image[1] in charts:
+            template: Any = environment().get_template("macros.html").module
+            parts.append(template.charts(charts[image[1]]))
         else:
-            tokens = _parser().parse(block)
-            for token in tokens:
-                if token.children:
-                    token.children = _linked(token.children, link)
-            parts.append(_parser().renderer.render(tokens, _parser().options, {}))
+            parts.append(_parser().render(block, {"link": link, "open": []}))
     return Markup("\n".join(parts))
-
-
-def inline(text: str, link: Link = lambda href: None) -> Markup:
-    """One line of markdown, such as a cell of a table."""
-    from markupsafe import Markup
-
-    (token,) = _parser().parseInline(text)
-    token.children = _linked(token.children or [], link)
-    return Markup(_parser().renderer.render([token], _parser().options, {}))
 
 
 @functools.cache
@@ -102,27 +102,14 @@ def _parser() -> MarkdownIt:
         # The page's tables break lines within cells. Text of records is in code spans, not here.
         return escapeHtml(tokens[index].content).replace("&lt;br&gt;", "<br>")
 
-    def table(tokens: Sequence[Token], index: int, *_: Any) -> str:
-        return '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>'
+    def link_open(tokens: Sequence[Token], index: int, _: Any, state: dict[str, Any]) -> str:
+        target = state["link"](str(tokens[index].attrs["href"]))
+        state["open"].append(target)
+        return f'<a href="{escapeHtml(target)}">' if target else ""
 
     rules: dict[str, Any] = parser.renderer.rules  # type: ignore[attr-defined, assignment]
-    rules["text"] = text
-    rules["table_open"] = table
-    rules["table_close"] = lambda *_: "</table></div>"
+    box = '<div class="scroll" tabindex="0" role="region" aria-label="Table"><table>'
+    rules |= {"text": text, "link_open": link_open, "image": lambda *_: ""}
+    rules |= {"table_open": lambda *_: box, "table_close": lambda *_: "</table></div>"}
+    rules["link_close"] = lambda *given: "</a>" if given[3]["open"].pop() else ""
     return parser
-
-
-def _linked(tokens: Sequence[Token], link: Link) -> list[Token]:
-    """Tokens with the addresses of their links; those without one lose their link."""
-    found, open_links = [], []
-    for token in tokens:
-        if token.type == "link_open":
-            target = link(str(token.attrs["href"]))
-            open_links.append(target)
-            if target is None:
-                continue
-            token.attrs["href"] = target
-        elif (token.type == "link_close" and open_links.pop() is None) or token.type == "image":
-            continue
-        found.append(token)
-    return found

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from statistics import mean
 from typing import Any
 
+from symsteer.leaderboard.figures import run_curves
 from symsteer.leaderboard.records import REPRODUCED, Evaluation, repeat_command
-from symsteer.leaderboard.site import charts
-from symsteer.leaderboard.site.board import Board, dials
-from symsteer.leaderboard.site.clips import media
+from symsteer.leaderboard.site.charts import charts, episodes, grouped
+from symsteer.leaderboard.site.media import films_of
 from symsteer.leaderboard.site.pages import options_of
+from symsteer.leaderboard.site.results import Results
 from symsteer.leaderboard.summary import Run
 from symsteer.leaderboard.text import compact, count, number
 
 
-def run_values(board: Board, run: Run) -> dict[str, Any]:
+def run_values(results: Results, run: Run) -> dict[str, Any]:
     """The values of the template."""
-    record, where = run.record, board.row_of.get(run.path)
-    settings, policy = record.settings, record.base_policy
+    record, where = run.record, results.row_of.get(run.path)
+    settings, policy, budget = record.settings, record.base_policy, record.budget
     table, row = where or (None, None)
     provenance, again = record.provenance, run.reproduction
-    commit = provenance.commit and provenance.commit + (" with changes" * bool(provenance.dirty))
+    sizes = record.parameters
     facts = {
         "status": record.status,
         "failure": record.failure,
@@ -28,11 +31,10 @@ def run_values(board: Board, run: Run) -> dict[str, Any]:
         "success, final window": number(run.success) if run.finished else None,
         "success, last checkpoint": number(record.final.success_once) if record.final else None,
         "Q diverged": None if run.diverged is None else ("yes" if run.diverged else "no"),
-        "environment steps": f"{count(record.budget.env_steps)} of {count(settings.env_steps)}",
-        "decisions, updates": f"{count(record.budget.decisions)}, {count(record.budget.updates)}",
-        "parameters (actor, critics)": f"{count(record.parameters.actor)}, "
-        f"{count(record.parameters.critic)}"
-        if record.parameters.total
+        "environment steps": f"{count(budget.env_steps)} of {count(settings.env_steps)}",
+        "decisions, updates": f"{count(budget.decisions)}, {count(budget.updates)}",
+        "parameters (actor, critics)": f"{count(sizes.actor)}, {count(sizes.critic)}"
+        if sizes.total
         else None,
         "started": f"{record.started:%Y-%m-%d %H:%M} UTC",
         "minutes": number(record.wall_clock.total / 60, 1),
@@ -43,7 +45,8 @@ def run_values(board: Board, run: Run) -> dict[str, Any]:
         "warning": policy.warning,
     }
     made = {
-        "commit": commit,
+        "commit": provenance.commit
+        and provenance.commit + " with changes" * bool(provenance.dirty),
         "version": provenance.version,
         "sha256 of the code": provenance.sha256,
         "device": provenance.device,
@@ -57,57 +60,52 @@ def run_values(board: Board, run: Run) -> dict[str, Any]:
         "configuration": record.config_hash,
     }
     command = repeat_command(record.config)
+    last = record.evaluations[-1] if record.evaluations else None
+    known = run.agent in results.summary.roles
     return {
         "name": record.run_id,
-        "agent": run.agent,
-        "agent_page": f"../{board.agent(run.agent)}" if run.agent in board.summary.roles else None,
+        "agent_page": results.agent(run.agent) if known else None,
         "label": row.label if row else run.agent,
         "role": record.role,
-        "cell": table and (board.names[table.key], f"../{board.cell(table.key)}"),
-        "dials": [(name, f"../{board.variant(name)}") for name in dials(settings.variant)]
-        if table
-        else [],
+        "cell": table and (results.names[table.key], results.cell(table.key)),
         "facts": {key: text for key, text in facts.items() if text},
         "made": {key: text for key, text in made.items() if text},
         "command": command and re.split(" (?=--)", command),
         "config": options_of(record.config),
-        "charts": charts.run_charts(record, run, run.feasible) if run.curve else [],
-        "episodes": charts.episodes_chart(run) if run.curve else None,
+        "charts": charts(run_curves(run)) if run.curve else [],
+        "episodes": [episodes(run)] if run.curve else [],
         "evaluations": [_evaluation(evaluation) for evaluation in run.curve.values()],
-        "last": _episodes(record.evaluations[-1]) if record.evaluations else [],
+        "last": _episodes(last) if last else [],
         "diagnostics": [
             (name, compact(value))
-            for name, value in sorted(record.evaluations[-1].diagnostics.items())
+            for name, value in sorted(last.diagnostics.items() if last else ())
             if value is not None
-        ]
-        if record.evaluations
-        else [],
-        "media": [(f"../{address}", kind, name) for address, kind, name, _ in media(run)],
+        ],
+        "films": films_of(run),
     }
-
-
-def _mean(values: list[Any]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
 
 
 def _evaluation(evaluation: Evaluation) -> list[str]:
     """A row of the table of evaluations."""
-    episodes, diagnostics = evaluation.episodes, evaluation.diagnostics
+    columns, diagnostics = evaluation.episodes, evaluation.diagnostics
     bias = diagnostics.get("q_bias", diagnostics.get("q_bias_successful"))
+    names = ("td_error", "equivariance_actor", "equivariance_critic")
     return [
-        f"{evaluation.env_steps:,}".replace(",", "\u202f"),
-        str(len(episodes.seed)),
+        grouped(evaluation.env_steps),
+        str(len(columns.seed)),
         number(evaluation.success_once),
-        number(_mean(list(episodes.success_at_end))),
-        number(_mean(list(episodes.return_)), 1),
-        number(_mean(list(episodes.episode_len)), 1),
+        number(_mean(columns.success_at_end)),
+        number(_mean(columns.return_), 1),
+        number(_mean(columns.episode_len), 1),
         compact(diagnostics.get("q_mean")),
         compact(bias),
-        compact(diagnostics.get("td_error")),
-        compact(diagnostics.get("equivariance_actor")),
-        compact(diagnostics.get("equivariance_critic")),
+        *(compact(diagnostics.get(name)) for name in names),
     ]
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return mean(known) if known else None
 
 
 def _episodes(evaluation: Evaluation) -> list[list[str]]:

@@ -1,4 +1,4 @@
-"""Figures that stay readable with many agents."""
+"""Figures that stay readable with many agents, and what describes them."""
 
 from __future__ import annotations
 
@@ -9,46 +9,44 @@ import pytest
 from matplotlib import style as mpl_style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import FillBetweenPolyCollection
+from matplotlib.figure import Figure
 
 from symsteer.agents import AGENTS
-from symsteer.leaderboard.figures import MANY, SHEETS, STYLES, learning_curves
-from symsteer.leaderboard.site.charts import look
+from symsteer.leaderboard.figures import MANY, STYLES, learning_curves
+from symsteer.leaderboard.plots import cut
 from symsteer.leaderboard.summary import Run, Table, summarize
+from symsteer.leaderboard.svg import SHEETS, draw, plain
 from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 
 LEARNERS = [name for name in AGENTS.names() if AGENTS.get(name).role != "reference"]
 
 
-def table_of(agents: list[str]) -> Table:
-    records = [
-        make_record(
-            [make_evaluation([1, 0] * 20, step) for step in (0, 500, 1000)], agent=a, seed=s
-        )
-        for a in agents
-        for s in range(5)
-    ]
-    return summarize([Run(Path(f"{i}.json"), record) for i, record in enumerate(records)]).tables[0]
+def drawn(tables: list[Table]) -> Figure:
+    with mpl_style.context(SHEETS):
+        figure = draw(learning_curves(tables))
+        FigureCanvasAgg(figure).draw()
+    return figure
 
 
 def test_every_agent_has_a_look_of_its_own() -> None:
     assert set(AGENTS.names()) <= set(STYLES)
     assert len({(color, line) for color, _, line in STYLES.values()}) == len(STYLES)
-    assert all(look(agent)["color"] for agent in STYLES)
 
 
 @pytest.mark.parametrize("number", [3, MANY, len(LEARNERS)])
-def test_the_legend_fits_and_bands_are_left_out_of_crowded_panels(number: int) -> None:
-    figure = learning_curves([table_of(LEARNERS[:number])])
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    box = figure.legends[0].get_window_extent(canvas.get_renderer())
+def test_the_legend_fits_and_bands_are_left_out_of_crowded_plots(number: int) -> None:
+    curve = [make_evaluation([1, 0] * 20, step) for step in (0, 500, 1000)]
+    records = [make_record(curve, agent=a, seed=s) for a in LEARNERS[:number] for s in range(5)]
+    runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(records)]
+    figure = drawn(summarize(runs).tables)
+    box = figure.legends[0].get_window_extent()
     assert box.x0 >= 0
     assert box.x1 <= figure.bbox.x1
     bands = [c for c in figure.axes[0].collections if isinstance(c, FillBetweenPolyCollection)]
     assert len(bands) == (number if number < MANY else 0)
 
 
-def test_titles_of_panels_say_how_they_differ_and_fit_beside_each_other() -> None:
+def test_titles_of_plots_say_how_they_differ_and_fit_beside_each_other() -> None:
     few = {"mode": "diverse", "count": 5, "seed": 0}
     rates = {"standard": 0.5, "equivariant": 0.5}
     records = make_cell(rates, 1, demonstrations=few) + make_cell(rates, 1)
@@ -56,24 +54,24 @@ def test_titles_of_panels_say_how_they_differ_and_fit_beside_each_other() -> Non
     for tau, utd, norm in itertools.product((0.005, 0.05), (1.0, 4.0), (False, True)):
         options = {"tau": tau, "utd": utd, "layer_norm": norm, "target_entropy": 0.5}
         records += make_cell(rates, 1, variant="wind:1", agent_options=options)
-    runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(records)]
-    for variant, titles in (
-        (
-            "none",
-            [
-                "unbroken, 5 demonstrations",
-                "unbroken, 50 demonstrations,\n50 k steps",
-                "unbroken, 50 demonstrations,\n500 k steps",
-            ],
-        ),
-        ("wind:1", ["wind:1\nlayer_norm false, tau 0.005, utd 1.0"]),
-    ):
-        own = [run for run in runs if run.record.settings.variant == variant]
-        with mpl_style.context(SHEETS):
-            figure = learning_curves(summarize(own).tables)
-            canvas = FigureCanvasAgg(figure)
-            canvas.draw()
-        shown = [ax.title for ax in figure.axes if ax.get_visible()]
-        assert [title.get_text() for title in shown][: len(titles)] == titles
-        boxes = [title.get_window_extent(canvas.get_renderer()) for title in shown[:3]]
+    titles = {
+        "none": [
+            "unbroken, 5 demonstrations",
+            "unbroken, 50 demonstrations,\n50 k steps",
+            "unbroken, 50 demonstrations,\n500 k steps",
+        ],
+        "wind:1": ["wind:1\nlayer_norm false, tau 0.005, utd 1.0"],
+    }
+    for variant, expected in titles.items():
+        own = [record for record in records if record.settings.variant == variant]
+        runs = [Run(Path(f"{i}.json"), record) for i, record in enumerate(own)]
+        shown = [ax.title for ax in drawn(summarize(runs).tables).axes if ax.get_visible()]
+        assert [title.get_text() for title in shown][: len(expected)] == expected
+        boxes = [title.get_window_extent() for title in shown[:3]]
         assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
+
+
+def test_names_of_any_kind_are_drawn_as_text() -> None:
+    """matplotlib would read mathematics between dollars, and has no glyphs for everything."""
+    assert cut("a\n\x00b" + "c" * 60) == "a b" + "c" * 34 + "..."
+    assert plain("$x$ \u00a0\u202e") == "?x?  ?"

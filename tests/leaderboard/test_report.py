@@ -14,12 +14,10 @@ import pytest
 
 from symsteer.files import csv_text
 from symsteer.leaderboard import command, paths
-from symsteer.leaderboard.figures import render_figures
-from symsteer.leaderboard.findings import analyse
+from symsteer.leaderboard.figures import q_values
 from symsteer.leaderboard.paths import RECORDS
 from symsteer.leaderboard.records import read_record, write_record
 from symsteer.leaderboard.report import generate, slug
-from symsteer.leaderboard.study import PAPER, read_study
 from symsteer.leaderboard.summary import Run, summarize
 from symsteer.leaderboard.text import code, compact, count, number, relative_link
 from tests.leaderboard.command_line import main
@@ -419,13 +417,8 @@ def test_a_cross_marks_a_q_that_is_not_finite_and_no_missing_bias() -> None:
         curve = [make_evaluation([1, 0], 25_000, False, q_mean=-5.0, q_max=-4.0)]
         curve.append(make_evaluation([1, 0], 50_000, q_mean=-5.0, **diagnostics))
         summary = summarize([Run(Path("a.json"), make_record(curve))])
-        (drawing,) = (
-            d
-            for d in render_figures(summary, analyse(summary, {}, read_study(PAPER)))
-            if d.kind == "q"
-        )
-        lines = [line for ax in drawing.figure.axes for line in ax.lines]
-        return sum(line.get_marker() == "x" for line in lines)
+        (plot,) = q_values(summary.tables).plots
+        return sum(trace.cross > 0 for trace in plot.traces)
 
     assert crosses(q_max=math.inf) == 1
     assert crosses(q_max=-4.0, q_bias=math.nan) == 0

@@ -26,6 +26,29 @@
 
   const facetsOf = (bar) => [...bar.querySelectorAll("select")];
 
+  // A cell may have several values, and counts before them, which are not filtered by.
+  const valuesOf = (cell) => (cell.dataset.facet !== undefined ? [cell.dataset.facet]
+    : cell.textContent.split(", ").map((text) => text.replace(/^\d+\s/, "")));
+
+  const element = (name, values = {}, ...children) => {
+    const made = Object.assign(document.createElement(name), values);
+    made.append(...children);
+    return made;
+  };
+
+  // A choice for each column of the kind "f" that has several values; null where there is none.
+  const filtersOf = (table, rows) => {
+    const selects = [...table.tHead.rows[0].cells].flatMap((head, column) => {
+      const values = [...new Set(rows.flatMap((row) => valuesOf(row.cells[column])))].sort();
+      if (!head.classList.contains("f") || values.length < 2) return [];
+      const select = element("select", { name: head.textContent }, element("option", { value: "" }, "all"), ...values.map((value) => element("option", { value }, value)));
+      select.dataset.column = column;
+      return [element("label", {}, head.textContent, select)];
+    });
+    const all = element("button", { type: "button", className: "plain" }, "Show all");
+    return selects.length ? element("div", { className: "filters" }, ...selects, all) : null;
+  };
+
   const readAddress = (bar) => {
     const wanted = new URLSearchParams(location.hash.slice(1));
     for (const select of facetsOf(bar)) {
@@ -44,9 +67,14 @@
     const DataTable = SymSteerTables.default;
     const page = Number(table.dataset.page || 0);
     if (!table.classList.contains("data")) addOrder(table);
-    const search = table.dataset.search !== undefined;
+    const search = page > 0;
+    const rows = [...(table.tBodies[0]?.rows || [])];
+    const bar = search ? filtersOf(table, rows) : null;
+    if (bar) table.before(bar);
+    // Of all rows, not of those alone that the present page shows.
+    const values = rows.map((row) => (bar ? facetsOf(bar).map((select) => valuesOf(row.cells[select.dataset.column])) : []));
     const made = new DataTable(table, {
-      paging: page > 0 && table.tBodies[0].rows.length > page,
+      paging: page > 0 && rows.length > page,
       pageLength: page || 10,
       info: search,
       searching: true,
@@ -69,11 +97,8 @@
       box.setAttribute("role", "region");
       box.setAttribute("aria-label", table.caption?.textContent || "Table");
     }
-    const bar = document.querySelector(`.filters[data-for="${table.id}"]`);
-    if (!bar || !table.id) return;
-    // Of all rows, not of those alone that the present page shows.
-    const rows = made.rows({ order: "index" }).nodes().toArray().map((row) => JSON.parse(row.dataset.facets));
-    const matches = (index) => facetsOf(bar).every((s) => !s.value || rows[index][s.name].includes(s.value));
+    if (!bar) return;
+    const matches = (index) => facetsOf(bar).every((s, k) => !s.value || values[index][k].includes(s.value));
     made.search.fixed("facets", (_text, _data, index) => matches(index));
     readAddress(bar);
     if (facetsOf(bar).some((select) => select.value)) made.draw();
@@ -93,138 +118,119 @@
   const shown = (value) => Number(value.toPrecision(3)).toString().replace("-", MINUS);
   const isDark = () => root.dataset.theme === "dark";
   const css = (name) => getComputedStyle(root).getPropertyValue(name).trim();
-  const colorOf = (series) => series.color[isDark() ? 1 : 0];
+  // The colour that a dark page needs: mixed with white until the contrast is 4.5 (WCAG 2).
+  const brightness = (parts) => [0.2126, 0.7152, 0.0722].reduce((sum, share, k) => sum + share * (parts[k] / 255) ** 2.2, 0);
+  const shade = (hex) => {
+    if (!isDark()) return hex;
+    const parts = [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
+    let mixed = parts;
+    for (let share = 0; share < 1 && brightness(mixed) < 0.216; share += 0.04) mixed = parts.map((part) => Math.round(part + (255 - part) * share));
+    return `#${mixed.map((part) => part.toString(16).padStart(2, "0")).join("")}`;
+  };
   const faint = (color, share) => color + Math.round(255 * share).toString(16).padStart(2, "0");
   const steps = (value) => (Math.abs(value) >= 1e6 ? `${shown(value / 1e6)}M` : Math.abs(value) >= 1e3 ? `${shown(value / 1e3)}k` : shown(value));
 
-  const axisOf = (spec) => ({
-    title: { text: safe(spec.title), standoff: 8, font: { size: 13, color: css("--muted") } },
-    range: spec.range,
-    type: spec.log ? "log" : "linear",
-    rangemode: spec.from_zero ? "tozero" : "normal",
-    zeroline: Boolean(spec.zero),
-    zerolinecolor: css("--muted"),
+  // Plotly's names of matplotlib's markers and line styles; the latter are tried in turn where rows of one agent differ in settings.
+  const SYMBOLS = { s: "square", D: "diamond", v: "triangle-down", o: "circle", "^": "triangle-up", X: "x", P: "cross", "<": "triangle-left", h: "hexagon", ">": "triangle-right", "*": "star", p: "pentagon", d: "diamond-tall" };
+  const DASHES = { "-": "solid", ":": "dot", "0,5,2": "dash", "0,3,1.5": "dash", "0,1,1.5": "dot", "0,5,1.5,1,1.5": "dashdot" };
+  const TWINS = ["solid", "dot", "dash", "longdash", "dashdot"];
+  const PIXELS = 4 / 3;
+  const symbolOf = (look) => (look.marker ? SYMBOLS[look.marker] + (look.hollow ? "-open" : "") : undefined);
+
+  const twins = (legend) => {
+    const taken = new Set();
+    for (const one of legend) {
+      const free = TWINS.filter((dash) => !taken.has(one.look.color + dash));
+      const wanted = DASHES[String(one.look.dash)];
+      one.dash = wanted && taken.has(one.look.color + wanted) ? free[0] || wanted : wanted;
+      taken.add(one.look.color + one.dash);
+    }
+  };
+
+  const isLog = (axis) => axis.scale === "log";
+  const axisOf = (spec, narrow = innerWidth < 620) => ({
+    title: { text: safe(spec.title || ""), standoff: 8, font: { size: 13, color: css("--muted") } },
+    range: spec.ends,
+    type: isLog(spec) ? "log" : "linear",
+    zeroline: false,
     gridcolor: css("--line"),
     linecolor: css("--line"),
-    tickfont: { size: 12, color: css("--muted") },
-    tickformat: spec.si ? "~s" : undefined,
-    exponentformat: spec.log ? "power" : "e",
-    dtick: spec.log ? 1 : spec.every,
+    tickfont: { size: narrow ? 10 : 12, color: css("--muted") },
+    tickformat: spec.in_steps ? "~s" : undefined,
+    exponentformat: isLog(spec) ? "power" : "e",
+    dtick: isLog(spec) ? 1 : spec.every || undefined,
     nticks: 7,
     automargin: true,
     fixedrange: false,
+    // Places from top to bottom that have names.
+    ...(spec.labels ? {
+      tickvals: spec.labels.map((_, k) => k), range: [spec.labels.length - 0.4, -0.6],
+      ticktext: spec.labels.map((text) => safe(narrow && text.length > 22 ? text.replace(/^(\S+ \S+) /, "$1\n") : text).replace("\n", "<br>")),
+    } : {}),
   });
 
-  const curves = (spec, state) => {
-    const traces = [];
-    spec.series.forEach((one, index) => {
-      if (state.hidden.has(index)) return;
-      const color = colorOf(one);
-      const name = safe(one.name);
-      const where = spec.x.si ? steps : shown;
-      const label = (x, y, k) => `<b>${name}</b><br>${where(x)}${spec.x.si ? " steps" : ""}: ${shown(y)}`
-        + (one.low ? ` [${shown(one.low[k])}, ${shown(one.high[k])}]` : "");
-      if (one.low && !one.bars && (one.band ?? !one.flat)) {
-        traces.push({
-          x: [...one.x, ...[...one.x].reverse()], y: [...one.high, ...[...one.low].reverse()],
-          fill: "toself", fillcolor: faint(color, 0.11), line: { width: 0 }, mode: "lines", hoverinfo: "skip",
-        });
-      }
-      for (const run of one.runs || []) {
-        // Of unfinished runs nothing else is shown; they end in a cross.
-        if (state.runs || run.open) {
-          traces.push({
-            x: run.x, y: run.y, mode: "lines+markers", opacity: run.open ? 0.8 : 0.5,
-            line: { color, width: run.open ? 1.4 : 1, dash: run.open ? "dot" : "solid" },
-            marker: run.open
-              ? { color, size: run.y.map((_, k) => (k + 1 < run.y.length ? 3 : 8)), symbol: run.y.map((_, k) => (k + 1 < run.y.length ? "circle" : "x-thin-open")), line: { color, width: 1.6 } }
-              : { color, size: 3 },
-            text: run.y.map((y, k) => `<b>${name}</b>, ${safe(run.name)}<br>${where(run.x[k])} steps: ${shown(y)}`),
-            hovertemplate: "%{text}<extra></extra>",
-          });
-        }
-      }
-      traces.push({
-        x: one.x, y: one.y, mode: one.flat || !one.symbol ? "lines" : "lines+markers",
-        line: { color, width: one.flat ? 1.8 : 2.2, dash: one.dash || "solid" },
-        marker: { color, size: 7, symbol: one.symbol || undefined },
-        error_y: one.bars ? {
-          type: "data", symmetric: false, color, thickness: 1, width: 3,
-          array: one.high.map((h, k) => h - one.y[k]), arrayminus: one.low.map((l, k) => one.y[k] - l),
-        } : undefined,
-        text: one.y.map((y, k) => label(one.x[k], y, k)),
-        hovertemplate: "%{text}<extra></extra>",
-      });
-      if (one.returns?.y.length) {
-        traces.push({
-          x: one.returns.x, y: one.returns.y, mode: "markers",
-          marker: { color, size: 7, symbol: "circle-open", line: { width: 1.6 } },
-          text: one.returns.y.map((y, k) => `<b>${name}</b>, fresh return<br>${where(one.returns.x[k])} steps: ${shown(y)}`),
-          hovertemplate: "%{text}<extra></extra>",
-        });
-      }
-    });
-    const shapes = spec.band ? [{
-      type: "rect", xref: "paper", x0: 0, x1: 1, y0: spec.band.low, y1: spec.band.high, layer: "below",
-      fillcolor: isDark() ? "#2c3a24" : "#e8f0dc", line: { width: 1, color: isDark() ? "#5b7a3c" : "#a9c284" },
-    }] : [];
-    return { traces, layout: { shapes } };
-  };
+  // The ends of an interval as the arms of an error bar.
+  const arms = (found, color, thickness) => (found.high === undefined ? undefined : {
+    type: "data", symmetric: false, color, thickness, width: 0,
+    array: [Math.max(0, found.high - found.value)], arrayminus: [Math.max(0, found.value - found.low)],
+  });
+  const between = (value, low, high) => `${shown(value)}${low === undefined ? "" : ` [${shown(low)}, ${shown(high)}]`}`;
 
-  const points = (spec, state) => {
-    const traces = [];
-    spec.series.forEach((one, index) => {
-      if (state.hidden.has(index)) return;
-      const color = colorOf(one);
-      for (const line of one.lines) {
-        traces.push({
-          x: [...line.x, ...[...line.x].reverse()], y: [...line.high, ...[...line.low].reverse()],
-          fill: "toself", fillcolor: faint(color, 0.1), line: { width: 0 }, mode: "lines", hoverinfo: "skip",
-        });
-        traces.push({ x: line.x, y: line.y, mode: "lines", line: { color, width: 1.6 }, hoverinfo: "skip" });
-      }
-      const arms = (axis) => ({
-        type: "data", symmetric: false, color, thickness: 1, width: 0,
-        array: one.points.map((p) => Math.max(0, p[`${axis}high`] - p[axis])),
-        arrayminus: one.points.map((p) => Math.max(0, p[axis] - p[`${axis}low`])),
-      });
-      traces.push({
-        x: one.points.map((p) => p.x), y: one.points.map((p) => p.y), mode: "markers",
-        marker: {
-          size: 9, color: one.points.map((p) => (p.hollow ? css("--raised") : color)),
-          symbol: one.symbol, line: { color, width: 1.6 },
-        },
-        error_x: arms("x"), error_y: arms("y"),
-        text: one.points.map((p) => `<b>${safe(one.name)}</b><br>${safe(p.name)}<br>${safe(p.text)}`),
-        hovertemplate: "%{text}<extra></extra>",
-      });
-    });
-    return { traces, layout: {} };
-  };
-
-  const bars = (spec, state) => {
-    const traces = spec.series.map((one, index) => {
-      const color = colorOf(one);
-      return {
-        visible: !state.hidden.has(index),
-        x: one.points.map((p) => p.x), y: one.points.map((p) => -p.at + (index ? 0.16 : -0.04)), mode: "markers",
-        marker: { size: index ? 9 : 10, color, symbol: one.symbol || "circle" },
-        error_x: {
-          type: "data", symmetric: false, color, thickness: index ? 1 : 2, width: 0,
-          array: one.points.map((p) => p.xhigh - p.x), arrayminus: one.points.map((p) => p.x - p.xlow),
-        },
-        text: one.points.map((p) => `<b>${safe(spec.names[p.at])}</b><br>${safe(p.text)}`),
-        hovertemplate: "%{text}<extra></extra>",
-      };
-    });
-    const narrow = innerWidth < 620;
-    const fold = (name) => (narrow && name.length > 22 ? name.replace(/^(\S+ \S+) /, "$1\n") : name);
-    const ticks = spec.names.map((name) => safe(fold(name)).replace("\n", "<br>"));
-    const yaxis = {
-      tickvals: spec.names.map((_, i) => -i), ticktext: ticks, range: [-spec.names.length + 0.4, 0.6],
-      automargin: true, zeroline: false, gridcolor: css("--line"), tickfont: { size: narrow ? 10 : 12, color: css("--text") },
+  const lineOf = (one, spec, dash) => {
+    const look = one.look, color = shade(look.color), last = one.x.length - 1;
+    const where = spec.x.in_steps ? (x) => `${steps(x)} steps` : shown;
+    const name = `<b>${safe(one.name)}</b>${one.label ? `, ${safe(one.label)}` : ""}`;
+    return {
+      x: one.x, y: one.y, opacity: look.alpha || 1,
+      mode: look.dash === "none" ? "markers" : look.marker || one.single ? "lines+markers" : "lines",
+      line: { color, width: look.width * PIXELS, dash: one.single ? DASHES[look.dash] : dash },
+      marker: { color, line: { color, width: 1.6 },
+        size: one.x.map((_, k) => (one.cross && k === last ? 8 : one.single ? 3 : look.size * PIXELS)),
+        symbol: one.x.map((_, k) => (one.cross && k === last ? "x-thin-open" : symbolOf(look) || "circle")) },
+      text: one.y.map((y, k) => `${name}<br>${where(one.x[k])}: ${between(y, one.low?.[k], one.high?.[k])}${one.remark ? `<br>${safe(one.remark)}` : ""}`),
+      hovertemplate: "%{text}<extra></extra>",
     };
-    return { traces, layout: { yaxis, height: 90 + spec.names.length * (narrow ? 38 : 30) } };
+  };
+
+  const bandOf = (one) => ({
+    x: [...one.x, ...[...one.x].reverse()], y: [...one.high, ...[...one.low].reverse()],
+    fill: "toself", fillcolor: faint(shade(one.look.color), 0.11), line: { width: 0 }, mode: "lines", hoverinfo: "skip",
+  });
+
+  const dotOf = (one, spec) => {
+    const look = one.look, color = shade(look.color);
+    const y = one.y.value ?? one.y;
+    const texts = [`<b>${safe(one.name)}</b>`, spec.y.labels ? safe(spec.y.labels[Math.round(y)]) : "", between(one.x.value, one.x.low, one.x.high), safe(one.text || ""), safe(one.remark || "")];
+    return {
+      x: [one.x.value], y: [y], mode: "markers", opacity: look.alpha || 1,
+      marker: { color, size: look.size * PIXELS, symbol: symbolOf(look), line: { color, width: 1.6 } },
+      error_x: arms(one.x, one.thick ? faint(color, 0.35) : color, one.thick ? 8 : look.width * PIXELS),
+      error_y: arms(one.y, color, look.width * PIXELS),
+      text: [texts.filter((text) => text).join("<br>")],
+      hovertemplate: "%{text}<extra></extra>",
+    };
+  };
+
+  const plotOf = (spec, state) => {
+    const seen = (one) => !state.hidden.has(one.name) && (!one.single || one.cross || state.runs);
+    const lines = (spec.traces || []).filter(seen);
+    const dash = Object.fromEntries(spec.legend.map((one) => [one.name, one.dash]));
+    const traces = [
+      ...lines.filter((one) => one.band).map(bandOf), ...lines.map((one) => lineOf(one, spec, dash[one.name])),
+      ...(spec.dots || []).filter(seen).map((one) => dotOf(one, spec)),
+    ];
+    const shapes = (spec.rules || []).map((rule) => ({
+      type: "line", layer: "below", line: { color: css("--muted"), width: 1, dash: DASHES[rule.dash] },
+      ...(rule.is_vertical ? { x0: rule.at, x1: rule.at, yref: "paper", y0: 0, y1: 1 } : { y0: rule.at, y1: rule.at, xref: "paper", x0: 0, x1: 1 }),
+    }));
+    if (spec.feasible) {
+      shapes.push({
+        type: "rect", xref: "paper", x0: 0, x1: 1, y0: spec.feasible[0], y1: spec.feasible[1], layer: "below",
+        fillcolor: isDark() ? "#2c3a24" : "#e8f0dc", line: { width: 1, color: isDark() ? "#5b7a3c" : "#a9c284" },
+      });
+    }
+    const height = spec.y.labels ? { height: Math.max(200, 90 + spec.y.labels.length * (innerWidth < 620 ? 38 : 30)) } : {};
+    return { traces, layout: { shapes, xaxis: axisOf(spec.x), yaxis: axisOf(spec.y), ...height } };
   };
 
   const WORDS = ["no success", "success, not at the end", "success at the end"];
@@ -244,17 +250,14 @@
     return { traces, layout: { xaxis: { ...axisOf({ title: "held-out episodes" }), showgrid: false }, yaxis, height: 110 + 24 * spec.rows.length } };
   };
 
-  const KINDS = { curves, points, bars, episodes };
-
   const draw = (figure) => {
     const { spec, state, plot } = figure;
-    const { traces, layout } = KINDS[spec.kind](spec, state);
+    const { traces, layout } = spec.seeds ? episodes(spec) : plotOf(spec, state);
     const full = {
       font: { family: css("--sans"), size: 13, color: css("--text") },
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       margin: { l: 48, r: 12, t: 8, b: 44 }, showlegend: false, hovermode: "closest",
       hoverlabel: { bgcolor: css("--bg"), bordercolor: css("--muted"), font: { family: css("--sans"), size: 13, color: css("--text") }, align: "left" },
-      ...(spec.x ? { xaxis: axisOf(spec.x) } : {}), ...(spec.y ? { yaxis: axisOf(spec.y) } : {}),
       dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
       ...layout,
     };
@@ -274,35 +277,35 @@
       svg.append(node);
     };
     const dashes = { dash: "6 3", dot: "1.5 3", dashdot: "6 3 1.5 3", longdash: "9 3" };
-    const color = colorOf(series);
-    if (series.dash) add("line", { x1: 0, x2: 30, y1: 6, y2: 6, stroke: color, "stroke-width": 2.4, "stroke-dasharray": dashes[series.dash] || "none" });
-    const shape = { square: "M11 2h8v8h-8z", diamond: "M15 1l5 5-5 5-5-5z", "triangle-up": "M15 1l5 9H10z", "triangle-down": "M15 11l5-9H10z", x: "M11 2l8 8M19 2l-8 8", cross: "M15 1v10M10 6h10" }[series.symbol?.replace("-open", "")];
-    const fill = series.symbol?.endsWith("open") ? css("--raised") : color;
+    const look = series.look, color = shade(look.color), symbol = symbolOf(look);
+    if (look.edge) add("path", { d: "M5 2h20v8H5z", fill: color, stroke: shade(look.edge) });
+    else if (series.dash) add("line", { x1: 0, x2: 30, y1: 6, y2: 6, stroke: color, "stroke-width": 2.4, "stroke-dasharray": dashes[series.dash] || "none" });
+    const shape = { square: "M11 2h8v8h-8z", diamond: "M15 1l5 5-5 5-5-5z", "triangle-up": "M15 1l5 9H10z", "triangle-down": "M15 11l5-9H10z", x: "M11 2l8 8M19 2l-8 8", cross: "M15 1v10M10 6h10" }[symbol?.replace("-open", "")];
+    const fill = look.hollow ? css("--raised") : color;
     if (shape) add("path", { d: shape, fill, stroke: color, "stroke-width": 1.5 });
-    else if (series.symbol) add("circle", { cx: 15, cy: 6, r: 3.6, fill, stroke: color, "stroke-width": 1.5 });
+    else if (symbol) add("circle", { cx: 15, cy: 6, r: 3.6, fill, stroke: color, "stroke-width": 1.5 });
     return svg;
   };
 
   const legend = (figure) => {
     const { spec, state, box } = figure;
-    if (!spec.series || (spec.series.length < 2 && !spec.series[0]?.returns)) return;
+    if (!spec.legend || (spec.legend.length < 2)) return;
     const button = (text, pressed, mark, toggle) => {
-      const made = document.createElement("button");
-      made.type = "button";
+      const made = element("button", { type: "button" }, ...mark, element("span", {}, text));
       made.setAttribute("aria-pressed", String(pressed));
-      if (mark) made.append(mark);
-      const label = document.createElement("span");
-      label.textContent = text;
-      made.append(label);
       made.addEventListener("click", () => { toggle(); legend(figure); draw(figure); });
       return made;
     };
     const focused = [...box.children].indexOf(document.activeElement);
-    box.replaceChildren(...spec.series.map((one, index) => button(one.name, !state.hidden.has(index), swatch(one), () => {
-      state.hidden.has(index) ? state.hidden.delete(index) : state.hidden.add(index);
-    })));
-    if (spec.series.some((one) => one.runs?.length)) {
-      const runs = button("single runs", state.runs, null, () => { state.runs = !state.runs; });
+    box.replaceChildren(...spec.legend.map((one) => {
+      // What no line or dot is called explains colours and markers.
+      if (!one.drawn) return element("span", { className: "key" }, swatch(one), element("span", {}, one.name));
+      return button(one.name, !state.hidden.has(one.name), [swatch(one)], () => {
+        state.hidden.has(one.name) ? state.hidden.delete(one.name) : state.hidden.add(one.name);
+      });
+    }));
+    if ((spec.traces || []).some((one) => one.single)) {
+      const runs = button("single runs", state.runs, [], () => { state.runs = !state.runs; });
       runs.className = "runs";
       box.append(runs);
     }
@@ -329,10 +332,11 @@
     }
     for (const element of document.querySelectorAll("figure.chart")) {
       const spec = JSON.parse(element.querySelector("script[type='application/json']").textContent);
+      if (spec.legend) twins(spec.legend);
       figures.set(element, {
         spec, drawn: false,
         // Beside the bands of many agents, single runs hide more than they show.
-        state: { hidden: new Set(), runs: !spec.series || spec.series.filter((one) => one.low && !one.flat).length < 3 },
+        state: { hidden: new Set(), runs: !spec.traces || spec.traces.filter((one) => one.band).length < 3 },
         plot: element.querySelector(".plot"), box: element.querySelector(".legend"),
       });
       seen.observe(element);

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from symsteer.cli import main
-from symsteer.leaderboard.compare.figure import draw
+from symsteer.leaderboard.compare.figure import described
 from symsteer.leaderboard.compare.sides import read_sides
 from tests.leaderboard.compare.runs import at_commit, changed, runs_of, save
 from tests.leaderboard.record_factory import make_cell
@@ -137,22 +137,17 @@ def test_json_is_all_that_is_printed(place, symsteer):
 
 def test_the_picture_has_a_row_for_each_cell(place):
     a, b = read_sides("equivariant", "standard", Path("runs"))
-    success, auc = draw(a, b, found := changed("equivariant", "standard")).axes
-    labels = [text.get_text() for text in success.get_yticklabels()]
-    assert labels == [
-        "PickCube-v1 floating none",
-        "PickCube-v1 floating action_gain:0.5",
-        "mean over cells",
-    ]
-    for ax, measure in ((success, "success"), (auc, "auc")):
-        drawn = [cell.measures[measure] for cell in found.cells] + [found.overall[measure]]
-        # Of each row an interval and a point, after the line at 0 and that above the mean.
-        lines = [line.get_xydata().tolist() for line in ax.lines[2:]]
-        for height, (change, bar, point) in enumerate(
-            zip(drawn, lines[::2], lines[1::2], strict=True)
-        ):
-            assert bar == [[change.difference.low, height], [change.difference.high, height]]
-            assert point == [[change.difference.value, height]]
+    figure = described(a, b, found := changed("equivariant", "standard"))
+    for plot, measure in zip(figure.plots, ("success", "auc"), strict=True):
+        assert plot.y.labels == [
+            "PickCube-v1 floating none",
+            "PickCube-v1 floating action_gain:0.5",
+            "mean over cells",
+        ]
+        changes = [cell.measures[measure] for cell in found.cells] + [found.overall[measure]]
+        assert [(dot.y, dot.x) for dot in plot.dots] == [
+            (height, change.difference) for height, change in enumerate(changes)
+        ]
 
 
 @pytest.mark.parametrize("name", ["folder/b.svg", "C.PNG"])

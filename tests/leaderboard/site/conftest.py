@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 from symsteer.leaderboard.records import RecordedExtension, RunRecord, write_record
 from symsteer.leaderboard.site.build import generate
+from symsteer.leaderboard.site.docs import build_documentation
 from symsteer.leaderboard.study import PAPER
 from tests.leaderboard.record_factory import make_cell, make_curve, make_evaluation, make_record
 
@@ -128,3 +130,12 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_all(hostile_records(), folder / "runs")
     generate([folder / "runs"], folder / "site", PAPER, docs=False)
     return folder / "site"
+
+
+@pytest.fixture(scope="session")
+def whole(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same site with the documentation."""
+    out = tmp_path_factory.mktemp("whole") / "site"
+    shutil.copytree(site, out)
+    build_documentation(out / "docs")
+    return out

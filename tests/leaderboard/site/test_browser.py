@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from symsteer.leaderboard.site.docs import build_documentation
 from tests.leaderboard.site.browser import Visit, chromium, opened
 from tests.leaderboard.site.conftest import EVIL
 
@@ -60,20 +59,20 @@ def sort(table: Any, name: str, direction: str) -> Any:
 def test_columns_sort_by_their_numbers(site: Path, context: Any) -> None:
     visit = Visit(context, site / "index.html")
     table = visit.page.locator("table.data")
-    before = column(visit, 6)
+    before = column(visit, 7)
     header = sort(table, "Success", "desc")
-    falling = [float(text.split()[0]) for text in column(visit, 6) if text[0].isdigit()]
+    falling = [float(text.split()[0]) for text in column(visit, 7) if text[0].isdigit()]
     assert len(falling) == len([text for text in before if text[0].isdigit()]) == 14
     assert falling == sorted(falling, reverse=True) != [float(t.split()[0]) for t in before[:14]]
     # With the keyboard, too.
     header.get_by_role("button").focus()
     visit.page.keyboard.press("Enter")
     table.locator("th.dt-ordering-asc").wait_for()
-    rising = [float(text.split()[0]) for text in column(visit, 6) if text[0].isdigit()]
+    rising = [float(text.split()[0]) for text in column(visit, 7) if text[0].isdigit()]
     assert rising == falling[::-1]
     # What is not known stands last, or first, never between numbers.
     sort(table, "Against base", "desc")
-    texts = column(visit, 7)
+    texts = column(visit, 8)
     known = [text != "\u2013" for text in texts]
     assert known == sorted(known, reverse=True)
     assert any(known)
@@ -97,7 +96,7 @@ def test_rows_are_filtered_and_the_address_keeps_it(site: Path, context: Any) ->
     every = page.inner_text(".dt-info")
     page.select_option("select[name=Agent]", "equivariant")
     assert set(column(visit, 6)) == {"equivariant"}
-    page.select_option("select[name=Break]", "action_gain")
+    page.select_option("select[name='Broken by']", "action_gain")
     assert set(column(visit, 4)) == {"action_gain"}
     assert len(column(visit, 1)) == 5
     assert "5 entries" in page.inner_text(".dt-info")
@@ -106,9 +105,9 @@ def test_rows_are_filtered_and_the_address_keeps_it(site: Path, context: Any) ->
     assert column(again, 1) == column(visit, 1)
     again.page.get_by_role("button", name="Show all").click()
     assert again.page.inner_text(".dt-info") == every
-    page.select_option("select[name=Break]", "arm kinematics")
+    page.select_option("select[name='Broken by']", "arm kinematics")
     assert set(column(visit, 3)) == {"panda"}
-    page.select_option("select[name=Break]", "")
+    page.select_option("select[name='Broken by']", "")
     page.select_option("select[name=Agent]", "")
     page.select_option("select[name=Status]", "set aside")
     assert len(column(visit, 1)) == 1
@@ -168,33 +167,31 @@ def test_lines_can_be_left_out(site: Path, context: Any) -> None:
     assert not visit.troubles
 
 
-def test_colours_follow_the_system_and_the_reader(site: Path, context: Any, tmp_path: Path) -> None:
-    def background(visit: Visit) -> str:
-        return visit.page.evaluate("getComputedStyle(document.body).backgroundColor")
+def test_colours_follow_the_system_and_the_reader(whole: Path, context: Any) -> None:
+    def background(page: Any) -> str:
+        return page.evaluate("getComputedStyle(document.body).backgroundColor")
 
     white, dark = "rgb(255, 255, 255)", "rgb(20, 24, 31)"
-    visit = Visit(context, sorted((site / "cells").iterdir())[0])
+    visit = Visit(context, sorted((whole / "cells").iterdir())[0])
     visit.draw_charts()
     ink = "getComputedStyle(document.querySelector('.plot .xtick text')).fill"
-    assert background(visit) == white
+    assert background(visit.page) == white
     light_ink = visit.page.evaluate(ink)
     visit.page.emulate_media(color_scheme="dark")
     visit.page.wait_for_selector("html[data-theme=dark]", state="attached")
-    assert background(visit) == dark
+    assert background(visit.page) == dark
     assert visit.page.evaluate(ink) != light_ink
     visit.page.get_by_role("button", name="Use light colours").click()
-    assert background(visit) == white
+    assert background(visit.page) == white
     # Remembered on the next page, and in the documentation.
-    build_documentation(tmp_path / "docs")
-    context.pages[0].emulate_media(color_scheme="dark")
-    for path in (site / "index.html", tmp_path / "docs" / "index.html"):
+    for path in (whole / "index.html", whole / "docs" / "index.html"):
         page = context.new_page()
         page.emulate_media(color_scheme="dark")
         page.goto(path.as_uri())
         assert page.evaluate("document.documentElement.dataset.theme") == "light"
-        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == white
+        assert background(page) == white
         page.locator("[data-switch-theme]").click()
-        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == dark
+        assert background(page) == dark
         page.locator("[data-switch-theme]").click()
     assert not visit.troubles
 
@@ -220,14 +217,13 @@ def test_no_page_is_wider_than_a_phone_or_has_errors(
     context.close()
 
 
-def test_the_documentation_is_searched_offline(tmp_path: Path, context: Any) -> None:
-    build_documentation(tmp_path / "docs")
+def test_the_documentation_is_searched_offline(whole: Path, context: Any) -> None:
     page = context.new_page()
     troubles: list[str] = []
     page.on("pageerror", lambda error: troubles.append(str(error)))
     page.on("console", lambda m: troubles.append(m.text) if m.type == "error" else None)
     page.on("request", lambda r: None if r.url.startswith("file:") else troubles.append(r.url))
-    page.goto((tmp_path / "docs" / "agents" / "partial.html").as_uri())
+    page.goto((whole / "docs" / "agents" / "partial.html").as_uri())
     page.click(".md-search__input")
     page.keyboard.type("divergence")
     page.wait_for_selector(".md-search-result__item")

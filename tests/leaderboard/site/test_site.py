@@ -12,10 +12,10 @@ import pytest
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.page import render_page
-from symsteer.leaderboard.site import assets, build
-from symsteer.leaderboard.site.assets import as_script
+from symsteer.leaderboard.site import build, libraries
 from symsteer.leaderboard.site.build import generate
 from symsteer.leaderboard.site.command import site as verb
+from symsteer.leaderboard.site.libraries import as_script
 from symsteer.leaderboard.study import PAPER
 from symsteer.leaderboard.summary import load_runs, summarize
 from symsteer.leaderboard.tables import cell_name, render_csv
@@ -33,7 +33,7 @@ TAGS = frozenset(
         *("figcaption", "img", "svg", "path", "circle", "button", "label", "select", "option"),
     }
 )
-STYLES = re.compile(r"flex:\d+|text-align:(left|right)")
+STYLES = re.compile(r"text-align:(left|right)")
 
 
 def page_of(folder: Path, kind: str, text: str) -> Page:
@@ -58,20 +58,14 @@ def test_every_cell_agent_variant_and_run_has_a_page(site: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["site", "hostile"])
-def test_every_address_leads_to_a_file_of_the_site(
-    kind: str, request: pytest.FixtureRequest
-) -> None:
+def test_nothing_of_a_record_becomes_markup(kind: str, request: pytest.FixtureRequest) -> None:
     pages = read_pages(request.getfixturevalue(kind))
     assert not dead_links(pages)
-
-
-@pytest.mark.parametrize("kind", ["site", "hostile"])
-def test_nothing_of_a_record_becomes_markup(kind: str, request: pytest.FixtureRequest) -> None:
-    for path, page in read_pages(request.getfixturevalue(kind)).items():
+    for path, page in pages.items():
         assert {tag for tag, _ in page.elements} <= TAGS, path
         for tag, attrs in page.elements:
             assert not [name for name in attrs if name.startswith("on")], (path, tag, attrs)
-            assert STYLES.fullmatch(attrs.get("style", "flex:1")), (path, tag, attrs)
+            assert STYLES.fullmatch(attrs.get("style", "text-align:left")), (path, tag, attrs)
             # Scripts are files or data; nothing runs that stands in a page.
             assert tag != "script" or attrs.get("src") or attrs == {"type": "application/json"}
         policy = next(a for t, a in page.elements if "http-equiv" in a)["content"]
@@ -92,8 +86,8 @@ def test_hostile_texts_are_shown_as_they_are(hostile: Path) -> None:
 
 
 def test_names_stay_in_their_folders_and_do_not_collide(hostile: Path) -> None:
-    expected = {"site", "assets", *build.FOLDERS} - {"site", "media"}
-    assert {path.name for path in hostile.iterdir() if path.is_dir()} == expected
+    folders = {path.name for path in hostile.iterdir() if path.is_dir()}
+    assert folders == {"assets", *build.FOLDERS} - {"media"}
     assert {path.name for path in hostile.parent.iterdir()} == {"runs", "site"}
     for kind in ("agents", "cells", "variants", "runs"):
         for path in (hostile / kind).iterdir():
@@ -125,7 +119,8 @@ def test_numbers_are_those_of_the_leaderboard(site: Path) -> None:
             assert interval(row.success) in index
             assert number(row.success.value) in cell.text
             # Charts hold the same curve as the table's last checkpoint.
-            (curve,) = [s for s in cell.data[0]["series"] if s["name"] == row.agent]
+            traces = cell.data[0]["traces"]
+            (curve,) = [t for t in traces if t["name"] == row.agent and not t["single"]]
             assert row.last
             assert curve["y"][-1] == pytest.approx(row.last.value, rel=1e-3)
     assert shown == 14
@@ -134,14 +129,14 @@ def test_numbers_are_those_of_the_leaderboard(site: Path) -> None:
 def test_unfinished_runs_are_drawn_apart(site: Path) -> None:
     cell = page_of(site, "cells", "wind:0.2..0.8")
     for chart in cell.data[:2]:
-        runs = {run["name"]: run["open"] for one in chart["series"] for run in one["runs"]}
+        runs = {one["label"]: one["cross"] > 0 for one in chart["traces"] if one["single"]}
         assert runs == {"seed 7": False, "seed 8, failed": True}
 
 
 def test_success_by_direction_is_shown_where_records_have_directions(site: Path) -> None:
     chart = page_of(site, "cells", "wind:0.2..0.8").data[-1]
-    assert [one["name"] for one in chart["series"]] == ["standard", "equivariant"]
-    assert chart["series"][0]["x"] == list(range(-180, 181, 45))
+    assert [one["name"] for one in chart["legend"]] == ["standard", "equivariant"]
+    assert chart["traces"][0]["x"] == list(range(-180, 181, 45))
     assert "before records held the directions" in page_of(site, "cells", "action_gain:0.5").text
 
 
@@ -178,7 +173,7 @@ def test_a_run_page_has_all_of_its_record(site: Path) -> None:
         "demonstrations.count",
     ):
         assert text in page.text
-    episodes = next(data for data in page.data if data["kind"] == "episodes")
+    episodes = next(data for data in page.data if "seeds" in data)
     seeds = record.evaluations[0].episodes.seed
     assert episodes["seeds"] == seeds
     assert len(episodes["rows"]) == len(record.evaluations) == 3
@@ -249,13 +244,17 @@ def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
     assert not dead_links(read_pages(out))
 
 
-def test_runs_that_have_not_ended_have_pages(tmp_path: Path) -> None:
+def test_runs_that_have_not_ended_have_pages(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     begun = make_evaluation([1, 0], env_steps=0)
     write_all(
         [make_record([], "running"), make_record([begun], "interrupted", agent="base", seed=2)],
         tmp_path / "runs",
     )
-    generate([tmp_path / "runs"], tmp_path / "site", PAPER, docs=False)
+    assert verb((tmp_path / "runs",), tmp_path / "site", docs=False) == 0
+    said = f"wrote {tmp_path / 'site' / 'index.html'}: the pages of 2 records"
+    assert said in capsys.readouterr().out
     assert not dead_links(read_pages(tmp_path / "site"))
     text = page_of(tmp_path / "site", "runs", "standard-0").text
     assert "running" in text
@@ -269,29 +268,20 @@ def test_mistakes_are_named(site: Path, tmp_path: Path, monkeypatch: pytest.Monk
     full.mkdir()
     (full / "index.html").write_text("<h1>My page</h1>")
     (tmp_path / "empty").mkdir()
-    for arguments, said in (
+    for arguments, text in (
         ({"records": (tmp_path / "nothing",)}, "does not exist"),
         ({"records": runs, "out": full}, "holds something else than a site"),
         ({"records": runs, "out": full / "index.html"}, "holds something else than a site"),
         ({"records": runs, "study": "papers"}, "did you mean 'paper'"),
         ({"records": runs, "audit": tmp_path / "empty"}, "holds no map.png"),
     ):
-        with pytest.raises(UserError, match=re.escape(said)):
+        with pytest.raises(UserError, match=re.escape(text)):
             verb(**{"out": tmp_path / "site", "docs": False} | arguments)  # type: ignore[arg-type]
     assert (full / "index.html").read_text() == "<h1>My page</h1>"
     assert not (tmp_path / "site").exists()
-    monkeypatch.setattr(assets.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(libraries.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=re.escape('pip install "symsteer[site]"')):
         verb(runs, tmp_path / "site", docs=False)
-
-
-def test_the_verb_says_what_it_wrote(
-    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert verb((site.parent / "runs" / "0",), tmp_path / "site", docs=False) == 0
-    said = capsys.readouterr().out
-    assert f"wrote {tmp_path / 'site' / 'index.html'}: " in said
-    assert "1 records" in said
 
 
 def test_maps_of_an_audit_folder(site: Path, tmp_path: Path) -> None:
@@ -306,14 +296,14 @@ def test_maps_of_an_audit_folder(site: Path, tmp_path: Path) -> None:
     page = page_of(out, "variants", "wind")
     pictures = [attrs["alt"] for tag, attrs in page.elements if tag == "img"]
     assert pictures == [
-        "Map of the defect in PushCube-v1, floating, wind:1",
-        "Map of the defect in PushCube-v1, floating, wind:0.5",
+        "PushCube-v1, floating, wind:1, seen from above",
+        "PushCube-v1, floating, wind:0.5, seen from above",
     ]
     assert not dead_links(read_pages(out))
     # The committed audit's numbers, with the unbroken control at strength 0.
-    series = page.data[0]["series"]
-    assert {one["name"] for one in series} >= {"PushCube-v1", "StackCube-v1"}
-    assert all(one["x"][0] == 0 and one["x"][-1] == 1 for one in series)
+    traces = page.data[0]["traces"]
+    assert {one["name"].split(",")[0] for one in traces} >= {"PushCube-v1", "StackCube-v1"}
+    assert all(one["x"][0] == 0 and one["x"][-1] == 1 for one in traces)
     (tmp_path / "audit" / "1" / "audit.json").write_text("[]")
     with pytest.raises(UserError, match="no result of an audit"):
         generate(runs, out, PAPER, tmp_path / "audit", docs=False)

@@ -19,6 +19,8 @@ EXPORT = re.compile(r"export\{([\w$,\s]+)\};")
 GLOBAL = "SymSteerTables"
 """Name under which the pages find DataTables."""
 
+PINNED = "install the version of requirements.txt"
+
 
 def needs(*packages: str) -> None:
     """Check that optional packages are installed.
@@ -36,7 +38,6 @@ def needs(*packages: str) -> None:
 
 def assets() -> dict[str, bytes]:
     """Contents by address."""
-    needs("plotly", "itables")
     tables = _packaged("itables", "html/dt_bundle.js").decode()
     found = {f"assets/{path.name}": path.read_bytes() for path in sorted(STATIC.iterdir())}
     return found | {
@@ -56,10 +57,7 @@ def as_script(module: str) -> str:
     """
     exports = EXPORT.findall(module)
     if len(exports) != 1:
-        raise UserError(
-            "itables packs DataTables in another form than expected; install the version of "
-            "requirements.txt"
-        )
+        raise UserError(f"itables packs DataTables in another form than expected; {PINNED}")
     names = (re.split(r"\s+as\s+", name.strip()) for name in exports[0].split(","))
     members = ",".join(f'"{name[-1]}":{name[0]}' for name in names)
     body = EXPORT.sub(lambda _: f"globalThis.{GLOBAL}={{{members}}};", module)
@@ -68,10 +66,9 @@ def as_script(module: str) -> str:
 
 def _packaged(package: str, name: str) -> bytes:
     """A file of an installed package, without importing it."""
+    needs(package)
     spec = importlib.util.find_spec(package)
     for folder in (spec.submodule_search_locations or []) if spec else []:
         if (path := Path(folder, name)).is_file():
             return path.read_bytes()
-    raise UserError(
-        f"the installed {package} has no {name}: install the version of requirements.txt"
-    )
+    raise UserError(f"the installed {package} has no {name}: {PINNED}")

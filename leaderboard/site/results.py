@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from symsteer.leaderboard.defects import Audit, parts_of
+from symsteer.leaderboard.defects import Audit, Defect, parts_of
 from symsteer.leaderboard.findings import Findings
 from symsteer.leaderboard.report import slug
 from symsteer.leaderboard.site.docs import Documentation
-from symsteer.leaderboard.statistics import Interval
+from symsteer.leaderboard.site.media import DIGITS, Medium
 from symsteer.leaderboard.summary import ARM, SYMMETRIC_EMBODIMENT, Key, Row, Run, Summary, Table
 from symsteer.leaderboard.tables import cell_name
 from symsteer.variant import UNBROKEN
-
-DIGITS = 10
-"""Hexadecimal digits at the end of a page's name: names that are cut or written alike differ."""
 
 
 def dials(variant: str) -> list[str]:
@@ -32,14 +29,6 @@ def strengths(variant: str) -> list[str]:
     return [part.text.removeprefix(f"{part.name}:") for part in parts_of(variant) or ()]
 
 
-def strength_of(variant: str, dial: str) -> float | None:
-    """The strength of a variant that is this dial alone, at a constant strength."""
-    parts = parts_of(variant)
-    if not parts or len(parts) > 1 or parts[0].name != dial or not parts[0].is_constant:
-        return None
-    return parts[0].strength if isinstance(parts[0].strength, float | int) else None
-
-
 def breaks(key: Key) -> list[str]:
     """What breaks the symmetry of a cell, without strengths; `unbroken` if nothing does."""
     arm = [] if key.embodiment == SYMMETRIC_EMBODIMENT else [ARM]
@@ -47,22 +36,8 @@ def breaks(key: Key) -> list[str]:
 
 
 @dataclass(frozen=True)
-class MapPicture:
-    """The audit's map of a cell: where in the workspace copies of a decision differ."""
-
-    task: str
-    embodiment: str
-    variant: str
-    path: Path
-
-    @property
-    def address(self) -> str:
-        return f"media/{slug('map', self.task, self.embodiment, self.variant, digits=DIGITS)}.png"
-
-
-@dataclass(frozen=True)
-class Board:
-    """All results of a site.
+class Results:
+    """All results of a site. Addresses of pages are relative to its folder.
 
     Attributes:
         study: name of the study or of its file.
@@ -74,8 +49,7 @@ class Board:
     audit: Audit
     study: str
     docs: Documentation
-    maps: Sequence[MapPicture] = ()
-    _names: dict[Path, str] = field(default_factory=dict)
+    maps: Sequence[Medium] = ()
 
     @cached_property
     def names(self) -> dict[Key, str]:
@@ -83,9 +57,9 @@ class Board:
         return {t.key: cell_name(t, self.summary).replace("`", "") for t in self.summary.tables}
 
     @cached_property
-    def runs(self) -> list[Run]:
-        """Runs that count, then those that are set aside."""
-        return [*self.summary.runs, *self.summary.set_aside]
+    def runs(self) -> dict[Path, Run]:
+        """Runs that count, then those that are set aside, by the path of their record."""
+        return {run.path: run for run in (*self.summary.runs, *self.summary.set_aside)}
 
     @cached_property
     def rows(self) -> list[tuple[Table, Row]]:
@@ -121,26 +95,29 @@ class Board:
 
     def run(self, run: Run) -> str:
         """Address of a run's page; records with the same bytes share one."""
-        if run.path not in self._names:
-            digest = hashlib.sha256(run.path.read_bytes()).hexdigest()
-            stem = slug(run.record.run_id, digits=DIGITS)[:-DIGITS]
-            self._names[run.path] = stem + digest[:DIGITS]
-        return f"runs/{self._names[run.path]}.html"
+        return f"runs/{self._run_names[run.path]}.html"
 
-    def audited(self, dial: str) -> list[tuple[str, str, str, float, Interval, str]]:
-        """Task, embodiment, group, strength, defect and its part, where this variant acts alone.
+    @cached_property
+    def _run_names(self) -> dict[Path, str]:
+        names = {}
+        for path, run in self.runs.items():
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            names[path] = slug(run.record.run_id, digits=DIGITS)[:-DIGITS] + digest[:DIGITS]
+        return names
+
+    def audited(self, dial: str) -> list[tuple[str, str, str, float, Defect]]:
+        """Task, embodiment, group, strength and defect where a variant acts alone, in this order.
 
         With the unbroken controls, at strength 0; empty if the variant was not audited.
         """
-        found = [
-            (task, embodiment, group, strength, defect.interval, defect.part)
-            for (task, embodiment, variant, group), defect in self.audit.items()
-            if (strength := strength_of(variant, dial)) is not None
-        ]
-        places = {cell[:3] for cell in found}
-        controls = [
-            (task, embodiment, group, 0.0, defect.interval, defect.part)
-            for (task, embodiment, variant, group), defect in self.audit.items()
-            if variant == UNBROKEN and (task, embodiment, group) in places
-        ]
-        return sorted(controls + found, key=lambda cell: cell[:4])
+        alone: list[tuple[str, str, str, float, Defect]] = []
+        for (task, embodiment, variant, group), defect in self.audit.items():
+            parts = parts_of(variant) or ()
+            if [part.name for part in parts] == [dial] and parts[0].is_constant:
+                strength = parts[0].strength
+                assert not isinstance(strength, tuple)
+                alone.append((task, embodiment, group, strength, defect))
+        for task, embodiment, group in {cell[:3] for cell in alone}:
+            if control := self.audit.get((task, embodiment, UNBROKEN, group)):
+                alone.append((task, embodiment, group, 0.0, control))
+        return sorted(alone, key=lambda cell: cell[:4])
