@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import shutil
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.image import imsave
 
-from symsteer.leaderboard.records import RecordedExtension, RunRecord, write_record
+from symsteer.leaderboard.records import RunRecord, write_record
 from symsteer.leaderboard.site.build import generate
 from symsteer.leaderboard.site.docs import build_documentation
 from symsteer.leaderboard.study import PAPER
@@ -19,20 +19,17 @@ from tests.leaderboard.record_factory import make_cell, make_curve, make_evaluat
 
 VIDEO = b"\x00\x00\x00\x18ftypisom" + bytes(64)
 
+SIDE_BY_SIDE = ("PickCube-v1-floating-wind=0.2..0.8", "PickCube-v1-floating-wind=1")
+"""Films of a cell that has runs, and of one that has none."""
+
 EVIL = "<img src=x onerror=\"window.evil=1\"><a href='javascript:window.evil=2'>x</a></script>"
 """Markup that would show itself as an element, and end a block of data."""
 
 
 def picture() -> bytes:
     """A PNG of one pixel."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        body = kind + data
-        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
-
-    header = struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0)
-    data = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\x00\x7f"))
-    return b"\x89PNG\r\n\x1a\n" + data + chunk(b"IEND", b"")
+    imsave(buffer := io.BytesIO(), np.zeros((1, 1, 3)), format="png")
+    return buffer.getvalue()
 
 
 def write_all(records: list[RunRecord], folder: Path) -> None:
@@ -61,61 +58,57 @@ def ordinary_records() -> list[RunRecord]:
     return found
 
 
+NAMES = (
+    EVIL,
+    "../../../../etc/passwd",
+    "a b",
+    "a-b",
+    "x" * 120,
+    "\x00\x1b[31m\u202e\r\n<b>",
+    "`|$x$|`[a](https://evil.example)<br>",
+    "{{ 7 * 7 }}%{y}&lt;b&gt;",
+)
+"""Markup, quotes and control characters, names that leave the folder, names that are alike as
+addresses."""
+
+TEXTS = ("name", "group", "warning", "version", "python", "platform", "device", "target")
+TEXTS += ("distribution", "task", "embodiment", "variant", "mode", "preset")
+
+
+def with_name(value: Any, name: str) -> Any:
+    """Data of a record with this name in all of its texts."""
+    if isinstance(value, dict):
+        return {key: name if key in TEXTS else with_name(v, name) for key, v in value.items()}
+    return [with_name(one, name) for one in value] if isinstance(value, list) else value
+
+
 def hostile_records() -> list[RunRecord]:
-    """Markup, quotes and control characters in every text, names that leave the folder, names that
-    are alike as addresses."""
-    names = [
-        EVIL,
-        "../../../../etc/passwd",
-        "a b",
-        "a-b",
-        "x" * 120,
-        "\x00\x1b[31m\u202e\r\n<b>",
-        "`|$x$|`[a](https://evil.example)<br>",
-        "{{ 7 * 7 }}%{y}&lt;b&gt;",
-    ]
-    found = []
-    for index, name in enumerate(names):
-        for agent in ("base", name):
-            evaluations = [make_evaluation([1, 0, 1], final=True, q_mean=-5.0, q_magnitude=0.5)]
-            record = make_record(evaluations, agent="standard", seed=index)
-            changed = record.base_policy.model_copy(
-                update={"name": name, "group": name, "warning": name}
-            )
-            extension = RecordedExtension(
-                kind="agent",
-                name=name,
-                target=name,
-                distribution=name,
-                version=name,
-                sha256="0" * 64,
-            )
-            texts = {"version": name, "python": name, "platform": name, "device": name}
-            provenance = record.provenance.model_copy(
-                update={**texts, "packages": {name: name}, "extensions": [extension]}
-            )
-            places = {"task": name, "embodiment": name, "variant": name, "agent": agent}
-            options = {name: name, "preset": name}
-            demonstrations = {"mode": name, "count": 50, "seed": 0}
-            config = record.config | places | {name: {name: [name, {name: None}]}}
-            config |= {"agent_options": options, "demonstrations": demonstrations}
-            update: dict[str, Any] = {"base_policy": changed, "provenance": provenance}
-            data = record.model_copy(update=update).model_dump(by_alias=True)
-            del data["config_hash"]
-            role = "reference" if agent == "base" else "learner"
-            found.append(RunRecord.model_validate({**data, "config": config, "role": role}))
+    """Records with each of `NAMES` in every text."""
     failed = make_record(status="failed", seed=99)
-    found.append(failed.model_copy(update={"failure": EVIL * 3}))
+    found = [failed.model_copy(update={"failure": EVIL * 3})]
+    for index, name in enumerate(NAMES):
+        for role, agent in (("reference", "base"), ("learner", name)):
+            curve = [make_evaluation([1, 0, 1], final=True, q_mean=-5.0, q_magnitude=0.5)]
+            options = {"agent_options": {name: name, "preset": name}, name: {name: [name, None]}}
+            data = make_record(curve, seed=index, **options).model_dump(by_alias=True)
+            del data["config_hash"]
+            extension = dict.fromkeys(("name", "target", "distribution", "version"), name)
+            data = with_name(data, name) | {"role": role}
+            data["config"]["agent"] = agent
+            data["provenance"]["packages"] = {name: name}
+            data["provenance"]["extensions"] = [extension | {"kind": "agent", "sha256": "0" * 64}]
+            found.append(RunRecord.model_validate(data))
     return found
 
 
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a site of ordinary records, with clips; its records lie in `../runs`."""
+    """The folder of a site of ordinary records, with films; its records lie in `../runs`."""
     folder = tmp_path_factory.mktemp("site")
     write_all(ordinary_records(), folder / "runs")
     run = folder / "runs" / "0"
-    (run / "film-none.mp4").write_bytes(VIDEO)
+    for place in (run / "film-none", *(folder / "runs" / f"film-{name}" for name in SIDE_BY_SIDE)):
+        place.with_name(f"{place.name}.mp4").write_bytes(VIDEO)
     (run / "paths-none.png").write_bytes(picture())
     (run / "film-text.mp4").write_text("no film")
     (run / "paths-link.png").symlink_to(run / "paths-none.png")

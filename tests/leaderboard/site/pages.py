@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,7 @@ class Page(HTMLParser):
         return {attrs["id"] for _, attrs in self.elements if "id" in attrs}
 
 
+@cache
 def read_pages(folder: Path) -> dict[Path, Page]:
     """Every page of results below a folder; the documentation's pages are not of these."""
     found = {path: Page(path) for path in sorted(folder.rglob("*.html"))}

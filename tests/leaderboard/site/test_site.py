@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import shutil
 from pathlib import Path
 
 import pytest
@@ -21,7 +20,7 @@ from symsteer.leaderboard.summary import load_runs, summarize
 from symsteer.leaderboard.tables import cell_name, render_csv
 from symsteer.leaderboard.text import SPACE, compact, interval, number
 from tests.leaderboard.record_factory import make_evaluation, make_record
-from tests.leaderboard.site.conftest import EVIL, VIDEO, picture, write_all
+from tests.leaderboard.site.conftest import EVIL, SIDE_BY_SIDE, picture, write_all
 from tests.leaderboard.site.pages import Page, dead_links, read_pages
 
 TAGS = frozenset(
@@ -194,28 +193,16 @@ def test_a_record_that_is_set_aside_says_so(site: Path) -> None:
     assert aside[0].record.run_id in Page(site / "findings.html").text
 
 
-def test_clips_and_paths_of_a_run_folder_are_copied(site: Path) -> None:
-    media = sorted(path.suffix for path in (site / "media").iterdir())
+def test_films_and_paths_are_copied_to_their_run_or_cell(site: Path) -> None:
     # Neither what only is called a film, nor a link, which may lead anywhere.
-    assert media == [".mp4", ".png"]
-    shown = [
-        attrs["src"]
-        for page in read_pages(site / "runs").values()
-        for tag, attrs in page.elements
-        if tag in ("img", "video")
-    ]
-    assert len(shown) == 2
-
-
-def test_films_side_by_side_are_on_the_page_of_their_cell(tmp_path: Path) -> None:
-    records = [make_record(agent=agent, variant="wind:0.5") for agent in ("base", "zero")]
-    write_all(records, tmp_path / "runs")
-    for name in ("film-PickCube-v1-floating-wind=0.5.mp4", "film-PickCube-v1-floating-wind=1.mp4"):
-        (tmp_path / "runs" / name).write_bytes(VIDEO)
-    generate([tmp_path / "runs"], tmp_path / "site", PAPER, docs=False)
-    (page,) = read_pages(tmp_path / "site" / "cells").values()
-    assert [tag for tag, _ in page.elements].count("video") == 1
-    assert "film-PickCube-v1-floating-wind=0.5" in page.text
+    assert sorted(path.suffix for path in (site / "media").iterdir()) == [".mp4", ".png"]
+    for kind, tags in (("runs", ["video", "img"]), ("cells", ["video"])):
+        pages = read_pages(site / kind).values()
+        shown = [
+            (page, tag) for page in pages for tag, _ in page.elements if tag in ("img", "video")
+        ]
+        assert [tag for _, tag in shown] == tags
+    assert f"film-{SIDE_BY_SIDE[0]}" in shown[0][0].text
 
 
 def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
@@ -225,7 +212,7 @@ def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
         files = (path for path in out.rglob("*") if path.is_file())
         return {str(path.relative_to(out)): path.read_bytes() for path in files}
 
-    out, runs = tmp_path / "site", tmp_path / "runs"
+    out = tmp_path / "site"
     generate([site.parent / "runs"], out, PAPER, docs=False)
     first = snapshot()
     assert first == {
@@ -234,10 +221,7 @@ def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
     (out / "runs" / "mine.txt").write_text("kept")
     (out / "docs").mkdir()
     (out / "docs" / "index.html").write_text("of an earlier site")
-    shutil.copytree(site.parent / "runs", runs)
-    for path in sorted(runs.iterdir())[3:]:
-        shutil.rmtree(path)
-    generate([runs], out, PAPER, docs=False)
+    generate([site.parent / "runs" / str(index) for index in range(3)], out, PAPER, docs=False)
     assert len(list((out / "runs").glob("*.html"))) == 3
     assert (out / "runs" / "mine.txt").read_text() == "kept"
     assert not (out / "docs").exists()
