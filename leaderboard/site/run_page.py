@@ -19,77 +19,48 @@ from symsteer.leaderboard.text import compact, count, number
 
 def run_values(results: Results, run: Run) -> dict[str, Any]:
     """The values of the template."""
-    record, where = run.record, results.row_of.get(run.path)
-    settings, policy, budget = record.settings, record.base_policy, record.budget
-    table, row = where or (None, None)
-    provenance, again = record.provenance, run.reproduction
-    sizes = record.parameters
+    record, again = run.record, run.reproduction
+    table, row = results.row_of.get(run.path) or (None, None)
+    budget = record.settings.env_steps
     facts = {
         "status": record.status,
         "failure": record.failure,
         "seed": str(run.seed),
         "success, final window": number(run.success) if run.finished else None,
         "success, last checkpoint": number(record.final.success_once) if record.final else None,
+        "base policy's success": number(record.base_policy.base_success),
         "Q diverged": None if run.diverged is None else ("yes" if run.diverged else "no"),
-        "environment steps": f"{count(budget.env_steps)} of {count(settings.env_steps)}",
-        "decisions, updates": f"{count(budget.decisions)}, {count(budget.updates)}",
-        "parameters (actor, critics)": f"{count(sizes.actor)}, {count(sizes.critic)}"
-        if sizes.total
-        else None,
-        "started": f"{record.started:%Y-%m-%d %H:%M} UTC",
+        "environment steps": f"{count(record.budget.env_steps)} of {count(budget)}",
         "minutes": number(record.wall_clock.total / 60, 1),
         "made again": again and f"{REPRODUCED[again.verdict]} on {again.repeated.ended:%Y-%m-%d}",
-        "continued": f"{record.wall_clock.resumed} times" if record.wall_clock.resumed else None,
-        "base policy": f"{policy.name} {policy.group or ''}, {policy.content_hash[:12]}",
-        "base policy's success": number(policy.base_success),
-        "warning": policy.warning,
-    }
-    made = {
-        "commit": provenance.commit
-        and provenance.commit + " with changes" * bool(provenance.dirty),
-        "version": provenance.version,
-        "sha256 of the code": provenance.sha256,
-        "device": provenance.device,
-        "platform": f"{provenance.platform}, Python {provenance.python}",
-        "processor": provenance.processor,
-        "packages": ", ".join(f"{name} {v}" for name, v in sorted(provenance.packages.items())),
-        "extensions": ", ".join(
-            f"{e.kind} {e.target} ({e.distribution or 'not installed'} {e.version or ''})"
-            for e in provenance.extensions
-        ),
-        "configuration": record.config_hash,
+        "warning": record.base_policy.warning,
     }
     command = repeat_command(record.config)
-    last = record.evaluations[-1] if record.evaluations else None
-    known = run.agent in results.summary.roles
+    measured = sorted({name for e in run.curve.values() for name in e.diagnostics})
+    header = ["Steps", "Episodes", "Success once", "Success at end", "Return", "Length", *measured]
+    every = record.model_dump(mode="json", by_alias=True, exclude={"evaluations"})
     return {
         "name": record.run_id,
-        "agent_page": results.agent(run.agent) if known else None,
+        "agent_page": results.agent(run.agent) if run.agent in results.summary.roles else None,
         "label": row.label if row else run.agent,
         "role": record.role,
         "cell": table and (results.names[table.key], results.cell(table.key)),
         "facts": {key: text for key, text in facts.items() if text},
-        "made": {key: text for key, text in made.items() if text},
+        "commit": record.provenance.commit,
+        "version": record.provenance.version,
         "command": command and re.split(" (?=--)", command),
-        "config": options_of(record.config),
+        "record": [(key, text) for key, text in options_of(every) if text != "null"],
         "charts": charts(run_curves(run)) if run.curve else [],
         "episodes": [episodes(run)] if run.curve else [],
-        "evaluations": [_evaluation(evaluation) for evaluation in run.curve.values()],
-        "last": _episodes(last) if last else [],
-        "diagnostics": [
-            (name, compact(value))
-            for name, value in sorted(last.diagnostics.items() if last else ())
-            if value is not None
-        ],
+        "evaluations": (header, [_evaluation(e, measured) for e in run.curve.values()]),
+        "last": _episodes(record.evaluations[-1]) if record.evaluations else [],
         "films": films_of(run),
     }
 
 
-def _evaluation(evaluation: Evaluation) -> list[str]:
-    """A row of the table of evaluations."""
-    columns, diagnostics = evaluation.episodes, evaluation.diagnostics
-    bias = diagnostics.get("q_bias", diagnostics.get("q_bias_successful"))
-    names = ("td_error", "equivariance_actor", "equivariance_critic")
+def _evaluation(evaluation: Evaluation, measured: Sequence[str]) -> list[str]:
+    """A row of the table of evaluations; diagnostics come last."""
+    columns = evaluation.episodes
     return [
         grouped(evaluation.env_steps),
         str(len(columns.seed)),
@@ -97,9 +68,7 @@ def _evaluation(evaluation: Evaluation) -> list[str]:
         number(_mean(columns.success_at_end)),
         number(_mean(columns.return_), 1),
         number(_mean(columns.episode_len), 1),
-        compact(diagnostics.get("q_mean")),
-        compact(bias),
-        *(compact(diagnostics.get(name)) for name in names),
+        *(compact(evaluation.diagnostics.get(name)) for name in measured),
     ]
 
 
