@@ -429,86 +429,47 @@ def base(
 
 
 def export(
-    run: Annotated[Path | None, tyro.conf.arg(metavar="[RUN]")] = None,
-    /,
-    *,
-    out: Path,
-    format: Literal["bundle", "lerobot"] = "bundle",
-    contents: Literal["all", "demonstrations", "policy"] = "all",
-    task: str | None = None,
-    embodiment: str | None = None,
-    count: int | None = None,
-    mode: Literal["clean", "diverse"] | None = None,
-    seed: int | None = None,
-    policy: str | None = None,
-    runs: Path = Path("runs"),
-    videos: Literal["auto", "on", "off"] = "auto",
-    trust: Trust = (),
+    run: Annotated[Path, tyro.conf.arg(metavar="RUN")], /, *, out: Path, trust: Trust = ()
 ) -> int:
-    """Write a base policy and its demonstrations to one file, or demonstrations for LeRobot.
-
-    They are those of a run, or of the settings --task, --embodiment, ..., as a run would make them;
-    what RUNS/base has of these is taken from there (docs/bundles.md).
+    """Write the base policy of a run and its demonstrations to one file (docs/bundles.md).
 
     Args:
-        run: Folder of a run; without it, the settings below.
-        out: The file to write (.zip); for --format lerobot a new folder.
-        format: bundle: one file for `symsteer fetch-bundle`; lerobot: demonstrations as a LeRobot
-            dataset, version 3.0.
-        contents: What goes into a bundle.
-        task: Task; `symsteer list` names them.
-        embodiment: floating (default) or panda.
-        count: Number of demonstrations (default 50).
-        mode: Kind of demonstrations (default diverse).
-        seed: Seed of demonstrations and policy (default 0).
-        policy: Base policy (default edp); `symsteer list` names them.
-        runs: Folder of runs; demonstrations and policies of settings are kept in RUNS/base.
-        videos: Whether a LeRobot dataset has a video; auto: where a Vulkan driver works.
+        run: Folder of a run; the folder base beside it has the demonstrations.
+        out: The file to write (.zip).
     """
-    allow(task, policy, *trust)
-    from symsteer.bench.bundles.bundle import check_path, write_bundle
-    from symsteer.bench.bundles.contents import contents_of_run, contents_of_settings
-    from symsteer.bench.runs.config import build_config
+    allow(*trust)
+    from symsteer.bench.bundles.bundle import write_bundle
 
-    given = {"task": task, "embodiment": embodiment, "seed": seed, "count": count, "mode": mode}
-    settings = {k: v for k, v in {**given, "policy": policy}.items() if v is not None}
-    if run is not None and settings:
-        raise UserError(
-            f"a run has its own settings: leave out {run}, or --{' and --'.join(settings)}"
-        )
-    if run is None and task is None:
-        raise UserError("name the folder of a run, or a task with --task")
-    if format == "lerobot" and contents == "policy":
-        raise UserError(
-            "a LeRobot dataset holds demonstrations only; use --format bundle for a policy"
-        )
-    if format == "bundle":
-        check_path(out)
-        wanted = contents
-    else:
-        with _extra("lerobot", "pyarrow", "a LeRobot dataset needs pyarrow"):
-            from symsteer.bench.bundles.lerobot import check_folder, write_dataset
-        check_folder(out)
-        wanted = "demonstrations"
-    prepare_folder(out.parent)
-    if run is not None:
-        found = contents_of_run(run, wanted)
-    else:
-        tables: dict[str, Any] = {
-            "demonstrations": {k: settings.pop(k) for k in ("count", "mode") if k in settings},
-            "policy": {"name": settings.pop("policy")} if "policy" in settings else {},
-        }
-        config = build_config({**settings, **tables}, "symsteer export")
-        found = contents_of_settings(config, runs, wanted)
-    if format == "lerobot":
-        print(write_dataset(found, out, videos))
-        return 0
-    manifest = write_bundle(found, out)
-    if found.left_out:
-        print(f"the bundle has no demonstrations: {found.left_out}", file=sys.stderr)
+    manifest, absent = write_bundle(run, out)
+    if absent:
+        print(f"the bundle has no demonstrations: {absent}", file=sys.stderr)
     held = [file.path for file in manifest.files]
     print(f"wrote {out} ({out.stat().st_size / 2**20:.1f} MiB): {', '.join(held)}")
     print(f"unpack it anywhere with: {to_paste('symsteer', 'fetch-bundle', out)}")
+    return 0
+
+
+def export_lerobot(
+    demos: Annotated[Path, tyro.conf.arg(metavar="DEMOS")],
+    /,
+    *,
+    out: Path,
+    videos: Literal["auto", "on", "off"] = "auto",
+    trust: Trust = (),
+) -> int:
+    """Write demonstrations as a LeRobot dataset, version 3.0 (docs/bundles.md).
+
+    Args:
+        demos: A file of `symsteer demos`, or of a run in RUNS/base (.h5, its .json beside it).
+        out: A new folder.
+        videos: Whether the dataset has a video; auto: where a Vulkan driver works.
+    """
+    allow(*trust)
+    with _extra("lerobot", "pyarrow", "a LeRobot dataset needs pyarrow"):
+        from symsteer.bench.bundles.lerobot import write_dataset
+
+    prepare_folder(out.parent)
+    print(write_dataset(demos, out, videos))
     return 0
 
 
@@ -524,22 +485,12 @@ def fetch_bundle(
         out: Folder to unpack to: RUNS/base.
     """
     from symsteer.bench.bundles.fetch import fetch_bundle
-    from symsteer.bench.bundles.manifest import next_commands
 
     manifest, places = fetch_bundle(file, out)
-    card, policy = manifest.path("card"), manifest.path("policy")
-    demonstrations = manifest.path("demonstrations", ".h5")
-    for kind, name in {"card": card, "policy": policy, "demonstrations": demonstrations}.items():
-        if name:
-            print(f"{kind + ':':16s}{places[name]}")
-    commands = next_commands(
-        manifest.task,
-        manifest.embodiment,
-        places[policy] if policy else None,
-        places[demonstrations] if demonstrations else None,
-        manifest.demonstrations.count,
-    )
-    for command in commands:
+    for kind in ("card", "policy", "demonstrations"):
+        if path := manifest.path(kind, ".h5" if kind == "demonstrations" else ""):
+            print(f"{kind + ':':16s}{places[path]}")
+    for command in manifest.commands(out):
         print(f"{'next:':16s}{command}")
     return 0
 

@@ -69,6 +69,7 @@ GROUPS = {
         "demos": Verb(f"{BENCH}:demos"),
         "base": Verb(f"{BENCH}:base"),
         "export": Verb(f"{BENCH}:export"),
+        "export-lerobot": Verb(f"{BENCH}:export_lerobot"),
         "fetch-bundle": Verb(f"{BENCH}:fetch_bundle", computes=False),
     },
     "broken symmetry, and agents": {

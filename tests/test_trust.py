@@ -27,7 +27,6 @@ import pytest
 
 from symsteer import cli
 from symsteer.bench.bundles.bundle import write_bundle
-from symsteer.bench.bundles.contents import contents_of_run
 from symsteer.bench.runs.arguments import Execution
 from symsteer.bench.runs.run import execute
 from tests import hostile
@@ -96,7 +95,7 @@ def intact(tmp_path_factory) -> Path:
     """Folder of an intact run, with demonstrations and base policy beside it."""
     out = tmp_path_factory.mktemp("intact")
     run = execute(tiny_config(agent="base", keep_replay=True), out, progress=False)
-    write_bundle(contents_of_run(run, "all"), out / "bundle.zip")
+    write_bundle(run, out / "bundle.zip")
     return run
 
 

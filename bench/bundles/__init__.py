@@ -1,7 +1,6 @@
 """Demonstrations and base policies to take away: bundles, and datasets for LeRobot.
 
-- `contents`: which files a run, or settings, stand for.
-- `bundle`: one zip file with a `manifest` and a `card`; `measure` says what the policy can do.
+- `bundle`: one zip file with a `manifest` and a card, which says what the policy can do.
 - `fetch`: checking and unpacking such a file.
 - `lerobot`: demonstrations as a LeRobot dataset; `film`: its video.
 """

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from symsteer.bench.bundles.manifest import FORMAT, MANIFEST, VERSION, Manifest
+from symsteer.bench.bundles.manifest import FORMAT, MANIFEST, VERSION, BundleManifest
 from symsteer.errors import UserError, first_problem
 from symsteer.files import write_together
 
@@ -32,7 +32,7 @@ DAMAGE = (
 """What ``zipfile`` raises for a damaged archive."""
 
 
-def fetch_bundle(path: Path, out: Path) -> tuple[Manifest, dict[str, Path]]:
+def fetch_bundle(path: Path, out: Path) -> tuple[BundleManifest, dict[str, Path]]:
     """Check a bundle as a whole, then write its files below ``out``, all or none.
 
     Card and manifest go to ``out/bundles/NAME``. Files that are there already with the same
@@ -72,7 +72,7 @@ def fetch_bundle(path: Path, out: Path) -> tuple[Manifest, dict[str, Path]]:
     return manifest, {file.path: places[file.path] for file in manifest.files}
 
 
-def read_bundle(path: Path) -> tuple[Manifest, dict[str, bytes]]:
+def read_bundle(path: Path) -> tuple[BundleManifest, dict[str, bytes]]:
     """The manifest and all files of a bundle, by name, checked against their hashes.
 
     Raises:
@@ -94,7 +94,7 @@ def read_bundle(path: Path) -> tuple[Manifest, dict[str, bytes]]:
         ) from error
 
 
-def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
+def _manifest(path: Path, archive: zipfile.ZipFile) -> BundleManifest:
     foreign = f"{path} is a zip file, but not a bundle of SymSteer"
     if MANIFEST not in archive.namelist():
         raise UserError(f"{foreign}: it has no {MANIFEST}; name one that `symsteer export` wrote")
@@ -114,14 +114,14 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
             f"reads version {VERSION}; use the SymSteer that wrote it, or export it again"
         )
     try:
-        return Manifest.model_validate_json(text)
+        return BundleManifest.model_validate_json(text)
     except ValidationError as error:
         raise UserError(
             f"the {MANIFEST} of {path} is wrong in {first_problem(error)}; copy it again"
         ) from error
 
 
-def _contents(path: Path, archive: zipfile.ZipFile, manifest: Manifest) -> dict[str, bytes]:
+def _contents(path: Path, archive: zipfile.ZipFile, manifest: BundleManifest) -> dict[str, bytes]:
     members = archive.infolist()
     listed = [MANIFEST, *(file.path for file in manifest.files)]
     if sorted(member.filename for member in members) != sorted(listed):

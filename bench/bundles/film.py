@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ import torch
 from tqdm import tqdm
 
 from symsteer.bench.demos.files import opened
-from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.film import write_video
 from symsteer.bench.runs.pictures import CAMERA
 from symsteer.bench.sim.trees import map_trees, rows_of
@@ -37,13 +37,13 @@ STRIDE = 4
 
 
 def film_demonstrations(
-    config: RunConfig, demonstrations: Path, lengths: list[int], out: Path
+    demonstrations: Path, task: str, embodiment: str, lengths: list[int], out: Path
 ) -> list[np.ndarray]:
     """Write one video of all episodes: a frame for each action, of the state before it.
 
     Args:
-        config: task and embodiment.
         demonstrations: the .h5 file.
+        task, embodiment: of the demonstrations.
         lengths: actions of each episode.
         out: the .mp4 file.
 
@@ -56,32 +56,25 @@ def film_demonstrations(
     pixels: list[list[np.ndarray]] = [[] for _ in lengths]
 
     def frames() -> Iterator[np.ndarray]:
-        with tqdm(total=sum(lengths), desc="video", disable=None) as bar:
-            for episode, frame in _frames(config, demonstrations, lengths):
-                pixels[episode].append(frame[::STRIDE, ::STRIDE])
-                yield frame
-                bar.update()
-
-    write_video(out, frames(), ENCODING)
-    return [np.stack(frames) for frames in pixels]
-
-
-def _frames(
-    config: RunConfig, demonstrations: Path, lengths: list[int]
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Number of the episode and picture ``[height, width, 3]`` uint8, for every frame."""
-    env = make(config.task, num_envs=1, embodiment=config.embodiment, **RENDERING)
-    try:
-        env.reset(seed=0)
-        with opened(demonstrations) as file:
+        env = make(task, num_envs=1, embodiment=embodiment, **RENDERING)
+        with (
+            contextlib.closing(env),
+            opened(demonstrations) as file,
+            tqdm(total=sum(lengths), desc="video", disable=None) as bar,
+        ):
+            env.reset(seed=0)
             for episode, length in enumerate(lengths):
                 states = _arrays(file[f"traj_{episode}/env_states"])
                 for step in range(length):
                     row = rows_of(states, slice(step, step + 1))
                     env.set_state_dict(map_trees(torch.from_numpy, row))
-                    yield episode, env.render()[0].cpu().numpy()[..., :3]
-    finally:
-        env.close()
+                    frame = env.render()[0].cpu().numpy()[..., :3]
+                    pixels[episode].append(frame[::STRIDE, ::STRIDE])
+                    yield frame
+                    bar.update()
+
+    write_video(out, frames(), ENCODING)
+    return [np.stack(frames) for frames in pixels]
 
 
 def _arrays(group: h5py.Group) -> dict[str, Any]:

@@ -29,11 +29,11 @@ PATHS: dict[Role, str] = {
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class _Block(BaseModel):
+class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-class BundledFile(_Block):
+class BundledFile(_Strict):
     """A file of a bundle; what it is decides the form of its path."""
 
     path: Annotated[str, Field(max_length=400)]
@@ -48,7 +48,7 @@ class BundledFile(_Block):
         return self
 
 
-class Code(_Block):
+class Code(_Strict):
     """The SymSteer that wrote a bundle, as in a record's provenance."""
 
     version: str | None
@@ -68,7 +68,7 @@ class Code(_Block):
         return f"SymSteer {self.version} ({which}{', changed' if self.dirty else ''})"
 
 
-class BundledDemonstrations(_Block):
+class BundledDemonstrations(_Strict):
     """Settings of the demonstrations that are in a bundle, or that its policy was trained on."""
 
     mode: Literal["clean", "diverse"]
@@ -76,7 +76,7 @@ class BundledDemonstrations(_Block):
     seed: int
 
 
-class Manifest(_Block):
+class BundleManifest(_Strict):
     """``manifest.json``: what a bundle holds, and where it came from.
 
     ``measured`` is null without a policy; ``origin`` has the hashes of files of the user that the
@@ -101,18 +101,16 @@ class Manifest(_Block):
 
     def path(self, role: str, suffix: str = "") -> str | None:
         """The first file with a role whose name ends so; None if there is none."""
-        found = (f.path for f in self.files if f.role == role and f.path.endswith(suffix))
-        return next(found, None)
+        paths = (f.path for f in self.files if f.role == role and f.path.endswith(suffix))
+        return next(paths, None)
 
-
-def next_commands(
-    task: str, embodiment: str, policy: Path | None, demonstrations: Path | None, count: int
-) -> list[str]:
-    """Commands that use an unpacked base policy, and ``count`` unpacked demonstrations."""
-    run = ("symsteer", "run", "--task", task, "--embodiment", embodiment)
-    commands = []
-    if policy is not None:
-        commands.append(to_paste(*run, "--base-policy", policy))
-    if demonstrations is not None:
-        commands.append(to_paste(*run, "--demos", demonstrations, "--demonstrations.count", count))
-    return commands
+    def commands(self, base: Path) -> list[str]:
+        """Commands that use what was unpacked to a folder."""
+        run = ("symsteer", "run", "--task", self.task, "--embodiment", self.embodiment)
+        commands = []
+        if policy := self.path("policy"):
+            commands.append(to_paste(*run, "--base-policy", base / policy))
+        if demos := self.path("demonstrations", ".h5"):
+            count = ("--demonstrations.count", self.demonstrations.count)
+            commands.append(to_paste(*run, "--demos", base / demos, *count))
+        return commands

@@ -66,6 +66,14 @@ class _Description(_Table):
     symsteer: dict[str, Any] = {}
     source_type: Any = "unknown"
 
+    @property
+    def embodiment(self) -> str:
+        """By its name here, or that of ManiSkill's robot."""
+        kwargs = self.env_info.env_kwargs
+        robot = kwargs.get("robot_uids", _STOCK_ROBOT)
+        robot = str(robot[0] if isinstance(robot, list) and len(robot) == 1 else robot)
+        return str(kwargs.get("embodiment", _SAME_ROBOT.get(robot, robot)))
+
     @field_validator("episodes")
     @classmethod
     def _once(cls, episodes: list[_Episode]) -> list[_Episode]:
@@ -97,7 +105,10 @@ class Demonstrations:
 
 
 def load(
-    h5_path: str | os.PathLike[str], task: str, embodiment: str, count: int | None = None
+    h5_path: str | os.PathLike[str],
+    task: str | None = None,
+    embodiment: str | None = None,
+    count: int | None = None,
 ) -> Demonstrations:
     """Read the first ``count`` successful episodes of a trajectory file.
 
@@ -106,17 +117,19 @@ def load(
 
     Args:
         h5_path: the ``.h5`` file; its ``.json`` lies next to it.
-        task: the task that the demonstrations must be of.
-        embodiment: the embodiment that they must be of.
+        task: the task that the demonstrations must be of; None: that of the file.
+        embodiment: the embodiment that they must be of; None: that of the file.
         count: how many; None for all.
 
     Raises:
         UserError: one sentence on why the file cannot be used.
     """
     path = Path(h5_path)
-    task, env_class = task_name(task), task_class(task)
-    check_embodiment(embodiment)
     raw, description = _read_description(path)
+    task = task_name(description.env_info.env_id if task is None else task)
+    embodiment = description.embodiment if embodiment is None else embodiment
+    env_class = task_class(task)
+    check_embodiment(embodiment)
     listed = _usable(path, description, task, embodiment, count)
     layout, dim = env_class.observation_layout, env_class.action_layout.dim
     in_our_layout = description.symsteer.get("observation_layout") == layout.to_json()
@@ -194,9 +207,7 @@ def _usable(
     info, kwargs = description.env_info, description.env_info.env_kwargs
     if (recorded := task_name(info.env_id)) != task:
         raise UserError(f"{path} holds demonstrations of {recorded}, but {task} is wanted")
-    robot = kwargs.get("robot_uids", _STOCK_ROBOT)
-    robot = str(robot[0] if isinstance(robot, list) and len(robot) == 1 else robot)
-    if (body := kwargs.get("embodiment", _SAME_ROBOT.get(robot, robot))) != embodiment:
+    if (body := description.embodiment) != embodiment:
         raise UserError(f"{path} was recorded with {body!r}, but {embodiment!r} is wanted")
     wanted = BODIES[embodiment].control_mode
     modes = {str(e.control_mode or kwargs.get("control_mode")) for e in description.episodes}

@@ -2,7 +2,7 @@
 
 Observations are LeRobot's: ``agent_pos`` is the gripper, ``environment_state`` what is observed of
 the objects, ``pixels`` a picture if ``IMAGES`` is set. They are those of the datasets that
-``symsteer export --format lerobot`` writes.
+``symsteer export-lerobot`` writes.
 """
 
 from __future__ import annotations

@@ -9,7 +9,6 @@ from unittest.mock import patch
 import pytest
 
 from symsteer.bench.bundles.bundle import write_bundle
-from symsteer.bench.bundles.contents import contents_of_run
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.run import execute
@@ -54,7 +53,7 @@ def workshop(tmp_path_factory) -> Workshop:
     folder = stop_after(CONFIG, out, checkpoints=2)
     other = stop_after(OTHER, out, checkpoints=1)
     h5 = next((out / "base").glob("*.h5"))
-    write_bundle(contents_of_run(folder, "all"), out / "bundle.zip")
+    write_bundle(folder, out / "bundle.zip")
     state = load_checkpoint(folder)
     assert state is not None
     write_sweep(make_plan(Suite("two", "", (CONFIG, OTHER)), out), 1, {other.name: "it broke"})

@@ -194,8 +194,8 @@ PAIR = ("standard", "equivariant")
 
 WRITERS = {
     "film": ("film", "RUN", "--episodes", 1, "--out", "OUT/a.gif"),
-    "bundle": ("export", "RUN", "--contents", "demonstrations", "--out", "OUT/a.zip"),
-    "lerobot": ("export", "RUN", "--format", "lerobot", "--videos", "off", "--out", "OUT/set"),
+    "bundle": ("export", "RUN", "--out", "OUT/a.zip"),
+    "lerobot": ("export-lerobot", "DEMOS", "--videos", "off", "--out", "OUT/set"),
     "audit": ("audit", "--task", "PushCube-v1", *SMALL_AUDIT, "--out", "OUT"),
     "report": ("report", "RESULTS", "--out", "OUT"),
     "site": ("site", "RESULTS", "--no-docs", "--out", "OUT"),
@@ -214,8 +214,9 @@ def test_what_a_verb_writes_is_whole_or_not_there(verb, undisturbed, tmp_path):
         (results / f"{agent}.json").write_text(dump_record(make_record(agent=agent)))
 
     def arguments(out):
-        places = {"RUN": str(undisturbed), "RESULTS": str(results), "OUT": str(out)}
-        return [places.get(str(w), str(w).replace("OUT/", f"{out}/")) for w in WRITERS[verb]]
+        demos = next(undisturbed.parent.glob("base/*.h5"))
+        places = {"RUN": undisturbed, "DEMOS": demos, "RESULTS": results, "OUT": out}
+        return [str(places.get(w, str(w).replace("OUT/", f"{out}/"))) for w in WRITERS[verb]]
 
     out = tmp_path / "out"
     with files_end_at(200):
@@ -225,7 +226,7 @@ def test_what_a_verb_writes_is_whole_or_not_there(verb, undisturbed, tmp_path):
     assert end_of(arguments(out)).kind == "done"
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
     assert before
-    if verb not in ("lerobot", "new"):
+    if verb not in ("audit", "lerobot", "new"):
         with files_end_at(200):
             complaint(*arguments(out))
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
@@ -269,7 +270,7 @@ def test_read_only_folders(undisturbed, workshop, read_only, tmp_path):
         ("audit", "--out", runs / "audit"),
         ("film", finished, "--episodes", 1),
         ("export", finished, "--out", runs / "a.zip"),
-        ("export", finished, "--format", "lerobot", "--out", runs / "set"),
+        ("export-lerobot", next(runs.glob("base/*.h5")), "--out", runs / "set"),
         ("site", finished, "--no-docs", "--out", runs / "site"),
         ("new", "agent", "mine", "--out", runs),
     ):

@@ -80,14 +80,13 @@ base --policies none
 export
 export --out a.zip
 export nowhere --out a.zip
-export folder --task PickCube-v1 --out a.zip
-export --task Nothing --out a.zip
-export --task PickCube-v1 --embodiment hand --out a.zip
-export --task PickCube-v1 --count 0 --out a.zip
-export --task PickCube-v1 --out a.tar
-export --task PickCube-v1 --out folder
-export --task PickCube-v1 --format rlds --out new
-export --task PickCube-v1 --format lerobot --contents policy --out new
+export file --out a.zip
+export nowhere --out a.tar
+export nowhere --out folder
+export-lerobot
+export-lerobot nowhere --out new
+export-lerobot folder.h5 --out new
+export-lerobot file --out file
 fetch-bundle
 fetch-bundle file
 fetch-bundle x.json

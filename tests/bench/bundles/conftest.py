@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from symsteer.bench.bundles.bundle import write_bundle
-from symsteer.bench.bundles.contents import contents_of_run
 from symsteer.bench.runs.run import execute
 from tests.bench.tiny_run import tiny_config
 
@@ -20,5 +19,6 @@ def run(tmp_path_factory) -> Path:
 def bundle(run, tmp_path_factory) -> Path:
     """Its base policy and demonstrations as a bundle."""
     path = tmp_path_factory.mktemp("bundle") / "all.zip"
-    write_bundle(contents_of_run(run, "all"), path)
+    _, absent = write_bundle(run, path)
+    assert absent is None
     return path

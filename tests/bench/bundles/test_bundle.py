@@ -14,14 +14,11 @@ import pytest
 import torch
 
 import symsteer
-from symsteer.bench.bundles.bundle import write_bundle
-from symsteer.bench.bundles.card import how_made
-from symsteer.bench.bundles.contents import Contents, contents_of_run, contents_of_settings
+from symsteer.bench.bundles.bundle import how_made, measure, write_bundle
 from symsteer.bench.bundles.fetch import fetch_bundle, read_bundle
-from symsteer.bench.bundles.measure import measure
 from symsteer.bench.demos import load
 from symsteer.bench.runs.arguments import parse_run
-from symsteer.bench.runs.base_policy import demonstration_path, find_base, prepare_base
+from symsteer.bench.runs.base_policy import find_base, prepare_base
 from symsteer.bench.runs.run import execute
 from symsteer.bench.tasks import task_class
 from symsteer.cli import main
@@ -40,11 +37,6 @@ def files_below(folder):
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*.*")}
 
 
-def command(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["symsteer", *map(str, arguments)])
-    return main()
-
-
 # ------------------------------------------------------------------ there and back
 
 
@@ -59,57 +51,66 @@ def test_a_run_elsewhere_finds_what_was_unpacked(run, bundle, tmp_path):
     policy = places[manifest.path("policy")]
     assert load_policy(policy).content_hash() == load_policy(run).content_hash()
     assert symsteer.load(policy).world["task"] == "PickCube-v1"
-    demos = load(places[manifest.path("demonstrations", ".h5")], "PickCube-v1", "floating")
+    demos = load(places[manifest.path("demonstrations", ".h5")])
     assert len(demos) == manifest.demonstrations.count == 3
 
 
 def test_unpacked_files_are_options_of_a_run(bundle, tmp_path):
     manifest, places = fetch_bundle(bundle, tmp_path / "unpacked")
     policy = places[manifest.path("policy")]
-    config = tiny_config(agent="zero")
-    with_policy = execute(config, tmp_path / "a", policy=policy, progress=False)
-    demos = places[manifest.path("demonstrations", ".h5")]
-    with_demos = execute(config, tmp_path / "b", demonstrations=demos, progress=False)
     wanted = load_policy(policy).content_hash()
-    assert load_policy(with_policy).content_hash() == wanted
-    assert load_policy(with_demos).content_hash() == wanted
+    config = tiny_config(agent="zero")
+    demos = places[manifest.path("demonstrations", ".h5")]
+    with_policy = execute(config, tmp_path / "a", policy=policy, progress=False)
+    with_demos = execute(config, tmp_path / "b", demonstrations=demos, progress=False)
     # Such runs can be taken away, too; where the demonstrations are unknown, without them.
-    assert contents_of_run(with_policy, "all").left_out
-    manifest = write_bundle(contents_of_run(with_demos, "policy"), tmp_path / "b.zip")
-    assert manifest.origin.keys() == {"demonstrations"}
-    assert manifest.origin["demonstrations"] in members(tmp_path / "b.zip")["CARD.md"].decode()
+    for made, kind in ((with_policy, "policy"), (with_demos, "demonstrations")):
+        assert load_policy(made).content_hash() == wanted
+        manifest, absent = write_bundle(made, tmp_path / f"{kind}.zip")
+        assert "does not have those that the policy was trained on" in absent
+        assert manifest.origin.keys() == {kind}
+        held = members(tmp_path / f"{kind}.zip")
+        assert held.keys() == {"manifest.json", "CARD.md", manifest.path("policy")}
+        assert manifest.origin[kind] in held["CARD.md"].decode()
 
 
-def test_the_same_contents_give_the_same_bytes(run, bundle, tmp_path):
-    write_bundle(contents_of_run(run, "all"), tmp_path / "again.zip")
-    assert (tmp_path / "again.zip").read_bytes() == bundle.read_bytes()
+def test_the_same_run_gives_the_same_bytes(run, bundle, tmp_path):
     copied = shutil.copytree(run.parent, tmp_path / "elsewhere")
-    write_bundle(contents_of_run(copied / run.name, "all"), tmp_path / "copy.zip")
+    write_bundle(copied / run.name, tmp_path / "copy.zip")
     assert (tmp_path / "copy.zip").read_bytes() == bundle.read_bytes()
 
 
-def test_settings_are_made_as_a_run_makes_them(run, bundle):
-    """What runs/base has is taken; the rest is made, which is the same on the CPU."""
-    made = contents_of_settings(tiny_config(agent="zero"), run.parent / "new", "all")
-    assert made.policy.content_hash() == load_policy(run).content_hash()
-    names = set(members(bundle))
-    assert {made.demonstrations.name, f"{made.name}/policy.safetensors"} < names
-    taken = contents_of_settings(tiny_config(agent="zero"), run.parent, "demonstrations")
-    assert taken.demonstrations.parent == run.parent / "base"
-    assert taken.policy is None
+def test_another_policy_of_the_same_settings_is_not_that_of_the_run(run, tmp_path):
+    """A base policy from a file may have the settings of one in runs/base, not its weights."""
+    copied = shutil.copytree(run.parent, tmp_path / "runs") / run.name
+    policy = load_policy(copied)
+    with torch.no_grad():
+        next(iter(policy.parameters())).add_(1.0)
+    save_policy(policy, copied)
+    manifest, absent = write_bundle(copied, tmp_path / "other.zip")
+    assert absent
+    assert policy.content_hash()[:12] in manifest.name
+
+
+def test_a_run_without_its_policy_is_refused(run, tmp_path):
+    copied = shutil.copytree(run, tmp_path / run.name)
+    (copied / "policy.safetensors").unlink()
+    with pytest.raises(UserError, match="has no base policy yet"):
+        write_bundle(copied, tmp_path / "a.zip")
 
 
 # ------------------------------------------------------------------ what a bundle says
 
 
-def test_the_manifest_lists_every_file_with_its_hash(run, bundle):
-    found = members(bundle)
-    manifest = json.loads(found["manifest.json"])
+def test_manifest_and_card_say_what_is_inside(run, bundle):
+    held = members(bundle)
+    manifest, card = json.loads(held["manifest.json"]), held["CARD.md"].decode()
     listed = {file["path"]: file for file in manifest["files"]}
-    assert listed.keys() == found.keys() - {"manifest.json"}
+    assert listed.keys() == held.keys() - {"manifest.json"}
     for name, file in listed.items():
-        assert file["size"] == len(found[name])
-        assert file["sha256"] == hashlib.sha256(found[name]).hexdigest()
+        assert file["size"] == len(held[name])
+        assert file["sha256"] == hashlib.sha256(held[name]).hexdigest()
+        assert name == "CARD.md" or f"| `{name}` | {file['size']} | `{file['sha256']}` |" in card
     task = task_class("PickCube-v1")
     assert manifest["observation_layout"] == task.observation_layout.to_json()
     assert manifest["action_layout"] == task.action_layout.to_json()
@@ -118,15 +119,13 @@ def test_the_manifest_lists_every_file_with_its_hash(run, bundle):
     assert manifest["policy"] == tiny_config().to_json()["policy"]
     assert manifest["code"]["version"] == symsteer.__version__
     assert manifest["code"]["commit"] or manifest["code"]["sha256"]
-    config = tiny_config()
-    assert demonstration_path(config, run.parent).name in found
-    assert f"{find_base(config, run.parent).name}/policy.safetensors" in found
+    for words in ("Apache-2.0", "CC BY-NC 4.0", "and the 3 diverse demonstrations"):
+        assert words in card
 
 
 def test_the_card_gives_what_was_measured(run, bundle):
-    found = members(bundle)
-    measured = json.loads(found["manifest.json"])["measured"]
-    card = found["CARD.md"].decode()
+    held = members(bundle)
+    measured, card = json.loads(held["manifest.json"])["measured"], held["CARD.md"].decode()
     assert measured["episodes"] == tiny_config().evaluation.final_episodes
     assert f"{measured['successes']} of {measured['episodes']} held-out episodes" in card
     low, high = measured["interval"]
@@ -134,11 +133,17 @@ def test_the_card_gives_what_was_measured(run, bundle):
     assert measured["steerability"] == load_policy(run).report["steerability"]
     assert "of 2 initial states are solved by at least one of 16 draws" in card
     assert measured["equivariance_error"] < 1e-4
-    for name, data in found.items():
-        if name not in ("CARD.md", "manifest.json"):
-            assert f"| `{name}` | {len(data)} | `{hashlib.sha256(data).hexdigest()}` |" in card
-    assert "Apache-2.0" in card
-    assert "CC BY-NC 4.0" in card
+
+
+def test_a_policy_without_symmetry_has_a_large_error(tmp_path):
+    config = tiny_config(policy_name="plain")
+    policy = prepare_base(config, tmp_path, progress=False)
+    plain = measure(config, policy)
+    assert plain["group"] == "C8"
+    assert plain["equivariance_error"] > 1e-2
+    del policy.report["steerability"]["solvable"]
+    with pytest.raises(UserError, match="lacks a part of its steerability report"):
+        measure(config, policy)
 
 
 def test_the_command_of_the_card_asks_for_the_same_policy(run, bundle):
@@ -151,57 +156,10 @@ def test_the_command_of_the_card_asks_for_the_same_policy(run, bundle):
 def test_flags_and_lists_of_the_command_are_as_they_are_typed():
     options = POLICIES.get("plain").Options(match_parameters=False, hold=("gripper", "yaw"))
     config = tiny_config(policy_name="plain", policy=options, seed=3)
-    task = task_class(config.task)
-    policy = POLICIES.get("plain")(options, task.observation_layout, task.action_layout)
-    made = how_made(Contents("name", config, None, policy, None, {}))
-    (line,) = re.findall(r"^symsteer run (.*)$", made, flags=re.MULTILINE)
-    found, _ = parse_run(line.split())
-    assert (found.policy, found.policy_seed) == (options, 3)
-    assert found.demonstrations == config.demonstrations
-
-
-def test_a_policy_without_symmetry_has_a_large_error(tmp_path):
-    config = tiny_config(policy_name="plain")
-    policy = prepare_base(config, tmp_path, progress=False)
-    plain = measure(config, policy)
-    assert plain.group == "C8"
-    assert plain.equivariance_error > 1e-2
-    del policy.report["steerability"]["solvable"]
-    with pytest.raises(UserError, match="lacks a part of its steerability report"):
-        measure(config, policy)
-
-
-def test_parts_alone(run, tmp_path):
-    write_bundle(contents_of_run(run, "policy"), tmp_path / "p.zip")
-    assert {name.rpartition(".")[2] for name in members(tmp_path / "p.zip")} == {
-        *("json", "md", "safetensors")
-    }
-    manifest = write_bundle(contents_of_run(run, "demonstrations"), tmp_path / "d.zip")
-    assert manifest.measured is None
-    assert len(members(tmp_path / "d.zip")) == 4
-    assert "symsteer demos" in members(tmp_path / "d.zip")["CARD.md"].decode()
-
-
-def test_a_run_whose_demonstrations_are_gone(run, tmp_path):
-    alone = shutil.copytree(run, tmp_path / run.name)
-    contents = contents_of_run(alone, "all")
-    assert contents.demonstrations is None
-    assert "demonstrations" in contents.left_out
-    assert contents_of_run(alone, "policy").left_out is None
-    with pytest.raises(UserError, match="--contents policy"):
-        contents_of_run(alone, "demonstrations")
-
-
-def test_another_policy_of_the_same_settings_is_not_that_of_the_run(run, tmp_path):
-    """A base policy from a file may have the settings of one in runs/base, not its weights."""
-    copied = shutil.copytree(run.parent, tmp_path / "runs") / run.name
-    policy = load_policy(copied)
-    with torch.no_grad():
-        next(iter(policy.parameters())).add_(1.0)
-    save_policy(policy, copied)
-    contents = contents_of_run(copied, "all")
-    assert contents.demonstrations is None
-    assert policy.content_hash()[:12] in contents.name
+    (line,) = re.findall(r"^symsteer run (.*)$", how_made(config, {}), flags=re.MULTILINE)
+    typed, _ = parse_run(line.split())
+    assert (typed.policy, typed.policy_seed) == (options, 3)
+    assert typed.demonstrations == config.demonstrations
 
 
 # ------------------------------------------------------------------ what is refused
@@ -343,9 +301,6 @@ def test_other_files_of_the_same_name_stay(bundle, tmp_path):
     assert not card.exists()
 
 
-# ------------------------------------------------------------------ the command line
-
-
 def test_links_in_the_target_are_not_followed(bundle, tmp_path):
     manifest, _ = fetch_bundle(bundle, tmp_path / "intact")
     policy, demos = manifest.path("policy"), manifest.path("demonstrations", ".h5")
@@ -365,36 +320,49 @@ def test_links_in_the_target_are_not_followed(bundle, tmp_path):
     fetch_bundle(bundle, tmp_path / "named")
 
 
-def test_export_and_fetch_on_the_command_line(run, bundle, tmp_path, monkeypatch, capsys):
+# ------------------------------------------------------------------ the command line
+
+
+@pytest.fixture
+def command(monkeypatch, tmp_path):
+    """Calls a verb in an empty folder; returns the exit code."""
     monkeypatch.chdir(tmp_path)
-    assert command(monkeypatch, "export", run, "--out", "mine.zip") == 0
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["symsteer", *map(str, arguments)])
+        return main()
+
+    return call
+
+
+def test_export_and_fetch_on_the_command_line(run, bundle, tmp_path, command, capsys):
+    assert command("export", run, "--out", "mine.zip") == 0
     assert "symsteer fetch-bundle mine.zip" in capsys.readouterr().out
     assert (tmp_path / "mine.zip").read_bytes() == bundle.read_bytes()
-    assert command(monkeypatch, "fetch-bundle", "mine.zip") == 0
+    assert command("fetch-bundle", "mine.zip") == 0
     shown = capsys.readouterr().out
     for word in ("--base-policy", "--demos"):
         (place,) = re.findall(rf"next: .* {word} (\S+)", shown)
         assert (tmp_path / place).is_file()
         assert place.startswith("runs/base/")
-
-
-def test_a_policy_without_its_demonstrations_is_said(run, tmp_path, monkeypatch, capsys):
     alone = shutil.copytree(run, tmp_path / run.name)
-    assert command(monkeypatch, "export", alone, "--out", tmp_path / "p.zip") == 0
+    assert command("export", alone, "--out", "p.zip") == 0
     assert "the bundle has no demonstrations: " in capsys.readouterr().err
 
 
-def test_settings_of_the_command_line_reach_the_files(tmp_path, monkeypatch):
-    options = ("--count", 2, "--mode", "clean", "--seed", 4, "--contents", "demonstrations")
-    path = tmp_path / "d.zip"
-    arguments = ("--task", "PushCube-v1", *options, "--runs", tmp_path / "runs", "--out", path)
-    assert command(monkeypatch, "export", *arguments) == 0
-    manifest, files = read_bundle(path)
-    assert manifest.task == "PushCube-v1"
-    assert vars(manifest.demonstrations) == {"mode": "clean", "count": 2, "seed": 4}
-    description = json.loads(files[manifest.path("demonstrations", ".json")])
-    assert description["symsteer"]["mode"] == "clean"
-    assert len(description["episodes"]) == 2
+def test_older_bundles_may_have_demonstrations_alone(bundle, tmp_path, command, capsys):
+    def without_policy(files):
+        manifest = files["manifest.json"]
+        manifest["measured"] = None
+        policy = manifest["files"].pop()
+        assert policy["role"] == "policy"
+        del files[policy["path"]]
+
+    path = rewritten(bundle, tmp_path / "old.zip", without_policy)
+    assert command("fetch-bundle", path) == 0
+    shown = capsys.readouterr().out
+    assert "--demos" in shown
+    assert "policy" not in shown
 
 
 def test_fetching_needs_neither_torch_nor_maniskill(bundle, tmp_path):

@@ -2,20 +2,22 @@
 
 import importlib.util
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import imageio.v2 as imageio
 import numpy as np
 import pandas as pd
 import pytest
 from pyarrow import parquet
 
-from symsteer.bench.bundles.contents import contents_of_run
 from symsteer.bench.bundles.film import PIXELS, RENDERING
 from symsteer.bench.bundles.lerobot import write_dataset
 from symsteer.bench.demos import load
+from symsteer.bench.demos.files import checksum
 from symsteer.bench.sim import rendering_works
 from symsteer.bench.tasks import make, task_class
 from symsteer.cli import main
@@ -30,26 +32,27 @@ needs_vulkan = pytest.mark.skipif(not rendering_works(), reason="needs a Vulkan 
 
 
 @pytest.fixture(scope="module")
-def contents(run):
-    return contents_of_run(run, "demonstrations")
+def path(run):
+    """The demonstrations of the run."""
+    return next(run.parent.glob("base/*.h5"))
 
 
 @pytest.fixture(scope="module")
-def demos(contents):
-    return load(contents.demonstrations, "PickCube-v1", "floating")
+def demos(path):
+    return load(path)
 
 
 @pytest.fixture(scope="module")
-def dataset(contents, tmp_path_factory):
+def dataset(path, tmp_path_factory):
     folder = tmp_path_factory.mktemp("lerobot") / "dataset"
-    assert "without a video" in write_dataset(contents, folder, "off")
+    assert "without a video" in write_dataset(path, folder, "off")
     return folder
 
 
 @pytest.fixture(scope="module")
-def filmed(contents, tmp_path_factory):
+def filmed(path, tmp_path_factory):
     folder = tmp_path_factory.mktemp("lerobot") / "filmed"
-    assert "with a video" in write_dataset(contents, folder, "on")
+    assert "with a video" in write_dataset(path, folder, "on")
     return folder
 
 
@@ -172,12 +175,10 @@ def test_the_card_has_the_header_of_a_data_set_hub(dataset):
 
 
 @needs_vulkan
-def test_the_video_has_a_frame_for_each_action(filmed, contents, demos):
+def test_the_video_has_a_frame_for_each_action(filmed, path, demos):
     found = info(filmed)
-    path = filmed / found["video_path"].format(
-        video_key="observation.image", chunk_index=0, file_index=0
-    )
-    frames = np.stack(imageio.mimread(path))
+    video = found["video_path"].format(video_key="observation.image", chunk_index=0, file_index=0)
+    frames = np.stack(imageio.mimread(filmed / video))
     assert frames.shape == (found["total_frames"], PIXELS, PIXELS, 3)
     assert found["features"]["observation.image"]["shape"] == [PIXELS, PIXELS, 3]
     episodes = rows(filmed, "meta/episodes/chunk-000/file-000.parquet").to_pylist()
@@ -187,7 +188,7 @@ def test_the_video_has_a_frame_for_each_action(filmed, contents, demos):
         assert episode["videos/observation.image/to_timestamp"] > begin
         assert np.shape(episode["stats/observation.image/mean"]) == (3, 1, 1)
     # The second episode begins with the picture of its seed.
-    description = json.loads(contents.demonstrations.with_suffix(".json").read_text())
+    description = json.loads(path.with_suffix(".json").read_text())
     env = make("PickCube-v1", num_envs=1, **RENDERING)
     env.reset(seed=description["episodes"][1]["episode_seed"])
     picture = env.render()[0].numpy().astype(float)
@@ -200,36 +201,53 @@ def test_the_video_has_a_frame_for_each_action(filmed, contents, demos):
 # ------------------------------------------------------------------ mistakes
 
 
-def test_a_folder_with_something_in_it_stays_as_it_is(contents, tmp_path):
+def test_a_folder_with_something_in_it_stays_as_it_is(path, tmp_path):
     (tmp_path / "mine").write_text("text")
     with pytest.raises(UserError, match="exists already"):
-        write_dataset(contents, tmp_path, "off")
+        write_dataset(path, tmp_path, "off")
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
 @pytest.mark.skipif(rendering_works(), reason="needs a machine without a Vulkan driver")
-def test_a_video_where_nothing_renders_leaves_nothing_behind(contents, tmp_path):
+def test_a_video_where_nothing_renders_leaves_nothing_behind(path, tmp_path):
     with pytest.raises(UserError, match="Vulkan"):
-        write_dataset(contents, tmp_path / "new", "on")
+        write_dataset(path, tmp_path / "new", "on")
     assert not list(tmp_path.iterdir())
 
 
-def test_without_pyarrow_the_command_says_what_to_install(run, tmp_path, monkeypatch, capsys):
+def command(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["symsteer", "export-lerobot", *map(str, arguments)])
+    return main()
+
+
+def test_without_pyarrow_the_command_says_what_to_install(path, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.delitem(sys.modules, "symsteer.bench.bundles.lerobot")
-    arguments = ["symsteer", "export", str(run), "--format", "lerobot", "--out"]
-    monkeypatch.setattr(sys, "argv", [*arguments, str(tmp_path / "new")])
-    assert main() == 2
+    assert command(monkeypatch, path, "--out", tmp_path / "new") == 2
     assert 'pip install "symsteer[lerobot]"' in capsys.readouterr().err
 
 
-def test_the_command_line_writes_a_dataset(run, demos, tmp_path, monkeypatch, capsys):
+def test_the_command_line_writes_a_dataset(path, demos, tmp_path, monkeypatch, capsys):
     out = tmp_path / "new"
-    arguments = ("export", run, "--format", "lerobot", "--videos", "off", "--out", out)
-    monkeypatch.setattr(sys, "argv", ["symsteer", *map(str, arguments)])
-    assert main() == 0
+    assert command(monkeypatch, path, "--videos", "off", "--out", out) == 0
     assert f"{len(demos)} episodes" in capsys.readouterr().out
-    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+    assert [found.name for found in tmp_path.iterdir()] == ["new"]
+    assert json.loads((out / "meta/symsteer.json").read_text())["demonstrations"] == {
+        **{"mode": "diverse", "count": 3, "seed": 0},
+    }
+
+
+def test_demonstrations_of_others_are_refused(path, tmp_path):
+    for file in (path, path.with_suffix(".json")):
+        shutil.copy(file, tmp_path / f"theirs{file.suffix}")
+    side = tmp_path / "theirs.json"
+    description = json.loads(side.read_text())
+    del description["symsteer"]["seed"]
+    with h5py.File(tmp_path / "theirs.h5", "r+") as file:
+        file.attrs["sha256"] = checksum(file, description)
+    side.write_text(json.dumps(description))
+    with pytest.raises(UserError, match="is not a file of SymSteer; write one with"):
+        write_dataset(tmp_path / "theirs.h5", tmp_path / "new", "off")
 
 
 # ------------------------------------------------------------------ the environment hub
@@ -245,14 +263,14 @@ def hub():
 
 
 @pytest.mark.parametrize("use_async_envs", [False, True])
-def test_the_environment_plays_the_demonstrations(hub, contents, demos, use_async_envs):
+def test_the_environment_plays_the_demonstrations(hub, path, demos, use_async_envs):
     """Observations, actions and success are those of the dataset."""
     ((task, numbered),) = hub.make_env(n_envs=2, use_async_envs=use_async_envs).items()
     envs = numbered[0]
     assert task == "PickCube-v1"
     assert envs.call("_max_episode_steps") == (50, 50)
     assert envs.call("task_description")[0] == "Pick up a cube and hold it at a goal in the air."
-    description = json.loads(contents.demonstrations.with_suffix(".json").read_text())
+    description = json.loads(path.with_suffix(".json").read_text())
     seed = description["episodes"][1]["episode_seed"]
     seen, taken = demos.episodes[1]
     try:
