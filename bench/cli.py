@@ -7,7 +7,6 @@ imported inside the functions, so that help, ``list`` and ``doctor`` do not wait
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -37,19 +36,11 @@ def run(arguments: list[str]) -> int:
     """
     from symsteer.bench.runs.arguments import parse_run
     from symsteer.bench.runs.run import execute
-    from symsteer.bench.runs.tracking import checked
+    from symsteer.bench.runs.tracking import check_tracking
 
-    config, options = parse_run(arguments)
-    folder = execute(
-        config,
-        options.out,
-        options.demos,
-        options.base_policy,
-        progress=not options.quiet,
-        workers=options.workers,
-        tracking=checked(options.track),
-    )
-    _print_places(folder)
+    config, how = parse_run(arguments)
+    check_tracking(how.track)
+    _print_places(execute(config, how))
     return 0
 
 
@@ -72,10 +63,12 @@ def resume(
         quiet: No progress bars.
     """
     allow(*trust)
+    from symsteer.bench.runs.config import Execution
     from symsteer.bench.runs.run import resume
-    from symsteer.bench.runs.tracking import checked
+    from symsteer.bench.runs.tracking import check_tracking
 
-    _print_places(resume(folder, not quiet, workers, checked(track)))
+    check_tracking(track)
+    _print_places(resume(folder, Execution(workers=workers, track=track, quiet=quiet)))
     return 0
 
 
@@ -88,7 +81,6 @@ def reproduce(
     base_from: Path | None = None,
     into: Path | None = None,
     workers: int = 1,
-    quiet: bool = False,
     trust: Trust = (),
 ) -> int:
     """Make a run again from its record, and say what agrees (docs/runner.md).
@@ -108,12 +100,13 @@ def reproduce(
         into: Folder that gets, named after the record's hash, what the leaderboard reads: a copy of
             reproduction.json, the new record, and the line for the list of the study.
         workers: Processes that share the simulation.
-        quiet: No progress bars.
     """
     allow(*trust)
+    from symsteer.bench.runs.config import Execution
     from symsteer.bench.runs.reproduce import reproduce, text
 
-    done = reproduce(record, out, demos, base_policy, into, not quiet, workers, base_from, _tell)
+    how = Execution(demos=demos, base_policy=base_policy, workers=workers)
+    done = reproduce(record, out, how, into, base_from, _tell)
     print(printable(text(done)))
     return 0 if done.reproduction.verdict == "exact" else 1
 
@@ -145,25 +138,25 @@ def evaluate(
 
     from symsteer.bench.runs.run import evaluate
 
-    found = evaluate(folder, variant, episodes, workers)
+    result = evaluate(folder, variant, episodes, workers)
     if json:
-        print(dumps(found.to_json()))
+        print(dumps(result.to_json()))
         return 0
-    columns = found.evaluation.episodes
-    count, successes = len(columns.seed), sum(columns.success_once)
+    played = result.evaluation.episodes
+    count, successes = len(played.seed), sum(played.success_once)
     sure = binomtest(successes, count).proportion_ci(method="wilson")
-    print(f"run           {found.run_id}, checkpoint at {found.evaluation.env_steps} steps")
-    print(f"variant       {found.variant}")
+    print(f"run           {result.run_id}, checkpoint at {result.evaluation.env_steps} steps")
+    print(f"variant       {result.variant}")
     print(
         f"success_once  {successes / count:.2f} [{sure.low:.2f}, {sure.high:.2f}] "
         f"({successes} of {count} held-out episodes; 95 % Wilson interval)"
     )
-    print(f"at the end    {sum(columns.success_at_end) / count:.2f}")
-    print(f"mean length   {sum(columns.episode_len) / count:.1f} steps")
-    if found.recorded is not None:
-        same = "the same episodes as in" if found.recorded else "NOT the episodes of"
+    print(f"at the end    {sum(played.success_at_end) / count:.2f}")
+    print(f"mean length   {sum(played.episode_len) / count:.1f} steps")
+    if result.recorded is not None:
+        same = "the same episodes as in" if result.recorded else "NOT the episodes of"
         print(f"record        {same} the final evaluation")
-    return 0 if found.recorded is not False else 1
+    return 0 if result.recorded is not False else 1
 
 
 def film(
@@ -227,7 +220,7 @@ def sweep(
     allow(*trust)
     from dataclasses import replace
 
-    from symsteer.bench.runs.tracking import checked
+    from symsteer.bench.runs.tracking import check_tracking
     from symsteer.bench.sweep.command import preview, run_plan
     from symsteer.bench.sweep.plan import make_plan, sweep_path
     from symsteer.bench.sweep.suite import load_suite
@@ -236,8 +229,8 @@ def sweep(
     if dry_run:
         print(preview(plan, workers, ray))
         return 0
-    plan = replace(plan, tracking=checked(track, plan.name))
-    ends = run_plan(plan, workers, ray, together)
+    check_tracking(track)
+    ends = run_plan(replace(plan, track=track), workers, ray, together)
     failed = [end for end in ends if end.status == "failed"]
     for end in failed:
         print(f"failed: {end.run.label}: {end.reason}", file=sys.stderr)
@@ -366,65 +359,13 @@ def demos(
         seed: Seed of the collection.
     """
     allow(task)
-    from tqdm import tqdm
-
     from symsteer.bench.demos import collect, load
+    from symsteer.terminal import progress_bar
 
-    with tqdm(total=count, desc="demonstrations", disable=None) as bar:
-
-        def advance(done: int, total: int) -> None:
-            bar.update(done - bar.n)
-
+    with progress_bar("demonstrations", count) as advance:
         collect(task, embodiment, count, mode, seed, path, progress=advance)
     steps = load(path, task, embodiment).meta["steps"]
     print(f"wrote {count} demonstrations, {steps} steps, to {path}")
-    return 0
-
-
-def base(
-    task: tuple[str, ...] = ("PickCube-v1",),
-    embodiment: str = "floating",
-    mode: Literal["clean", "diverse"] = "diverse",
-    policies: tuple[str, ...] = ("edp", "plain", "plain-augmented"),
-    demonstrations: tuple[int, ...] = (5, 10, 20, 50),
-    seeds: int = 3,
-    episodes: int = 200,
-    workers: int = 0,
-    out: Path = Path("runs"),
-) -> int:
-    """Train base policies from few demonstrations and compare their success.
-
-    Each has the settings that it has by default in `symsteer run`.
-
-    Args:
-        task: Tasks; `symsteer list` names them. Joint policies are trained on all of them together,
-            the others on each.
-        embodiment: floating or panda.
-        mode: Kind of demonstrations.
-        policies: Policies; `symsteer list` names them.
-        demonstrations: Numbers of demonstrations.
-        seeds: Seeds per policy and number of demonstrations; each seed has its own demonstrations.
-        episodes: Held-out episodes per policy.
-        workers: Number of policies trained at the same time; 0: one per core.
-        out: Folder for demonstrations and the table's data.
-    """
-    allow(*task, *policies)
-    from symsteer.bench.runs.base_study import study, table, write_study
-    from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
-    from symsteer.bench.runs.run import check
-    from symsteer.policies import POLICIES
-
-    demos = DemonstrationConfig(mode=mode)
-    configs = [RunConfig(task=name, embodiment=embodiment, demonstrations=demos) for name in task]
-    for config in configs:
-        check(config)
-    options = {name: POLICIES.get(name).Options() for name in policies}
-    workers = workers or os.cpu_count() or 1
-    rows = study(configs, out, options, demonstrations, seeds, episodes, workers)
-    path = out / "base" / f"study-{'+'.join(task)}-{embodiment}-{mode}.json"
-    write_study(path, configs[0], options, rows)
-    print(table(rows))
-    print(f"wrote {path}")
     return 0
 
 
@@ -665,8 +606,8 @@ def _print_places(folder: Path) -> None:
     from symsteer.leaderboard.records import read_record
 
     out, record = folder.parent, read_record(folder / "record.json")
-    if found := record.not_finite or record.nonfinite_q * "Q":
-        print(f"warning: not finite: {found}; see {folder / 'record.json'}", file=sys.stderr)
+    if names := record.not_finite or record.nonfinite_q * "Q":
+        print(f"warning: not finite: {names}; see {folder / 'record.json'}", file=sys.stderr)
     print(f"record:      {folder / 'record.json'}")
     print(f"TensorBoard: {to_paste('tensorboard', '--logdir', out)}  then {BOARD}")
     print(f"leaderboard: {to_paste('symsteer', 'report', out, '--out', out / 'leaderboard')}")

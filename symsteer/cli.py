@@ -67,7 +67,6 @@ GROUPS = {
     },
     "demonstrations and base policies": {
         "demos": Verb(f"{BENCH}:demos"),
-        "base": Verb(f"{BENCH}:base"),
         "export": Verb(f"{BENCH}:export"),
         "export-lerobot": Verb(f"{BENCH}:export_lerobot"),
         "fetch-bundle": Verb(f"{BENCH}:fetch_bundle", computes=False),

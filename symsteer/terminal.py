@@ -10,7 +10,7 @@ import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from symsteer.errors import UserError
@@ -111,3 +111,33 @@ def complain(error: BaseException, text: str, code: int) -> int:
         line = f"{line[:half]} ... {line[-half:]}"
     print(line, *getattr(error, "__notes__", ()), sep="\n", file=sys.stderr)
     return code
+
+
+@contextlib.contextmanager
+def progress_bar(
+    title: str, total: int | None = None, quiet: bool = False, unit: str = "it"
+) -> Iterator[Callable[..., None]]:
+    """A progress bar on stderr; none where that is no terminal.
+
+    Yields:
+        ``advance(done, total=None, **shown)``: how much is done, of how much if that has become
+        known, and what to show beside the bar.
+    """
+    from tqdm import tqdm
+
+    with tqdm(total=total, desc=title, unit=unit, disable=True if quiet else None) as bar:
+
+        def advance(done: int, total: int | None = None, **shown: str) -> None:
+            bar.total = total or bar.total
+            bar.update(done - bar.n)
+            if shown:
+                bar.set_postfix(shown)
+
+        yield advance
+
+
+def tell(line: str) -> None:
+    """Print a line above the progress bar, if there is one."""
+    from tqdm import tqdm
+
+    tqdm.write(line)

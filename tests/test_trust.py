@@ -27,10 +27,9 @@ import pytest
 
 from symsteer import cli
 from symsteer.bench.bundles.bundle import write_bundle
-from symsteer.bench.runs.arguments import Execution
-from symsteer.bench.runs.run import execute
+from symsteer.bench.runs.config import Execution
 from tests import hostile
-from tests.bench.tiny_run import tiny_config, write_suite
+from tests.bench.tiny_run import execute, tiny_config, write_suite
 from tests.children import ROOT, start
 from tests.fuzz.conftest import options_of
 
@@ -94,7 +93,7 @@ HARMLESS = (
 def intact(tmp_path_factory) -> Path:
     """Folder of an intact run, with demonstrations and base policy beside it."""
     out = tmp_path_factory.mktemp("intact")
-    run = execute(tiny_config(agent="base", keep_replay=True), out, progress=False)
+    run = execute(tiny_config(agent="base"), out)
     write_bundle(run, out / "bundle.zip")
     return run
 

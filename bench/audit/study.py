@@ -10,7 +10,7 @@ from symsteer.bench.audit.defects import audit, reference_task, visit_all
 from symsteer.bench.audit.report import read_result, write_result
 from symsteer.bench.audit.result import AuditResult, AuditSettings
 from symsteer.bench.runs.base_policy import prepare_base
-from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.tasks import TASKS, task_class
 from symsteer.bench.variants import VARIANTS, read
 from symsteer.errors import UserError
@@ -128,4 +128,5 @@ def audited_policy(settings: AuditSettings, path: Path | None, runs: Path = RUNS
     task = task_class(settings.task)
     if path is not None:
         return load_policy(path, task.observation_layout, task.action_layout)
-    return prepare_base(RunConfig(task=settings.task, embodiment=settings.embodiment), runs)
+    config = RunConfig(task=settings.task, embodiment=settings.embodiment)
+    return prepare_base(config, Execution(runs))

@@ -7,6 +7,7 @@ demonstrations and policies of the same settings.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
@@ -30,19 +31,23 @@ from symsteer.bench.bundles.manifest import (
     Role,
 )
 from symsteer.bench.runs.base_policy import demonstration_path, find_base
-from symsteer.bench.runs.base_study import held_out_episodes, unbroken, visited_states
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.stored import named, stored_config
-from symsteer.bench.tasks import TASKS, task_class
+from symsteer.bench.runs.stored import Run
+from symsteer.bench.steering.evaluation import VISITED, held_out_episodes
+from symsteer.bench.steering.latent_env import LatentNoiseEnv
+from symsteer.bench.tasks import TASKS, make, task_class
 from symsteer.errors import UserError
 from symsteer.files import prepare_folder, write_atomically
 from symsteer.leaderboard.records import flat
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path
 from symsteer.policies.geometry import Group
-from symsteer.policies.steerability import decode_error
+from symsteer.policies.steerability import decode_error, evenly
 from symsteer.tables import markdown
 from symsteer.terminal import option_words, to_paste
+
+PARALLEL = 100
+"""Parallel environments in which a policy is measured, at most."""
 
 LICENCE = "Apache-2.0"
 """Of SymSteer, and so of the demonstrations and policies that it makes."""
@@ -72,15 +77,13 @@ def write_bundle(run: Path, out: Path) -> tuple[BundleManifest, str | None]:
     if out.is_dir():
         raise UserError(f"{out} is a folder; name a file for the bundle")
     prepare_folder(out.parent)
-    run = named(run)
-    config, origin = stored_config(run)
-    file = policy_path(run)
-    if not file.is_file():
+    begun = Run.stored(run)
+    run, config, origin = begun.folder, begun.config, begun.files
+    policy, file, task = begun.policy(), policy_path(run), task_class(config.task)
+    if policy is None:
         raise UserError(
             f"the run {run.name} has no base policy yet; `symsteer resume` brings it to its end"
         )
-    task = task_class(config.task)
-    policy = load_policy(run, task.observation_layout, task.action_layout)
     demonstrations, absent = None, None
     base = find_base(config, run.parent)
     # A policy that came from a file of the user has the settings of another one in ``base``.
@@ -159,12 +162,15 @@ def measure(config: RunConfig, policy: ChunkPolicy) -> dict[str, Any]:
             "shows; export it from the run that made it"
         )
     seed, episodes = config.policy_seed, config.evaluation.final_episodes
-    with unbroken(config, policy, episodes) as env:
-        played = held_out_episodes(env, policy, seed, episodes)
+    num_envs = min(PARALLEL, episodes)
+    env = make(config.task, num_envs=num_envs, embodiment=config.embodiment)
+    with contextlib.closing(LatentNoiseEnv(env, policy, ignore_terminations=True)) as latent:
+        played = held_out_episodes(latent, policy, seed, episodes)
+    visited = evenly(played.obs[played.running], VISITED)
     successes = int(played.episodes["success_once"].sum())
     sure = binomtest(successes, episodes).proportion_ci(method="wilson")
     group = policy.group if policy.group.order > 1 else Group.parse("C8")
-    error = decode_error(policy, visited_states(played), group, seed)
+    error = decode_error(policy, visited, group, seed)
     return {
         "success": successes / episodes,
         "interval": [round(float(sure.low), 4), round(float(sure.high), 4)],

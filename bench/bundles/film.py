@@ -13,8 +13,7 @@ import torch
 from tqdm import tqdm
 
 from symsteer.bench.demos.files import opened
-from symsteer.bench.runs.film import write_video
-from symsteer.bench.runs.pictures import CAMERA
+from symsteer.bench.runs.film import CAMERA, write_video
 from symsteer.bench.sim.trees import map_trees, rows_of
 from symsteer.bench.tasks import make
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from symsteer.bench.demos import FORMAT, MODES, Demonstrations, collect, load
-from symsteer.bench.runs.config import RunConfig, build_config, content_key
-from symsteer.bench.steering.evaluation import DRAWS, Steerability, steerability
+from symsteer.bench.runs.config import Execution, RunConfig, build_config, content_key
+from symsteer.bench.steering.evaluation import DRAWS, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
@@ -23,6 +21,7 @@ from symsteer.leaderboard.records import BasePolicy, flat
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path, save_policy
+from symsteer.terminal import progress_bar, tell
 
 STEERABILITY_ENVS = 128
 """Parallel environments of the steerability report; fewer if it has fewer episodes."""
@@ -31,57 +30,41 @@ MEASURED = ("episodes", "action_std", "solvable", "equivariance_error", "jump", 
 """Of the steerability report, in the record under the same names."""
 
 
-def prepare_base(
-    config: RunConfig,
-    out: Path,
-    demonstrations: Path | None = None,
-    policy: Path | None = None,
-    progress: bool = True,
-    workers: int = 1,
-) -> ChunkPolicy:
+def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
     """The frozen base policy of a run, with its steerability report.
 
     It is trained on demonstrations of the unbroken task in the run's embodiment, for every variant:
-    the agent has to handle the broken symmetry, not the base policy.
-
-    Args:
-        config: the run.
-        out: folder of the runs; ``out/base`` keeps demonstrations and policies.
-        demonstrations: a trajectory file to train on, instead of demonstrations of the expert.
-        policy: a saved policy to use instead of training one.
-        progress: whether to show progress bars.
-        workers: processes that share the environments of the steerability report.
+    the agent has to handle the broken symmetry, not the base policy. The folder ``base`` of the
+    runs keeps demonstrations and policies.
 
     Raises:
-        UserError: if a file does not fit the task, or nothing can be written to ``out``.
+        UserError: if a file does not fit the task, or nothing can be written.
     """
     task = task_class(config.task)
     layouts = (task.observation_layout, task.action_layout)
-    if policy is not None:
-        return _measured(config, load_policy(policy, *layouts), progress, workers)
+    if how.base_policy is not None:
+        return _measured(config, load_policy(how.base_policy, *layouts), how)
     paths = {}
     for name in config.policy_tasks:
-        own = demonstrations if name == config.task else None
-        one = dataclasses.replace(config, task=name)
-        paths[name] = own or demonstration_file(one, out, progress)
+        given = how.demos if name == config.task else None
+        paths[name] = given or demonstration_file(_on(config, name), how.out, how.quiet)
     demos = _loaded(config, paths)
-    folder = _policy_folder(config, out, demos)
+    folder = _policy_folder(config, how.out, demos)
     if not policy_path(folder).is_file():
-        for name, base in _train(config, demos, progress).items():
-            one = dataclasses.replace(config, task=name)
-            base.report["world"] = {
-                "task": one.task,
-                "embodiment": one.embodiment,
-                "demonstrations": dataclasses.asdict(one.demonstrations),
-                "policy_seed": one.policy_seed,
+        for name, policy in _train(config, demos, how.quiet).items():
+            policy.report["world"] = {
+                "task": name,
+                "embodiment": config.embodiment,
+                "demonstrations": dataclasses.asdict(config.demonstrations),
+                "policy_seed": config.policy_seed,
             }
-            save_policy(base, _policy_folder(one, out, demos))
-    base = load_policy(folder, *layouts)
-    new = "steerability" not in base.report
-    base = _measured(config, base, progress, workers)
+            save_policy(policy, _policy_folder(_on(config, name), how.out, demos))
+    policy = load_policy(folder, *layouts)
+    new = "steerability" not in policy.report
+    policy = _measured(config, policy, how)
     if new:
-        save_policy(base, folder)
-    return base
+        save_policy(policy, folder)
+    return policy
 
 
 def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
@@ -106,21 +89,21 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
                 f"{path} was trained for {there}, and this run's {key} is {here}; name a policy of "
                 "the same task and embodiment"
             )
-    own: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "policy": {"name": POLICIES.name_of(type(base)), **base.options.to_json()}
     }
     if "demonstrations" in world:
-        own["demonstrations"] = world["demonstrations"]
-        own["policy_seed"] = world.get("policy_seed")
-    told = build_config(config.to_json() | own, str(path))
+        settings["demonstrations"] = world["demonstrations"]
+        settings["policy_seed"] = world.get("policy_seed")
+    told = build_config(config.to_json() | settings, str(path))
     # A setting with its default value was not asked for: the value of the file is used.
     plain = RunConfig(agent=config.agent, policy_name=config.policy_name, seed=config.seed)
-    default, asked, found = (flat(c.to_json()) for c in (plain, config, told))
+    default, asked, known = (flat(c.to_json()) for c in (plain, config, told))
     default["policy.name"] = RunConfig.policy_name
     for key, value in asked.items():
-        if value not in (default[key], found.get(key)):
+        if value not in (default[key], known.get(key)):
             raise UserError(
-                f"{path} was trained with {key} {found.get(key)}, and this run asks for {value}; "
+                f"{path} was trained with {key} {known.get(key)}, and this run asks for {value}; "
                 f"leave --{key.replace('_', '-')} out, or name no base policy, to train one like "
                 "that"
             )
@@ -181,17 +164,13 @@ def demonstration_path(config: RunConfig, out: Path) -> Path:
     return out / "base" / name
 
 
-def demonstration_file(config: RunConfig, out: Path, progress: bool = True) -> Path:
+def demonstration_file(config: RunConfig, out: Path, quiet: bool = False) -> Path:
     """The scripted expert's demonstrations of the unbroken task; collected if they do not exist."""
     wanted = config.demonstrations
     path = demonstration_path(config, out)
     if path.is_file():
         return path
-    with tqdm(total=wanted.count, desc="demonstrations", disable=None if progress else True) as bar:
-
-        def advance(done: int, total: int) -> None:
-            bar.update(done - bar.n)
-
+    with progress_bar("demonstrations", wanted.count, quiet) as advance:
         how = (wanted.count, wanted.mode, wanted.seed, path)
         return collect(config.task, config.embodiment, *how, progress=advance)
 
@@ -213,10 +192,7 @@ def describe_base(policy: ChunkPolicy) -> BasePolicy:
 
 
 def _demonstration_paths(config: RunConfig, out: Path) -> dict[str, Path]:
-    return {
-        name: demonstration_path(dataclasses.replace(config, task=name), out)
-        for name in config.policy_tasks
-    }
+    return {task: demonstration_path(_on(config, task), out) for task in config.policy_tasks}
 
 
 def _loaded(config: RunConfig, paths: Mapping[str, Path]) -> dict[str, Demonstrations]:
@@ -235,67 +211,45 @@ def _policy_folder(config: RunConfig, out: Path, demos: Mapping[str, Demonstrati
     return out / "base" / f"{config.task}-{config.embodiment}-{short}-{key}"
 
 
+def _on(config: RunConfig, task: str) -> RunConfig:
+    return dataclasses.replace(config, task=task)
+
+
 def _train(
-    config: RunConfig, demos: Mapping[str, Demonstrations], progress: bool
+    config: RunConfig, demos: Mapping[str, Demonstrations], quiet: bool
 ) -> dict[str, ChunkPolicy]:
     """The policies of all tasks whose demonstrations the run's policy is trained on."""
     kind: Any = POLICIES.get(config.policy_name)
-    with tqdm(desc="base policy", disable=None if progress else True) as bar:
+    with progress_bar("base policy", quiet=quiet) as bar:
 
         def advance(step: int, steps: int, loss: float) -> None:
-            bar.total = steps
-            bar.update(step - bar.n)
-            bar.set_postfix(loss=f"{loss:.4f}")
+            bar(step, steps, loss=f"{loss:.4f}")
 
-        own = demos[config.task]
-        how = (own.action_layout, config.policy_seed, advance, config.device)
+        mine = demos[config.task]
+        how = (mine.action_layout, config.policy_seed, advance, config.device)
         if len(demos) == 1:
-            fitted = kind.fit(config.policy, own.episodes, own.observation_layout, *how)
+            fitted = kind.fit(config.policy, mine.episodes, mine.observation_layout, *how)
             return {config.task: fitted}
         data = {name: (d.episodes, d.observation_layout) for name, d in demos.items()}
         return kind.fit_tasks(config.policy, data, *how)
 
 
-def _measured(config: RunConfig, base: ChunkPolicy, progress: bool, workers: int) -> ChunkPolicy:
+def _measured(config: RunConfig, policy: ChunkPolicy, how: Execution) -> ChunkPolicy:
     """The policy on its device, with a report on as many states as the run asks for."""
-    found = base.report.get("steerability")
-    if found is None or found.get("states") != config.evaluation.steerability_states:
-        report = _measure(config, base, workers)
-        if report.warning and progress:
-            tqdm.write(f"warning: {report.warning}")
-        base.report["steerability"] = dataclasses.asdict(report)
-    return base.to(config.device)
-
-
-def _measure(config: RunConfig, policy: ChunkPolicy, workers: int) -> Steerability:
     states = config.evaluation.steerability_states
-    num_envs = min(STEERABILITY_ENVS, DRAWS * states)
-    env = make(
-        config.task,
-        num_envs=num_envs,
-        embodiment=config.embodiment,
-        sim=config.sim,
-        workers=min(workers, num_envs),
-    )
-    latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
-    with contextlib.closing(latent), torch.no_grad():
-        return steerability(latent, policy, config.policy_seed, states)
-
-
-def origin(demonstrations: Path | None, policy: Path | None) -> dict[str, Any]:
-    """Content hashes of the files that a run starts from, for its name and record.
-
-    Raises:
-        UserError: if a file is missing.
-    """
-    named = {"demonstrations": demonstrations, "policy": policy and policy_path(policy)}
-    hashes = {}
-    for kind, path in named.items():
-        if path is not None:
-            try:
-                hashes[kind] = hashlib.sha256(path.read_bytes()).hexdigest()
-            except OSError as error:
-                raise UserError(
-                    f"cannot read the {kind} file {path}: {error.strerror}; name another one"
-                ) from error
-    return hashes
+    if (policy.report.get("steerability") or {}).get("states") != states:
+        num_envs = min(STEERABILITY_ENVS, DRAWS * states)
+        env = make(
+            config.task,
+            num_envs=num_envs,
+            embodiment=config.embodiment,
+            sim=config.sim,
+            workers=min(how.workers, num_envs),
+        )
+        latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
+        with contextlib.closing(latent), torch.no_grad():
+            report = steerability(latent, policy, config.policy_seed, states)
+        if report["warning"] and not how.quiet:
+            tell(f"warning: {report['warning']}")
+        policy.report["steerability"] = report
+    return policy.to(config.device)

@@ -32,14 +32,11 @@ Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Part = Literal["simulate", "decode", "update", "evaluate", "diagnose", "total"]
 
 
-class _State(BaseModel):
-    """What a run saves; agent and replay check their own parts."""
+class Counters(BaseModel):
+    """The numbers of a run that a checkpoint keeps."""
 
     model_config = ConfigDict(strict=True)
 
-    base_policy: str
-    agent: dict[str, Any]
-    replay: dict[str, Any] | None
     env_steps: Count
     decisions: Count
     updates: Count
@@ -47,6 +44,14 @@ class _State(BaseModel):
     next_evaluation: Count
     fresh_starts: Count
     final: bool
+
+
+class _State(Counters):
+    """What a run saves; agent and replay check their own parts."""
+
+    base_policy: str
+    agent: dict[str, Any]
+    replay: dict[str, Any] | None
     evaluations: Count
     history: str
     recent_episodes: dict[str, list[float]]
@@ -93,9 +98,9 @@ def load_checkpoint(folder: Path) -> dict[str, Any] | None:
         file = torch.load(io.BytesIO(archive), map_location="cpu", weights_only=True)
         # torch believes the sizes that are written beside its tensors, and reads beyond their ends.
         tensors = (leaf for leaf in tree_leaves(file) if isinstance(leaf, torch.Tensor))
-        found = {s.data_ptr(): s.nbytes() for s in map(torch.Tensor.untyped_storage, tensors)}
+        held = {s.data_ptr(): s.nbytes() for s in map(torch.Tensor.untyped_storage, tensors)}
         told = (size for name, size in sizes.items() if "/data/" in name)
-        if sorted(filter(None, found.values())) != sorted(filter(None, told)):
+        if sorted(filter(None, held.values())) != sorted(filter(None, told)):
             raise ValueError("a tensor has another size than its data")
     # Pickles of other programs fail in many ways.
     except Exception as error:

@@ -6,21 +6,23 @@ import contextlib
 import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 
 from symsteer.agents import AGENTS
-from symsteer.agents.agent import Agent, Deterministic, HasCritic
+from symsteer.agents.agent import Agent, AgentContext, Deterministic, HasCritic
 from symsteer.agents.episodes import LongEpisodes, Played, Rollout
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.sim.environment import MAX_SCENES
 from symsteer.bench.steering.evaluation import Act, long_episodes, long_limit, rollout
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.steering.seeds import DIAGNOSTIC_SEED, diagnostic_seeds, held_out_seeds
-from symsteer.bench.tasks import make
+from symsteer.bench.tasks import make, task_class
+from symsteer.bench.variants import build, highest_cost
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.variant import VariantSpec
+from symsteer.variant import VariantSpec, specs_at
 
 LONG_ENVS = 32
 """Parallel environments of long episodes, at most."""
@@ -61,35 +63,66 @@ def check_room(
         )
 
 
-def make_env(
-    config: RunConfig,
-    base: ChunkPolicy,
-    agent: Agent,
-    num_envs: int,
-    variants: Sequence[VariantSpec],
-    ignore_terminations: bool,
-    workers: int,
-) -> LatentNoiseEnv:
-    """The latent-noise environment of a run's task."""
-    env = make(
-        config.task,
-        num_envs=num_envs,
-        embodiment=config.embodiment,
-        variant=variants,
-        sim=config.sim,
-        workers=min(workers, num_envs),
-    )
-    return LatentNoiseEnv(env, base, ignore_terminations, config.seed, decode=agent.decode)
+def new_agent(config: RunConfig, policy: ChunkPolicy) -> Agent:
+    """An untrained agent for a run's base policy."""
+    context = AgentContext.of(policy, config.device, config.seed)
+    return AGENTS.get(config.agent)(context, config.agent_options)
+
+
+@dataclass(eq=False)
+class Steered:
+    """A frozen base policy and the agent that steers it, in the worlds of a run."""
+
+    config: RunConfig
+    policy: ChunkPolicy
+    agent: Agent
+
+    @property
+    def gamma(self) -> float:
+        """The discount per decision of the agent's Q-values; 0 for an agent without one."""
+        return getattr(self.agent.options, "gamma", 0.0)
+
+    @property
+    def timeouts_end(self) -> bool:
+        """Whether Q-values count nothing after a time-out, rather than bootstrap."""
+        return getattr(self.agent.options, "timeouts_terminal", False)
+
+    @functools.cached_property
+    def feasible(self) -> tuple[float, float]:
+        """Lowest and highest discounted return that the run's reward allows, per decision."""
+        return task_class(self.config.task).feasible_return(
+            self.gamma,
+            self.policy.execute,
+            bootstrap_truncation=not self.timeouts_end,
+            step_cost=highest_cost(build(specs_at(self.config.variants, 1))),
+        )
+
+    def make_env(
+        self,
+        variants: Sequence[VariantSpec],
+        num_envs: int,
+        ignore_terminations: bool,
+        workers: int,
+    ) -> LatentNoiseEnv:
+        """The latent-noise environment of the run's task."""
+        config = self.config
+        env = make(
+            config.task,
+            num_envs=num_envs,
+            embodiment=config.embodiment,
+            variant=variants,
+            sim=config.sim,
+            workers=min(workers, num_envs),
+        )
+        decode = self.agent.decode
+        return LatentNoiseEnv(env, self.policy, ignore_terminations, config.seed, decode=decode)
 
 
 class Evaluator:
     """Plays the held-out episodes and measures the diagnostics; does not change the agent.
 
     Args:
-        config: the run.
-        base: the frozen policy.
-        agent: the agent that plays.
-        feasible: lowest and highest return that the reward allows, per decision.
+        steered: who plays.
         variants: of the first episodes.
         workers: processes that share the environments.
 
@@ -98,22 +131,10 @@ class Evaluator:
         played: the deterministic episodes of the last :meth:`play`; None before the first one.
     """
 
-    def __init__(
-        self,
-        config: RunConfig,
-        base: ChunkPolicy,
-        agent: Agent,
-        feasible: tuple[float, float],
-        variants: Sequence[VariantSpec],
-        workers: int = 1,
-    ):
-        self.config, self.agent, self.feasible = config, agent, feasible
-        self.variants = tuple(variants)
+    def __init__(self, steered: Steered, variants: Sequence[VariantSpec], workers: int = 1):
+        self.steered, self.variants, self.workers = steered, tuple(variants), workers
         self.played: Rollout | None = None
-        self.made = functools.partial(
-            make_env, config, base, agent, ignore_terminations=True, workers=workers
-        )
-        self.env = self._env(config.evaluation.episodes)
+        self.env = self._env(steered.config.evaluation.episodes)
         self.long_env: LatentNoiseEnv | None = None
 
     def enter(self, variants: Sequence[VariantSpec]) -> None:
@@ -121,17 +142,16 @@ class Evaluator:
         if self.variants != tuple(variants):
             self.close()
             self.variants = tuple(variants)
-            self.env, self.long_env = self._env(self.config.evaluation.episodes), None
+            self.env, self.long_env = self._env(self.steered.config.evaluation.episodes), None
 
     def _env(self, num_envs: int) -> LatentNoiseEnv:
-        return self.made(num_envs=num_envs, variants=self.variants)
+        return self.steered.make_env(self.variants, num_envs, True, self.workers)
 
     def play(self, count: int) -> Rollout:
         """Episodes of the deterministic actor on the first ``count`` held-out seeds."""
         with self._unchanged_agent() as agent:
-            self.played = rollout(
-                self.env, lambda obs, _: agent.act(obs, True), held_out_seeds(count)
-            )
+            seeds = held_out_seeds(count)
+            self.played = rollout(self.env, lambda obs, _: agent.act(obs, True), seeds)
         return self.played
 
     def diagnose(self, count: int) -> Mapping[str, float | None]:
@@ -141,7 +161,7 @@ class Evaluator:
             count: episodes of the stochastic actor, with whose returns Q-values are compared.
         """
         assert self.played is not None
-        seed, device = self.config.seed, self.agent.device
+        seed = self.steered.config.seed
         with self._unchanged_agent() as agent:
             long: LongEpisodes | None = None
             if isinstance(agent, HasCritic):
@@ -151,20 +171,20 @@ class Evaluator:
                     agent.sample,
                     agent.gaussian_noise,
                     diagnostic_seeds(count),
-                    discount(agent),
-                    torch.Generator(device).manual_seed(DIAGNOSTIC_SEED + seed + 1),
+                    self.steered.gamma,
+                    torch.Generator(agent.device).manual_seed(DIAGNOSTIC_SEED + seed + 1),
                 )
-            generator = torch.Generator(device).manual_seed(seed)
-            return agent.diagnostics(Played(self.played, long, self.feasible, generator))
+            generator = torch.Generator(agent.device).manual_seed(seed)
+            return agent.diagnostics(Played(self.played, long, self.steered.feasible, generator))
 
     def compare(self, count: int) -> dict[str, float]:
         """Success of the agent's other ways to act, on the first ``count`` held-out seeds."""
-        found = {}
+        success = {}
         with self._unchanged_agent() as agent:
-            for name, act in agent.alternatives().items():
-                episodes = rollout(self.env, _without_rows(act), held_out_seeds(count)).episodes
-                found[f"success_{name}"] = episodes["success_once"].double().mean().item()
-        return found
+            for name, way in agent.alternatives().items():
+                played = rollout(self.env, _every_row(way), held_out_seeds(count)).episodes
+                success[f"success_{name}"] = played["success_once"].double().mean().item()
+        return success
 
     def close(self) -> None:
         """Free the simulation."""
@@ -178,31 +198,21 @@ class Evaluator:
             if self.long_env is not None:
                 self.long_env.close()
             self.long_env = env = self._env(num_envs)
-            if not timeouts_end(self.agent):
-                env.max_episode_steps = long_limit(
-                    env.max_episode_steps, env.execute, discount(self.agent)
-                )
+            if not self.steered.timeouts_end:
+                limit, gamma = env.max_episode_steps, self.steered.gamma
+                env.max_episode_steps = long_limit(limit, env.execute, gamma)
         return self.long_env
 
     @contextlib.contextmanager
     def _unchanged_agent(self) -> Iterator[Agent]:
         """The agent; its random numbers continue afterwards as if nothing had happened."""
-        state = self.agent.generator.get_state()
+        agent = self.steered.agent
+        state = agent.generator.get_state()
         try:
-            yield self.agent
+            yield agent
         finally:
-            self.agent.generator.set_state(state)
+            agent.generator.set_state(state)
 
 
-def _without_rows(act: Deterministic) -> Act:
+def _every_row(act: Deterministic) -> Act:
     return lambda obs, rows: act(obs)
-
-
-def discount(agent: Agent) -> float:
-    """The discount per decision of an agent's Q-values; 0 for an agent without one."""
-    return getattr(agent.options, "gamma", 0.0)
-
-
-def timeouts_end(agent: Agent) -> bool:
-    """Whether an agent's Q-values count nothing after a time-out, rather than bootstrap."""
-    return getattr(agent.options, "timeouts_terminal", False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,26 +13,39 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 from imageio_ffmpeg import count_frames_and_secs, write_frames
+from mani_skill.utils.sapien_utils import look_at
+from PIL import Image, ImageDraw, ImageFont
 
-from symsteer.bench.caption import captioned
 from symsteer.bench.runs.evaluator import Evaluator
-from symsteer.bench.runs.pictures import (
-    FAILURE,
-    FRAMES_PER_SECOND,
-    SUCCESS,
-    Filmed,
-    draw_paths,
-    filmed,
-    to_gif,
-)
+from symsteer.bench.runs.pictures import FAILURE, SUCCESS, draw_paths
 from symsteer.bench.runs.stored import Restored, restored
-from symsteer.bench.runs.trainer import feasible_return
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import held_out_seeds
+from symsteer.bench.tasks import make
 from symsteer.bench.variants import evaluation_variants, read
 from symsteer.errors import UserError
 from symsteer.files import prepare_folder, staged, write_atomically
 from symsteer.variant import VariantSpec, file_name, variant_text
+
+SIZE = 320
+"""Width and height of a rendered frame, pixels."""
+
+CAMERA = {
+    "pose": look_at([0.5, 0.65, 0.55], [0.0, 0.0, 0.08]),
+    "fov": 0.8,
+    "width": SIZE,
+    "height": SIZE,
+}
+"""The camera of rendered frames."""
+
+FRAMES_PER_SECOND = 20
+"""ManiSkill's control frequency: films with a frame for each control step run in real time."""
+
+CAPTION = 26
+"""Height of a caption, pixels."""
+
+COLOURS, PALETTE_FRAMES = 128, 6
+"""Colours of a GIF, and the number of its frames that they are from."""
 
 COLUMNS = 4
 """Films side by side, at most; more of them begin another row."""
@@ -49,17 +63,7 @@ def film(
     episodes: int = 3,
     out: Path | None = None,
 ) -> Path:
-    """Film held-out episodes of the last checkpoints of runs.
-
-    Several runs play the same episodes side by side, each with a caption that says when the
-    episode was solved.
-
-    Args:
-        folders: of the runs; several must be of one task and embodiment.
-        variant: how the symmetry is broken; default: as in the runs' evaluations.
-        episodes: how many, from the first held-out seed on.
-        out: the film, .mp4 or .gif; default: ``film-VARIANT.mp4`` in the run's folder, for several
-            runs ``film-TASK-EMBODIMENT-VARIANT.mp4`` beside the first one.
+    """What `symsteer film` does; its help explains the options.
 
     Returns:
         The file that was written: the film where a Vulkan driver works, else a picture, .png, of
@@ -77,9 +81,9 @@ def film(
     first = runs[0]
     places = {run.config.place for run in runs}
     if len(places) > 1:
-        found = " and ".join(sorted(" ".join(place) for place in places))
+        names = " and ".join(sorted(" ".join(place) for place in places))
         raise UserError(
-            f"these runs are of different tasks ({found}), which cannot be side by side; film "
+            f"these runs are of different tasks ({names}), which cannot be side by side; film "
             "runs of one task and embodiment"
         )
     if variant is None:
@@ -94,12 +98,11 @@ def film(
         variants = read(variant, place=first.config.place)
     kind = "film" if rendering_works() else "paths"
     if out is None:
-        name = variant_text(variants)
-        if len(runs) == 1:
-            out = first.folder / f"{kind}-{file_name(name)}.mp4"
-        else:
-            stem = f"{kind}-{'-'.join(first.config.place)}-{name}"
-            out = first.folder.parent / f"{file_name(stem)}.mp4"
+        folder, name = first.folder, f"{kind}-{variant_text(variants)}"
+        if len(runs) > 1:
+            place = "-".join(first.config.place)
+            folder, name = folder.parent, f"{kind}-{place}-{variant_text(variants)}"
+        out = folder / f"{file_name(name)}.mp4"
     prepare_folder(out.parent)
     if kind == "paths":
         out = out.with_suffix(".png")
@@ -112,7 +115,7 @@ def film(
     frames: list[Any] = [
         frame
         for seed in held_out_seeds(episodes)
-        for frame in _episode(runs, _captions(runs), variants, seed, every)
+        for frame in _episode(runs, variants, seed, every)
     ]
     if moving:
         write_atomically(out, to_gif(frames, FRAMES_PER_SECOND / every))
@@ -139,6 +142,34 @@ def write_video(path: Path, frames: Iterator[np.ndarray], encoding: Sequence[str
         raise OSError(errno.EIO, "ffmpeg failed")
 
 
+def to_gif(frames: Sequence[np.ndarray], rate: float) -> bytes:
+    """An animated GIF that repeats for ever.
+
+    Args:
+        frames: ``[height, width, 3]`` uint8.
+        rate: frames per second.
+    """
+    pictures = [Image.fromarray(frame) for frame in frames]
+    # One palette, and no dithering: parts that stay the same then take no space.
+    chosen = np.linspace(0, len(frames) - 1, PALETTE_FRAMES).round().astype(int)
+    some = Image.fromarray(np.concatenate([frames[i] for i in chosen]))
+    palette = some.quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
+    first, *others = (p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
+    file, duration = io.BytesIO(), round(1000 / rate)
+    first.save(file, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    return file.getvalue()
+
+
+def captioned(
+    picture: np.ndarray, text: str, colour: str = "black", ground: str = "white"
+) -> np.ndarray:
+    """A picture ``[height, width, 3]`` below a line of text, ``[CAPTION + height, width, 3]``."""
+    bar = Image.new("RGB", (picture.shape[1], CAPTION), ground)
+    font = ImageFont.load_default(15)
+    ImageDraw.Draw(bar).text((8, CAPTION / 2), text, fill=colour, font=font, anchor="lm")
+    return np.concatenate([np.asarray(bar), picture])
+
+
 def _captions(runs: Sequence[Restored]) -> list[str]:
     """Names of the agents, with the seed where an agent occurs twice."""
     agents = [run.config.agent.rpartition(":")[2] for run in runs]
@@ -149,32 +180,64 @@ def _captions(runs: Sequence[Restored]) -> list[str]:
 
 
 def _episode(
-    runs: Sequence[Restored],
-    captions: Sequence[str],
-    variants: Sequence[VariantSpec],
-    seed: int,
-    every: int,
+    runs: Sequence[Restored], variants: Sequence[VariantSpec], seed: int, every: int
 ) -> list[np.ndarray]:
-    """Frames of one episode, those of several runs side by side."""
-    played = [filmed(run.config, run.policy, run.agent, variants, seed, every) for run in runs]
+    """Frames of one episode, those of several runs side by side below captions."""
+    films = [_filmed(run, variants, seed, every) for run in runs]
     if len(runs) == 1:
-        return played[0].frames
-    length = max(len(one.frames) for one in played) + PAUSE // every
-    return [
-        _in_rows([_panel(one, text, t) for one, text in zip(played, captions, strict=True)])
-        for t in range(length)
-    ]
+        return films[0][0]
+    panels = []
+    for (frames, ending, solved), caption in zip(films, _captions(runs), strict=True):
+        ground = SUCCESS if solved else FAILURE
+        last = captioned(frames[-1], f"{caption}: {ending}", "white", ground)
+        panels.append([*(captioned(frame, caption) for frame in frames[:-1]), last])
+    length = max(map(len, panels)) + PAUSE // every
+    return [_in_rows([panel[min(t, len(panel) - 1)] for panel in panels]) for t in range(length)]
 
 
-def _panel(played: Filmed, caption: str, step: int) -> np.ndarray:
-    """A frame below its caption; the last frame stays."""
-    last = len(played.frames) - 1
-    text, color, ground = caption, "black", "white"
-    if step >= last:
-        seconds = played.steps / FRAMES_PER_SECOND
-        text += f": solved in {seconds:.1f} s" if played.solved else ": not solved"
-        color, ground = "white", SUCCESS if played.solved else FAILURE
-    return captioned(played.frames[min(step, last)], text, color, ground)
+def _filmed(
+    run: Restored, variants: Sequence[VariantSpec], seed: int, every: int
+) -> tuple[list[np.ndarray], str, bool]:
+    """Play an episode up to its first success or time limit, and render it.
+
+    Returns:
+        The frames, ``[height, width, 3]`` uint8, one at the start, one after every so many control
+        steps and the last one; how the episode ended, in words; whether with success.
+    """
+    config, agent = run.config, run.agent
+    env = make(
+        config.task,
+        num_envs=1,
+        embodiment=config.embodiment,
+        variant=variants,
+        sim=config.sim,
+        render=True,
+        render_mode="rgb_array",
+        human_render_camera_configs=CAMERA,
+    )
+    frames = []
+
+    def render() -> None:
+        # The upper fifth shows only the horizon.
+        frames.append(env.render()[0].cpu().numpy()[SIZE // 5 :, :, :3])
+
+    # Not through the latent-noise environment: it starts a new episode before the last frame.
+    with contextlib.closing(env):
+        obs, _ = env.reset(seed=[seed])
+        render()
+        for step in itertools.count():
+            if step % run.policy.execute == 0:
+                obs = obs.to(config.device)
+                chunk = agent.decode(obs, agent.act(obs, deterministic=True)).to(env.device)
+            obs, _, _, truncated, info = env.step(chunk[:, step % run.policy.execute])
+            done = bool(info["success"] | truncated)
+            if done or (step + 1) % every == 0:
+                render()
+            if done:
+                break
+    solved = bool(info["success"])
+    ending = f"solved in {(step + 1) / FRAMES_PER_SECOND:.1f} s" if solved else "not solved"
+    return frames, ending, solved
 
 
 def _in_rows(pictures: Sequence[np.ndarray]) -> np.ndarray:
@@ -188,9 +251,7 @@ def _in_rows(pictures: Sequence[np.ndarray]) -> np.ndarray:
 
 def _paths(run: Restored, variants: Sequence[VariantSpec], episodes: int) -> np.ndarray:
     config = run.config
-    feasible = feasible_return(config, run.agent, run.policy)
-    evaluator = Evaluator(config, run.policy, run.agent, feasible, variants)
-    with contextlib.closing(evaluator):
+    with contextlib.closing(Evaluator(run, variants)) as evaluator:
         played = evaluator.play(episodes)
     title = f"{config.agent} on {config.task} ({variant_text(variants)}), seed {config.seed}"
     return draw_paths(played, run.policy.obs_layout, title)

@@ -1,8 +1,8 @@
 """The folder of a run: its files, its lock and its state.
 
 The files: config.json, record.json, policy.safetensors (the base policy that is steered),
-demonstrations.safetensors (if the agent learns from them), checkpoint.pt, progress.json, the
-TensorBoard events, and .lock, which is locked by the process that works on the run.
+checkpoint.pt, progress.json, the TensorBoard events, and .lock, which is locked by the process that
+works on the run.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class RunBusyError(UserError):
 
 
 def run_id(
-    config: RunConfig, origin: dict[str, Any], stored: Mapping[str, Any] | None = None
+    config: RunConfig, origin: Mapping[str, Any], stored: Mapping[str, Any] | None = None
 ) -> str:
     """A readable name that is unique for the configuration.
 

@@ -1,7 +1,4 @@
-"""Observers that write the results of a run: record, pictures, progress.
-
-The record comes first; the others show what it holds.
-"""
+"""Observers that write the results of a run: the record, and its progress."""
 
 from __future__ import annotations
 
@@ -14,22 +11,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from tqdm import tqdm
 
 from symsteer.bench.runs.base_policy import describe_base
-from symsteer.bench.runs.config import RunConfig, content_key
-from symsteer.bench.runs.extensions import extensions_of
+from symsteer.bench.runs.config import content_key
 from symsteer.bench.runs.folder import CHECKPOINT, PROGRESS, RECORD
-from symsteer.bench.runs.pictures import (
-    FRAMES_PER_SECOND,
-    contact_sheet,
-    draw_paths,
-    first_episode,
-)
-from symsteer.bench.runs.scalars import Means, Scalars
-from symsteer.bench.runs.tracking import Tracking
+from symsteer.bench.runs.scalars import Means
+from symsteer.bench.runs.stored import extensions_of
 from symsteer.bench.runs.trainer import Observer, Trainer
-from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.steering.seeds import HELD_OUT_SEED
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
@@ -45,6 +33,7 @@ from symsteer.leaderboard.records import (
     read_record,
     write_record,
 )
+from symsteer.terminal import progress_bar, tell
 
 SHOW_EVERY = 10
 """Decisions (of all environments together) between two changes of the numbers beside the bar."""
@@ -54,20 +43,15 @@ PROGRESS_SECONDS = 2.0
 
 
 class RecordWriter(Observer):
-    """Keeps record.json: written at the start, after every evaluation, and at the end.
-
-    Args:
-        resolved: the configuration as in the record.
-    """
+    """Keeps record.json: written at the start, after every evaluation, and at the end."""
 
     record: RunRecord
 
-    def __init__(self, resolved: dict[str, Any]):
-        self.resolved = resolved
-
     def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
         provenance = Provenance.collect(
-            device=_device_name(run.agent.device),
+            device=torch.cuda.get_device_name(run.agent.device)
+            if run.agent.device.type == "cuda"
+            else "cpu",
             torch_threads=torch.get_num_threads(),
             extensions=extensions_of(run.config),
             together=run.together,
@@ -83,7 +67,7 @@ class RecordWriter(Observer):
         self.record = RunRecord(
             run_id=run.folder.name,
             role=run.agent.role,
-            config=self.resolved,
+            config=dict(run.run.resolved),
             provenance=provenance,
             seeds={
                 "run": config.seed,
@@ -92,13 +76,8 @@ class RecordWriter(Observer):
                 "first_held_out": HELD_OUT_SEED,
             },
             started=datetime.now(UTC),
-            parameters=Parameters(
-                actor=counts["actor"],
-                critic=counts["critic"],
-                total=counts["total"],
-                width=counts["width"] or None,
-            ),
-            base_policy=describe_base(run.base),
+            parameters=Parameters.model_validate({**counts, "width": counts["width"] or None}),
+            base_policy=describe_base(run.policy),
             feasible_q=FeasibleQ(low=feasible[0], high=feasible[1]) if run.has_critic else None,
         )
 
@@ -108,7 +87,7 @@ class RecordWriter(Observer):
         """Restore the record of the checkpoint."""
         self.record = record = read_record(run.folder / RECORD)
         del record.evaluations[checkpoint["evaluations"] :]
-        mine = (run.folder.name, config_hash(self.resolved), checkpoint["history"])
+        mine = (run.folder.name, config_hash(run.run.resolved), checkpoint["history"])
         if (record.run_id, record.config_hash, _history(record)) != mine:
             raise UserError(
                 f"{run.folder / RECORD} is not the record that {CHECKPOINT} beside it "
@@ -152,44 +131,11 @@ class RecordWriter(Observer):
         write_record(self.record, run.folder / RECORD)
 
 
-class Pictures(Observer):
-    """Pictures of the last evaluation beside the scalars; the record is closed by then.
+class TerminalProgress(Observer):
+    """A progress bar for the terminal, and progress.json for `symsteer status` and sweeps."""
 
-    Args:
-        scalars: writes them.
-        quiet: do not print why a picture is missing.
-    """
-
-    def __init__(self, scalars: Scalars, quiet: bool):
-        self.scalars, self.quiet = scalars, quiet
-
-    def finished(self, run: Trainer) -> None:
-        played = run.evaluator.played
-        if played is None:
-            return
-        try:
-            paths = draw_paths(played, run.base.obs_layout, run.title)
-            self.scalars.picture("eval/paths", paths, run.env_steps)
-            if rendering_works():
-                frames = first_episode(run.config, run.base, run.agent)
-                rate = FRAMES_PER_SECOND / run.base.execute
-                self.scalars.picture("eval/frames", contact_sheet(frames), run.env_steps)
-                self.scalars.film("eval/film", frames, rate, run.env_steps)
-        except Exception as error:
-            if not self.quiet:
-                tqdm.write(f"no picture of the evaluation: {type(error).__name__}: {error}")
-
-
-class Progress(Observer):
-    """A progress bar for the terminal, and progress.json for `symsteer status` and sweeps.
-
-    Args:
-        quiet: no bar and no lines.
-    """
-
-    def __init__(self, quiet: bool):
-        self.quiet = quiet
-        self.bar: tqdm | None = None
+    def __init__(self) -> None:
+        self.bar = contextlib.ExitStack()
         self.means = Means()
         self.rounds = 0
         self.success: float | None = None
@@ -202,33 +148,33 @@ class Progress(Observer):
 
     def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None:
         budget = run.config.env_steps
-        if self.bar is None:
-            disable = True if self.quiet else None  # None: where the output is no terminal
-            self.bar = tqdm(total=budget, desc=run.title, unit="step", disable=disable)
-        self.bar.update(min(run.env_steps, budget) - self.bar.n)
+        if not self.rounds:
+            bar = progress_bar(run.config.title, budget, run.how.quiet, "step")
+            self.advance = self.bar.enter_context(bar)
         self.means.add({k: v for k, v in scalars[0].items() if k == "train/success_once"})
         self.rounds += 1
+        shown: dict[str, float | None] = {}
         if self.rounds % SHOW_EVERY == 0:
-            shown = {"success": self.means.take().get("train/success_once")}
-            shown["held_out"] = self.success
-            self.bar.set_postfix({k: f"{v:.2f}" for k, v in shown.items() if v is not None})
+            success = self.means.take().get("train/success_once")
+            shown = {"success": success, "held_out": self.success}
+        texts = {name: f"{value:.2f}" for name, value in shown.items() if value is not None}
+        self.advance(min(run.env_steps, budget), **texts)
         self.file.write("training", run.env_steps, self.success)
 
     def evaluated(self, run: Trainer, evaluation: Evaluation) -> None:
         self.success = evaluation.success_once
-        if not self.quiet:
+        if not run.how.quiet:
             count = len(evaluation.episodes.seed)
-            tqdm.write(
-                f"{run.title}: {run.env_steps:7d} steps, held-out success {self.success:.2f} "
-                f"({count} episodes{', final' if evaluation.final else ''})"
+            tell(
+                f"{run.config.title}: {run.env_steps:7d} steps, held-out success "
+                f"{self.success:.2f} ({count} episodes{', final' if evaluation.final else ''})"
             )
 
     def finished(self, run: Trainer) -> None:
-        if self.bar is not None:
-            self.bar.close()
+        self.bar.close()
 
     def failed(self, run: Trainer, error: BaseException) -> None:
-        self.finished(run)
+        self.bar.close()
 
 
 class ProgressFile:
@@ -267,30 +213,8 @@ class ProgressFile:
             write_atomically(self._path, json.dumps(data).encode(), durable=False)
 
 
-def observers_of(
-    config: RunConfig, resolved: dict[str, Any], progress: bool, tracking: Tracking | None = None
-) -> list[Observer]:
-    """The observers of a run, in the order in which they are told.
-
-    Args:
-        config: of the run.
-        resolved: the configuration as in the record.
-        progress: whether to show progress.
-        tracking: a service that shows the run, too.
-    """
-    records = RecordWriter(resolved)
-    scalars = Scalars(records, tracking)
-    pictures = Pictures(scalars, quiet=not progress)
-    # The record is closed before the pictures are drawn, TensorBoard after them.
-    return [records, Progress(quiet=not progress), pictures, scalars]
-
-
 def _history(record: RunRecord) -> str:
     """A hash of all evaluations in the record."""
     return content_key(
         [evaluation.model_dump(mode="json", by_alias=True) for evaluation in record.evaluations]
     )
-
-
-def _device_name(device: torch.device) -> str:
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"

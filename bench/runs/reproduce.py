@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import secrets
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from symsteer.bench.runs.base_policy import origin, take_base
-from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.extensions import extensions_of
-from symsteer.bench.runs.folder import CONFIG, RECORD, is_finished, run_id
-from symsteer.bench.runs.run import check, check_all, check_device, execute
-from symsteer.bench.runs.stored import newer_options, read_back
+from symsteer.bench.runs.base_policy import take_base
+from symsteer.bench.runs.config import Execution, RunConfig
+from symsteer.bench.runs.folder import CONFIG, RECORD, is_finished
+from symsteer.bench.runs.run import check, check_all, execute
+from symsteer.bench.runs.stored import Run, extensions_of, newer_options, read_back
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.records import (
@@ -32,6 +31,7 @@ from symsteer.leaderboard.records import (
     read_record,
     reproduction_of,
 )
+from symsteer.tables import aligned
 
 RESULT = "reproduction.json"
 
@@ -52,16 +52,8 @@ DIGITS = 12
 
 @dataclass(frozen=True)
 class Reproduced:
-    """A run made again.
+    """A run made again: its folder, the files with the comparison, and their content."""
 
-    Attributes:
-        record: the record that was repeated.
-        run: folder of the repeated run.
-        results: the files with the comparison.
-        reproduction: its content.
-    """
-
-    record: RunRecord
     run: Path
     results: tuple[Path, ...]
     reproduction: Reproduction
@@ -69,31 +61,19 @@ class Reproduced:
 
 def reproduce(
     path: Path,
-    out: Path | None = None,
-    demonstrations: Path | None = None,
-    policy: Path | None = None,
+    out: Path | None,
+    how: Execution,
     into: Path | None = None,
-    progress: bool = True,
-    workers: int = 1,
     base_from: Path | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Reproduced:
-    """Run the configuration of a record again, and compare.
-
-    Nothing of the first run is used but its record: demonstrations and base policy are made anew,
-    unless the run began from files or they are taken from other runs. The same call continues a
-    reproduction that was stopped.
+    """What `symsteer reproduce` does; its help explains the options.
 
     Args:
-        path: of a record, of a run's folder, or of a folder of submitted records, one of which is
-            drawn.
-        out: where to put a folder with the new run and the comparison; default: a temporary one.
-        demonstrations, policy: the files that the run began from, if it did.
-        into: a folder that gets what the leaderboard reads, named after the record's hash: the
-            comparison, the repeated record, and the line for the list of the study.
-        progress: whether to show progress bars.
-        workers: processes that share the environments.
-        base_from: a folder of runs whose demonstrations and base policy are taken.
+        path: of a record, of a run's folder, or of a folder of submitted records.
+        out: where to put a folder with the new run and the comparison; None: a temporary one.
+        how: it is executed, with the files that the run began from, if it did.
+        into, base_from: as in the help.
         report: receives lines on where the new run is, and why it may differ.
 
     Raises:
@@ -116,12 +96,13 @@ def reproduce(
             "with; name the record of a finished run"
         )
     config, files = _configuration(path, record)
-    _check_files(record, files, demonstrations, policy)
-    name, taking = run_id(config, files), base_from is not None
-    if out is None or not is_finished(_place(path, out, taking) / name):
-        check_all(config, workers)
-    place = _place(path, out, taking)
-    folder = place / name
+    _check_files(record, files, how.files)
+    # One with a base policy that was taken does not continue one that trains it.
+    name = f"reproduction-{file_hash(path)[:DIGITS]}{'-taken' if base_from else ''}"
+    if out is None or not is_finished(Run.new(config, out / name, files).folder):
+        check_all(config, how.workers)
+    place = out / name if out else Path(tempfile.mkdtemp(prefix="symsteer-reproduction-"))
+    folder = Run.new(config, place, files).folder
     report(f"repeating {record.run_id} in {place}")
     report(f"the recorded run took {record.wall_clock.total / 60:.1f} minutes")
     here = Provenance.collect(config.device, torch.get_num_threads(), extensions_of(config))
@@ -138,18 +119,21 @@ def reproduce(
     if is_finished(folder):
         report("the run is there and finished: it is compared without making it again")
     else:
-        execute(config, place, demonstrations, policy, progress, workers)
+        execute(config, replace(how, out=place))
     made = read_record(folder / RECORD).provenance
-    found = reproduction_of(path, folder / RECORD, taken + conditions(record, config, made))
-    written = {place / RESULT: dump_reproduction(found)}
+    compared = reproduction_of(path, folder / RECORD, taken + conditions(record, config, made))
+    content = dump_reproduction(compared)
+    written = {place / RESULT: content}
     if into is not None:
-        digest = hashlib.sha256(dump_reproduction(found)).hexdigest()
-        line = f"{digest}  {into.resolve().name}/{found.record.sha256}.json\n"
-        contents = dump_reproduction(found), (folder / RECORD).read_bytes(), line.encode()
-        names = (f"{found.record.sha256}{end}" for end in (".json", REPEATED, ".sha256"))
-        written |= {into / name: data for name, data in zip(names, contents, strict=True)}
+        stem = into / compared.record.sha256
+        line = f"{hashlib.sha256(content).hexdigest()}  {into.resolve().name}/{stem.name}.json\n"
+        written |= {
+            stem.with_suffix(".json"): content,
+            stem.with_suffix(REPEATED): (folder / RECORD).read_bytes(),
+            stem.with_suffix(".sha256"): line.encode(),
+        }
     write_together(written)
-    return Reproduced(record, folder, tuple(written), found)
+    return Reproduced(folder, tuple(written), compared)
 
 
 def conditions(record: RunRecord, config: RunConfig, now: Provenance) -> list[str]:
@@ -197,21 +181,27 @@ def conditions(record: RunRecord, config: RunConfig, now: Provenance) -> list[st
 
 def text(done: Reproduced) -> str:
     """What the terminal shows of a reproduction."""
-    found = done.reproduction
-    success, area = found.success, found.area
+    shown = done.reproduction
+    success, area = shown.success, shown.area
     lines = [
-        f"record         {found.record.run_id}, sha256 {found.record.sha256[:DIGITS]}",
+        f"record         {shown.record.run_id}, sha256 {shown.record.sha256[:DIGITS]}",
         f"new run        {done.run}",
-        *(f"note           {line}" for line in found.conditions),
+        *(f"note           {line}" for line in shown.conditions),
     ]
-    differing = [one.part for one in found.differences]
-    if differing:
-        lines += ["", _row("part", "values that differ", "first at", "largest", "first of them")]
-    for one in found.differences:
-        first = "" if one.first is None else f"{one.first} steps"
-        largest = "" if one.largest is None else f"{one.largest:.3g}"
-        lines.append(_row(one.part, f"{one.differ} of {one.of}", first, largest, one.example))
-    alike = [part for part in PARTS if part not in differing]
+    rows = [
+        (
+            one.part,
+            f"{one.differ} of {one.of}",
+            "" if one.first is None else f"{one.first} steps",
+            "" if one.largest is None else f"{one.largest:.3g}",
+            one.example,
+        )
+        for one in shown.differences
+    ]
+    if rows:
+        header = ("part", "values that differ", "first at", "largest", "first of them")
+        lines += ["", aligned(header, rows)]
+    alike = [part for part in PARTS if part not in {one.part for one in shown.differences}]
     lines += [
         "",
         f"agree exactly  {', '.join(alike) or 'nothing'}",
@@ -220,40 +210,31 @@ def text(done: Reproduced) -> str:
         f"area           {area.recorded:.3f} in the record, {area.repeated:.3f} here "
         f"({area.repeated - area.recorded:+.3f})",
         "",
-        SENTENCES[found.verdict],
+        SENTENCES[shown.verdict],
         *(f"wrote {path}" for path in done.results),
     ]
     return "\n".join(lines)
 
 
-def _row(part: str, count: str, first: str, largest: str, example: str) -> str:
-    return f"{part:12s} {count:>18s}  {first:>12s}  {largest:>9s}  {example}".rstrip()
-
-
 def _configuration(path: Path, record: RunRecord) -> tuple[RunConfig, dict[str, str]]:
     """Configuration of a record, and the hashes of the files that its run began from."""
     try:
-        config, files = read_back(record.config, path, path)
+        config = read_back(record.config, path, path)
+        files: Any = record.config.get("files", {})
         if not isinstance(files, dict) or not files.keys() <= FILES.keys():
             raise UserError("it began from files of a kind that this version does not know")
-        check(dataclasses.replace(config, sim="cpu", device="cpu"))
+        check(replace(config, sim="cpu", device="cpu"))
     except UserError as error:
         raise UserError(
             f"this version of SymSteer cannot repeat {path} ({error}); the record is of "
             f"{_code(record.provenance)}: use that"
         ) from error
-    check_device(config, f"the run of {path}")
+    check(config, begun=f"the run of {path}")
     return config, files
 
 
-def _check_files(
-    record: RunRecord,
-    recorded: Mapping[str, str],
-    demonstrations: Path | None,
-    policy: Path | None,
-) -> None:
+def _check_files(record: RunRecord, recorded: Mapping[str, str], given: Mapping[str, str]) -> None:
     """Compare the files that were given with those that the run began from, by their hashes."""
-    given = origin(demonstrations, policy)
     for kind, (option, placeholder) in FILES.items():
         if kind in given and kind not in recorded:
             raise UserError(f"{record.run_id} began from no {kind} file; leave {option} out")
@@ -267,16 +248,6 @@ def _check_files(
                 f"the {kind} file has the hash {given[kind][:DIGITS]}, but {record.run_id} began "
                 f"from one with {recorded[kind][:DIGITS]}; give that one with {option}"
             )
-
-
-def _place(path: Path, out: Path | None, taken: bool) -> Path:
-    """The folder of the reproduction of the record at a path.
-
-    One with a base policy that was `taken` has its own: it does not continue one that trains it.
-    """
-    if out is None:
-        return Path(tempfile.mkdtemp(prefix="symsteer-reproduction-"))
-    return out / f"reproduction-{file_hash(path)[:DIGITS]}{'-taken' if taken else ''}"
 
 
 def _code(provenance: Provenance) -> str:

@@ -9,15 +9,16 @@ import math
 import re
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
+from symsteer.bench.runs.pictures import draw_paths
 from symsteer.bench.runs.tensorboard import RunLog
-from symsteer.bench.runs.tracking import Tracking, WandbLog
+from symsteer.bench.runs.tracking import WandbLog
 from symsteer.bench.runs.trainer import Observer, Trainer
 from symsteer.leaderboard.records import Evaluation, RunRecord
+from symsteer.terminal import tell
 
 if TYPE_CHECKING:
     from symsteer.bench.runs.observers import RecordWriter
@@ -35,53 +36,27 @@ SMALLEST_ERROR = 1e-8
 """Smaller errors are rounding; this number stands for them in logarithms."""
 
 
-class Log(Protocol):
-    """A view of one run; steps are control steps."""
-
-    def scalars(self, values: Mapping[str, float | None], step: int) -> None:
-        """Write all values that are not None, by tag."""
-
-    def level(self, values: Mapping[str, float | None], budget: int) -> None:
-        """Show values that hold for the whole run."""
-
-    def picture(self, tag: str, picture: np.ndarray, step: int) -> None:
-        """Write a picture ``[height, width, 3]`` uint8."""
-
-    def film(self, tag: str, frames: Sequence[np.ndarray], rate: float, step: int) -> None:
-        """Write pictures of one size, ``rate`` of them per second."""
-
-    def flush(self) -> None:
-        """Write everything to disk."""
-
-    def finish(self) -> None:
-        """The run has finished."""
-
-    def close(self) -> None:
-        """The run did not finish."""
-
-
 class Scalars(Observer):
-    """Writes what the record holds, and scalars of training between evaluations.
+    """Writes what the record holds, scalars of training between evaluations, and pictures.
 
     Args:
         records: the observer that writes the record.
-        tracking: a service that shows the run, too.
     """
 
-    def __init__(self, records: RecordWriter, tracking: Tracking | None):
-        self.records, self.tracking = records, tracking
-        self.logs: list[Log] = []
+    def __init__(self, records: RecordWriter):
+        self.records = records
+        self.logs: list[RunLog | WandbLog] = []
         self.means = Means()
 
     def began(self, run: Trainer, checkpoint: Mapping[str, Any] | None) -> None:
         record = self.records.record
         # Even without a checkpoint, an earlier process may have written events.
         self.logs.append(RunLog(run.folder, record, run.env_steps + 1 if checkpoint else 0))
-        if self.tracking is not None:
-            self.logs.append(WandbLog(run.folder, record, self.tracking))
+        if run.how.track:
+            self.logs.append(WandbLog(run.folder, record, run.how.group))
         for log in self.logs:
             log.level(reference_lines(record), run.config.env_steps)
-        self.recent = RecentMeans((checkpoint or {}).get("recent_episodes", {}))
+        self.recent = Means((checkpoint or {}).get("recent_episodes", {}))
         self.written = run.env_steps
 
     def stepped(self, run: Trainer, scalars: Sequence[Mapping[str, torch.Tensor]]) -> None:
@@ -111,22 +86,21 @@ class Scalars(Observer):
         return {"recent_episodes": self.recent.state()}
 
     def finished(self, run: Trainer) -> None:
+        if run.evaluator.played is not None:
+            try:
+                policy, title = run.policy, run.config.title
+                paths = draw_paths(run.evaluator.played, policy.obs_layout, title)
+                for log in self.logs:
+                    log.picture("eval/paths", paths, run.env_steps)
+            except Exception as error:
+                if not run.how.quiet:
+                    tell(f"no picture of the evaluation: {type(error).__name__}: {error}")
         for log in self.logs:
-            log.finish()
+            log.end(finished=True)
 
     def failed(self, run: Trainer, error: BaseException) -> None:
         for log in self.logs:
-            log.close()
-
-    def picture(self, tag: str, picture: np.ndarray, step: int) -> None:
-        """Show a picture ``[height, width, 3]`` uint8."""
-        for log in self.logs:
-            log.picture(tag, picture, step)
-
-    def film(self, tag: str, frames: Sequence[np.ndarray], rate: float, step: int) -> None:
-        """Show pictures of one size, ``rate`` of them per second."""
-        for log in self.logs:
-            log.film(tag, frames, rate, step)
+            log.end(finished=False)
 
     def _write_training(self, run: Trainer) -> None:
         seconds = run.seconds
@@ -149,11 +123,11 @@ class Scalars(Observer):
 
 def evaluation_scalars(evaluation: Evaluation) -> dict[str, float | None]:
     """The scalars of an evaluation, by tag."""
-    columns = evaluation.episodes.model_dump(by_alias=True)
+    episodes = evaluation.episodes.model_dump(by_alias=True)
     values: dict[str, float | None] = {
-        f"eval/{name}": sum(columns[name]) / len(columns[name])
+        f"eval/{name}": sum(episodes[name]) / len(episodes[name])
         for name in ("success_once", "success_at_end", "return", "episode_len")
-        if None not in columns[name]
+        if None not in episodes[name]
     }
     for name, value in evaluation.diagnostics.items():
         # The record holds null for a number that is not finite, and says which.
@@ -181,53 +155,35 @@ def reference_lines(record: RunRecord) -> dict[str, float | None]:
 
 
 class Means:
-    """Means of named tensors since the last call of ``take``. Only ``take`` reads the device."""
+    """Means of named tensors. Only ``take`` and ``state`` read the device.
 
-    def __init__(self) -> None:
-        self._sums: dict[str, torch.Tensor] = {}
-        self._counts: dict[str, int] = {}
+    Args:
+        recent: None for means since the last call of ``take``; or what :meth:`state` has returned,
+            for running means over the last ``RECENT`` numbers of each name.
+    """
+
+    def __init__(self, recent: Mapping[str, Sequence[float]] | None = None):
+        self._limit = None if recent is None else RECENT
+        self._numbers = {name: deque(numbers, RECENT) for name, numbers in (recent or {}).items()}
+        self._new: dict[str, list[torch.Tensor]] = {}
 
     def add(self, values: Mapping[str, torch.Tensor]) -> None:
         """Count the numbers of each tensor."""
         for name, value in values.items():
             if value.numel():
-                total = value.detach().double().sum()
-                self._sums[name] = self._sums.get(name, 0.0) + total
-                self._counts[name] = self._counts.get(name, 0) + value.numel()
+                self._new.setdefault(name, []).append(value.detach().flatten())
 
     def take(self) -> dict[str, float]:
-        """The means; begins anew."""
-        means = {name: (total / self._counts[name]).item() for name, total in self._sums.items()}
-        self._sums.clear()
-        self._counts.clear()
+        """The means, of names with any numbers."""
+        means = {name: sum(numbers) / len(numbers) for name, numbers in self.state().items()}
+        if self._limit is None:
+            self._numbers.clear()
         return means
 
-
-class RecentMeans:
-    """Running means over the last ``RECENT`` numbers of each name.
-
-    Args:
-        state: what :meth:`state` has returned, to continue.
-    """
-
-    def __init__(self, state: Mapping[str, Sequence[float]]):
-        self._recent = {name: deque(numbers, RECENT) for name, numbers in state.items()}
-        self._new: dict[str, list[torch.Tensor]] = {}
-
-    def add(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Count the numbers of each tensor; does not read the device."""
-        for name, value in values.items():
-            if value.numel():
-                self._new.setdefault(name, []).append(value.detach())
-
-    def take(self) -> dict[str, float]:
-        """The means, of names with any numbers so far."""
-        return {name: sum(numbers) / len(numbers) for name, numbers in self.state().items()}
-
     def state(self) -> dict[str, list[float]]:
-        """The last numbers of each name."""
+        """The numbers of each name that the next means are of."""
         for name, values in self._new.items():
-            recent = self._recent.setdefault(name, deque(maxlen=RECENT))
-            recent.extend(torch.cat(values).double().tolist())
+            numbers = self._numbers.setdefault(name, deque(maxlen=self._limit))
+            numbers.extend(torch.cat(values).double().tolist())
         self._new.clear()
-        return {name: list(numbers) for name, numbers in self._recent.items()}
+        return {name: list(numbers) for name, numbers in self._numbers.items()}

@@ -1,44 +1,110 @@
-"""Reading a run's folder: configuration, base policy, trained agent."""
+"""Runs as their folders hold them: configuration, base policy, trained agent."""
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 
-from symsteer.agents.agent import Agent
+from symsteer.agents import AGENTS
 from symsteer.bench.runs.checkpoint import fitting, load_checkpoint
 from symsteer.bench.runs.config import RunConfig, build_config
-from symsteer.bench.runs.extensions import require_extensions
+from symsteer.bench.runs.evaluator import Steered, new_agent
 from symsteer.bench.runs.folder import CHECKPOINT, CONFIG, RECORD, read_config, run_id
-from symsteer.bench.runs.trainer import new_agent
-from symsteer.bench.tasks import task_class
+from symsteer.bench.tasks import TASKS, task_class
+from symsteer.bench.variants import VARIANTS, evaluation_variants
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import DERIVED, flat
+from symsteer.leaderboard.records import DERIVED, flat, read_record
+from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path
+from symsteer.registry import Extension
+from symsteer.variant import variant_text
+
+REGISTRIES = {registry.kind: registry for registry in (AGENTS, POLICIES, TASKS, VARIANTS)}
 
 
 @dataclass(frozen=True)
-class Restored:
-    """A run at its last checkpoint.
+class Run:
+    """A run and the folder that is its own, whether it exists or not.
 
     Attributes:
-        folder: of the run.
-        config: of the run; with the device on which it was restored.
-        policy: the frozen base policy.
-        agent: with the weights of the checkpoint.
-        state: the whole checkpoint.
+        folder: of the run; its name is the run's name.
+        config: of the run.
+        resolved: the configuration as plain data, as `config.json` and the record have it.
     """
 
     folder: Path
     config: RunConfig
-    policy: ChunkPolicy
-    agent: Agent
+    resolved: Mapping[str, Any]
+
+    @classmethod
+    def new(cls, config: RunConfig, out: Path, files: Mapping[str, str]) -> Self:
+        """A run of a configuration.
+
+        Args:
+            config: what to run.
+            out: folder of the runs.
+            files: content hashes of the files that it starts from.
+        """
+        variant = variant_text(evaluation_variants(config.variants))
+        derived = {"evaluation_variant": variant, "files": dict(files)}
+        return cls(out / run_id(config, files), config, config.to_json() | derived)
+
+    @classmethod
+    def stored(cls, folder: Path) -> Self:
+        """The run of a folder, which may be given as ``.`` or as a link.
+
+        Raises:
+            UserError: if it is not the folder of a run, or its configuration is damaged, edited, or
+                of a version with fewer options.
+        """
+        folder = Path(os.path.realpath(folder))
+        resolved = read_config(folder)
+        config = read_back(resolved, folder / CONFIG, folder / RECORD)
+        if newer := newer_options(config, resolved):
+            raise UserError(
+                f"the run {folder.name} was begun by an older version, without {', '.join(newer)}; "
+                "use that version for it, or start it again with `symsteer run`"
+            )
+        run = cls(folder, config, resolved)
+        named = isinstance(run.files, dict) and run_id(config, run.files, _settings(resolved))
+        if named != folder.name:
+            raise UserError(
+                f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or "
+                "the folder renamed; undo that"
+            )
+        return run
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Content hashes of the files that it started from."""
+        return self.resolved.get("files", {})
+
+    def policy(self) -> ChunkPolicy | None:
+        """Its base policy; None if it is not there yet."""
+        if not policy_path(self.folder).is_file():
+            return None
+        task = task_class(self.config.task)
+        policy = load_policy(self.folder, task.observation_layout, task.action_layout)
+        return policy.to(self.config.device)
+
+
+@dataclass(eq=False)
+class Restored(Steered):
+    """A run at its last checkpoint.
+
+    Attributes:
+        folder: of the run.
+        state: the whole checkpoint.
+    """
+
+    folder: Path
     state: Mapping[str, Any]
 
 
@@ -50,62 +116,35 @@ def restored(folder: Path) -> Restored:
     Raises:
         UserError: if the folder is not a run's, it has no checkpoint yet, or a file is damaged.
     """
-    folder = named(folder)
-    config, _ = stored_config(folder)
+    run = Run.stored(folder)
     if not torch.cuda.is_available():
-        config = replace(config, device="cpu")
-    state = load_checkpoint(folder)
+        run = dataclasses.replace(run, config=dataclasses.replace(run.config, device="cpu"))
+    state = load_checkpoint(run.folder)
     if state is None:
         raise UserError(
-            f"the run {folder.name} has no checkpoint yet; `symsteer resume` brings it to its end"
+            f"the run {run.folder.name} has no checkpoint yet; `symsteer resume` brings it to its "
+            "end"
         )
-    policy = stored_policy(folder, config)
+    policy = run.policy()
     if policy is None or policy.content_hash() != state["base_policy"]:
         raise UserError(
-            f"{policy_path(folder)} is not the base policy that the checkpoint of {folder.name} "
-            "steers; restore it from where the run was made"
+            f"{policy_path(run.folder)} is not the base policy that the checkpoint of "
+            f"{run.folder.name} steers; restore it from where the run was made"
         )
-    agent = new_agent(config, policy)
-    with fitting(folder / CHECKPOINT):
+    agent = new_agent(run.config, policy)
+    with fitting(run.folder / CHECKPOINT):
         agent.load_state_dict(state["agent"])
-    return Restored(folder, config, policy, agent, state)
+    return Restored(run.config, policy, agent, run.folder, state)
 
 
-def named(folder: Path) -> Path:
-    """The folder's full path, also for ``.`` or a link: its name is the run's name."""
-    return Path(os.path.realpath(folder))
-
-
-def stored_config(folder: Path) -> tuple[RunConfig, dict[str, Any]]:
-    """Configuration of a run's folder, and the content hashes of the files it started from.
-
-    Raises:
-        UserError: if the folder is not a run's, or its configuration is damaged, edited, or of a
-            version with fewer options.
-    """
-    data = read_config(folder)
-    config, files = read_back(data, folder / CONFIG, folder / RECORD)
-    if newer := newer_options(config, data):
-        raise UserError(
-            f"the run {folder.name} was begun by an older version, without {', '.join(newer)}; "
-            "use that version for it, or start it again with `symsteer run`"
-        )
-    own = {key: value for key, value in data.items() if key not in DERIVED}
-    if not isinstance(files, dict) or run_id(config, files, own) != folder.name:
-        raise UserError(
-            f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or the "
-            "folder renamed; undo that"
-        )
-    return config, files
-
-
-def read_back(data: Mapping[str, Any], path: Path, record: Path) -> tuple[RunConfig, Any]:
-    """A run's configuration, and the content hashes of its files, from its resolved configuration.
+def read_back(data: Mapping[str, Any], path: Path, record: Path) -> RunConfig:
+    """A run's configuration from its resolved configuration.
 
     Args:
         data: as `config.json` and records have it.
         path: the file that it is from, for messages.
-        record: of the run; all code that it names must be installed.
+        record: of the run; all code from outside SymSteer that it names must be installed. A record
+            that is missing or damaged names none.
 
     Raises:
         UserError: if this version has no such configuration, or code is not installed.
@@ -115,9 +154,18 @@ def read_back(data: Mapping[str, Any], path: Path, record: Path) -> tuple[RunCon
             f"{path} is of a run of SymSteer 0.1, which this version reports but cannot load, "
             "continue or repeat; use SymSteer 0.1 for that"
         )
-    require_extensions(record)
-    own = {key: value for key, value in data.items() if key not in DERIVED}
-    return build_config(own, str(path)), data.get("files", {})
+    try:
+        extensions = read_record(record).provenance.extensions
+    except UserError:
+        extensions = []
+    for one in extensions:
+        REGISTRIES[one.kind].require(one.name, one.target, one.distribution, record)
+    return build_config(_settings(data), str(path))
+
+
+def _settings(resolved: Mapping[str, Any]) -> dict[str, Any]:
+    """What was asked for, without what the run has added."""
+    return {key: value for key, value in resolved.items() if key not in DERIVED}
 
 
 def newer_options(config: RunConfig, data: Mapping[str, Any]) -> list[str]:
@@ -125,10 +173,12 @@ def newer_options(config: RunConfig, data: Mapping[str, Any]) -> list[str]:
     return sorted(flat(config.to_json()).keys() - flat(data).keys())
 
 
-def stored_policy(folder: Path, config: RunConfig) -> ChunkPolicy | None:
-    """The base policy in a run's folder; None if it is not there yet."""
-    if not policy_path(folder).is_file():
-        return None
-    task = task_class(config.task)
-    base = load_policy(folder, task.observation_layout, task.action_layout)
-    return base.to(config.device)
+def extensions_of(config: RunConfig) -> list[Extension]:
+    """The agent, policy, task and variants of a run that are not SymSteer's own."""
+    named = [
+        AGENTS.extension(config.agent),
+        POLICIES.extension(config.policy_name),
+        TASKS.extension(config.task),
+        *(VARIANTS.extension(spec.name) for spec in config.variants),
+    ]
+    return [extension for extension in named if extension is not None]

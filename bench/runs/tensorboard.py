@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,38 +13,27 @@ import numpy as np
 from tensorboard.compat.proto.summary_pb2 import DATA_CLASS_SCALAR, Summary, SummaryMetadata
 from tensorboard.compat.proto.tensor_pb2 import TensorProto
 from tensorboard.compat.proto.tensor_shape_pb2 import TensorShapeProto
+from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.custom_scalar import metadata as custom_scalars
-from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from tensorboard.plugins.scalar import metadata as scalar
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
 from symsteer.agents import AGENTS
-from symsteer.bench.runs.charts import DESCRIPTIONS, LAYOUT
+from symsteer.bench.runs.charts import DESCRIPTIONS, FINAL_METRICS, LINES, POINTS
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.pictures import to_gif
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import Provenance, RunRecord, flat
+from symsteer.leaderboard.records import RunRecord, flat
 from symsteer.policies import POLICIES
+from symsteer.tables import markdown
 
-IDENTITY = frozenset({"task", "embodiment", "variant", "agent", "seed"})
+FIRST = ("run", "task", "embodiment", "variant", "agent", "seed")
 """Settings that the HParams tab shows first; the others can be selected."""
 
-FINAL_METRICS = (
-    "eval/success_once",
-    "eval/success_at_end",
-    "eval/return",
-    "eval/episode_len",
-    "diag/q_mean",
-    "diag/q_bias",
-    "diag/q_correlation",
-    "diag/q_magnitude",
-    "diag/td_error",
-    "diag/equivariance_actor",
-    "diag/equivariance_critic",
-    "diag/alpha",
-    "time/env_steps_per_second",
+AT_THE_START = frozenset(
+    {"run_id", "started", "provenance", "continued", "parameters", "base_policy", "feasible_q"}
 )
-"""Columns of the HParams tab: the last value of each of these scalars."""
+"""What the text of a run has of the record, beside its configuration."""
 
 
 class RunLog:
@@ -69,17 +57,19 @@ class RunLog:
         self.folder, self._purge_step = folder, purge_step
         self._described: set[str] = set()
         _silence_writing_thread()
+        # The end of the run's name: the tab would cut a whole one to the part that all runs share.
+        settings = {"run": record.run_id.rpartition("-")[2], **_settings(record.config)}
+        columns = {**dict.fromkeys(FIRST, ""), **_known_settings(), **settings}
+        metrics = dict.fromkeys(FINAL_METRICS, 0.0)
+        # Not SummaryWriter.add_hparams: it opens a second event file and renames the metrics.
+        experiment, _, _ = hparams(columns, metrics)
+        _, session, self._finished = hparams(settings, metrics)
         with self._reported():
             self.writer = SummaryWriter(str(folder), purge_step=purge_step)
-            self._add(_layout())
+            for summary in (_layout(), experiment, session):
+                self._add(summary)
             # A continued run may use another commit: its text is added to the first one.
             self.writer.add_text("config", config_text(record), purge_step)
-            settings = _settings(record.config)
-            known = {**_known_settings(), **settings}
-            self._hparams(metadata.EXPERIMENT_TAG, experiment=_experiment(known))
-            self._hparams(
-                metadata.SESSION_START_INFO_TAG, session_start_info=_session(record, settings)
-            )
             self.writer.flush()
 
     def scalars(self, values: Mapping[str, float | None], step: int) -> None:
@@ -103,35 +93,19 @@ class RunLog:
         with self._reported():
             self.writer.add_image(tag, picture, step, dataformats="HWC")
 
-    def film(self, tag: str, frames: Sequence[np.ndarray], rate: float, step: int) -> None:
-        """Write ``frames``, each ``[height, width, 3]`` uint8, as a film, ``rate`` per second."""
-        height, width, _ = frames[0].shape
-        image = Summary.Image(
-            height=height, width=width, colorspace=3, encoded_image_string=to_gif(frames, rate)
-        )
-        with self._reported():
-            self._add(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
-
-    def finish(self) -> None:
-        """Mark the run as finished in the HParams tab, and close."""
-        end = plugin_data_pb2.SessionEndInfo(
-            status=api_pb2.STATUS_SUCCESS, end_time_secs=time.time()
-        )
-        with contextlib.suppress(OSError):
-            self._hparams(metadata.SESSION_END_INFO_TAG, session_end_info=end)
-        self.close()
-
     def flush(self) -> None:
         """Write all events to disk."""
         with self._reported():
             self.writer.flush()
 
-    def close(self) -> None:
-        """Write all events to disk and close.
+    def end(self, finished: bool) -> None:
+        """Write all events to disk and close; the HParams tab says whether the run has finished.
 
         The record is already closed, so errors are ignored.
         """
         with contextlib.suppress(OSError):
+            if finished:
+                self._add(self._finished)
             self.writer.close()
 
     @contextlib.contextmanager
@@ -143,15 +117,6 @@ class RunLog:
                 f"cannot write TensorBoard's events to {self.folder}: {error.strerror}; free space "
                 "or choose another folder, then continue the run"
             ) from error
-
-    def _hparams(self, tag: str, **content: Any) -> None:
-        data = plugin_data_pb2.HParamsPluginData(**content)
-        summary = Summary()
-        summary.value.add(
-            tag=tag, metadata=metadata.create_summary_metadata(data), tensor=metadata.NULL_TENSOR
-        )
-        # SummaryWriter's own add_hparams opens a second event file and renames the metrics.
-        self._add(summary)
 
     def _add(self, summary: Summary, step: int | None = None) -> None:
         assert self.writer.file_writer is not None
@@ -168,12 +133,29 @@ class RunLog:
 
 
 def _layout() -> Summary:
-    tensor = TensorProto(
-        dtype="DT_STRING", string_val=[LAYOUT.SerializeToString()], tensor_shape=TensorShapeProto()
-    )
+    """The charts.
+
+    By default TensorBoard smooths the lines of a multi-line chart, fits the axis to the smoothed
+    values, and cuts off the 5 % at either end, so that points are missing. It smooths no margin
+    chart. So few and separate points are shown in margin charts whose margins have no width: lines
+    through all points.
+    """
+    categories = []
+    for title in dict.fromkeys((*POINTS, *LINES)):
+        charts = []
+        for name, tags in LINES.get(title, {}).items():
+            lines = layout_pb2.MultilineChartContent(tag=[f"{tag}$" for tag in tags])
+            charts.append(layout_pb2.Chart(title=name, multiline=lines))
+        # TensorBoard shows the margin charts of a category after the others, the last one first.
+        for name, tags in reversed(POINTS.get(title, {}).items()):
+            kind = layout_pb2.MarginChartContent
+            margin = kind(series=[kind.Series(value=t, lower=t, upper=t) for t in tags])
+            charts.append(layout_pb2.Chart(title=name, margin=margin))
+        categories.append(layout_pb2.Category(title=title, chart=charts))
+    layout = layout_pb2.Layout(category=categories).SerializeToString()
     value = Summary.Value(
         tag=custom_scalars.CONFIG_SUMMARY_TAG,
-        tensor=tensor,
+        tensor=TensorProto(dtype="DT_STRING", string_val=[layout], tensor_shape=TensorShapeProto()),
         metadata=custom_scalars.create_summary_metadata(),
     )
     return Summary(value=[value])
@@ -192,107 +174,37 @@ def _silence_writing_thread() -> None:
     threading.excepthook = hook
 
 
-def _settings(config: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
-    """A configuration with dotted names and values of TensorBoard's types; "none" for None."""
+def _settings(config: Mapping[str, Any]) -> dict[str, float | str]:
+    """A configuration with dotted names and numbers and texts as values; "none" for None."""
 
-    def known(value: Any) -> bool | int | float | str:
-        if value is None:
-            return "none"
-        return value if isinstance(value, bool | int | float | str) else str(value)
+    def plain(value: Any) -> float | str:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return value
+        return "none" if value is None else str(value)
 
-    return {name: known(value) for name, value in flat(config).items()}
+    return {name: plain(value) for name, value in flat(config).items()}
 
 
 @functools.cache
-def _known_settings() -> dict[str, bool | int | float | str]:
-    """The settings of all agents and policies of SymSteer, with their defaults."""
+def _known_settings() -> dict[str, float | str]:
+    """The settings of all agents and policies of SymSteer, with their defaults.
+
+    TensorBoard reads the columns of any one run, so they have to be those of all.
+    """
     runs = [RunConfig(agent=name) for name in AGENTS.builtin]
     runs += [RunConfig(policy_name=name) for name in POLICIES.builtin]
-    known: dict[str, bool | int | float | str] = {"evaluation_variant": "none"}
+    known: dict[str, float | str] = {"evaluation_variant": "none"}
     for run in runs:
         known |= _settings(run.to_json())
     return dict(sorted(known.items()))
 
 
 def config_text(record: RunRecord) -> str:
-    """Two markdown tables: facts about a run, and its whole configuration."""
-    base = record.base_policy
-    facts = {
-        "run": record.run_id,
-        "started": record.started.isoformat(),
-        "commit": _commit(record.provenance),
-        "continued": "; ".join(map(_commit, record.continued)) or None,
-        "device": f"{record.provenance.device}, {record.provenance.platform}",
-        "packages": ", ".join(f"{k} {v}" for k, v in record.provenance.packages.items()),
-        "parameters": f"{record.parameters.actor:,} in the actor, "
-        f"{record.parameters.critic:,} in all critics",
-        "base policy": f"{base.name}, group {base.group}, content {base.content_hash[:12]}",
-        "its success": f"{_share(base.base_success)} of {base.episodes} episodes with random noise",
-        "its steerability": f"{_share(base.solvable)} of the initial states are solved by one of "
-        f"{base.draws} noise draws; the noise moves the normalised actions by "
-        f"{base.action_std:.2f}"
-        if base.action_std is not None
-        else None,
-        "its warning": base.warning,
-        "feasible Q": f"{record.feasible_q.low:g} to {record.feasible_q.high:g}"
-        if record.feasible_q
-        else None,
-    }
-    return "\n".join(
-        [
-            *_table("this run", "", {k: v for k, v in facts.items() if v is not None}),
-            "",
-            *_table("setting", "value", _settings(record.config)),
-        ]
-    )
-
-
-def _commit(provenance: Provenance) -> str:
-    name = provenance.commit or "unknown"
-    return f"{name} with uncommitted changes" if provenance.dirty else name
-
-
-def _table(left: str, right: str, rows: Mapping[str, Any]) -> Iterator[str]:
-    yield f"| {left} | {right} |"
-    yield "| :-- | :-- |"
-    for name, value in rows.items():
-        text = str(value).replace("|", "\\|").replace("\n", " ")
-        yield f"| {name} | `{text}` |"
-
-
-def _share(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.0%}"
-
-
-def _experiment(settings: Mapping[str, Any]) -> api_pb2.Experiment:
-    """Columns of the HParams tab, equal for all runs: TensorBoard reads those of any one run."""
-    types = {
-        bool: api_pb2.DATA_TYPE_BOOL,
-        int: api_pb2.DATA_TYPE_FLOAT64,
-        float: api_pb2.DATA_TYPE_FLOAT64,
-        str: api_pb2.DATA_TYPE_STRING,
-    }
-    return api_pb2.Experiment(
-        hparam_infos=[
-            api_pb2.HParamInfo(name=name, type=types[type(value)], differs=name in IDENTITY)
-            for name, value in settings.items()
-        ],
-        metric_infos=[
-            api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag)) for tag in FINAL_METRICS
-        ],
-    )
-
-
-def _session(record: RunRecord, settings: Mapping[str, Any]) -> plugin_data_pb2.SessionStartInfo:
-    # The first column of the table. A full run name would be cut to the part that all runs share.
-    session = plugin_data_pb2.SessionStartInfo(
-        group_name=record.run_id.rpartition("-")[2], start_time_secs=record.started.timestamp()
-    )
-    for name, value in settings.items():
-        if isinstance(value, bool):
-            session.hparams[name].bool_value = value
-        elif isinstance(value, str):
-            session.hparams[name].string_value = value
-        else:
-            session.hparams[name].number_value = value
-    return session
+    """A markdown table: facts about a run, and its whole configuration."""
+    facts = flat(record.model_dump(mode="json", include=set(AT_THE_START))) | flat(record.config)
+    rows = []
+    for name, value in facts.items():
+        if value is not None:
+            text = str(value).replace("|", "\\|").replace("\n", " ")
+            rows.append((name, f"`{text}`"))
+    return markdown(("this run", ""), rows, left=2)

@@ -7,24 +7,19 @@ can be known at the start is checked there; later errors end the tracking, never
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from symsteer.bench.runs.pictures import to_gif
 from symsteer.errors import UserError
 from symsteer.files import away, write_atomically
 from symsteer.leaderboard.records import RunRecord
-
-Service = Literal["wandb"]
+from symsteer.terminal import tell
 
 PROJECT = "symsteer"
 """The project of W&B, if WANDB_PROJECT names no other."""
@@ -39,29 +34,14 @@ FINISH_SECONDS = 60.0
 """How long the end of a run waits until W&B has everything; the rest can be uploaded later."""
 
 
-@dataclass(frozen=True)
-class Tracking:
-    """That runs are tracked by W&B.
-
-    Attributes:
-        group: name of what the runs belong to: the suite of a sweep.
-    """
-
-    group: str | None = None
-
-
-def checked(service: Service | None, group: str | None = None) -> Tracking | None:
-    """What was asked for, if it can work.
-
-    Args:
-        service: of ``--track``.
-        group: see :class:`Tracking`.
+def check_tracking(service: str | None) -> None:
+    """Check that the service of ``--track`` can work.
 
     Raises:
         UserError: if W&B is not installed, or nobody is logged in and it is not offline.
     """
     if service is None:
-        return None
+        return
     try:
         # A folder wandb, as W&B makes them, can be imported, too, but it is empty.
         from wandb import login, setup
@@ -81,7 +61,6 @@ def checked(service: Service | None, group: str | None = None) -> Tracking | Non
             f"--track wandb cannot log in to Weights & Biases ({reason}); run `wandb login`, set "
             "WANDB_MODE=offline to upload later, or leave --track out"
         )
-    return Tracking(group)
 
 
 class WandbLog:
@@ -90,13 +69,13 @@ class WandbLog:
     Args:
         folder: of the run; W&B's files are in the folder ``wandb`` there.
         record: the run's record at its start.
-        tracking: what was asked for.
+        group: name of what the run belongs to; a run that goes on keeps its own.
     """
 
-    def __init__(self, folder: Path, record: RunRecord, tracking: Tracking):
+    def __init__(self, folder: Path, record: RunRecord, group: str | None):
         self._path = folder / STATE
         state = _read(self._path)
-        self._state = {"id": secrets.token_hex(4), "group": tracking.group, "step": -1, **state}
+        self._state = {"id": secrets.token_hex(4), "group": group, "step": -1, **state}
         # What W&B has already; a continued run repeats steps after its checkpoint.
         self._first = self._state["step"] + 1
         self._run: Any = None
@@ -122,7 +101,7 @@ class WandbLog:
             )
             offline = f"`wandb sync {Path(self._run.dir).parent}` uploads it"
             place = offline if self._run.offline else self._run.url
-            tqdm.write(f"{record.run_id} in Weights & Biases: {place or 'disabled'}")
+            tell(f"{record.run_id} in Weights & Biases: {place or 'disabled'}")
 
     def scalars(self, values: Mapping[str, float | None], step: int) -> None:
         """Log all values that are not None, by tag."""
@@ -141,25 +120,14 @@ class WandbLog:
 
                 self._log({tag: Image(picture)}, max(step, self._state["step"]))
 
-    def film(self, tag: str, frames: Sequence[np.ndarray], rate: float, step: int) -> None:
-        """Log a film of pictures, ``rate`` of them per second."""
-        with self._tolerant():
-            if self._run is not None:
-                from wandb import Video
-
-                film = Video(io.BytesIO(to_gif(frames, rate)), format="gif")
-                self._log({tag: film}, max(step, self._state["step"]))
-
     def flush(self) -> None:
         """Nothing to do: another process writes what was logged."""
 
-    def finish(self) -> None:
-        """The run has finished."""
-        self._end(0)
-
-    def close(self) -> None:
-        """The run did not finish."""
-        self._end(1)
+    def end(self, finished: bool) -> None:
+        """Say that the run has ended, and whether it has finished."""
+        with self._tolerant():
+            if self._run is not None:
+                self._run.finish(exit_code=0 if finished else 1)
 
     def _log(self, values: Mapping[str, Any], step: int) -> None:
         if self._run is None or step < self._first or not values:
@@ -170,11 +138,6 @@ class WandbLog:
                 self._state["step"] = step
                 self._write()
 
-    def _end(self, exit_code: int) -> None:
-        with self._tolerant():
-            if self._run is not None:
-                self._run.finish(exit_code=exit_code)
-
     def _write(self) -> None:
         write_atomically(self._path, json.dumps(self._state).encode(), durable=False)
 
@@ -184,9 +147,7 @@ class WandbLog:
             yield
         except Exception as error:
             self._run = None
-            tqdm.write(
-                f"{self._path.parent.name} goes on without Weights & Biases: {_one_line(error)}"
-            )
+            tell(f"{self._path.parent.name} goes on without Weights & Biases: {_one_line(error)}")
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from symsteer.bench.runs.stored import restored
 from symsteer.bench.tasks import make
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
-from symsteer.policies.files import load_policy
+from symsteer.policies.files import load_policy, policy_path
 from symsteer.registry import allow
 
 
@@ -58,8 +58,8 @@ class Trained:
                 f"observations have the shape [N, {self.policy.obs_layout.dim}], not "
                 f"{list(given.shape)}; make the environments with make_env()"
             )
-        own = given.to(self.agent.device, torch.float32)
-        chunk = self.agent.decode(own, self.agent.act(own, deterministic))
+        seen = given.to(self.agent.device, torch.float32)
+        chunk = self.agent.decode(seen, self.agent.act(seen, deterministic))
         return chunk[:, : self.policy.execute].to(given.device)
 
     def make_env(self, num_envs: int = 1, variant: str | None = None, **options: Any) -> Any:
@@ -99,7 +99,7 @@ def load(path: str | Path, device: str = "cpu", trust: Sequence[str] = ()) -> Tr
     """
     allow(*trust)
     path = Path(path)
-    if (path / CONFIG).is_file() or (path.is_dir() and not (path / "policy.safetensors").is_file()):
+    if (path / CONFIG).is_file() or (path.is_dir() and not policy_path(path).is_file()):
         run = restored(path)
         world = {key: getattr(run.config, key) for key in ("task", "embodiment", "variant")}
         return Trained(run.policy, run.agent, run.config, world)

@@ -13,32 +13,24 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Generator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
 
-from symsteer.agents import AGENTS
-from symsteer.agents.agent import Agent, AgentContext, Budget, HasCritic
+from symsteer.agents.agent import Budget, HasCritic
 from symsteer.agents.replay import Batch
-from symsteer.bench.runs.checkpoint import fitting, save_checkpoint
-from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.evaluator import Evaluator, discount, make_env, timeouts_end
+from symsteer.bench.runs.checkpoint import Counters, fitting, save_checkpoint
+from symsteer.bench.runs.config import Execution, RunConfig
+from symsteer.bench.runs.evaluator import Evaluator, Steered, new_agent
 from symsteer.bench.runs.folder import CHECKPOINT
-from symsteer.bench.runs.replays import store_replay
+from symsteer.bench.runs.stored import Run
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import task_class
-from symsteer.bench.variants import build, evaluation_variants, highest_cost
+from symsteer.bench.variants import evaluation_variants
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.variant import VariantSpec, specs_at
-
-COUNTERS = (
-    *("env_steps", "decisions", "updates", "train_until"),
-    *("next_evaluation", "fresh_starts", "final"),
-)
-"""Numbers of a run that a checkpoint keeps."""
 
 Updates: TypeAlias = Generator[Batch, Mapping[str, torch.Tensor] | None, None]
 """A run that hands out every batch that is due, and is sent the scalars of the update."""
@@ -46,31 +38,8 @@ Updates: TypeAlias = Generator[Batch, Mapping[str, torch.Tensor] | None, None]
 
 def budget_of(config: RunConfig) -> Budget:
     """What the agent of a run may use."""
-    return Budget(
-        config.env_steps,
-        config.num_envs,
-        config.policy.execute,
-        task_class(config.task).max_episode_steps,
-    )
-
-
-def new_agent(config: RunConfig, base: ChunkPolicy) -> Agent:
-    """An untrained agent for a run's base policy."""
-    context = AgentContext.of(base, config.device, config.seed)
-    return AGENTS.get(config.agent)(context, config.agent_options)
-
-
-def feasible_return(config: RunConfig, agent: Agent, base: ChunkPolicy) -> tuple[float, float]:
-    """Lowest and highest discounted return that the run's reward allows, per decision.
-
-    The discount is the agent's; 0 for an agent without one.
-    """
-    return task_class(config.task).feasible_return(
-        discount(agent),
-        base.execute,
-        bootstrap_truncation=not timeouts_end(agent),
-        step_cost=highest_cost(build(specs_at(config.variants, 1))),
-    )
+    limit = task_class(config.task).max_episode_steps
+    return Budget(config.env_steps, config.num_envs, config.policy.execute, limit)
 
 
 class Observer:
@@ -102,16 +71,15 @@ class Observer:
         """The run did not finish; its last checkpoint is kept."""
 
 
-class Trainer:
+class Trainer(Steered):
     """State of a run; :meth:`play` executes the rest of it.
 
     Args:
-        config: what to run.
-        folder: the run's folder.
-        base: the frozen policy.
+        run: what to execute.
+        policy: the frozen policy.
         checkpoint: a state to continue from.
         observers: called in this order.
-        workers: processes that share the environments.
+        how: how it is executed.
         together: number of runs in this process.
 
     Attributes:
@@ -124,18 +92,16 @@ class Trainer:
 
     def __init__(
         self,
-        config: RunConfig,
-        folder: Path,
-        base: ChunkPolicy,
+        run: Run,
+        policy: ChunkPolicy,
         checkpoint: Mapping[str, Any] | None,
         observers: Sequence[Observer],
-        workers: int = 1,
+        how: Execution,
         together: int = 1,
     ):
-        self.config, self.folder, self.base = config, folder, base
-        self.observers, self.workers, self.together = observers, workers, together
-        self.agent = new_agent(config, base)
-        self.feasible = feasible_return(config, self.agent, base)
+        super().__init__(run.config, policy, new_agent(run.config, policy))
+        self.run, self.folder = run, run.folder
+        self.observers, self.how, self.together = observers, how, together
         self.env_steps = self.decisions = self.updates = 0
         self.train_until: int | None = None
         self.next_evaluation = 0
@@ -143,24 +109,17 @@ class Trainer:
         self.share = 0.0
         self.final = False
         self.clock = Clock()
-        self.update_seconds = self.evaluate_seconds = self.diagnose_seconds = 0.0
         self.waited = 0.0  # seconds in which other runs of this process went on
         earlier = self._restore(checkpoint) if checkpoint else 0.0
         self.start = time.perf_counter() - earlier
         for observer in observers:
             observer.began(self, checkpoint)
         try:
-            variants = evaluation_variants(config.variants, self.share)
-            self.evaluator = Evaluator(config, base, self.agent, self.feasible, variants, workers)
+            variants = evaluation_variants(self.config.variants, self.share)
+            self.evaluator = Evaluator(self, variants, how.workers)
         except BaseException as error:
             self.stop(error)
             raise
-
-    @property
-    def title(self) -> str:
-        """The run as a short text."""
-        config = self.config
-        return f"{config.agent} on {config.task} ({config.variant}), seed {config.seed}"
 
     @property
     def has_critic(self) -> bool:
@@ -170,14 +129,7 @@ class Trainer:
     @property
     def seconds(self) -> dict[str, float]:
         """Seconds spent so far, by part, and in all."""
-        return {
-            "simulate": self.clock.simulate,
-            "decode": self.clock.decode,
-            "update": self.update_seconds,
-            "evaluate": self.evaluate_seconds,
-            "diagnose": self.diagnose_seconds,
-            "total": time.perf_counter() - self.start - self.waited,
-        }
+        return {**vars(self.clock), "total": time.perf_counter() - self.start - self.waited}
 
     def play(self) -> None:
         """Execute the rest of the run."""
@@ -191,7 +143,7 @@ class Trainer:
 
     def add_update(self, seconds: float) -> None:
         """Count the time of an update that somebody else has made."""
-        self.update_seconds += seconds
+        self.clock.update += seconds
         self.waited -= seconds
 
     def updates_due(self) -> Updates:
@@ -205,8 +157,6 @@ class Trainer:
             yield from self._train()
             self.evaluate(final=True)
             self.final = True
-            if self.config.keep_replay and self.agent.replay is not None:
-                store_replay(self.agent.replay, self.folder)
             self._checkpoint()
         self.evaluator.close()
         for observer in self.observers:
@@ -225,21 +175,22 @@ class Trainer:
         wanted = self.config.evaluation
         share = 1.0 if final else self.share
         self.evaluator.enter(evaluation_variants(self.config.variants, share))
-        columns = self.evaluator.play(wanted.final_episodes if final else wanted.episodes).episodes
+        count = wanted.final_episodes if final else wanted.episodes
+        episodes = self.evaluator.play(count).episodes
         played = time.perf_counter()
         long = wanted.final_diagnostic_episodes if final else wanted.diagnostic_episodes
         diagnostics = dict(self.evaluator.diagnose(long))
         if final:
             diagnostics |= self.evaluator.compare(wanted.final_episodes)
-        self.evaluate_seconds += played - begin
-        self.diagnose_seconds += time.perf_counter() - played
+        self.clock.evaluate += played - begin
+        self.clock.diagnose += time.perf_counter() - played
         evaluation = Evaluation(
             env_steps=self.env_steps,
             decisions=self.decisions,
             updates=self.updates,
             wall_clock=self.seconds["total"],
             final=final,
-            episodes=Episodes.model_validate(columns),
+            episodes=Episodes.model_validate(episodes),
             diagnostics=diagnostics,
         )
         for observer in self.observers:
@@ -304,14 +255,14 @@ class Trainer:
             agent.observe(step)
             for batch in agent.batches():
                 given = time.perf_counter()
-                self.update_seconds += given - begin
-                found = yield batch
-                assert found is not None
-                scalars.append(found)
+                self.clock.update += given - begin
+                updated = yield batch
+                assert updated is not None
+                scalars.append(updated)
                 begin = time.perf_counter()
                 self.waited += begin - given
                 self.updates += 1
-            self.update_seconds += time.perf_counter() - begin
+            self.clock.update += time.perf_counter() - begin
             for observer in self.observers:
                 observer.stepped(self, scalars)
             if self.next_evaluation <= self.env_steps < end:
@@ -324,8 +275,8 @@ class Trainer:
             self._checkpoint()
 
     def _make_env(self, ignore_terminations: bool) -> LatentNoiseEnv:
-        how = (self.config.num_envs, self.world, ignore_terminations, self.workers)
-        env = make_env(self.config, self.base, self.agent, *how)
+        how = (self.config.num_envs, ignore_terminations, self.how.workers)
+        env = self.make_env(self.world, *how)
         env.clock = self.clock
         return env
 
@@ -333,10 +284,10 @@ class Trainer:
         """Save everything that the rest of the run depends on; the replay only until the end."""
         replay = None if self.final else self.agent.replay
         state: dict[str, Any] = {
-            "base_policy": self.base.content_hash(),
+            "base_policy": self.policy.content_hash(),
             "agent": self.agent.state_dict(),
             "replay": replay.state_dict() if replay else None,
-            **{name: getattr(self, name) for name in COUNTERS},
+            **{name: getattr(self, name) for name in Counters.model_fields},
         }
         for observer in self.observers:
             state |= observer.saving(self)
@@ -344,7 +295,7 @@ class Trainer:
 
     def _restore(self, state: Mapping[str, Any]) -> float:
         """Load a checkpoint's state; returns the seconds that the run had taken until then."""
-        if state["base_policy"] != self.base.content_hash():
+        if state["base_policy"] != self.policy.content_hash():
             raise UserError(
                 f"{self.folder / CHECKPOINT} steers another base policy than "
                 f"{self.folder / 'policy.safetensors'}; restore that file, or delete the run's "
@@ -354,14 +305,11 @@ class Trainer:
             self.agent.load_state_dict(state["agent"])
             if self.agent.replay is not None and state["replay"] is not None:
                 self.agent.replay.load_state_dict(state["replay"])
-        for name in COUNTERS:
+        for name in Counters.model_fields:
             setattr(self, name, state[name])
         self.share = self.env_steps / self.config.env_steps
-        seconds = state["seconds"]
-        self.clock.simulate, self.clock.decode = seconds["simulate"], seconds["decode"]
-        self.update_seconds, self.evaluate_seconds = seconds["update"], seconds["evaluate"]
-        self.diagnose_seconds = seconds["diagnose"]
-        return seconds["total"]
+        self.clock = Clock(**{part: state["seconds"][part] for part in vars(self.clock)})
+        return state["seconds"]["total"]
 
 
 def next_batch(updates: Updates, scalars: Mapping[str, torch.Tensor] | None = None) -> Batch | None:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 
 from symsteer.agents.episodes import DECISION_FIELDS, LongEpisodes, Rollout
 from symsteer.bench.steering.directions import directions
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
-from symsteer.bench.steering.seeds import steerability_seeds
+from symsteer.bench.steering.seeds import held_out_seeds, steerability_seeds
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
@@ -24,7 +24,17 @@ from symsteer.policies.steerability import (
 )
 
 Act = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-"""``(obs [N, obs_dim], rows [N]) -> noise [N, Tp, Da]``; ``rows`` index the list of seeds."""
+"""``(obs [N, obs_dim], rows [N]) -> action [N, rows, Da]``; ``rows`` index the list of seeds."""
+
+
+def _batches(seeds: Sequence[int], num_envs: int) -> Iterator[tuple[list[int], torch.Tensor, int]]:
+    """Seeds in batches of ``num_envs``: the seeds, their rows in the list, and how many count.
+
+    If the last batch is not full, the other environments repeat a seed and do not count.
+    """
+    for start in range(0, len(seeds), num_envs):
+        rows = torch.arange(start, start + num_envs).clamp(max=len(seeds) - 1)
+        yield [seeds[int(row)] for row in rows], rows, min(num_envs, len(seeds) - start)
 
 
 def rollout(env: LatentNoiseEnv, act: Act, seeds: Sequence[int]) -> Rollout:
@@ -40,12 +50,7 @@ def rollout(env: LatentNoiseEnv, act: Act, seeds: Sequence[int]) -> Rollout:
     """
     if not env.ignore_terminations:
         raise UserError("evaluation needs an environment with ignore_terminations=True")
-    parts = []
-    for start in range(0, len(seeds), env.num_envs):
-        # If the last batch is not full, the other environments repeat a seed and are dropped.
-        rows = torch.arange(start, start + env.num_envs).clamp(max=len(seeds) - 1)
-        keep = min(env.num_envs, len(seeds) - start)
-        parts.append(_rollout_batch(env, act, [seeds[int(row)] for row in rows], rows, keep))
+    parts = [_rollout_batch(env, act, *batch) for batch in _batches(seeds, env.num_envs)]
     return Rollout(
         episodes={k: torch.cat([p.episodes[k] for p in parts]) for k in parts[0].episodes},
         **{name: torch.cat([getattr(p, name) for p in parts], dim=1) for name in DECISION_FIELDS},
@@ -57,14 +62,13 @@ def _rollout_batch(
 ) -> Rollout:
     obs = env.reset(seeds)
     direction = directions(obs, env.policy.obs_layout)
-    decisions = math.ceil(env.max_episode_steps / env.execute)
     steps: dict[str, list[torch.Tensor]] = {name: [] for name in DECISION_FIELDS}
     running = torch.ones(env.num_envs, dtype=torch.bool, device=obs.device)
-    for _ in range(decisions):
-        noise = act(obs, rows)
-        result = env.step(noise)
+    for _ in range(math.ceil(env.max_episode_steps / env.execute)):
+        action = act(obs, rows)
+        result = env.step(action)
         succeeded = running & result.success_once
-        row = (obs, noise, result.reward, result.next_obs, running, succeeded)
+        row = (obs, action, result.reward, result.next_obs, running, succeeded)
         for name, value in zip(DECISION_FIELDS, row, strict=True):
             steps[name].append(value[:keep])
         running = running & ~succeeded
@@ -75,6 +79,31 @@ def _rollout_batch(
     if direction is not None:
         episodes["direction"] = direction[:keep]
     return Rollout(episodes=episodes, **{k: torch.stack(v) for k, v in steps.items()})
+
+
+def random_noise(policy: ChunkPolicy, seed: int) -> Act:
+    """The base policy without an agent: noise from N(0, I)."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        shape = (len(obs), policy.horizon, policy.act_layout.dim)
+        return torch.randn(shape, generator=generator).to(obs.device)
+
+    return act
+
+
+def held_out_episodes(
+    env: LatentNoiseEnv, policy: ChunkPolicy, seed: int, episodes: int
+) -> Rollout:
+    """The first held-out episodes of a base policy with noise from N(0, I).
+
+    Args:
+        env: the policy's task.
+        policy: the base policy.
+        seed: of the noise.
+        episodes: how many.
+    """
+    return rollout(env, random_noise(policy, seed), held_out_seeds(episodes))
 
 
 Sample = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
@@ -145,21 +174,13 @@ def long_episodes(
         generator: of the base policy's draws, on the environment's device.
     """
     within = math.ceil(env.env.max_episode_steps / env.execute)
-    begin = random_beginnings(len(seeds), within)
+    begin = torch.tensor(random_beginnings(len(seeds), within), device=env.device)
+    tail = tail_decisions(gamma)
     parts = []
-    for start in range(0, len(seeds), env.num_envs):
-        # As in rollout(): the rest of the last batch repeats a seed and is dropped.
-        rows = [min(start + i, len(seeds) - 1) for i in range(env.num_envs)]
-        part = _long_batch(
-            env,
-            sample,
-            draw,
-            [seeds[row] for row in rows],
-            torch.tensor([begin[row] for row in rows], device=env.device),
-            tail_decisions(gamma),
-            generator,
-        )
-        parts.append({name: value[:, : len(seeds) - start] for name, value in part.items()})
+    for batch, rows, keep in _batches(seeds, env.num_envs):
+        begins = begin[rows.to(env.device)]
+        part = _long_batch(env, sample, draw, batch, begins, tail, generator)
+        parts.append({name: value[:, :keep] for name, value in part.items()})
     longest = max(len(part["reward"]) for part in parts)
 
     def joined(name: str) -> torch.Tensor:
@@ -214,36 +235,6 @@ def _long_batch(
     return {name: torch.stack(values) for name, values in steps.items()}
 
 
-@dataclass
-class Steerability:
-    """How much the noise of a base policy changes its behaviour.
-
-    Attributes:
-        success: share of successful episodes over all states and draws (noise from N(0, I)).
-        episodes: number of episodes.
-        solvable: share of initial states that at least one of the draws solves.
-        states: number of initial states.
-        draws: noise draws per state.
-        action_std: spread of the normalised actions over the noise on visited states; see
-            :func:`symsteer.policies.steerability.action_spread`.
-        equivariance_error: of decoding on visited states, under C8; see
-            :func:`symsteer.policies.steerability.decode_error`.
-        jump: largest change of the executed actions, but for one in a thousand, if a visited state
-            moves by a millimetre; see :func:`symsteer.policies.steerability.jumps`.
-        warning: why steering is unlikely to work, or None.
-    """
-
-    success: float
-    episodes: int
-    solvable: float
-    states: int
-    draws: int
-    action_std: float
-    equivariance_error: float
-    jump: float
-    warning: str | None
-
-
 VISITED = 256
 """Visited states at which symmetry and jumps are measured."""
 
@@ -256,19 +247,22 @@ MIN_SOLVABLE = 0.9
 
 def steerability(
     env: LatentNoiseEnv, policy: ChunkPolicy, seed: int, states: int, draws: int = DRAWS
-) -> Steerability:
-    """Draw noise ``draws`` times for each of ``states`` initial states.
+) -> dict[str, Any]:
+    """How much the noise of a base policy changes its behaviour.
 
-    The thresholds of the warning come from pilot runs: below them, SAC did not improve the base.
+    The noise is drawn ``draws`` times for each of ``states`` initial states. The thresholds of the
+    warning come from pilot runs: below them, SAC did not improve the base.
+
+    Returns:
+        ``success`` over all ``episodes``; ``states`` and ``draws``; ``solvable``, the share of
+        states that at least one draw solves; of visited states ``action_std``
+        (:func:`symsteer.policies.steerability.action_spread`), ``equivariance_error`` of decoding
+        under C8 (:func:`symsteer.policies.steerability.decode_error`) and ``jump``
+        (:func:`symsteer.policies.steerability.jumps`); ``warning``, why steering is unlikely to
+        work, or None.
     """
-    generator = torch.Generator().manual_seed(seed)
     seeds = [start for start in steerability_seeds(seed, states) for _ in range(draws)]
-
-    def act(obs: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-        shape = (len(obs), policy.horizon, policy.act_layout.dim)
-        return torch.randn(shape, generator=generator).to(obs.device)
-
-    result = rollout(env, act, seeds)
+    result = rollout(env, random_noise(policy, seed), seeds)
     success = result.episodes["success_once"].float().view(states, draws)
     # The states that the first draw of every initial state visits before its first success.
     visited = result.obs[:, ::draws][result.running[:, ::draws]]
@@ -280,14 +274,14 @@ def steerability(
         reasons.append(f"only {solvable:.0%} of the initial states are ever solved")
     if action_std < DESIRED_ACTION_STD:
         reasons.append(f"the noise moves the actions by only {action_std:.2f}")
-    return Steerability(
-        success=success.mean().item(),
-        episodes=states * draws,
-        solvable=solvable,
-        states=states,
-        draws=draws,
-        action_std=action_std,
-        equivariance_error=decode_error(policy, some, Group.parse("C8"), seed),
-        jump=jumps(policy, some, seed)["high"],
-        warning=f"little to steer: {' and '.join(reasons)}" if reasons else None,
-    )
+    return {
+        "success": success.mean().item(),
+        "episodes": states * draws,
+        "solvable": solvable,
+        "states": states,
+        "draws": draws,
+        "action_std": action_std,
+        "equivariance_error": decode_error(policy, some, Group.parse("C8"), seed),
+        "jump": jumps(policy, some, seed)["high"],
+        "warning": f"little to steer: {' and '.join(reasons)}" if reasons else None,
+    }

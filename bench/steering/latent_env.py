@@ -1,7 +1,9 @@
 """The MDP that a steering agent sees: its action is the noise that the base policy decodes.
 
-State s, action w in R^(Tp x Da). The frozen policy decodes a = pi_dp(s, w). The first Ta actions
-are executed, and their rewards are summed (DSRL, arXiv 2506.15799; Equi-DSRL, arXiv 2512.11345).
+State s, action w in R^(Tp x Da). The frozen policy decodes the chunk a = pi_dp(s, w). The first Ta
+actions of it are executed, and their rewards are summed (DSRL, arXiv 2506.15799; Equi-DSRL, arXiv
+2512.11345). An agent whose action is something else, such as a correction of a chunk, says with
+its own ``decode`` what the action does.
 """
 
 from __future__ import annotations
@@ -40,21 +42,25 @@ class Step(Transition):
 
 @dataclass
 class Clock:
-    """Seconds spent decoding noise and simulating."""
+    """Seconds that a run has spent on its parts."""
 
-    decode: float = 0.0
     simulate: float = 0.0
+    decode: float = 0.0
+    update: float = 0.0
+    evaluate: float = 0.0
+    diagnose: float = 0.0
 
 
 @dataclass
 class LatentNoiseEnv:
-    """N parallel environments whose action is the noise of an action chunk.
+    """N parallel environments in which one action of an agent is a chunk of actions of the task.
 
     Args:
         env: parallel ManiSkill environments from :func:`symsteer.bench.tasks.make`.
         policy: frozen decoder with the same layouts. All inputs and outputs are on its device,
             also if physics runs on another one.
-        decode: turns actions of an agent into chunks; default: those of the policy.
+        decode: ``(obs, action) -> chunk [N, Tp, Da]`` of an agent; default: the action is noise,
+            and the policy decodes it.
         ignore_terminations: episodes go on to the time limit after a success, as in ManiSkill's
             evaluation. If False, a success ends the episode.
         seed: of the run, for :meth:`training_seeds`.
@@ -99,14 +105,15 @@ class LatentNoiseEnv:
         return self._obs
 
     @torch.no_grad()
-    def step(self, noise: torch.Tensor) -> Step:
-        """Decode ``noise [N, Tp, Da]``, execute the first Ta actions, reset ended episodes.
+    def step(self, action: torch.Tensor) -> Step:
+        """Decode ``action [N, rows, Da]``, execute Ta steps of the chunk, reset ended episodes.
 
-        Steps of a chunk after the end of its episode are not counted.
+        Steps of a chunk after the end of its episode are not counted. The transition holds the
+        action in its field ``noise``.
         """
         start = time.perf_counter()
         obs = next_obs = self._obs
-        chunk = (self.decode or self.policy.decode)(obs, noise)
+        chunk = (self.decode or self.policy.decode)(obs, action)
         actions = chunk.to(self.env.device)
         decoded = time.perf_counter()
         alive = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -153,7 +160,7 @@ class LatentNoiseEnv:
         self.clock.simulate += time.perf_counter() - decoded
         return Step(
             obs=obs,
-            noise=noise,
+            noise=action,
             actions=chunk[:, : self.execute],
             reward=reward,
             next_obs=next_obs,

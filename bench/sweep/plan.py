@@ -7,14 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import run_id, write_json
 from symsteer.bench.runs.run import check
-from symsteer.bench.runs.tracking import Tracking
 from symsteer.bench.sweep.suite import Suite
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import flat
@@ -70,7 +69,7 @@ class Plan:
     description: str
     out: Path
     configs: dict[PlannedRun, RunConfig]
-    tracking: Tracking | None = None
+    track: Literal["wandb"] | None = None
     """A service that shows the runs."""
 
     @property

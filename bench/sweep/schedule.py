@@ -13,7 +13,7 @@ from typing import Any, Literal
 from symsteer.agents import AGENTS
 from symsteer.agents.team import can_join
 from symsteer.bench.runs.base_policy import demonstration_path, find_base
-from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.evaluator import check_room
 from symsteer.bench.sweep.plan import Plan, PlannedRun
 from symsteer.bench.sweep.pool import Workers
@@ -176,7 +176,8 @@ def _call(task: Task, plan: Plan, patience: float) -> tuple[Any, ...]:
     """The function that executes a task, and its arguments."""
     configs = [plan.configs[run] for run in task.runs]
     if task.kind == "run":
-        return play, configs, plan.out, patience, plan.tracking
+        how = Execution(plan.out, track=plan.track, quiet=True, group=plan.name)
+        return play, configs, how, patience
     build: Callable[..., list[Result]]
     build = build_base if task.kind == "base policy" else build_demonstrations
     return build, configs[:1], plan.out

@@ -17,11 +17,10 @@ from typing import Literal
 import torch
 
 from symsteer.bench.runs.base_policy import demonstration_file, find_base, prepare_base
-from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.folder import RunBusyError, is_finished, run_id
 from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.together import execute_together
-from symsteer.bench.runs.tracking import Tracking
 from symsteer.errors import UserError
 
 POLL_SECONDS = 0.5
@@ -53,48 +52,43 @@ def one_thread() -> None:
 
 def build_demonstrations(configs: Sequence[RunConfig], out: Path) -> list[Result]:
     """Collect the demonstrations that runs share, if they do not exist."""
-    return [_guarded(lambda: demonstration_file(configs[0], out, progress=False))]
+    return [_guarded(lambda: demonstration_file(configs[0], out, quiet=True))]
 
 
 def build_base(configs: Sequence[RunConfig], out: Path) -> list[Result]:
     """Train the base policy that runs share, if it does not exist."""
-    return [_guarded(lambda: prepare_base(configs[0], out, progress=False))]
+    return [_guarded(lambda: prepare_base(configs[0], Execution(out, quiet=True)))]
 
 
-def play(
-    configs: Sequence[RunConfig], out: Path, patience: float = 0.0, tracking: Tracking | None = None
-) -> list[Result]:
+def play(configs: Sequence[RunConfig], how: Execution, patience: float = 0.0) -> list[Result]:
     """Execute runs, or continue them; several are trained together.
 
     Args:
         configs: of the runs.
-        out: folder of the runs.
+        how: they are executed.
         patience: seconds to wait until files of another machine are visible here: the base policies
             that it has trained, or the released lock of a run.
-        tracking: a service that shows the runs.
     """
     deadline = time.monotonic() + patience
-    while any(find_base(c, out) is None for c in configs) and time.monotonic() < deadline:
+    while any(find_base(c, how.out) is None for c in configs) and time.monotonic() < deadline:
         time.sleep(POLL_SECONDS)
     if len(configs) == 1:
-        return [_play(configs[0], out, deadline, tracking)]
+        return [_play(configs[0], how, deadline)]
     one_thread()
-    errors = execute_together(configs, out, tracking)
+    errors = execute_together(configs, how)
     results = [
-        _play(config, out, deadline, tracking)
-        if isinstance(error, RunBusyError)
-        else _result(error)
+        _play(config, how, deadline) if isinstance(error, RunBusyError) else _result(error)
         for config, error in zip(configs, errors, strict=True)
     ]
     gc.collect()
     return results
 
 
-def _play(config: RunConfig, out: Path, deadline: float, tracking: Tracking | None) -> Result:
-    folder = out / run_id(config, {})
+def _play(config: RunConfig, how: Execution, deadline: float) -> Result:
+    folder = how.out / run_id(config, {})
     while not is_finished(folder):
         try:
-            return _guarded(lambda: execute(config, out, progress=False, tracking=tracking))
+            return _guarded(lambda: execute(config, how))
         except RunBusyError as error:
             if time.monotonic() > deadline:
                 return Result("busy", str(error))

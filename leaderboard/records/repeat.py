@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from symsteer.leaderboard.records.retired import SAC_OPTION, without_retired
+from symsteer.leaderboard.records.retired import without_retired
 from symsteer.leaderboard.records.values import flat
 from symsteer.terminal import option_words, to_paste
 
@@ -16,7 +16,7 @@ DERIVED = ("evaluation_variant", "files")
 KEYS = frozenset(
     {
         *("task", "embodiment", "variant", "agent", "seed", "env_steps", "num_envs"),
-        *("checkpoint_every", "keep_replay", "sim", "device", "demonstrations", "policy"),
+        *("checkpoint_every", "sim", "device", "demonstrations", "policy"),
         *("policy_seed", "agent_options", "evaluation"),
     }
 )
@@ -42,11 +42,9 @@ def repeat_command(config: Mapping[str, Any]) -> str | None:
         and for texts that no option has, because a reader may copy the command into a shell.
     """
     tables = config.get("agent_options"), config.get("policy")
-    own = {key: value for key, value in config.items() if key not in DERIVED}
+    own = {k: v for k, v in without_retired(config, ()).items() if k not in DERIVED}
     if not own.keys() <= KEYS or not all(isinstance(table, Mapping) for table in tables):
         return None
-    if SAC_OPTION in own["agent_options"]:
-        own["agent_options"] = without_retired(own["agent_options"], ())
     words = ["symsteer", "run"]
     for key, value in flat(own).items():
         name = key.replace("agent_options.", "agent.", 1)

@@ -22,27 +22,41 @@ RETIRED: dict[str, JsonValue] = {
 }
 """Options of the SAC agents, and the one value that was ever used."""
 
+RETIRED_OF_RUNS: dict[str, JsonValue] = {"keep_replay": False}
+"""Options of runs of any agent."""
+
 SAC_OPTION = "target_entropy"
 """An option that all SAC agents have, and no others."""
 
 
 def with_retired(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration in which no retired option is missing, to compare old and new ones."""
+    whole = {**RETIRED_OF_RUNS, **config}
     options = config.get("agent_options")
-    if not isinstance(options, Mapping) or SAC_OPTION not in options:
-        return dict(config)
-    return {**config, "agent_options": {**RETIRED, **options}}
+    if isinstance(options, Mapping) and SAC_OPTION in options:
+        whole["agent_options"] = {**RETIRED, **options}
+    return whole
 
 
-def without_retired(options: Mapping[str, Any], known: Collection[str]) -> dict[str, Any]:
-    """Options of an agent without the retired ones whose value still means the same.
+def without_retired(config: Mapping[str, Any], known: Collection[str]) -> dict[str, Any]:
+    """A configuration without the retired options whose value still means the same.
 
     Args:
-        options: as a record has them.
-        known: the options that the agent has today.
+        config: as a record has it.
+        known: the options that its agent has today.
     """
+    kept = _without(config, RETIRED_OF_RUNS, ())
+    options = kept.get("agent_options")
+    if isinstance(options, Mapping) and SAC_OPTION in options:
+        kept["agent_options"] = _without(options, RETIRED, known)
+    return kept
+
+
+def _without(
+    options: Mapping[str, Any], retired: Mapping[str, Any], known: Collection[str]
+) -> dict[str, Any]:
     return {
         name: value
         for name, value in options.items()
-        if name in known or name not in RETIRED or value != RETIRED[name]
+        if name in known or name not in retired or value != retired[name]
     }

@@ -15,8 +15,8 @@ import termios
 from importlib.metadata import version
 from pathlib import Path
 
+import h5py
 import pytest
-import torch
 
 import symsteer as symsteer_package
 from symsteer import bench
@@ -64,8 +64,8 @@ def sentence(capsys) -> str:
         (["--agent.group", "E8"], "C8"),
         (["--agent.preset", "frist"], "did you mean 'first'"),
         (["--policy.name", "plian"], "did you mean 'plain'"),
-        (["--env-steps", "0"], "between 1 and"),
-        (["--seed", str(2**32)], "seed is"),
+        (["--env-steps", "0"], "env_steps: Input should be greater than"),
+        (["--seed", str(2**32)], "seed: Input should be less than"),
         (["--agent", "residual-pathway", "--agent.penalty", "inf"], "penalty is inf"),
     ],
 )
@@ -76,18 +76,32 @@ def test_mistakes_in_a_run(arguments, words, monkeypatch, capsys, tmp_path):
     assert not any(tmp_path.rglob("record.json"))
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
-@pytest.mark.parametrize("option", ["--sim", "--device"])
-def test_cuda_where_there_is_none(option, monkeypatch, capsys, tmp_path):
-    assert symsteer(monkeypatch, "run", option, "cuda", "--out", tmp_path) == 2
-    assert "no CUDA device" in sentence(capsys)
+def cut_off(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
 
 
-def test_demonstrations_of_another_task(demos, monkeypatch, capsys, tmp_path):
-    arguments = ("run", "--quiet", "--task", "PushCube-v1", "--demos", demos, "--out", tmp_path)
-    assert symsteer(monkeypatch, *arguments) == 2
-    assert "PickCube-v1" in sentence(capsys)
-    assert not any(tmp_path.iterdir())
+def with_nan(path):
+    with h5py.File(path, "r+") as file:
+        file["traj_0/actions"][0, 0] = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("damage", "task", "words"),
+    [
+        (lambda path: None, "PushCube-v1", "PickCube-v1"),
+        (cut_off, "PickCube-v1", "truncated"),
+        (with_nan, "PickCube-v1", "bad.h5"),
+    ],
+)
+def test_demonstrations_that_do_not_fit(damage, task, words, demos, monkeypatch, capsys, tmp_path):
+    bad = tmp_path / "bad.h5"
+    for suffix in (".h5", ".json"):
+        bad.with_suffix(suffix).write_bytes(demos.with_suffix(suffix).read_bytes())
+    damage(bad)
+    arguments = ("--task", task, "--demos", bad, "--demonstrations.count", 2)
+    assert symsteer(monkeypatch, "run", "--quiet", *arguments, "--out", tmp_path / "runs") == 2
+    assert words in sentence(capsys)
+    assert not (tmp_path / "runs").is_dir() or not any((tmp_path / "runs").iterdir())
 
 
 def test_a_checkpoint_of_another_layout(monkeypatch, capsys, tmp_path):
@@ -115,6 +129,38 @@ def test_report_checks_and_verifies_from_any_folder(monkeypatch, capsys, tmp_pat
     assert "LEADERBOARD.md: missing" in capsys.readouterr().out
     assert symsteer(monkeypatch, "report", "--verify", "--check") == 2
     assert {path.name for path in tmp_path.iterdir()} == {"a.json", "--odd"}
+    capsys.readouterr()
+    assert symsteer(monkeypatch, "report", "a.json", "--out", tmp_path / "page") == 2
+    assert "a.json" in sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["/proc/nowhere/a.h5"], "/proc/nowhere cannot be written"),
+        (["a.h5", "--seed", "-1"], "seed"),
+        (["a.txt"], ".h5"),
+        (["a.h5", "--count", "0"], "at least 1"),
+    ],
+)
+def test_mistakes_in_demos(arguments, words, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert symsteer(monkeypatch, "demos", *arguments) == 2
+    assert words in sentence(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["sweep", "smoke", "--out", "/proc/nowhere"], "/proc/nowhere"),
+        (["sweep", "dmeo"], "demo"),
+        (["swep", "smoke"], "did you mean 'sweep'"),
+    ],
+)
+def test_mistakes_in_a_sweep(arguments, words, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert symsteer(monkeypatch, *arguments) == 2
+    assert words in sentence(capsys)
 
 
 def test_list_names_everything(monkeypatch, capsys):
@@ -264,9 +310,8 @@ def test_a_full_device_is_one_sentence(arguments, full, tmp_path):
         assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "columns"), [(["--help"], "terminal"), (["film", "--help"], "variable")]
-)
+@pytest.mark.parametrize("arguments", [["film", "--help"], ["list"]])
+@pytest.mark.parametrize("columns", ["variable", "terminal"])
 def test_a_narrow_terminal_has_help(arguments, columns, tmp_path):
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("4H", 1, 1, 0, 0))

@@ -6,9 +6,14 @@ import json
 import pytest
 
 from symsteer.agents import AGENTS
-from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
+from symsteer.bench.runs import run
+from symsteer.bench.runs.config import (
+    DemonstrationConfig,
+    EvaluationConfig,
+    Execution,
+    RunConfig,
+)
 from symsteer.bench.runs.folder import run_id, state_of
-from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.policies import POLICIES
 
@@ -47,7 +52,22 @@ def tiny_config(agent="equivariant", policy_name="edp", options=None, **changes)
     return RunConfig(**{**values, **changes})
 
 
-def stop(config, out, env_steps, tracking=None):
+def execute(config, out, **options):
+    """Execute a run without progress bars; further options of an `Execution` as keywords."""
+    return run.execute(config, quiet(out=out, **options))
+
+
+def resume(folder, **options):
+    """Continue a run without progress bars."""
+    return run.resume(folder, quiet(**options))
+
+
+def quiet(**options) -> Execution:
+    """How a run is executed, without progress bars if nothing else is said."""
+    return Execution(**{"quiet": True, **options})
+
+
+def stop(config, out, env_steps, **options):
     """Execute a run until after the evaluation at a step or later, which is in no checkpoint."""
     evaluate = Trainer.evaluate
 
@@ -59,7 +79,7 @@ def stop(config, out, env_steps, tracking=None):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Trainer, "evaluate", evaluate_and_stop)
         with pytest.raises(RuntimeError, match="stopped"):
-            execute(config, out, progress=False, tracking=tracking)
+            execute(config, out, **options)
     folder = out / run_id(config, {})
     assert state_of(folder) == "failed"
     return folder

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from symsteer import UserError, load
-from symsteer.bench.runs.run import evaluate, resume
+from symsteer.bench.runs.run import evaluate
 from symsteer.registry import code_hash
+from tests.bench.tiny_run import resume
 
 REPOSITORY = Path(__file__).parents[2]
 EXAMPLES = REPOSITORY / "examples"

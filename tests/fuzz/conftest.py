@@ -11,12 +11,11 @@ import pytest
 from symsteer.bench.bundles.bundle import write_bundle
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep.plan import make_plan, write_sweep
 from symsteer.bench.sweep.suite import Suite
 from symsteer.leaderboard.records import dump_record, repeat_command
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import execute, tiny_config
 from tests.fuzz.kinds import Workshop
 from tests.leaderboard.record_factory import make_record
 
@@ -38,7 +37,7 @@ def stop_after(config, out, checkpoints):
 
     whole = Trainer._checkpoint
     with patch.object(Trainer, "_checkpoint", save), pytest.raises(KeyboardInterrupt):
-        execute(config, out, progress=False)
+        execute(config, out)
     return written[0]
 
 

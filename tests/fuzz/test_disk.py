@@ -20,11 +20,10 @@ import pytest
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.film import write_video
 from symsteer.bench.runs.folder import state_of
-from symsteer.bench.runs.run import execute, resume
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import dump_record, read_record
-from tests.bench.tiny_run import without_clock
+from tests.bench.tiny_run import execute, resume, without_clock
 from tests.fuzz.conftest import CONFIG, options_of
 from tests.fuzz.judge import end_of
 from tests.leaderboard.record_factory import make_record
@@ -86,7 +85,7 @@ def undisturbed(workshop, tmp_path_factory):
     """A run without errors; its demonstrations and base policy are in the same folder."""
     out = tmp_path_factory.mktemp("undisturbed")
     shutil.copytree(workshop.base, out / "base")
-    return execute(SHORT, out, progress=False)
+    return execute(SHORT, out)
 
 
 def complaint(*arguments):
@@ -129,7 +128,7 @@ def test_a_run_outlives_a_full_disk(size, undisturbed, tmp_path):
     state = load_checkpoint(folder)
     assert state["env_steps"] == 80
     assert len(read_record(folder / "record.json").evaluations) >= state["evaluations"]
-    resume(folder, progress=False)
+    resume(folder)
     assert without_clock(folder) == without_clock(undisturbed)
     assert read_record(folder / "record.json").wall_clock.resumed == 1
     assert not leftovers(folder)

@@ -74,9 +74,6 @@ demos folder.h5
 demos file/a.h5
 demos a.h5 --seed 99999999999999
 demos a.h5 --mode messy
-base --task Nothing
-base --demonstrations -5
-base --policies none
 export
 export --out a.zip
 export nowhere --out a.zip

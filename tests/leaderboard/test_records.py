@@ -456,10 +456,13 @@ def test_foreign_files_are_refused(tmp_path: Path, text: bytes, word: str) -> No
 def test_of_an_option_that_is_no_more_one_value_means_the_same() -> None:
     old = make_config(agent_options={"target_entropy": 0.5, **RETIRED})
     new = make_config(agent_options={"target_entropy": 0.5})
-    assert with_retired(new) == with_retired(old) == old
+    assert with_retired(new) == with_retired(old) == {**old, "keep_replay": False}
     assert with_retired(make_config(agent_options={"candidates": 64}))["agent_options"] == {
         "candidates": 64
     }
-    options = {**old["agent_options"], "n_step": 3}
-    assert without_retired(options, ["target_entropy"]) == {"target_entropy": 0.5, "n_step": 3}
-    assert without_retired(old["agent_options"], ["subset"]) == {"target_entropy": 0.5, "subset": 2}
+    config = {"keep_replay": False, "agent_options": {**old["agent_options"], "n_step": 3}}
+    options = {"target_entropy": 0.5, "n_step": 3}
+    assert without_retired(config, ["target_entropy"]) == {"agent_options": options}
+    config = {"keep_replay": True, "agent_options": old["agent_options"]}
+    options = {"target_entropy": 0.5, "subset": 2}
+    assert without_retired(config, ["subset"]) == {"keep_replay": True, "agent_options": options}

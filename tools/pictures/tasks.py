@@ -17,8 +17,7 @@ import numpy as np
 import sapien
 from PIL import Image, ImageDraw
 
-from symsteer.bench.caption import captioned
-from symsteer.bench.runs.pictures import CAMERA, SIZE
+from symsteer.bench.runs.film import CAMERA, SIZE, captioned
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
 from symsteer.bench.tasks.clouds import CAMERAS, PIXELS
 from symsteer.bench.tasks.experts import Expert

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from symsteer.bench.runs.base_policy import prepare_base
-from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.folder import RECORD, run_id
 from symsteer.bench.runs.run import check
 from symsteer.bench.runs.together import execute_together
@@ -48,7 +48,7 @@ def measure(
     """
     for config in configs:
         check(config)
-    prepare_base(configs[0], out, progress=False)
+    prepare_base(configs[0], Execution(out, quiet=True))
     contenders = [(config, members) for config in configs for members in (1, team)]
     found: list[list[dict[str, float]]] = [[] for _ in contenders]
     for turn in range(repeats):
@@ -88,7 +88,7 @@ def _time(configs: Sequence[RunConfig], out: Path) -> dict[str, float]:
         folder = Path(name)
         (folder / "base").symlink_to((out / "base").resolve())
         begin = time.process_time()
-        for error in execute_together(configs, folder):
+        for error in execute_together(configs, Execution(folder, quiet=True)):
             if error is not None:
                 raise error
         cpu = (time.process_time() - begin) / len(configs)

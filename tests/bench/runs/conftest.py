@@ -11,7 +11,7 @@ from filelock import FileLock, Timeout
 
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import is_finished, run_id
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import execute, quiet, tiny_config
 
 LEARNERS = ("standard", "equivariant", "constrained")
 
@@ -31,13 +31,11 @@ def ensure(config: RunConfig, out: Path, patience: float = -1) -> Path:
         out: the shared folder.
         patience: seconds to wait for the other process; -1 for no limit.
     """
-    from symsteer.bench.runs.run import execute
-
     folder = out / run_id(config, {})
     out.mkdir(exist_ok=True)
     with contextlib.suppress(Timeout), FileLock(f"{folder}.lock", patience):
         if not is_finished(folder):
-            execute(config, out, progress=False)
+            execute(config, out)
     return folder
 
 
@@ -59,7 +57,7 @@ def lend(shared) -> Callable[[Path], Path]:
     bases = shared.with_name("bases")
     with FileLock(f"{bases}.lock"):
         for seed in (0, 1):
-            prepare_base(tiny_config(seed=seed), bases, progress=False)
+            prepare_base(tiny_config(seed=seed), quiet(out=bases))
     return lambda out: shutil.copytree(bases / "base", out / "base")
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from symsteer.bench.runs.arguments import last_value, parse_run
+from symsteer.bench.runs.arguments import parse_run
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.errors import UserError
 
@@ -31,6 +31,9 @@ def test_options_of_the_named_agent_and_policy():
             "--out",
             "a",
             "--quiet",
+            "--agent=standard",
+            "--agent",
+            "residual-pathway",
         ]
     )
     assert (config.agent, config.policy_name) == ("residual-pathway", "plain")
@@ -86,9 +89,3 @@ def test_unknown_options_name_the_nearest(capsys):
     assert "--agent.penalty" in capsys.readouterr().err
     with pytest.raises(UserError, match="did you mean 'residual-pathway'"):
         parse_run(["--agent", "residual-pathwy", "--help"])
-
-
-def test_the_last_value_counts():
-    assert last_value(["--agent", "a", "--agent=b"], "--agent") == "b"
-    assert last_value(["--agent.width", "3", "--agents", "x", "--agent"], "--agent") is None
-    assert parse_run(["--agent", "standard", "--agent", "zero"])[0].agent == "zero"

@@ -1,14 +1,20 @@
-"""A base policy from another package: trained, measured, saved and found again."""
+"""Base policies of runs: made once, found again, steered; of several tasks, and of strangers."""
 
 import pytest
 
+from symsteer.bench.demos import collect
 from symsteer.bench.runs.base_policy import describe_base, find_base, prepare_base, with_policy_of
 from symsteer.bench.runs.config import build_config
+from symsteer.bench.runs.folder import run_id
+from symsteer.bench.runs.run import check
+from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
+from symsteer.leaderboard.records import read_record
 from symsteer.policies import POLICIES
 from symsteer.policies.files import policy_path
 from symsteer.registry import allow
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import POLICY, execute, quiet, tiny_config
+from tests.marks import slow_except
 
 STRANGER = '''
 """A policy from outside of SymSteer."""
@@ -39,12 +45,12 @@ def test_a_policy_from_another_package(tmp_path, monkeypatch):
     data = tiny_config().to_json() | {"policy": {"name": name, "horizon": 4, "execute": 2}}
     config = build_config(data, "test")
     assert find_base(config, tmp_path) is None
-    base = prepare_base(config, tmp_path, progress=False)
+    base = prepare_base(config, quiet(out=tmp_path))
     assert (base.name, base.horizon, base.execute) == ("echo", 4, 2)
     assert describe_base(base).episodes == 32
     # Found again instead of trained again.
     monkeypatch.setattr(POLICIES.get(name), "fit", None)
-    again = prepare_base(config, tmp_path, progress=False)
+    again = prepare_base(config, quiet(out=tmp_path))
     assert again.content_hash() == base.content_hash()
     # A run that names the file takes its settings; other settings are refused.
     path = policy_path(find_base(config, tmp_path))
@@ -55,3 +61,104 @@ def test_a_policy_from_another_package(tmp_path, monkeypatch):
     # Changed code is another policy.
     (tmp_path / "stranger_policy.py").write_text(STRANGER + "\n")
     assert find_base(config, tmp_path) is None
+
+
+STEERED = [
+    *(("PickCube-v1", name) for name in POLICIES.builtin if name != "edp"),
+    *((task, "spherical") for task in ("TiltedPickCube-v1", "TiltedPushCube-v1")),
+]
+OFTEN = {("PickCube-v1", "canonical"), ("TiltedPickCube-v1", "spherical")}
+
+
+@pytest.mark.parametrize(
+    ("task", "name"),
+    [
+        pytest.param(*one, marks=pytest.mark.long if one in OFTEN else pytest.mark.slow)
+        for one in STEERED
+    ],
+)
+def test_every_policy_is_trained_and_steered(task, name, tmp_path):
+    """On a tilted table an equivariant agent uses the turns about the laboratory's vertical."""
+    config = tiny_config(policy_name=name, task=task, env_steps=160)
+    record = read_record(execute(config, tmp_path) / "record.json")
+    assert record.status == "finished"
+    assert record.base_policy.name == name
+    assert (record.base_policy.group == "C8") or name != "spherical"
+    assert record.budget.updates > 0
+
+
+TASKS = ("PickCube-v1", "PushCube-v1", "PlaceSphere-v1")
+
+
+def joint(task, tasks=TASKS, name="edp-joint", **changes):
+    policy = POLICIES.get(name).Options(**POLICY, tasks=tasks)
+    return tiny_config(task=task, policy_name=name, policy=policy, **changes)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", slow_except(["edp-joint", "plain-joint"], "edp-joint"))
+def test_it_is_trained_once_for_the_runs_on_all_tasks(name, tmp_path, monkeypatch):
+    first = joint("PushCube-v1", name=name)
+    assert find_base(first, tmp_path) is None
+    base = prepare_base(first, quiet(out=tmp_path))
+    assert base.options.tasks == tuple(sorted(TASKS))
+    monkeypatch.setattr(POLICIES.get(name), "fit_tasks", None)
+    hashes = {base.content_hash()}
+    for task in TASKS:
+        other = joint(task, name=name)
+        path = find_base(other, tmp_path)
+        assert path is not None
+        policy = prepare_base(other, quiet(out=tmp_path))
+        assert policy.obs_layout == task_class(task).observation_layout
+        assert policy.report["world"]["task"] == task
+        # Its report is kept, and it is that of its own task.
+        assert "steerability" in (again := prepare_base(other, quiet(out=tmp_path))).report
+        assert again.content_hash() == policy.content_hash()
+        hashes.add(policy.content_hash())
+        if name == "edp-joint":
+            assert with_policy_of(other, policy_path(path)).policy == other.policy
+    assert len(hashes) == 3
+    record = read_record(
+        execute(joint(TASKS[0], name=name, env_steps=160), tmp_path) / "record.json"
+    )
+    assert (record.status, record.base_policy.name) == ("finished", name)
+    assert record.budget.updates > 0
+    # Another seed, or other tasks, are other policies.
+    assert find_base(joint(TASKS[0], name=name, policy_seed=7), tmp_path) is None
+    assert find_base(joint(TASKS[0], TASKS[:2], name=name), tmp_path) is None
+
+
+@pytest.mark.long
+def test_other_demonstrations_of_one_task_are_another_policy_of_all(tmp_path):
+    pair = ("PickCube-v1", "PushCube-v1")
+    demos = collect("PushCube-v1", "floating", 3, "diverse", 99, tmp_path / "own.h5")
+    prepare_base(joint("PushCube-v1", pair), quiet(out=tmp_path, demos=demos))
+    # The runs that begin from the expert's demonstrations do not find it.
+    for task in pair:
+        prepare_base(joint(task, ()), quiet(out=tmp_path))
+    for task in pair:
+        assert find_base(joint(task, pair), tmp_path) is None
+        assert find_base(joint(task, ()), tmp_path) is not None
+
+
+def test_the_order_of_tasks_and_the_runs_own_do_not_matter():
+    wanted = joint("PickCube-v1")
+    for tasks in (TASKS[::-1], TASKS[1:]):
+        assert joint("PickCube-v1", tasks) == wanted
+        assert run_id(joint("PickCube-v1", tasks), {}) == run_id(wanted, {})
+    assert build_config(wanted.to_json(), "test") == wanted
+    alone = joint("PickCube-v1", ())
+    assert alone.policy.tasks == ()
+    assert alone.policy_tasks == ("PickCube-v1",)
+    # Other policies have no such option.
+    with pytest.raises(UserError, match=r"policy\.tasks"):
+        build_config({"policy": {"name": "edp", "tasks": ["PushCube-v1"]}}, "test")
+
+
+def test_tasks_that_cannot_be_joined_are_refused():
+    with pytest.raises(UserError, match=r"'PushCub-v1'.*did you mean 'PushCube-v1'"):
+        check(joint("PickCube-v1", ("PushCub-v1",)))
+    other = "tests.bench.tasks.lab:OtherActions"
+    allow(other)
+    with pytest.raises(UserError, match=f"the actions of {other} have another layout than those"):
+        check(joint("PickCube-v1", (other,)))

@@ -16,11 +16,11 @@ from symsteer.agents import AGENTS
 from symsteer.agents.team import can_join
 from symsteer.bench.runs.base_policy import prepare_base
 from symsteer.bench.runs.folder import run_id
-from symsteer.bench.runs.run import evaluate, execute, resume
+from symsteer.bench.runs.run import evaluate
 from symsteer.bench.runs.together import execute_together
 from symsteer.leaderboard.records import read_record
 from symsteer.policies import POLICIES
-from tests.bench.tiny_run import stop, tiny_config
+from tests.bench.tiny_run import execute, quiet, resume, stop, tiny_config
 
 pytestmark = [
     pytest.mark.gpu,
@@ -34,7 +34,7 @@ def bases(tmp_path_factory) -> Path:
     """A folder with the base policies of tiny runs with seeds 0 and 1, trained on the GPU."""
     out = tmp_path_factory.mktemp("bases")
     for seed in (0, 1):
-        prepare_base(tiny_config(seed=seed, device="cuda"), out, progress=False)
+        prepare_base(tiny_config(seed=seed, device="cuda"), quiet(out=out))
     return out / "base"
 
 
@@ -57,7 +57,7 @@ def without_gpu(*args: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize("name", AGENTS.builtin)
 def test_every_agent_runs_and_is_restored(name, out):
     config = tiny_config(name, device="cuda")
-    folder = execute(config, out, progress=False)
+    folder = execute(config, out)
     record = read_record(folder / "record.json")
     assert record.status == "finished"
     assert record.provenance.device == torch.cuda.get_device_name()
@@ -77,7 +77,7 @@ def test_every_policy_decodes_as_on_the_cpu(name, tmp_path):
     if name == "escnn":
         pytest.importorskip("escnn.nn")
     config = tiny_config(policy_name=name, device="cuda")
-    policy = prepare_base(config, tmp_path, progress=False)
+    policy = prepare_base(config, quiet(out=tmp_path))
     assert policy.device.type == "cuda"
     generator = torch.Generator().manual_seed(0)
     obs = 0.1 * torch.randn(16, policy.obs_layout.dim, generator=generator)
@@ -89,7 +89,7 @@ def test_every_policy_decodes_as_on_the_cpu(name, tmp_path):
 @pytest.mark.parametrize("name", TEAMS)
 def test_teams_train(name, out):
     configs = [tiny_config(name, seed=seed, device="cuda") for seed in (0, 1)]
-    assert execute_together(configs, out) == [None, None]
+    assert execute_together(configs, quiet(out=out)) == [None, None]
     for config in configs:
         record = read_record(out / run_id(config, {}) / "record.json")
         assert (record.status, record.provenance.together) == ("finished", 2)
@@ -97,12 +97,12 @@ def test_teams_train(name, out):
 
 def test_a_stopped_run_goes_on(out):
     folder = stop(tiny_config(device="cuda", checkpoint_every=40), out, env_steps=160)
-    assert read_record(resume(folder, progress=False) / "record.json").status == "finished"
+    assert read_record(resume(folder) / "record.json").status == "finished"
 
 
 def test_a_run_is_used_where_there_is_no_gpu(out):
     """It is evaluated on the CPU; it is not continued there, and nothing is lost."""
-    folder = execute(tiny_config(device="cuda"), out, progress=False)
+    folder = execute(tiny_config(device="cuda"), out)
     here = evaluate(folder)
     assert here.recorded is None
     done = without_gpu("evaluate", str(folder), "--json")
@@ -115,4 +115,4 @@ def test_a_run_is_used_where_there_is_no_gpu(out):
     assert refused.returncode != 0
     assert "was begun with --device cuda, but torch finds no CUDA device" in refused.stderr
     assert "Traceback" not in refused.stderr
-    assert read_record(resume(stopped, progress=False) / "record.json").status == "finished"
+    assert read_record(resume(stopped) / "record.json").status == "finished"

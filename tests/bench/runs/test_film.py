@@ -1,13 +1,16 @@
+import io
+from types import SimpleNamespace
+
 import imageio.v2 as imageio
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from symsteer.bench.runs.film import film
-from symsteer.bench.runs.run import execute
+from symsteer.bench.runs import film as film_module
+from symsteer.bench.runs.film import film, to_gif
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.errors import UserError
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import execute, tiny_config
 
 pytestmark = pytest.mark.long
 
@@ -17,7 +20,16 @@ RENDERS = pytest.mark.skipif(not rendering_works(), reason="needs a Vulkan drive
 @pytest.fixture(scope="module")
 def base(finished):
     """A run of the base policy beside the one that is finished."""
-    return execute(tiny_config(agent="base"), finished[1].parent, progress=False)
+    return execute(tiny_config(agent="base"), finished[1].parent)
+
+
+def test_a_gif_plays_the_frames_in_order_and_in_time():
+    grey = [np.full((40, 60, 3), level, np.uint8) for level in (0, 100, 200)]
+    moving = Image.open(io.BytesIO(to_gif(grey, rate=5)))
+    assert (moving.format, moving.n_frames, moving.info["loop"]) == ("GIF", 3, 0)
+    for frame, shown in zip(grey, ImageSequence.Iterator(moving), strict=True):
+        assert shown.info["duration"] == 200
+        assert np.abs(np.asarray(shown.convert("RGB")).astype(int) - frame).max() < 5
 
 
 def test_a_film_is_a_video_or_the_picture_of_paths(finished):
@@ -72,11 +84,15 @@ def test_mistakes(finished, tmp_path, options, words):
         film([finished[1]], **options)
 
 
-def test_runs_of_different_tasks_or_worlds_are_refused(finished, tmp_path):
-    other = execute(tiny_config(agent="base", task="PushCube-v1"), tmp_path, progress=False)
-    with pytest.raises(UserError, match="of different tasks"):
-        film([finished[1], other])
-    config = tiny_config(agent="base", variant="action_gain:1")
-    broken = execute(config, finished[1].parent, progress=False)
-    with pytest.raises(UserError, match=r"of different worlds \(action_gain:1, none\); say with"):
-        film([finished[1], broken])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"task": "PushCube-v1"}, "of different tasks"),
+        ({"variant": "action_gain:1"}, r"of different worlds \(action_gain:1, none\); say with"),
+    ],
+)
+def test_runs_of_different_tasks_or_worlds_are_refused(change, words, monkeypatch):
+    runs = [SimpleNamespace(config=tiny_config(**one)) for one in ({}, change)]
+    monkeypatch.setattr(film_module, "restored", lambda run: run)
+    with pytest.raises(UserError, match=words):
+        film(runs)

@@ -12,18 +12,15 @@ import torch
 
 from symsteer.agents.sac import SacAgent
 from symsteer.bench.runs import evaluator, trainer
-from symsteer.bench.runs.base_policy import prepare_base
-from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
-from symsteer.bench.runs.folder import is_finished, run_id, state_of
-from symsteer.bench.runs.run import check_all, evaluate, execute, resume
+from symsteer.bench.runs.folder import is_finished, state_of
+from symsteer.bench.runs.run import check_all, evaluate
 from symsteer.bench.sim import environment
-from symsteer.bench.steering import evaluation
-from symsteer.bench.steering.seeds import HELD_OUT_SEED, held_out_seeds
+from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
-from tests.bench.tiny_run import tiny_config, without_clock
+from tests.bench.tiny_run import execute, tiny_config, without_clock
 from tests.marks import slow_except
 
 REFERENCES = ("base", "zero", "golden-ticket")
@@ -58,39 +55,18 @@ def test_the_record_tells_the_whole_run(finished):
     assert stored == record.config
     assert stored["agent_options"]["width"] == 16
     assert record.role == "learner"
-
-
-def test_no_path_of_this_machine_is_recorded(finished):
-    _, folder = finished
-    text = (folder / "record.json").read_text() + (folder / "config.json").read_text()
-    assert str(folder.parent) not in text
-    assert "/" not in json.loads(text.split("}\n{")[0] + ("}" if "}\n{" in text else ""))["run_id"]
-
-
-def test_the_record_has_symmetry_and_jumps_of_the_base_policy(finished):
-    _, folder = finished
-    base = read_record(folder / "record.json").base_policy
+    base = record.base_policy
     assert base.name == "edp"
     assert 0 < base.equivariance_error < 1e-5
     assert 0 < base.jump < 1
-
-
-def test_the_checkpoint_restores_the_agent(finished):
-    config, folder = finished
-    state = load_checkpoint(folder)
-    base = prepare_base(config, folder.parent, progress=False)
-    agent = trainer.new_agent(dataclasses.replace(config, seed=99), base)
-    obs = torch.randn(4, base.obs_layout.dim)
-    before = agent.act(obs, deterministic=True)
-    agent.load_state_dict(state["agent"])
-    assert agent.updates == read_record(folder / "record.json").budget.updates
-    assert not torch.equal(before, agent.act(obs, deterministic=True))
+    # No path of this machine is recorded.
+    assert str(folder.parent) not in (folder / "record.json").read_text()
 
 
 @pytest.mark.parametrize("workers", slow_except((1, 2), 2))
 def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_path):
     config, folder = finished
-    again = execute(config, tmp_path, progress=False, workers=workers)
+    again = execute(config, tmp_path, workers=workers)
     assert again.name == folder.name
     assert without_clock(again) == without_clock(folder)
 
@@ -100,7 +76,7 @@ def test_evaluating_more_often_does_not_change_training(finished, lend, tmp_path
     config, folder = finished
     lend(tmp_path)
     evaluation = dataclasses.replace(config.evaluation, every=80)
-    often = execute(tiny_config(evaluation=evaluation), tmp_path, progress=False)
+    often = execute(tiny_config(evaluation=evaluation), tmp_path)
     assert len(read_record(often / "record.json").evaluations) == 5
     last = [without_clock(f)["evaluations"][-1] for f in (folder, often)]
     assert last[0]["episodes"] == last[1]["episodes"]
@@ -121,7 +97,7 @@ def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
     _, folder = finished
     one_policy = DemonstrationConfig(count=3, seed=0)
     config = tiny_config(seed=2, policy_seed=0, demonstrations=one_policy)
-    execute(config, folder.parent, progress=False)
+    execute(config, folder.parent)
     assert not any(terminal.any() for _, _, terminal in stored)
     jumps = sum(
         (next_obs != following[0]).any(dim=1).int()
@@ -157,19 +133,6 @@ def test_the_final_evaluation_plays_the_other_ways_to_act(broken):
     assert "success_truncated" not in other.diagnostics
 
 
-def test_a_finished_run_is_not_overwritten(finished):
-    config, folder = finished
-    before = (folder / "record.json").read_bytes()
-    with pytest.raises(UserError, match="finished already"):
-        execute(config, folder.parent, progress=False)
-    assert (folder / "record.json").read_bytes() == before
-
-
-def test_a_strength_written_otherwise_is_the_same_run():
-    ids = {run_id(tiny_config(variant=f"action_gain:{text}"), {}) for text in ("0.5", "0.50", ".5")}
-    assert len(ids) == 1
-
-
 @pytest.mark.parametrize(
     "place",
     [(SacAgent, "diagnostics"), pytest.param((trainer, "Evaluator"), marks=pytest.mark.long)],
@@ -184,12 +147,12 @@ def test_a_failed_run_says_so_and_is_continued(place, finished, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(*place, fail)
         with pytest.raises(RuntimeError):
-            execute(broken, folder.parent, progress=False)
+            execute(broken, folder.parent)
     [failed] = folder.parent.glob("*-s1-*")
     record = read_record(failed / "record.json")
     assert record.status == state_of(failed) == "failed"
     assert "the network exploded" in record.failure
-    execute(broken, folder.parent, progress=False)
+    execute(broken, folder.parent)
     assert state_of(failed) == "finished"
     assert read_record(failed / "record.json").failure is None
     shutil.rmtree(failed)
@@ -212,7 +175,7 @@ def test_a_failed_run_says_so_and_is_continued(place, finished, monkeypatch):
 )
 def test_mistakes_are_refused_before_anything_is_built(change, words, tmp_path):
     with pytest.raises(UserError, match=words):
-        execute(tiny_config(**change), tmp_path, progress=False)
+        execute(tiny_config(**change), tmp_path)
     assert not any(tmp_path.iterdir())
 
 
@@ -220,17 +183,15 @@ def test_mistakes_are_refused_before_anything_is_built(change, words, tmp_path):
 @pytest.mark.parametrize("option", ["sim", "device"])
 def test_missing_cuda_is_refused(option, tmp_path):
     with pytest.raises(UserError, match="no CUDA device"):
-        execute(tiny_config(**{option: "cuda"}), tmp_path, progress=False)
+        execute(tiny_config(**{option: "cuda"}), tmp_path)
 
 
-@pytest.mark.parametrize(
-    "change", [{"workers": 0}, {"workers": 10_000}, {"workers": 2, "sim": "cuda"}]
-)
+@pytest.mark.parametrize("change", [{"workers": 0}, {"workers": 2, "sim": "cuda"}])
 def test_bad_numbers_of_workers_are_refused(change, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     workers = change.pop("workers")
     with pytest.raises(UserError, match=r"--workers (is|needs)"):
-        execute(tiny_config(**change), tmp_path, progress=False, workers=workers)
+        execute(tiny_config(**change), tmp_path, workers=workers)
 
 
 ROOMY = {"num_envs": 500, "env_steps": 10**6}
@@ -247,7 +208,6 @@ ROOMY = {"num_envs": 500, "env_steps": 10**6}
             "; make fewer .*--evaluation.episodes",
         ),
         (ROOMY, 2, None),
-        (ROOMY | {"num_envs": 450, "evaluation": EvaluationConfig(episodes=450)}, 2, None),
         (ROOMY | {"agent": "base"}, 1, None),
     ],
 )
@@ -256,13 +216,8 @@ def test_more_environments_than_processes_can_hold(change, workers, words, tmp_p
     if words is None:
         return check_all(config, workers)
     with pytest.raises(UserError, match=words):
-        execute(config, tmp_path, progress=False, workers=workers)
-    folder = tmp_path / run_id(config, {})
-    folder.mkdir()
-    (folder / "config.json").write_text(json.dumps({**config.to_json(), "files": {}}))
-    with pytest.raises(UserError, match=words):
-        resume(folder, progress=False, workers=workers)
-    assert [p.name for p in tmp_path.rglob("*")] == [folder.name, "config.json"]
+        execute(config, tmp_path, workers=workers)
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.long
@@ -270,20 +225,20 @@ def test_a_run_needs_just_as_many_scenes_as_is_said(lend, tmp_path, monkeypatch)
     lend(tmp_path)
     monkeypatch.setattr(evaluator, "MAX_SCENES", 26)
     with pytest.raises(UserError, match="at most 26 PhysX scenes, but 27 are"):
-        execute(tiny_config(num_envs=11), tmp_path, progress=False)
+        execute(tiny_config(num_envs=11), tmp_path)
     gc.collect()
     there = environment._count(environment._LIVE_SCENES)
     monkeypatch.setattr(evaluator, "MAX_SCENES", 27)
     for spare in (0, -1):
         monkeypatch.setattr(environment, "MAX_SCENES", there + 27 + spare)
         with contextlib.nullcontext() if spare == 0 else pytest.raises(UserError, match="exist"):
-            execute(tiny_config(num_envs=11, seed=-spare), tmp_path, progress=False)
+            execute(tiny_config(num_envs=11, seed=-spare), tmp_path)
 
 
 def test_an_unwritable_folder_is_refused(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UserError, match="writable"):
-        execute(tiny_config(), tmp_path / "file", progress=False)
+        execute(tiny_config(), tmp_path / "file")
 
 
 @pytest.mark.long
@@ -296,7 +251,7 @@ def test_the_settings_of_a_given_base_policy_are_recorded(finished, tmp_path):
         policy=RunConfig().policy,
         demonstrations=DemonstrationConfig(),
     )
-    found = read_record(execute(plain, tmp_path, policy=file, progress=False) / "record.json")
+    found = read_record(execute(plain, tmp_path, base_policy=file) / "record.json")
     said = found.config
     assert said["policy"] == config.to_json()["policy"]
     assert said["demonstrations"]["count"] == 3
@@ -307,8 +262,7 @@ def test_the_settings_of_a_given_base_policy_are_recorded(finished, tmp_path):
         execute(
             dataclasses.replace(tiny_config(agent="zero", seed=6), policy=RunConfig().policy),
             tmp_path,
-            policy=file,
-            progress=False,
+            base_policy=file,
         )
         / "record.json"
     )
@@ -317,7 +271,7 @@ def test_the_settings_of_a_given_base_policy_are_recorded(finished, tmp_path):
     more = dataclasses.replace(
         plain, evaluation=dataclasses.replace(plain.evaluation, steerability_states=3)
     )
-    found = read_record(execute(more, tmp_path, policy=file, progress=False) / "record.json")
+    found = read_record(execute(more, tmp_path, base_policy=file) / "record.json")
     assert (known.episodes, found.base_policy.episodes) == (32, 48)
 
 
@@ -325,15 +279,15 @@ def test_a_base_policy_of_another_world_is_refused(finished, tmp_path):
     config, folder = finished
     panda = tiny_config(embodiment="panda")
     with pytest.raises(UserError, match="trained for floating, and this run's embodiment is panda"):
-        execute(panda, tmp_path, policy=folder, progress=False)
+        execute(panda, tmp_path, base_policy=folder)
     other = tiny_config(policy=dataclasses.replace(config.policy, steps=21))
     with pytest.raises(UserError, match=r"trained with policy\.steps 20, and this run asks for 21"):
-        execute(other, tmp_path, policy=folder, progress=False)
+        execute(other, tmp_path, base_policy=folder)
     for change in ({"policy_seed": 4}, {"demonstrations": DemonstrationConfig(count=3, seed=9)}):
         with pytest.raises(UserError, match=rf"trained with {min(change)}\S* 0, and this run"):
-            execute(tiny_config(**change), tmp_path, policy=folder, progress=False)
+            execute(tiny_config(**change), tmp_path, base_policy=folder)
     with pytest.raises(UserError, match="leave one of them out"):
-        execute(config, tmp_path, demonstrations=folder, policy=folder, progress=False)
+        execute(config, tmp_path, demos=folder, base_policy=folder)
     assert not any(tmp_path.iterdir())
 
 
@@ -343,20 +297,3 @@ def test_an_evaluation_in_the_runs_own_world_is_compared_however_it_is_spelled(b
     assert (spelled.variant, spelled.recorded) == ("action_gain:0.5", True)
     with pytest.raises(UserError, match="there is no variant ''"):
         evaluate(folder, "")
-
-
-def test_steerability_stays_below_the_held_out_seeds(monkeypatch):
-    """However large the policy's seed is."""
-    seen = []
-
-    def note(env, act, seeds):
-        seen.extend(seeds)
-        raise StopIteration
-
-    monkeypatch.setattr(evaluation, "rollout", note)
-    for seed in (0, 1, 20_834, 2**32 - 1):
-        with pytest.raises(StopIteration):
-            evaluation.steerability(None, None, seed, 24)
-    assert min(seen) >= HELD_OUT_SEED // 2
-    assert max(seen) < HELD_OUT_SEED
-    assert seen[0] == HELD_OUT_SEED // 2

@@ -15,17 +15,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, metadata
 
-from symsteer.bench.runs import observers, scalars
-from symsteer.bench.runs.charts import DESCRIPTIONS
-from symsteer.bench.runs.observers import observers_of
-from symsteer.bench.runs.run import execute, resume
-from symsteer.bench.runs.scalars import DETAILS
-from symsteer.bench.runs.tensorboard import FINAL_METRICS, IDENTITY, RunLog
-from symsteer.bench.runs.trainer import Observer
-from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.runs import scalars
+from symsteer.bench.runs.charts import DESCRIPTIONS, FINAL_METRICS
+from symsteer.bench.runs.scalars import DETAILS, Scalars
+from symsteer.bench.runs.tensorboard import RunLog
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
-from tests.bench.tiny_run import stop, tiny_config
+from tests.bench.tiny_run import execute, resume, stop, tiny_config
 
 pytestmark = pytest.mark.long
 
@@ -70,23 +66,13 @@ def continued(finished):
     _, folder = finished
     stopped = stop(LONGER, folder.parent, 320)
     written = points(stopped, "eval/success_once")[-1][0]
-    assert resume(stopped, progress=False) == stopped
+    assert resume(stopped) == stopped
     return stopped, written
-
-
-@pytest.mark.long
-def test_every_tag_is_documented_and_every_documented_tag_written(every):
-    written = set().union(*map(scalar_tags, every.values()))
-    assert not written & CORRELATIONS
-    documented = documented_tags()
-    details = {tag for tag in documented if DETAILS.fullmatch(tag.removeprefix("diag/"))}
-    assert written | CORRELATIONS == documented - details
-    assert {tag.partition("/")[0] for tag in written} == NAMESPACES
 
 
 def assert_equals_record(folder):
     """Points of eval/ and diag/ are the record's evaluations: all of them, once, no others."""
-    events, record = load(folder), read_record(folder / "record.json")
+    record = read_record(folder / "record.json")
     budget = record.config["env_steps"]
     wanted: dict[str, list[tuple[int, float]]] = {}
     for evaluation in record.evaluations:
@@ -105,17 +91,22 @@ def assert_equals_record(folder):
             if tag.startswith("eval/") and evaluation.final and evaluation.env_steps < budget:
                 # A reference: its success is a line to the end of the axis.
                 wanted[tag].append((budget, value))
-    tags = {tag for tag in events.Tags()["scalars"] if tag.startswith(("eval/", "diag/"))}
-    assert tags == set(wanted)
+    assert {t for t in scalar_tags(folder) if t.startswith(("eval/", "diag/"))} == set(wanted)
     for tag, stored in wanted.items():
         shown = points(folder, tag)
         assert [step for step, _ in shown] == [step for step, _ in stored]
         assert [v for _, v in shown] == pytest.approx([v for _, v in stored], rel=1e-6, nan_ok=True)
 
 
-def test_evaluations_are_those_of_the_record(broken):
-    for folder in broken.values():
+def test_what_is_written_documented_and_described(every):
+    written = set().union(*map(scalar_tags, every.values())) | CORRELATIONS
+    details = {tag for tag in documented_tags() if DETAILS.fullmatch(tag.removeprefix("diag/"))}
+    assert written == documented_tags() - details
+    assert {tag.partition("/")[0] for tag in written} == NAMESPACES
+    assert set(DESCRIPTIONS) <= written
+    for folder in every.values():
         assert_equals_record(folder)
+        assert charts_of(folder) == charts_of(every["equivariant"])
 
 
 def test_references_are_lines_over_the_whole_axis(broken, continued):
@@ -138,18 +129,13 @@ def test_references_are_lines_over_the_whole_axis(broken, continued):
             assert points(folder, tag) == line, tag
 
 
-def test_errors_of_equivariance_are_shown_as_powers_of_ten(broken):
-    for folder in broken.values():
-        tags = scalar_tags(folder)
-        for kind in ("actor", "critic"):
-            shown, error = f"log10/equivariance_{kind}", f"diag/equivariance_{kind}"
-            assert (shown in tags) == (error in tags)
-            if shown in tags:
-                wanted = [max(math.log10(max(v, 1e-30)), -8) for _, v in points(folder, error)]
-                assert [v for _, v in points(folder, shown)] == pytest.approx(wanted, abs=1e-4)
-
-
-def test_errors_without_a_logarithm_are_shown_too(finished):
+def test_errors_of_equivariance_are_shown_as_powers_of_ten(broken, finished):
+    folder = broken["equivariant"]
+    for kind in ("actor", "critic"):
+        shown, error = f"log10/equivariance_{kind}", f"diag/equivariance_{kind}"
+        wanted = [max(math.log10(max(v, 1e-30)), -8) for _, v in points(folder, error)]
+        assert [v for _, v in points(folder, shown)] == pytest.approx(wanted, abs=1e-4)
+    # Also those without a logarithm.
     evaluation = read_record(finished[1] / "record.json").evaluations[-1]
     evaluation.diagnostics.update(equivariance_actor=0.0, equivariance_critic=None)
     evaluation.nonfinite["diagnostics/equivariance_critic"] = "inf"
@@ -158,29 +144,21 @@ def test_errors_without_a_logarithm_are_shown_too(finished):
     assert values["log10/equivariance_critic"] == math.inf
 
 
-def test_a_continued_run_shows_every_point_once(continued):
+def test_a_continued_run_shows_what_one_shows_that_was_not_stopped(continued, tmp_path):
     folder, written = continued
-    steps = [e.env_steps for e in read_record(folder / "record.json").evaluations]
     # The stopped process had written an evaluation that was repeated.
-    assert written in steps[:-1]
+    assert written in [e.env_steps for e in read_record(folder / "record.json").evaluations][:-1]
     assert len(list(folder.glob("events.*"))) == 2
     assert_equals_record(folder)
-    for tag in scalar_tags(folder):
-        found = [step for step, _ in points(folder, tag)]
-        assert found == sorted(set(found)), tag
-
-
-def test_a_continued_run_shows_what_one_shows_that_was_not_stopped(continued, tmp_path):
-    folder, _ = continued
     shutil.copytree(folder.parent / "base", tmp_path / "base")
-    other = execute(LONGER, tmp_path, progress=False)
+    other = execute(LONGER, tmp_path)
     tags = scalar_tags(other)
     assert tags == scalar_tags(folder)
     assert "train/return" in tags
     for tag in tags:
         mine, theirs = points(folder, tag), points(other, tag)
         if tag.startswith("time/"):
-            mine, theirs = ([step for step, _ in found] for found in (mine, theirs))
+            mine, theirs = ([step for step, _ in shown] for shown in (mine, theirs))
         assert mine == theirs, tag
 
 
@@ -191,17 +169,16 @@ def test_training_is_shown_at_some_steps_as_means_of_the_last_episodes(
     monkeypatch.setattr(scalars, "RECENT", 3)
     returns: list[float] = []
     wanted: dict[int, list[float]] = {}
+    stepped = Scalars.stepped
 
-    class Noting(Observer):
-        def stepped(self, run, scalars):
-            returns.extend(scalars[0]["train/return"].tolist())
-            wanted[run.env_steps] = returns[-3:]
+    def noting(self, run, values):
+        returns.extend(values[0]["train/return"].tolist())
+        wanted[run.env_steps] = returns[-3:]
+        stepped(self, run, values)
 
-    monkeypatch.setattr(
-        "symsteer.bench.runs.run.observers_of", lambda *args: [*observers_of(*args), Noting()]
-    )
+    monkeypatch.setattr(Scalars, "stepped", noting)
     shutil.copytree(finished[1].parent / "base", tmp_path / "base")
-    folder = execute(LONGER, tmp_path, progress=False)
+    folder = execute(LONGER, tmp_path)
     assert len(returns) > 3
     # At a tenth of the budget each, and before each of the two fresh starts.
     assert 8 <= len(points(folder, "losses/critic")) <= 12
@@ -228,33 +205,20 @@ def charts_of(folder):
     return charts
 
 
-@pytest.mark.long
-def test_every_agent_writes_what_is_described_and_can_be_read(every):
-    assert set(DESCRIPTIONS) <= set().union(*map(scalar_tags, every.values())) | CORRELATIONS
-    for folder in every.values():
-        assert_equals_record(folder)
-        assert charts_of(folder) == charts_of(every["equivariant"])
-
-
 def test_a_chart_shows_few_tags_and_all_of_them_are_written_and_described(broken):
-    tags = scalar_tags(broken["equivariant"]) | CORRELATIONS
-    charts = charts_of(broken["equivariant"])
-    shown = set()
-    for patterns in charts.values():
+    folder = broken["equivariant"]
+    tags, shown = scalar_tags(folder) | CORRELATIONS, set()
+    for patterns in charts_of(folder).values():
         matches = [tag for tag in tags if any(re.match(pattern, tag) for pattern in patterns)]
         # One line a run, and its level lines.
         assert len([tag for tag in matches if not tag.startswith("reference/")]) == 1
-        assert len(matches) <= 3
-        for pattern in patterns:
-            assert any(re.match(pattern, tag) for tag in tags), pattern
+        assert len(matches) == len(patterns) <= 3
         shown |= set(matches)
     assert {tag for tag in tags if tag.startswith(("reference/", "log10/"))} <= shown
     assert shown <= set(DESCRIPTIONS)
-    events = load(broken["equivariant"])
-    for tag in set(DESCRIPTIONS) & scalar_tags(broken["equivariant"]):
+    events = load(folder)
+    for tag in set(DESCRIPTIONS) & scalar_tags(folder):
         assert events.SummaryMetadata(tag).summary_description == DESCRIPTIONS[tag]
-    # TensorBoard shows the charts of all runs: they must be the same ones.
-    assert all(charts_of(folder) == charts for folder in broken.values())
 
 
 def test_hyperparameters_can_be_compared_across_runs(broken):
@@ -265,49 +229,35 @@ def test_hyperparameters_can_be_compared_across_runs(broken):
         def content(tag, events=events):
             return events.SummaryMetadata(tag).plugin_data.content
 
-        record = read_record(folder / "record.json")
-        start = metadata.parse_session_start_info_plugin_data(
+        values = metadata.parse_session_start_info_plugin_data(
             content(metadata.SESSION_START_INFO_TAG)
-        )
-        values = start.hparams
+        ).hparams
         assert values["agent"].string_value == name
-        own = record.config["agent_options"]
-        for key in ("lr", "penalty", "candidates"):
-            if key in own:
-                assert values[f"agent_options.{key}"].number_value == own[key]
+        assert folder.name.endswith(values["run"].string_value)
         assert values["demonstrations.count"].number_value == 3
-        if "layer_norm" in own:
-            assert values["agent_options.layer_norm"].bool_value is True
-            found = values["agent_options.target_entropy"].number_value
-            assert found == own["target_entropy"]
-        assert folder.name.endswith(start.group_name)
+        options = read_record(folder / "record.json").config["agent_options"]
+        for key in {"lr", "penalty", "candidates", "target_entropy"} & options.keys():
+            assert values[f"agent_options.{key}"].number_value == options[key]
         experiment = metadata.parse_experiment_plugin_data(content(metadata.EXPERIMENT_TAG))
         assert set(values) <= {info.name for info in experiment.hparam_infos}
-        assert {info.name for info in experiment.hparam_infos if info.differs} == IDENTITY
         end = metadata.parse_session_end_info_plugin_data(content(metadata.SESSION_END_INFO_TAG))
         assert end.status == api_pb2.STATUS_SUCCESS
         experiments.append(experiment)
     # TensorBoard uses the columns of any one run.
     assert all(experiment == experiments[0] for experiment in experiments)
+    assert experiments[0].hparam_infos[0].name == "run"
     assert [info.name.tag for info in experiments[0].metric_infos] == list(FINAL_METRICS)
-    tags = scalar_tags(broken["equivariant"])
-    assert set(FINAL_METRICS) <= tags | CORRELATIONS
 
 
 def test_the_text_says_what_was_run(broken):
-    for folder in broken.values():
-        record = read_record(folder / "record.json")
-        [event] = load(folder).Tensors("config/text_summary")
-        text = event.tensor_proto.string_val[0].decode()
-        rows = dict(re.findall(r"^\| (\S.*?) \| `(.*)` \|$", text, re.MULTILINE))
-        assert rows["run"] == record.run_id
-        assert rows["commit"].startswith(record.provenance.commit or "unknown")
-        assert f"{record.base_policy.base_success:.0%} of 32 episodes" in rows["its success"]
-        assert f"{record.base_policy.action_std:.2f}" in rows["its steerability"]
-        assert rows["its warning"] == record.base_policy.warning
-        own = record.config["agent_options"]
-        assert rows.get("agent_options.lr") == (str(own["lr"]) if "lr" in own else None)
-        assert rows["evaluation.final_episodes"] == "5"
+    record = read_record(broken["equivariant"] / "record.json")
+    [event] = load(broken["equivariant"]).Tensors("config/text_summary")
+    text = event.tensor_proto.string_val[0].decode()
+    rows = dict(re.findall(r"^\| (\S.*?) \| `(.*)` \|$", text, re.MULTILINE))
+    assert rows["run_id"] == record.run_id
+    assert rows.get("provenance.commit") == record.provenance.commit
+    assert rows["base_policy.warning"] == record.base_policy.warning
+    assert rows["agent_options.lr"] == str(record.config["agent_options"]["lr"])
 
 
 def test_the_final_evaluation_has_a_picture(broken):
@@ -317,28 +267,14 @@ def test_the_final_evaluation_has_a_picture(broken):
         pixels = np.asarray(Image.open(io.BytesIO(event.encoded_image_string)))
         assert pixels.shape[2] == 3
         assert pixels.std() > 10
-        others = {"eval/frames", "eval/film"} if rendering_works() else set()
-        assert set(load(folder).Tags()["images"]) == {"eval/paths"} | others
-
-
-def test_a_film_is_an_animated_picture(finished, tmp_path):
-    log = RunLog(tmp_path, read_record(finished[1] / "record.json"))
-    frames = [np.full((40, 60, 3), level, np.uint8) for level in (0, 120, 240)]
-    log.film("eval/film", frames, 5, 320)
-    log.finish()
-    [event] = load(tmp_path).Images("eval/film")
-    assert (event.step, event.width, event.height) == (320, 60, 40)
-    film = Image.open(io.BytesIO(event.encoded_image_string))
-    assert (film.format, film.n_frames) == ("GIF", 3)
 
 
 def test_a_picture_that_fails_does_not_harm_the_run(finished, monkeypatch, capsys):
     def fail(*args):
         raise OSError("no fonts")
 
-    monkeypatch.setattr(observers, "draw_paths", fail)
-    _, folder = finished
-    other = execute(tiny_config(agent="zero"), folder.parent, progress=True)
+    monkeypatch.setattr(scalars, "draw_paths", fail)
+    other = execute(tiny_config(agent="zero"), finished[1].parent, quiet=False)
     assert read_record(other / "record.json").status == "finished"
     assert load(other).Tags()["images"] == []
     assert "no fonts" in "".join(capsys.readouterr())
@@ -347,16 +283,15 @@ def test_a_picture_that_fails_does_not_harm_the_run(finished, monkeypatch, capsy
 def test_a_full_disk_is_reported_in_one_sentence(finished, tmp_path, monkeypatch):
     record = read_record(finished[1] / "record.json")
     log = RunLog(tmp_path, record)
-    # TensorBoard raises errors of its writing thread in later calls.
-    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    # TensorBoard raises errors of its writing thread in later calls.
     def fail(*args):
-        raise full
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(log.writer.file_writer.event_writer._async_writer, "write", fail)
     with pytest.raises(UserError, match=r"cannot write TensorBoard's events .*No space left"):
         log.scalars({"eval/success_once": 0.5}, 0)
-    log.finish()
+    log.end(finished=True)
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="cannot write TensorBoard's events"):
         RunLog(tmp_path / "file" / "run", record)

@@ -12,10 +12,9 @@ import pytest
 from symsteer.agents.standard import StandardAgent
 from symsteer.agents.team import Team
 from symsteer.bench.runs.folder import run_id
-from symsteer.bench.runs.run import execute
 from symsteer.bench.runs.together import _next, execute_together
 from symsteer.leaderboard.records import read_record
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import execute, quiet, tiny_config
 
 pytestmark = pytest.mark.long
 
@@ -26,31 +25,24 @@ def configs(agent="standard", seeds=SEEDS, **changes):
     return [tiny_config(agent, seed=seed, **changes) for seed in seeds]
 
 
-def outcome(folder):
-    """What an episode-by-episode comparison needs: successes, returns, and rounded diagnostics."""
-    record = read_record(folder / "record.json")
-    return record, [
-        (e.env_steps, e.updates, e.episodes.seed, e.episodes.success_once)
-        for e in record.evaluations
-    ]
-
-
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory, lend):
     """The folder of runs that were executed one after the other."""
     out = tmp_path_factory.mktemp("alone")
     lend(out)
     for config in configs():
-        execute(config, out, progress=False)
+        execute(config, out)
     return out
 
 
 def assert_same(folder, other):
-    (mine, points), (theirs, others) = outcome(folder), outcome(other)
+    """Equal episode by episode, with diagnostics but for rounding."""
+    mine, theirs = (read_record(one / "record.json") for one in (folder, other))
     assert mine.status == theirs.status == "finished"
-    assert points == others
     assert mine.budget == theirs.budget
     for e, f in zip(mine.evaluations, theirs.evaluations, strict=True):
+        assert (e.env_steps, e.updates) == (f.env_steps, f.updates)
+        assert e.episodes.success_once == f.episodes.success_once
         for key, value in e.diagnostics.items():
             wanted = f.diagnostics[key]
             if wanted is not None:
@@ -58,35 +50,27 @@ def assert_same(folder, other):
             assert value == wanted, key
 
 
-@pytest.fixture(scope="module")
-def team(tmp_path_factory):
-    """The folder of the same runs, executed together."""
-    out = tmp_path_factory.mktemp("team")
+def test_the_records_are_those_of_single_runs(alone, tmp_path):
     begin = time.perf_counter()
-    assert execute_together(configs(), out) == [None] * len(SEEDS)
-    (out / "seconds").write_text(str(time.perf_counter() - begin))
-    return out
-
-
-def test_the_records_are_those_of_single_runs(alone, team):
+    assert execute_together(configs(), quiet(out=tmp_path)) == [None] * len(SEEDS)
+    seconds, total = time.perf_counter() - begin, 0.0
+    before = {}
     for config in configs():
         name = run_id(config, {})
-        assert_same(team / name, alone / name)
-        assert read_record(team / name / "record.json").provenance.together == len(SEEDS)
+        assert_same(tmp_path / name, alone / name)
+        record = read_record(tmp_path / name / "record.json")
+        assert record.provenance.together == len(SEEDS)
         assert read_record(alone / name / "record.json").provenance.together == 1
-
-
-def test_the_time_of_a_run_does_not_contain_that_of_the_others(team):
-    total = 0.0
-    for config in configs():
-        clock = read_record(team / run_id(config, {}) / "record.json").wall_clock
-        parts = sum(
-            getattr(clock, part)
-            for part in ("simulate", "decode", "update", "evaluate", "diagnose")
-        )
-        assert 0 < clock.update < parts <= clock.total
+        # The time of a run does not contain that of the others.
+        clock = record.wall_clock
+        parts = ("simulate", "decode", "update", "evaluate", "diagnose")
+        assert 0 < clock.update < sum(getattr(clock, part) for part in parts) <= clock.total
         total += clock.total
-    assert total <= float((team / "seconds").read_text())
+        before[tmp_path / name / "record.json"] = (tmp_path / name / "record.json").read_bytes()
+    assert total <= seconds
+    # Finished runs are left alone.
+    assert execute_together(configs(), quiet(out=tmp_path)) == [None] * len(SEEDS)
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_runs_that_are_behind_are_served_first():
@@ -98,7 +82,7 @@ def test_runs_that_are_behind_are_served_first():
         return SimpleNamespace(index=index, agent=agent)
 
     ahead, behind, other, last = member(0, 8), member(1, 5), member(2, 5, "other"), member(3, 5)
-    assert _next([ahead, last, behind]) == [behind, last]
+    assert _next([ahead, behind, last]) == [behind, last]
     assert _next([other, ahead, behind, last]) == [other]
     assert _next([ahead]) == [ahead]
 
@@ -120,14 +104,14 @@ def test_a_killed_team_continues(lend, tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "save_checkpoint", save)
     changed = [dataclasses.replace(config, checkpoint_every=5) for config in configs()]
     with pytest.raises(KeyboardInterrupt):
-        execute_together(changed, tmp_path)
+        execute_together(changed, quiet(out=tmp_path))
     states = [json.loads((tmp_path / run_id(c, {}) / "record.json").read_text()) for c in changed]
     assert {state["status"] for state in states} == {"interrupted"}
     monkeypatch.setattr(trainer, "save_checkpoint", stock)
-    assert execute_together(changed, tmp_path) == [None] * len(SEEDS)
+    assert execute_together(changed, quiet(out=tmp_path)) == [None] * len(SEEDS)
     out = tmp_path / "undisturbed"
     lend(out)
-    assert execute_together(changed, out) == [None] * len(SEEDS)
+    assert execute_together(changed, quiet(out=out)) == [None] * len(SEEDS)
     for config in changed:
         assert_same(tmp_path / run_id(config, {}), out / run_id(config, {}))
 
@@ -142,7 +126,7 @@ def test_an_error_of_one_run_does_not_stop_the_others(alone, lend, tmp_path, mon
         stock(self, transition)
 
     monkeypatch.setattr(StandardAgent, "observe", observe)
-    first, error = execute_together(configs(), tmp_path)
+    first, error = execute_together(configs(), quiet(out=tmp_path))
     assert first is None
     assert "not finite" in str(error)
     names = [run_id(config, {}) for config in configs()]
@@ -154,35 +138,16 @@ def test_an_error_of_one_run_does_not_stop_the_others(alone, lend, tmp_path, mon
 
 @pytest.mark.slow
 def test_an_error_of_an_update_ends_its_team_alone(tmp_path, monkeypatch):
-    """The run of another kind, which shares the process, goes on."""
+    """Runs that cannot be members share the process, and go on."""
 
     def update(self, batches):
         raise RuntimeError("out of memory")
 
     monkeypatch.setattr(Team, "update", update)
-    mixed = [*configs(), *configs("equivariant", seeds=(0,))]
-    first, second, other = execute_together(mixed, tmp_path)
+    mixed = [*configs(), *configs("equivariant", seeds=(0,)), *configs("zero", seeds=(0,))]
+    first, second, *others = execute_together(mixed, quiet(out=tmp_path))
     assert "out of memory" in str(first)
     assert "out of memory" in str(second)
-    assert other is None
+    assert others == [None, None]
     found = [read_record(tmp_path / run_id(c, {}) / "record.json").status for c in mixed]
-    assert found == ["failed", "failed", "finished"]
-
-
-@pytest.mark.slow
-def test_runs_that_cannot_be_a_team_share_a_process_all_the_same(tmp_path):
-    mixed = [
-        *configs("zero", seeds=(0,)),
-        *configs(seeds=(0,)),
-        *configs("equivariant", seeds=(0,)),
-    ]
-    assert execute_together(mixed, tmp_path) == [None] * 3
-    for config in mixed:
-        assert read_record(tmp_path / run_id(config, {}) / "record.json").status == "finished"
-
-
-def test_finished_runs_are_left_alone(team):
-    paths = [team / run_id(config, {}) / "record.json" for config in configs()]
-    before = [path.read_bytes() for path in paths]
-    assert execute_together(configs(), team) == [None] * len(SEEDS)
-    assert [path.read_bytes() for path in paths] == before
+    assert found == ["failed", "failed", "finished", "finished"]

@@ -6,20 +6,24 @@ import struct
 import sys
 from importlib.machinery import PathFinder
 
-import numpy as np
 import pytest
-from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from symsteer.bench.cli import run, sweep
-from symsteer.bench.runs.arguments import parse_run
 from symsteer.bench.runs.folder import run_id
-from symsteer.bench.runs.run import execute, resume
-from symsteer.bench.runs.tracking import Tracking, WandbLog, checked
+from symsteer.bench.runs.tracking import check_tracking
 from symsteer.bench.sweep.work import play
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
-from tests.bench.tiny_run import stop, tiny_config, without_clock, write_suite
+from tests.bench.tiny_run import (
+    execute,
+    quiet,
+    resume,
+    stop,
+    tiny_config,
+    without_clock,
+    write_suite,
+)
 
 pytestmark = pytest.mark.long
 
@@ -121,7 +125,7 @@ def assert_mirrored(shown, folder):
 
 def test_a_tracked_run_has_the_same_record_and_its_scalars_are_in_wandb(finished, out, capsys):
     config, folder = finished
-    tracked = execute(config, out, progress=False, tracking=checked("wandb", "suite"))
+    tracked = execute(config, out, track="wandb", group="suite")
     assert without_clock(tracked) == without_clock(folder)
     assert tracked.name == folder.name
     [(run, points)] = read(tracked)
@@ -137,8 +141,8 @@ def test_a_tracked_run_has_the_same_record_and_its_scalars_are_in_wandb(finished
 
 def test_a_continued_run_goes_on_in_wandb_without_points_twice(out):
     config = tiny_config(env_steps=480, checkpoint_every=60)
-    folder = stop(config, out, 320, tracking=Tracking("suite"))
-    assert resume(folder, progress=False, tracking=Tracking()) == folder
+    folder = stop(config, out, 320, track="wandb", group="suite")
+    assert resume(folder, track="wandb") == folder
     (first, before), (second, after) = read(folder)
     assert first.run_id == second.run_id
     assert first.run_group == second.run_group == "suite"
@@ -151,7 +155,7 @@ def test_a_continued_run_goes_on_in_wandb_without_points_twice(out):
 
 def test_runs_of_one_process_are_runs_of_their_own_in_wandb(out):
     configs = tuple(tiny_config(agent=agent) for agent in ("zero", "base"))
-    assert play(configs, out, 0, Tracking("suite")).status == "done"
+    assert play(configs, quiet(out=out, track="wandb", group="suite"), 0).status == "done"
     ids = set()
     for config in configs:
         folder = out / run_id(config, {})
@@ -173,19 +177,6 @@ def test_a_sweep_tracks_its_runs_as_a_group(out):
     assert_mirrored(points, folder)
 
 
-def test_a_film_is_in_wandb(finished, tmp_path):
-    record = read_record(finished[1] / "record.json")
-    log = WandbLog(tmp_path, record, Tracking())
-    log.scalars({"eval/return": -1.0}, 320)
-    # Pictures of a reference belong to step 0, and its line goes to the end of the budget.
-    log.film("eval/film", [np.full((40, 60, 3), 80 * i, np.uint8) for i in range(3)], 5, 0)
-    log.finish()
-    [(_, points)] = read(tmp_path)
-    assert points["eval/film/_type"] == {320: "video-file"}
-    [film] = tmp_path.glob("wandb/offline-run-*/files/media/videos/eval/*.gif")
-    assert Image.open(film).n_frames == 3
-
-
 @pytest.mark.parametrize("method", ["init", "log", "finish"])
 def test_a_run_does_not_end_with_the_tracking(method, out, monkeypatch, capsys):
     def fail(*args, **options):
@@ -194,7 +185,7 @@ def test_a_run_does_not_end_with_the_tracking(method, out, monkeypatch, capsys):
     monkeypatch.setattr(wandb if method == "init" else wandb.Run, method, fail)
     if method != "finish":
         monkeypatch.setattr(wandb, "Image", fail)  # is not even asked for
-    folder = execute(tiny_config("zero"), out, progress=False, tracking=Tracking())
+    folder = execute(tiny_config("zero"), out, track="wandb")
     assert read_record(folder / "record.json").status == "finished"
     assert scalars(folder)
     said = [line for line in capsys.readouterr().out.splitlines() if "goes on" in line]
@@ -202,23 +193,17 @@ def test_a_run_does_not_end_with_the_tracking(method, out, monkeypatch, capsys):
 
 
 def test_a_damaged_state_begins_a_new_run_in_wandb(out):
-    folder = stop(tiny_config("zero"), out, 0, tracking=Tracking())
+    folder = stop(tiny_config("zero"), out, 0, track="wandb")
     (folder / "wandb.json").write_text('{"id": 3}')
-    resume(folder, progress=False, tracking=Tracking())
+    resume(folder, track="wandb")
     (first, _), (second, points) = read(folder)
     assert first.run_id != second.run_id
     assert_mirrored(points, folder)
 
 
-def test_whether_it_is_tracked_is_no_part_of_a_run():
-    config, options = parse_run(["--track", "wandb"])
-    assert options.track == "wandb"
-    assert config == parse_run([])[0]
-    assert parse_run([])[1].track is None
-    assert checked(None) is None
-
-
 def test_mistakes_are_told_before_anything_is_built(monkeypatch, tmp_path):
+    check_tracking(None)
+
     def refused():
         with pytest.raises(UserError) as error:
             run(["--out", str(tmp_path / "runs"), "--track", "wandb"])

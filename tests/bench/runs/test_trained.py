@@ -11,10 +11,11 @@ import symsteer
 from symsteer.bench.runs.checkpoint import load_checkpoint, save_checkpoint
 from symsteer.bench.runs.folder import is_finished, run_id
 from symsteer.bench.runs.reproduce import reproduce
-from symsteer.bench.runs.run import evaluate, resume
+from symsteer.bench.runs.run import evaluate
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import config_hash, read_record
+from tests.bench.tiny_run import quiet, resume
 
 
 def success(run, count, **options):
@@ -45,16 +46,10 @@ def test_a_loaded_run_plays_what_its_record_says(finished):
     assert torch.equal(actions, steered[:, : run.policy.execute])
     assert torch.equal(run.act(obs.numpy()), actions)
     assert not torch.equal(run.act(obs, deterministic=False), actions)
-
-
-def test_a_loaded_run_acts_in_another_variant(finished):
-    run = symsteer.load(str(finished[1]))
-    env = run.make_env(num_envs=2, variant="action_gain:1")
-    assert [variant.name for variant in env.variants] == ["action_gain"]
-    env.close()
-    env = run.make_env(num_envs=2)
-    assert env.variants == ()
-    env.close()
+    for variant, names in (("action_gain:1", ["action_gain"]), (None, [])):
+        env = run.make_env(num_envs=2, variant=variant)
+        assert [one.name for one in env.variants] == names
+        env.close()
 
 
 def made_on_a_gpu(finished, tmp_path, option):
@@ -94,9 +89,9 @@ def test_a_run_of_a_gpu_is_used_without_one(finished, tmp_path):
     before = {path: path.read_bytes() for path in of_a_gpu.iterdir() if path.is_file()}
     message = "was begun with --device cuda, but torch finds no CUDA device here"
     with pytest.raises(UserError, match=message):
-        resume(of_a_gpu, progress=False)
+        resume(of_a_gpu)
     with pytest.raises(UserError, match=message):
-        reproduce(of_a_gpu)
+        reproduce(of_a_gpu, None, quiet())
     assert before == {path: path.read_bytes() for path in of_a_gpu.iterdir() if path.is_file()}
     simulated = made_on_a_gpu(finished, tmp_path, "sim")
     assert symsteer.load(simulated).act(obs).isfinite().all()

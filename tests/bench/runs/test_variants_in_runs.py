@@ -3,14 +3,12 @@
 import pytest
 
 from symsteer.bench.runs import evaluator
-from symsteer.bench.runs.observers import observers_of
-from symsteer.bench.runs.run import execute
-from symsteer.bench.runs.trainer import Observer
+from symsteer.bench.runs.observers import TerminalProgress
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from symsteer.variant import variant_text
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import execute, tiny_config
 
 
 def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, monkeypatch):
@@ -25,7 +23,7 @@ def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, mon
     monkeypatch.setattr(evaluator, "make", noting)
     variant = "spawn_sector:1+directional_reward:0.5"
     config = tiny_config(variant=variant, env_steps=160)
-    record = read_record(execute(config, folder.parent, progress=False) / "record.json")
+    record = read_record(execute(config, folder.parent) / "record.json")
     # Held-out episodes and those that Q is compared with have environments of their own.
     assert made.count(variant) == 1
     assert set(made) == {"directional_reward:0.5", variant}
@@ -51,21 +49,20 @@ def test_the_world_may_break_in_the_course_of_a_run(finished, monkeypatch):
         made.append((kwargs["num_envs"], variant_text(kwargs["variant"])))
         return make(task, **kwargs)
 
-    class Noting(Observer):
+    class Noting(TerminalProgress):
         def paused(self, run):
             begun.append(run.env_steps)
 
         def evaluated(self, run, evaluation):
+            super().evaluated(run, evaluation)
             evaluated.append((run.env_steps, variant_text(run.evaluator.variants)))
 
     monkeypatch.setattr(evaluator, "make", noting)
-    monkeypatch.setattr(
-        "symsteer.bench.runs.run.observers_of", lambda *args: [*observers_of(*args), Noting()]
-    )
+    monkeypatch.setattr("symsteer.bench.runs.run.TerminalProgress", Noting)
     config = tiny_config(
         variant="action_gain:1@0.25..0.75+wind:0.5@0.5", env_steps=320, checkpoint_every=28
     )
-    record = read_record(execute(config, folder.parent, progress=False) / "record.json")
+    record = read_record(execute(config, folder.parent) / "record.json")
     # 28 steps of 4 environments, and the ends of the ramp at 80 and 240, and the step at 160.
     assert begun == [80, 160, 240, 320]
     training = [text for count, text in made if count == config.num_envs]
@@ -79,5 +76,5 @@ def test_the_world_may_break_in_the_course_of_a_run(finished, monkeypatch):
 def test_an_obstacle_cannot_be_drawn_for_each_episode(tmp_path):
     config = tiny_config(variant="obstacle:0..1")
     with pytest.raises(UserError, match="built with the scene"):
-        execute(config, tmp_path, progress=False)
+        execute(config, tmp_path)
     assert not list(tmp_path.iterdir())

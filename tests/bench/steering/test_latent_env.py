@@ -5,7 +5,7 @@ import torch
 
 from symsteer.bench.steering.evaluation import long_episodes, long_limit, rollout, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
-from symsteer.bench.steering.seeds import HELD_OUT_SEED, held_out_seeds
+from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
@@ -227,10 +227,6 @@ def test_steerability_of_an_untrained_policy_warns(env):
     policy = untrained_policy()
     latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
     report = steerability(latent, policy, seed=0, states=2, draws=4)
-    assert report.episodes == 8
-    assert report.solvable < 0.9
-    assert "initial states" in report.warning
-
-
-def test_held_out_seeds_are_fixed_and_apart():
-    assert held_out_seeds(3) == [HELD_OUT_SEED, HELD_OUT_SEED + 1, HELD_OUT_SEED + 2]
+    assert report["episodes"] == 8
+    assert report["solvable"] < 0.9
+    assert "initial states" in report["warning"]

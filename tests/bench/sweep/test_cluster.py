@@ -11,7 +11,6 @@ import psutil
 import pytest
 
 from symsteer.bench.runs.folder import CHECKPOINT, LOCK
-from symsteer.bench.runs.run import execute
 from symsteer.bench.sweep import cluster as cluster_module
 from symsteer.bench.sweep.cluster import RayCluster
 from symsteer.bench.sweep.command import run_plan
@@ -20,7 +19,7 @@ from symsteer.bench.sweep.suite import Suite
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG, wait_for
-from tests.bench.tiny_run import tiny_config, without_clock
+from tests.bench.tiny_run import execute, tiny_config, without_clock
 
 MACHINE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
 
@@ -128,5 +127,5 @@ def test_a_machine_dies_and_nothing_is_lost(cluster, undisturbed, tmp_path, caps
     assert capsys.readouterr().out.count("finished  [") == 2
     assert read_record(run / "record.json").wall_clock.resumed == 1
     assert without_clock(run) == without_clock(undisturbed)
-    alone = execute(other, undisturbed.parent, progress=False)
+    alone = execute(other, undisturbed.parent)
     assert without_clock(out / alone.name) == without_clock(alone)

@@ -10,13 +10,12 @@ import torch
 
 from symsteer.bench.audit.result import AuditSettings
 from symsteer.bench.demos import collect, load
-from symsteer.bench.runs.run import execute
 from symsteer.bench.sim import rendering_works
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.clouds import POINTS, thinned
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import execute, tiny_config
 
 needs_vulkan = pytest.mark.skipif(not rendering_works(), reason="needs a Vulkan driver")
 SEEN = ["SeenPushCube-v1", "SeenPickCube-v1"]
@@ -184,7 +183,7 @@ def test_a_policy_is_trained_on_clouds_and_steered(tmp_path):
     demos = load(path, SEEN[0], "floating")
     assert demos.episodes[0][0].shape[1] == demos.observation_layout.dim
     config = tiny_config(task=SEEN[0], env_steps=80, num_envs=2)
-    folder = execute(config, tmp_path / "runs", progress=False)
+    folder = execute(config, tmp_path / "runs")
     record = read_record(folder / "record.json")
     assert record.status == "finished"
     assert record.base_policy.solvable is not None
