@@ -64,6 +64,7 @@ class RecordWriter(Observer):
 
     def _open(self, run: Trainer, provenance: Provenance) -> None:
         config, counts, feasible = run.config, run.agent.parameter_counts(), run.feasible
+        sizes = {key: counts[key] for key in ("actor", "critic", "total")}
         self.record = RunRecord(
             run_id=run.folder.name,
             role=run.agent.role,
@@ -76,7 +77,7 @@ class RecordWriter(Observer):
                 "first_held_out": HELD_OUT_SEED,
             },
             started=datetime.now(UTC),
-            parameters=Parameters.model_validate({**counts, "width": counts["width"] or None}),
+            parameters=Parameters(**sizes, width=counts["width"] or None),
             base_policy=describe_base(run.policy),
             feasible_q=FeasibleQ(low=feasible[0], high=feasible[1]) if run.has_critic else None,
         )

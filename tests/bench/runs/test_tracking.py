@@ -1,18 +1,17 @@
-"""Runs in Weights & Biases: what its offline files hold, and that a run never depends on it."""
+"""Runs in Weights & Biases: what is logged there, and that a run never depends on it."""
 
-import json
 import shutil
-import struct
 import sys
 from importlib.machinery import PathFinder
+from types import SimpleNamespace
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from symsteer.bench.cli import run, sweep
 from symsteer.bench.runs.folder import run_id
+from symsteer.bench.runs.together import execute_together
 from symsteer.bench.runs.tracking import check_tracking
-from symsteer.bench.sweep.work import play
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import (
@@ -28,9 +27,6 @@ from tests.bench.tiny_run import (
 pytestmark = pytest.mark.long
 
 wandb = pytest.importorskip("wandb")
-
-BLOCK = 32768
-"""Bytes of a block of W&B's files, which are logs of LevelDB."""
 
 
 @pytest.fixture(autouse=True)
@@ -55,48 +51,24 @@ def out(finished, tmp_path):
     return tmp_path
 
 
-def records_of(path):
-    """The protocol buffers in a file of W&B."""
-    from wandb.proto.wandb_internal_pb2 import Record
+@pytest.fixture
+def begun(monkeypatch):
+    """What is logged, in place of W&B: for each of its runs the options, points, and exit code."""
+    runs = []
 
-    data, position, parts = path.read_bytes(), 7, b""
-    while position + 7 <= len(data):
-        if BLOCK - position % BLOCK < 7:
-            position += BLOCK - position % BLOCK
-            continue
-        size, kind = struct.unpack_from("<HB", data, position + 4)
-        parts += data[position + 7 : position + 7 + size]
-        position += 7 + size
-        if kind in (1, 4):  # a whole record, or the last part of one
-            record, parts = Record(), parts
-            record.ParseFromString(parts)
-            parts = b""
-            yield record
+    def init(**options):
+        run = SimpleNamespace(options=options, points={}, code=None, offline=False, url="there")
 
+        def log(values, step):
+            for tag, value in values.items():
+                run.points.setdefault(tag, {})[step] = value
 
-def read(folder):
-    """What each process has written for a run: its facts, and its points by tag."""
-    wandb.teardown()  # its service may still be writing when a run has finished
-    found = []
-    for path in sorted(folder.glob("wandb/offline-run-*/*.wandb")):
-        points: dict[str, dict[int, float]] = {}
-        for record in records_of(path):
-            if record.WhichOneof("record_type") == "run":
-                run = record.run
-            if record.WhichOneof("record_type") == "history":
-                row = {
-                    "/".join(item.nested_key) or item.key: json.loads(item.value_json)
-                    for item in record.history.item
-                }
-                for tag, value in row.items():
-                    if not tag.startswith("_"):
-                        points.setdefault(tag, {})[row["_step"]] = value
-        found.append((run, points))
-    return found
+        run.log, run.finish = log, lambda exit_code: setattr(run, "code", exit_code)
+        runs.append(run)
+        return run
 
-
-def config_of(run):
-    return {item.key: json.loads(item.value_json) for item in run.config.update}
+    monkeypatch.setattr(wandb, "init", init)
+    return runs
 
 
 def scalars(folder):
@@ -112,93 +84,83 @@ def scalars(folder):
 def assert_mirrored(shown, folder):
     """W&B has TensorBoard's points, and one of each level line."""
     wanted = scalars(folder)
-    assert set(wanted) <= set(shown)
+    assert set(shown) == {*wanted, "eval/paths"}
     for tag, points in wanted.items():
-        found = {step: float(value) for step, value in shown[tag].items()}
         if tag.startswith("reference/"):
             points = {0: points[0]}
         if tag.startswith("time/"):  # a continued run repeats steps, at other times
-            assert found.keys() == points.keys()
+            assert shown[tag].keys() == points.keys()
         else:
-            assert found == pytest.approx(points, rel=1e-6, nan_ok=True), tag
+            assert shown[tag] == pytest.approx(points, rel=1e-6, nan_ok=True), tag
 
 
-def test_a_tracked_run_has_the_same_record_and_its_scalars_are_in_wandb(finished, out, capsys):
+def test_a_tracked_run_has_the_same_record_and_wandb_has_its_points(finished, out, capsys):
+    """Also beside another run in one process."""
     config, folder = finished
-    tracked = execute(config, out, track="wandb", group="suite")
+    other = tiny_config("zero")
+    how = quiet(out=out, track="wandb", group="suite")
+    assert execute_together([config, other], how) == [None, None]
+    wandb.teardown()  # its service may still be writing when a run has finished
+    tracked = out / folder.name
     assert without_clock(tracked) == without_clock(folder)
-    assert tracked.name == folder.name
-    [(run, points)] = read(tracked)
-    record = read_record(tracked / "record.json")
-    assert (run.project, run.run_group, run.display_name) == ("symsteer", "suite", record.run_id)
-    assert run.job_type == "learner"
-    assert config_of(run)["agent_options"] == record.config["agent_options"]
-    assert config_of(run)["commit"] == record.provenance.commit
-    assert_mirrored(points, tracked)
-    assert points["eval/paths/_type"] == {record.budget.env_steps: "image-file"}
+    [beside] = (out / run_id(other, {})).glob("wandb/offline-run-*/*.wandb")
+    assert run_id(other, {}).encode() in beside.read_bytes()
+    [file] = tracked.glob("wandb/offline-run-*/*.wandb")
+    content = file.read_bytes()
+    for text in (tracked.name, "symsteer", "suite", "learner", "losses/critic", "commit"):
+        assert text.encode() in content
+    assert list(file.parent.glob("files/media/images/eval/paths*.png"))
     assert f"wandb sync {tracked}" in capsys.readouterr().out.replace("\n", "")
 
 
-def test_a_continued_run_goes_on_in_wandb_without_points_twice(out):
+def test_a_continued_run_goes_on_in_wandb_without_points_twice(out, begun):
     config = tiny_config(env_steps=480, checkpoint_every=60)
     folder = stop(config, out, 320, track="wandb", group="suite")
     assert resume(folder, track="wandb") == folder
-    (first, before), (second, after) = read(folder)
-    assert first.run_id == second.run_id
-    assert first.run_group == second.run_group == "suite"
-    for tag in before:
-        assert max(before[tag]) < min(after.get(tag, [10**9])), tag
-    assert_mirrored(
-        {tag: before.get(tag, {}) | after.get(tag, {}) for tag in before | after}, folder
-    )
-
-
-def test_runs_of_one_process_are_runs_of_their_own_in_wandb(out):
-    configs = tuple(tiny_config(agent=agent) for agent in ("zero", "base"))
-    assert play(configs, quiet(out=out, track="wandb", group="suite"), 0).status == "done"
-    ids = set()
-    for config in configs:
-        folder = out / run_id(config, {})
-        [(run, points)] = read(folder)
-        ids.add(run.run_id)
-        assert run.display_name == folder.name
-        assert_mirrored(points, folder)
-        assert list(points["eval/paths/_type"].values()) == ["image-file"]
-    assert len(ids) == 2
+    first, second = begun
+    for key in ("id", "group", "name"):
+        assert first.options[key] == second.options[key]
+    assert (first.options["group"], first.options["project"]) == ("suite", "symsteer")
+    assert (first.code, second.code) == (1, 0)
+    for tag in first.points:
+        assert max(first.points[tag]) < min(second.points.get(tag, [10**9])), tag
+    tags = first.points | second.points
+    both = {tag: first.points.get(tag, {}) | second.points.get(tag, {}) for tag in tags}
+    assert_mirrored(both, folder)
+    # A damaged state begins a new run there.
+    other = stop(tiny_config("zero"), out, 0, track="wandb")
+    (other / "wandb.json").write_text('{"id": 3}')
+    resume(other, track="wandb")
+    assert begun[2].options["id"] != begun[3].options["id"]
+    assert_mirrored(begun[3].points, other)
 
 
 @pytest.mark.slow
 def test_a_sweep_tracks_its_runs_as_a_group(out):
     config = tiny_config(agent="zero")
     assert sweep(write_suite(out, config, "seed = [0]"), out=out, workers=1, track="wandb") == 0
-    folder = out / run_id(config, {})
-    [(run, points)] = read(folder)
-    assert (run.run_group, run.job_type) == ("tiny", "reference")
-    assert_mirrored(points, folder)
+    [file] = (out / run_id(config, {})).glob("wandb/offline-run-*/*.wandb")
+    assert b"tiny" in file.read_bytes()
 
 
 @pytest.mark.parametrize("method", ["init", "log", "finish"])
-def test_a_run_does_not_end_with_the_tracking(method, out, monkeypatch, capsys):
+def test_a_run_does_not_end_with_the_tracking(method, out, begun, monkeypatch, capsys):
     def fail(*args, **options):
         raise wandb.errors.CommError("the network\nis down")
 
-    monkeypatch.setattr(wandb if method == "init" else wandb.Run, method, fail)
-    if method != "finish":
-        monkeypatch.setattr(wandb, "Image", fail)  # is not even asked for
+    init = wandb.init
+
+    def begin(**options):
+        run = init(**options)
+        setattr(run, method, fail)
+        return run
+
+    monkeypatch.setattr(wandb, "init", fail if method == "init" else begin)
     folder = execute(tiny_config("zero"), out, track="wandb")
     assert read_record(folder / "record.json").status == "finished"
     assert scalars(folder)
     said = [line for line in capsys.readouterr().out.splitlines() if "goes on" in line]
     assert said == [f"{folder.name} goes on without Weights & Biases: the network is down"]
-
-
-def test_a_damaged_state_begins_a_new_run_in_wandb(out):
-    folder = stop(tiny_config("zero"), out, 0, track="wandb")
-    (folder / "wandb.json").write_text('{"id": 3}')
-    resume(folder, track="wandb")
-    (first, _), (second, points) = read(folder)
-    assert first.run_id != second.run_id
-    assert_mirrored(points, folder)
 
 
 def test_mistakes_are_told_before_anything_is_built(monkeypatch, tmp_path):
