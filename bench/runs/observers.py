@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import torch
 
+from symsteer.agents.agent import HasCritic
 from symsteer.bench.runs.base_policy import describe_base
 from symsteer.bench.runs.config import content_key
 from symsteer.bench.runs.folder import CHECKPOINT, PROGRESS, RECORD
@@ -68,7 +69,7 @@ class RecordWriter(Observer):
         self.record = RunRecord(
             run_id=run.folder.name,
             role=run.agent.role,
-            config=dict(run.run.resolved),
+            config=dict(run.resolved),
             provenance=provenance,
             seeds={
                 "run": config.seed,
@@ -79,7 +80,9 @@ class RecordWriter(Observer):
             started=datetime.now(UTC),
             parameters=Parameters(**sizes, width=counts["width"] or None),
             base_policy=describe_base(run.policy),
-            feasible_q=FeasibleQ(low=feasible[0], high=feasible[1]) if run.has_critic else None,
+            feasible_q=FeasibleQ(low=feasible[0], high=feasible[1])
+            if isinstance(run.agent, HasCritic)
+            else None,
         )
 
     def _continue(
@@ -88,7 +91,7 @@ class RecordWriter(Observer):
         """Restore the record of the checkpoint."""
         self.record = record = read_record(run.folder / RECORD)
         del record.evaluations[checkpoint["evaluations"] :]
-        mine = (run.folder.name, config_hash(run.run.resolved), checkpoint["history"])
+        mine = (run.folder.name, config_hash(run.resolved), checkpoint["history"])
         if (record.run_id, record.config_hash, _history(record)) != mine:
             raise UserError(
                 f"{run.folder / RECORD} is not the record that {CHECKPOINT} beside it "

@@ -171,7 +171,9 @@ class Means:
         """Count the numbers of each tensor."""
         for name, value in values.items():
             if value.numel():
-                self._new.setdefault(name, []).append(value.detach().flatten())
+                # A copy: the agent may use the same memory again.
+                number = value.detach().flatten().to(torch.float64, copy=True)
+                self._new.setdefault(name, []).append(number)
 
     def take(self) -> dict[str, float]:
         """The means, of names with any numbers."""
@@ -184,6 +186,6 @@ class Means:
         """The numbers of each name that the next means are of."""
         for name, values in self._new.items():
             numbers = self._numbers.setdefault(name, deque(maxlen=self._limit))
-            numbers.extend(torch.cat(values).double().tolist())
+            numbers.extend(torch.cat(values).tolist())
         self._new.clear()
         return {name: list(numbers) for name, numbers in self._numbers.items()}

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 import torch
 
-from symsteer.agents.agent import Budget, HasCritic
+from symsteer.agents.agent import Budget
 from symsteer.agents.replay import Batch
 from symsteer.bench.runs.checkpoint import Counters, fitting, save_checkpoint
 from symsteer.bench.runs.config import Execution, RunConfig
@@ -100,7 +100,7 @@ class Trainer(Steered):
         together: int = 1,
     ):
         super().__init__(run.config, policy, new_agent(run.config, policy))
-        self.run, self.folder = run, run.folder
+        self.folder, self.resolved = run.folder, run.resolved
         self.observers, self.how, self.together = observers, how, together
         self.env_steps = self.decisions = self.updates = 0
         self.train_until: int | None = None
@@ -120,11 +120,6 @@ class Trainer(Steered):
         except BaseException as error:
             self.stop(error)
             raise
-
-    @property
-    def has_critic(self) -> bool:
-        """Whether the agent has Q-values to diagnose."""
-        return isinstance(self.agent, HasCritic)
 
     @property
     def seconds(self) -> dict[str, float]:
