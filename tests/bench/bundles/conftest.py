@@ -5,14 +5,13 @@ from pathlib import Path
 import pytest
 
 from symsteer.bench.bundles.bundle import write_bundle
-from symsteer.bench.runs.run import execute
-from tests.bench.tiny_run import tiny_config
+from tests.bench.tiny_run import execute, tiny_config
 
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory) -> Path:
     """The folder of a finished run."""
-    return execute(tiny_config(agent="zero"), tmp_path_factory.mktemp("runs"), progress=False)
+    return execute(tiny_config(agent="zero"), tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture(scope="session")

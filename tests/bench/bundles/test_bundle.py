@@ -19,13 +19,12 @@ from symsteer.bench.bundles.fetch import fetch_bundle, read_bundle
 from symsteer.bench.demos import load
 from symsteer.bench.runs.arguments import parse_run
 from symsteer.bench.runs.base_policy import find_base, prepare_base
-from symsteer.bench.runs.run import execute
 from symsteer.bench.tasks import task_class
 from symsteer.cli import main
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy, save_policy
-from tests.bench.tiny_run import tiny_config, without_clock
+from tests.bench.tiny_run import execute, quiet, tiny_config, without_clock
 
 
 def members(bundle):
@@ -44,7 +43,7 @@ def test_a_run_elsewhere_finds_what_was_unpacked(run, bundle, tmp_path):
     base = tmp_path / "runs" / "base"
     manifest, places = fetch_bundle(bundle, base)
     before = {path: path.stat().st_mtime_ns for path in base.rglob("*.*")}
-    again = execute(tiny_config(agent="zero"), tmp_path / "runs", progress=False)
+    again = execute(tiny_config(agent="zero"), tmp_path / "runs")
     assert without_clock(again) == without_clock(run)
     # Neither the demonstrations nor the policy was made again.
     assert {path: path.stat().st_mtime_ns for path in base.rglob("*.*")} == before
@@ -61,8 +60,8 @@ def test_unpacked_files_are_options_of_a_run(bundle, tmp_path):
     wanted = load_policy(policy).content_hash()
     config = tiny_config(agent="zero")
     demos = places[manifest.path("demonstrations", ".h5")]
-    with_policy = execute(config, tmp_path / "a", policy=policy, progress=False)
-    with_demos = execute(config, tmp_path / "b", demonstrations=demos, progress=False)
+    with_policy = execute(config, tmp_path / "a", base_policy=policy)
+    with_demos = execute(config, tmp_path / "b", demos=demos)
     # Such runs can be taken away, too; where the demonstrations are unknown, without them.
     for made, kind in ((with_policy, "policy"), (with_demos, "demonstrations")):
         assert load_policy(made).content_hash() == wanted
@@ -137,7 +136,7 @@ def test_the_card_gives_what_was_measured(run, bundle):
 
 def test_a_policy_without_symmetry_has_a_large_error(tmp_path):
     config = tiny_config(policy_name="plain")
-    policy = prepare_base(config, tmp_path, progress=False)
+    policy = prepare_base(config, quiet(out=tmp_path))
     plain = measure(config, policy)
     assert plain["group"] == "C8"
     assert plain["equivariance_error"] > 1e-2
