@@ -25,14 +25,18 @@ RETIRED: dict[str, JsonValue] = {
 RETIRED_OF_RUNS: dict[str, JsonValue] = {"keep_replay": False}
 """Options of runs of any agent."""
 
+POLICY_OPTION = "process"
+"""An option of policies that came with those of runs: older configurations have neither."""
+
 SAC_OPTION = "target_entropy"
 """An option that all SAC agents have, and no others."""
 
 
 def with_retired(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration in which no retired option is missing, to compare old and new ones."""
-    whole = {**RETIRED_OF_RUNS, **config}
-    options = config.get("agent_options")
+    policy, options = config.get("policy"), config.get("agent_options")
+    is_old = not isinstance(policy, Mapping) or POLICY_OPTION not in policy
+    whole = dict(config) if is_old else {**RETIRED_OF_RUNS, **config}
     if isinstance(options, Mapping) and SAC_OPTION in options:
         whole["agent_options"] = {**RETIRED, **options}
     return whole

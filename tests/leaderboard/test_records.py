@@ -456,7 +456,10 @@ def test_foreign_files_are_refused(tmp_path: Path, text: bytes, word: str) -> No
 def test_of_an_option_that_is_no_more_one_value_means_the_same() -> None:
     old = make_config(agent_options={"target_entropy": 0.5, **RETIRED})
     new = make_config(agent_options={"target_entropy": 0.5})
-    assert with_retired(new) == with_retired(old) == {**old, "keep_replay": False}
+    assert with_retired(new) == with_retired(old) == old
+    policy = {"name": "edp", "process": "diffusion"}
+    later = [make_config(policy=policy), make_config(policy=policy, keep_replay=False)]
+    assert with_retired(later[0]) == with_retired(later[1]) == later[1]
     assert with_retired(make_config(agent_options={"candidates": 64}))["agent_options"] == {
         "candidates": 64
     }
