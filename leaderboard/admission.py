@@ -25,6 +25,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from symsteer.errors import UserError, first_problem
 from symsteer.leaderboard import catalogue
+from symsteer.leaderboard.keys import Key, RowKey, row_key, seeds_of
+from symsteer.leaderboard.known_agents import row_place
 from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import (
     DERIVED,
@@ -42,8 +44,8 @@ from symsteer.leaderboard.records.provenance import checkout, git
 from symsteer.leaderboard.records.repeat import KEYS
 from symsteer.leaderboard.records.schema import Q_VALUES
 from symsteer.leaderboard.records.values import Count, Sha256
+from symsteer.leaderboard.rows import MIN_SEEDS
 from symsteer.leaderboard.study import all_listed
-from symsteer.leaderboard.summary import MIN_SEEDS, Key, RowKey, row_key, row_place, seeds_of
 from symsteer.variant import file_name, parse_variant, specs_at, variant_text
 
 MIN_EPISODES = 100

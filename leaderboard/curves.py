@@ -1,15 +1,20 @@
-"""Curves over environment steps and over directions: what the figures and the site draw of runs."""
+"""Curves over environment steps and over directions: for figures, the site and a terminal."""
 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from symsteer.leaderboard.row_numbers import summarize
+from symsteer.leaderboard.rows import AgentRow, Table
+from symsteer.leaderboard.runs import Run, aligned, episode_success, load_runs
 from symsteer.leaderboard.statistics import Sample, success_interval
-from symsteer.leaderboard.summary import Row, Run, aligned, episode_success
+from symsteer.tables import aligned as aligned_table
 
 BAND_RESAMPLES = 1000
 
@@ -27,7 +32,7 @@ class Curve:
     high: list[float]
 
 
-def success_curve(row: Row) -> Curve:
+def success_curve(row: AgentRow) -> Curve:
     """The IQM of success over the finished runs of a row, where all of them were evaluated."""
     points = _common(row.finished)
     cells = [
@@ -45,7 +50,7 @@ def _with_bands(steps: list[float], cells: Sequence[Sequence[Sample]]) -> Curve:
     return Curve(steps, [b.value for b in bands], [b.low for b in bands], [b.high for b in bands])
 
 
-def direction_curve(row: Row) -> Curve | None:
+def direction_curve(row: AgentRow) -> Curve | None:
     """The IQM of success at the end by the direction in which an episode has to go.
 
     Steps are the middles of the sectors in degrees, -180 to 180; the first one is the last one
@@ -57,12 +62,12 @@ def direction_curve(row: Row) -> Curve | None:
         if final is None or final.episodes.direction is None:
             continue
         success = episode_success(final)
-        found: list[list[tuple[int, float]]] = [[] for _ in range(SECTORS)]
+        by_sector: list[list[tuple[int, float]]] = [[] for _ in range(SECTORS)]
         for seed, angle in zip(final.episodes.seed, final.episodes.direction, strict=True):
             if angle is not None:
                 sector = round(angle * SECTORS / (2 * math.pi)) % SECTORS
-                found[sector].append((seed, success[seed]))
-        for sector, values in enumerate(found):
+                by_sector[sector].append((seed, success[seed]))
+        for sector, values in enumerate(by_sector):
             if values:
                 sectors[sector].append(Sample.pooled(values, run.policy))
     # Sector 4 of 8 is at 180 degrees, and at -180.
@@ -75,24 +80,20 @@ def direction_curve(row: Row) -> Curve | None:
 
 def series(run: Run, name: str) -> tuple[list[int], list[float]]:
     """Steps and finite values of a diagnostic of one run."""
-    pairs = [
-        (step, value)
-        for step, evaluation in run.curve.items()
-        if (value := evaluation.diagnostics.get(name)) is not None
-    ]
-    return [step for step, _ in pairs], [value for _, value in pairs]
+    values = run.diagnostic(name)
+    return list(values), list(values.values())
 
 
 def mean_series(runs: Sequence[Run], name: str) -> tuple[list[float], list[float]]:
     """Steps and mean of a diagnostic over runs, where all have measured it."""
-    found = [dict(zip(*series(run, name), strict=True)) for run in runs]
+    measured = [run.diagnostic(name) for run in runs]
     points = [
         point
         for point in _common(runs)
-        if all(step in one for step, one in zip(point, found, strict=True))
+        if all(step in values for step, values in zip(point, measured, strict=True))
     ]
     means = [
-        float(np.mean([one[step] for step, one in zip(point, found, strict=True)]))
+        float(np.mean([values[step] for step, values in zip(point, measured, strict=True)]))
         for point in points
     ]
     return _places(points), means
@@ -110,3 +111,40 @@ def _common(runs: Sequence[Run]) -> list[tuple[int, ...]]:
 def _places(points: Sequence[tuple[int, ...]]) -> list[float]:
     """Where points of several runs are drawn: at the median of their steps."""
     return [float(np.median(point)) for point in points]
+
+
+def curves_as_text(records: Sequence[Path]) -> str:
+    """Mean success of each agent at every evaluation, one table per cell.
+
+    Args:
+        records: record files, run folders, or folders of these.
+
+    Raises:
+        UserError: for records that cannot be read.
+    """
+    return "\n\n".join(_cell(table) for table in summarize(load_runs(records)).tables)
+
+
+def _cell(table: Table) -> str:
+    curves = {row.label: _curve(row) for row in table.rows if row.finished}
+    steps = sorted({step for curve in curves.values() for step in curve})
+    world = " and ".join(table.key.broken_by) or "unbroken"
+    rows = [
+        [f"  {name}", *(f"{curve[step]:.0%}" if step in curve else "" for step in steps)]
+        for name, curve in curves.items()
+    ]
+    header = ["  success after steps", *(f"{step}k" for step in steps)]
+    return f"{table.key.task} {table.key.embodiment}, {world}\n{aligned_table(header, rows)}"
+
+
+def _curve(row: AgentRow) -> dict[int, float]:
+    """Mean success of a row's finished runs by thousands of steps.
+
+    A reference does not learn: its one evaluation stands in the last column.
+    """
+    rates: dict[int, list[float]] = defaultdict(list)
+    for run in row.finished:
+        for step, evaluation in run.curve.items():
+            at = run.record.settings.env_steps if evaluation.final else step
+            rates[round(at / 1_000)].append(evaluation.success_once)
+    return {step: float(np.mean(values)) for step, values in rates.items()}

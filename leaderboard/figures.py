@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from symsteer.leaderboard.answer import Gain
-from symsteer.leaderboard.comparisons import THRESHOLDS, Comparisons, Profile
+from symsteer.leaderboard.advantage_by_defect import Fit, Point
+from symsteer.leaderboard.cell_names import beside_variant
 from symsteer.leaderboard.curves import (
     Curve,
     direction_curve,
@@ -24,9 +24,9 @@ from symsteer.leaderboard.curves import (
     series,
     success_curve,
 )
-from symsteer.leaderboard.defects import MEASURES, Defect, DefectMap, Fit, Point
-from symsteer.leaderboard.findings import Findings
-from symsteer.leaderboard.paper import BASE, STANDARD
+from symsteer.leaderboard.defects import AuditedDefect
+from symsteer.leaderboard.known_agents import BASE, STANDARD
+from symsteer.leaderboard.pairs import MEASURES
 from symsteer.leaderboard.plots import (
     FEASIBLE,
     GREY,
@@ -40,8 +40,19 @@ from symsteer.leaderboard.plots import (
     Trace,
     cut,
 )
-from symsteer.leaderboard.summary import MIN_SEEDS, Row, Run, Summary, Table
-from symsteer.leaderboard.tables import beside_variant
+from symsteer.leaderboard.rows import MIN_SEEDS, AgentRow, Table
+from symsteer.leaderboard.runs import Run
+from symsteer.leaderboard.sections import (
+    Findings,
+    defect_map,
+    performance_profiles,
+    probability_of_improvement,
+    what_symmetry_gains,
+)
+from symsteer.leaderboard.sections.defect_map import DefectMap
+from symsteer.leaderboard.sections.performance_profiles import THRESHOLDS, Profile, groups
+from symsteer.leaderboard.sections.probability_of_improvement import Improvement
+from symsteer.leaderboard.sections.what_symmetry_gains import Gain
 from symsteer.leaderboard.text import MARKS, SPACE, ends, interval
 
 STYLES: dict[str, tuple[str, str, Dash]] = {
@@ -106,18 +117,22 @@ def look_of(agent: str, **more: Any) -> Look:
 
 def overall_figures(findings: Findings) -> list[Figure]:
     """Those over all cells, in the order of the page; figures without data are left out."""
-    compared = findings.comparisons
-    figures = [gained(findings.gains)] if findings.gains else []
-    figures += [advantage_map(findings.map, e) for e in findings.map.embodiments]
-    figures += [performance_profiles(compared)] if any(compared.profiles.values()) else []
-    return figures + ([improvement(compared)] if any(compared.improvements.values()) else [])
+    cells = {group: len(tables) for group, tables in groups(findings.summary).items()}
+    gains = findings.of(what_symmetry_gains.SECTION)
+    advantages = findings.of(defect_map.SECTION)
+    profiles = findings.of(performance_profiles.SECTION)
+    improvements = findings.of(probability_of_improvement.SECTION)
+    figures = [gained(gains)] if gains else []
+    figures += [advantage_map(advantages, embodiment) for embodiment in advantages.embodiments]
+    figures += [profile_plots(profiles, cells)] if any(profiles.values()) else []
+    return figures + ([improvement(improvements, cells)] if any(improvements.values()) else [])
 
 
-def render_figures(summary: Summary, findings: Findings) -> list[Figure]:
+def render_figures(findings: Findings) -> list[Figure]:
     """All figures in the order of the page; figures without data are left out."""
     figures = overall_figures(findings)
     places: dict[tuple[str, str], list[Table]] = {}
-    for table in summary.tables:
+    for table in findings.summary.tables:
         if table.runs:
             places.setdefault((table.key.task, table.key.embodiment), []).append(table)
     for tables in places.values():
@@ -148,7 +163,7 @@ def _entries(agents: Mapping[str, str]) -> dict[str, Look]:
     return {name: look_of(agent, size=5) for name, agent in agents.items()}
 
 
-def _success(row: Row) -> list[Trace]:
+def _success(row: AgentRow) -> list[Trace]:
     """Single runs of a row, and what they have in common."""
     name, few = cut(row.label), 1 < len(row.finished) < MIN_SEEDS
     shown = [run for run in row.runs if not (run.finished and row.is_reference)]
@@ -210,7 +225,7 @@ def is_crowded(table: Table) -> bool:
     return len(table.learners) >= MANY
 
 
-def _q(row: Row, many: bool) -> list[Trace]:
+def _q(row: AgentRow, many: bool) -> list[Trace]:
     """Q of single runs, its mean and that of fresh returns."""
     name, look = cut(row.label), look_of(row.agent, width=1.7, size=4)
     runs = [run for run in row.runs if run.record.has_critic]
@@ -258,7 +273,7 @@ def run_curves(run: Run) -> Figure:
     alone: dict[str, Any] = {"look": look, "single": False}
     steps, share = _steps(run.record.settings.env_steps), Axis("success_once", SHARE)
     plots = [Plot(steps, share, [replace(_single_success(name, run), **alone)], title="Success")]
-    if run.diagnostics("q_mean"):
+    if run.diagnostic("q_mean"):
         fresh = replace(look, dash="none", hollow=True)
         traces = [replace(_single_q(name, run), **alone)]
         traces.append(Trace(name, *series(run, "return_mean"), fresh, label=FRESH))
@@ -440,22 +455,22 @@ def by_rows(
     return Figure(plots, columns=len(plots), same_y=True, **more)
 
 
-def performance_profiles(found: Comparisons) -> Figure:
+def profile_plots(by_group: Mapping[str, Sequence[Profile]], cells: Mapping[str, int]) -> Figure:
     """Share of runs that close at least a share of the gap to certain success, with 95 % bands."""
     title, legend, plots = "share of the gap from the base to certain success", {}, []
-    for group, profiles in found.profiles.items():
+    for group, profiles in by_group.items():
         traces = []
         for profile in profiles:
             name, is_reference = cut(profile.agent), profile.role == "reference"
             legend[name] = replace(look_of(profile.agent, width=1.7), marker="")
-            some = profile.cells < found.cells[group]
+            some = profile.cells < cells[group]
             remark = f"{_cells(profile.cells)} only" if some else ""
             band = () if is_reference else (profile.low, profile.high, 0.13)
             trace = Trace(name, THRESHOLDS, profile.share, legend[name], *band)
             traces.append(replace(trace, remark=remark))
         if traces:
             x, y = Axis(title, _from_start(profiles)), Axis("share of runs at or above", SHARE)
-            plot = Plot(x, y, traces, [], [Rule(0, is_vertical=True)], _group(group, found))
+            plot = Plot(x, y, traces, [], [Rule(0, is_vertical=True)], _group(group, cells))
             plots.append(replace(plot, is_crowded=sum(bool(t.band) for t in traces) >= MANY))
     named: dict[str, Any] = {"kind": "profiles", "text": "Performance profiles"}
     return Figure(plots, legend, height=3.3, columns=len(plots), same_y=True, **named)
@@ -472,29 +487,29 @@ def _cells(number: int) -> str:
     return f"{number} cell{'s' if number > 1 else ''}"
 
 
-def _group(group: str, found: Comparisons) -> str:
-    return f"{group} symmetry, {_cells(found.cells[group])}"
+def _group(group: str, cells: Mapping[str, int]) -> str:
+    return f"{group} symmetry, {_cells(cells[group])}"
 
 
-def improvement(found: Comparisons) -> Figure:
+def improvement(by_group: Mapping[str, Sequence[Improvement]], cells: Mapping[str, int]) -> Figure:
     """P(X > Y) of every pair of learning agents with its 95 % interval; 0.5 is no difference."""
-    every = [pair for pairs in found.improvements.values() for pair in pairs]
+    every = [pair for pairs in by_group.values() for pair in pairs]
     names = list(dict.fromkeys((pair.first, pair.second) for pair in every))
     columns: dict[str, list[Dot]] = {}
-    for group, pairs in found.improvements.items():
+    for group, pairs in by_group.items():
         for pair in pairs:
-            remark = f"{_cells(pair.cells)} only" if pair.cells < found.cells[group] else ""
+            remark = f"{_cells(pair.cells)} only" if pair.cells < cells[group] else ""
             look = Look(look_of(pair.first).color, "o", size=5)
             place = names.index((pair.first, pair.second))
             dot = Dot("", pair.probability, place, look, remark=remark, thick=True)
-            columns.setdefault(_group(group, found), []).append(dot)
+            columns.setdefault(_group(group, cells), []).append(dot)
     labels = [f"{cut(first, 24)} > {cut(second, 24)}" for first, second in names]
     more: dict[str, Any] = {"kind": "improvement", "text": "Probability of improvement"}
     rules, height = [Rule(0.5, is_vertical=True)], 1.1 + 0.3 * len(names)
     return by_rows(labels, columns, Axis("P(X > Y)", SHARE), rules, height=height, **more)
 
 
-def standing(rows: Mapping[str, tuple[Row, Row | None]]) -> Figure:
+def standing(rows: Mapping[str, tuple[AgentRow, AgentRow | None]]) -> Figure:
     """Success of an agent in each cell, by its name, beside that of the best reference."""
     dots = []
     for index, (own, reference) in enumerate(rows.values()):
@@ -508,7 +523,7 @@ def standing(rows: Mapping[str, tuple[Row, Row | None]]) -> Figure:
     return by_rows(labels, {"": dots}, axis, text="Success in each cell")
 
 
-def audited_defects(cells: Sequence[tuple[str, str, str, float, Defect]]) -> Figure:
+def audited_defects(cells: Sequence[tuple[str, str, str, float, AuditedDefect]]) -> Figure:
     """Defect of a decision over the strength of one variant, with 95 % bands.
 
     Args:

@@ -11,17 +11,16 @@ from pathlib import Path
 
 from symsteer.errors import UserError
 from symsteer.files import write_together
-from symsteer.leaderboard.claims_page import PAPER_TITLE, paper_page
 from symsteer.leaderboard.defects import Audit, read_audit
 from symsteer.leaderboard.figures import render_figures
-from symsteer.leaderboard.findings import analyse
-from symsteer.leaderboard.listing import render_records
-from symsteer.leaderboard.page import render_page
+from symsteer.leaderboard.page import other_files, render_page
 from symsteer.leaderboard.paths import reproductions_for
+from symsteer.leaderboard.row_numbers import summarize
+from symsteer.leaderboard.runs import Run, load_runs
+from symsteer.leaderboard.sections import Findings, View
+from symsteer.leaderboard.sections.verdicts import PAPER_TITLE
 from symsteer.leaderboard.study import PAPER, Study, read_study
-from symsteer.leaderboard.summary import Run, load_runs, summarize
 from symsteer.leaderboard.svg import to_svg
-from symsteer.leaderboard.tables import render_csv
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
 
@@ -56,10 +55,7 @@ def generate(
         UserError: for bad records, a full disk or a folder that cannot be written; `out` is then
             as it was (`write_together`).
     """
-    claims = read_study(study)
-    runs = load_runs(records, reproductions_for(records, reproductions), claims.listed)
-    out = _folder(out)
-    files = render(runs, out, read_audit(audit), claims)
+    out, files, _ = _files(records, out, audit, study, reproductions)
     if (out / "figures").is_symlink():
         raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it")
     stale = [out / name for name in _stale(out, files)]
@@ -78,12 +74,18 @@ def verify(
 
     Arguments and errors are those of `generate`.
     """
+    out, files, number = _files(records, out, audit, study, reproductions)
+    return Verification(number, len(files), differences(files, _stale(out, files), out))
+
+
+def _files(
+    records: Sequence[Path], out: Path, audit: Path | None, study: str, reproductions: Path | None
+) -> tuple[Path, dict[str, bytes], int]:
+    """The folder, what belongs into it, and the number of records."""
     claims = read_study(study)
     runs = load_runs(records, reproductions_for(records, reproductions), claims.listed)
     out = _folder(out)
-    files = render(runs, out, read_audit(audit), claims)
-    found = differences(files, _stale(out, files), out)
-    return Verification(len(runs), len(files), found)
+    return out, render(runs, out, read_audit(audit), claims), len(runs)
 
 
 def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[str, bytes]:
@@ -92,22 +94,18 @@ def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[s
     Depends on the records, the audit, the study, and where the records lie relative to `out`,
     nothing else.
     """
-    summary = summarize(runs)
-    findings = analyse(summary, audit, study)
+    findings = Findings(summarize(runs), audit, study)
     files: dict[str, bytes] = {}
-    shown: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
-    for drawing in render_figures(summary, findings):
+    figures: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
+    for drawing in render_figures(findings):
         stem = "-".join([drawing.kind, *([slug(*drawing.place)] if drawing.place else [])])
         name = f"figures/{stem}.svg"
         files[name] = to_svg(drawing)
-        shown.setdefault(drawing.place, {})[drawing.kind] = (drawing.text, name)
+        figures.setdefault(drawing.place, {})[drawing.kind] = (drawing.text, name)
     links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
-    files["records.csv"] = render_records(summary, links).encode()
-    files["leaderboard.csv"] = render_csv(summary).encode()
-    files["LEADERBOARD.md"] = render_page(summary, findings, shown, links).encode()
-    if paper := paper_page(findings):
-        files["PAPER.md"] = paper.encode()
-    return files
+    view = View(findings, links, figures)
+    texts = {"LEADERBOARD.md": render_page(view), **other_files(view)}
+    return files | {name: text.encode() for name, text in texts.items()}
 
 
 def slug(*texts: str, digits: int = 6) -> str:
@@ -132,8 +130,8 @@ def _folder(out: Path) -> Path:
 def _stale(out: Path, files: Mapping[str, bytes]) -> list[str]:
     """Files in `out` that carry a name of ours and are not of `files`."""
     names = [path.name for path in (out / "figures").glob("*.svg")]
-    own = [f"figures/{name}" for name in names if FIGURE_NAME.fullmatch(name)]
+    ours = [f"figures/{name}" for name in names if FIGURE_NAME.fullmatch(name)]
     paper = out / "PAPER.md"
     if paper.is_file() and paper.read_bytes().startswith(PAPER_TITLE.encode()):
-        own.append(paper.name)
-    return sorted(name for name in own if name not in files)
+        ours.append(paper.name)
+    return sorted(name for name in ours if name not in files)

@@ -10,7 +10,7 @@ import hashlib
 import math
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Protocol, Self, TypeVar
 
@@ -44,7 +44,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Block:
+class EpisodeBlock:
     """Episodes of one run, each measured in one or more evaluations.
 
     Entry i of each belongs to the episode with the seed `seeds[i]`: the sum of its values and how
@@ -73,7 +73,7 @@ class Sample:
     evaluation, weighted by the trapezoidal rule.
     """
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[EpisodeBlock, ...]
     weights: tuple[float, ...] = (1.0,)
     policy: str = ""
     """Content hash of the base policy that the run steers."""
@@ -86,7 +86,7 @@ class Sample:
             gathered[seed].append(value)
         totals = np.array([sum(gathered[seed]) for seed in gathered], dtype=np.float64)
         counts = np.array([len(gathered[seed]) for seed in gathered], dtype=np.float64)
-        return cls((Block(tuple(gathered), totals, counts),), policy=policy)
+        return cls((EpisodeBlock(tuple(gathered), totals, counts),), policy=policy)
 
     @classmethod
     def constant(cls, value: float, policy: str = "") -> Self:
@@ -94,11 +94,17 @@ class Sample:
         return cls.pooled([(0, value)], policy)
 
     @classmethod
+    def weighted(cls, samples: Sequence[Self], factors: Iterable[float]) -> Self:
+        """The sum of samples on one base policy, each times its factor."""
+        blocks = tuple(block for sample in samples for block in sample.blocks)
+        pairs = zip(factors, samples, strict=True)
+        weights = tuple(float(f) * weight for f, sample in pairs for weight in sample.weights)
+        return cls(blocks, weights, samples[0].policy)
+
+    @classmethod
     def mean(cls, runs: Sequence[Self]) -> Self:
         """The mean over runs on one base policy."""
-        blocks = tuple(block for run in runs for block in run.blocks)
-        weights = tuple(weight / len(runs) for run in runs for weight in run.weights)
-        return cls(blocks, weights, runs[0].policy)
+        return cls.weighted(runs, [1 / len(runs)] * len(runs))
 
     @cached_property
     def value(self) -> float:
@@ -108,9 +114,6 @@ class Sample:
         """The value under each resample's weights of episodes: [resamples]."""
         blocks = zip(self.weights, self.blocks, strict=True)
         return np.sum([weight * block.draw(resamples) for weight, block in blocks], axis=0)
-
-    def negated(self) -> Self:
-        return replace(self, weights=tuple(-weight for weight in self.weights))
 
 
 @lru_cache(maxsize=512)
@@ -203,7 +206,7 @@ class Effect(Protocol):
 
 
 @dataclass(frozen=True)
-class Estimate:
+class BootstrapEstimate:
     """A bootstrapped estimate.
 
     Attributes:
@@ -262,11 +265,11 @@ def p_equivalence(effect: Effect, margin: float) -> float:
     """
 
     def inside(p: float) -> bool:
-        found = effect.interval(1 - 2 * p)
-        return -margin < found.low and found.high < margin
+        interval = effect.interval(1 - 2 * p)
+        return -margin < interval.low and interval.high < margin
 
-    found = _smallest(inside, 0.5)
-    return found if found < 0.5 else 1.0
+    smallest = _smallest(inside, 0.5)
+    return smallest if smallest < 0.5 else 1.0
 
 
 def _smallest(holds: Callable[[float], bool], largest: float) -> float:
@@ -307,7 +310,7 @@ def cell_estimates(
     cells: Sequence[Sequence[Sample]],
     statistic: Callable[..., Array] = mean,
     resamples: int = RESAMPLES,
-) -> list[Estimate]:
+) -> list[BootstrapEstimate]:
     """`statistic` over the units (`units_of`) of each cell, all drawn together.
 
     Units and episodes are crossed factors: every run is scored on the same initial states. Each
@@ -324,7 +327,7 @@ def cell_estimates(
         raise ValueError("every run needs at least one episode")
     named = [units_of(runs, index) for index, runs in enumerate(cells)]
     freedom = degrees_of_freedom(named)
-    found = []
+    estimates = []
     for units in named:
         number = len(units)
         values = np.stack([unit.draw(resamples) for unit in units.values()], axis=1)
@@ -334,8 +337,8 @@ def cell_estimates(
             change = statistic(values, weights) - of_all
             change *= np.sqrt((number + 1) / (number - 1))
         value = float(statistic([unit.value for unit in units.values()]))
-        found.append(Estimate(value, of_all, change, freedom))
-    return found
+        estimates.append(BootstrapEstimate(value, of_all, change, freedom))
+    return estimates
 
 
 def degrees_of_freedom(cells: Iterable[Iterable[str]]) -> int:
@@ -348,13 +351,15 @@ def degrees_of_freedom(cells: Iterable[Iterable[str]]) -> int:
     return sum(len(group) - 1 for group in groups)
 
 
-def combined(cells: Sequence[Estimate], weights: Sequence[float] | None = None) -> Estimate:
+def combined(
+    cells: Sequence[BootstrapEstimate], weights: Sequence[float] | None = None
+) -> BootstrapEstimate:
     """A weighted sum of estimates that were drawn together; by default their mean.
 
     The cells themselves are not drawn: the interval is about these cells.
     """
     factors = np.full(len(cells), 1 / len(cells)) if weights is None else np.asarray(weights)
-    return Estimate(
+    return BootstrapEstimate(
         float(sum(f * cell.value for f, cell in zip(factors, cells, strict=True))),
         np.sum([f * cell.episodes for f, cell in zip(factors, cells, strict=True)], axis=0),
         np.sum([f * cell.units for f, cell in zip(factors, cells, strict=True)], axis=0),
@@ -472,32 +477,30 @@ def probability_of_improvement(
     """
     if not cells:
         raise ValueError("there is no cell")
-    values, changes, names = [], [], []
+    drawn, names = [], []
     for index, (first, second) in enumerate(cells):
         units = sorted({policy for policy, _ in first} & {policy for policy, _ in second})
         if not units:
             raise ValueError("every cell needs runs of both agents on one base policy")
         wins = [_wins(first, second, policy) for policy in units]
         if len(units) > 1:
-            value, change = _drawn(units, np.array([won.mean() for won in wins]), resamples)
+            drawn.append(_drawn(units, np.array([won.mean() for won in wins]), resamples))
         else:
             rows, columns = (
                 [f"{index} {axis} {i}" for i in range(size)]
                 for axis, size in enumerate(wins[0].shape)
             )
             value, of_first = _drawn(rows, wins[0].mean(axis=1), resamples)
-            change = of_first + _drawn(columns, wins[0].mean(axis=0), resamples)[1]
+            of_second = _drawn(columns, wins[0].mean(axis=0), resamples)[1]
+            drawn.append((value, of_first + of_second))
             units = min(rows, columns, key=len)
-        values.append(value)
-        changes.append(change)
         names.append(units)
-    won = float(np.mean(values))
+    won, draws = _over_cells(drawn, names)
     if won in (0.0, 1.0):
         number = len({name for units in names for name in units})
-        return Interval(won, *wilson(won * number, number))
-    factor = tails(CONFIDENCE, degrees_of_freedom(names))
-    result = percentile(won, won + factor * np.mean(changes, axis=0))
-    return Interval(won, max(0.0, result.low), min(1.0, result.high))
+        return Interval(float(won), *wilson(float(won) * number, number))
+    interval = percentile(float(won), draws)
+    return Interval(interval.value, max(0.0, interval.low), min(1.0, interval.high))
 
 
 def _wins(first: Values, second: Values, policy: str) -> Array:
@@ -518,7 +521,7 @@ def performance_profile(
     if not cells or not all(cells):
         raise ValueError("every cell needs runs")
     levels = np.asarray(thresholds, dtype=np.float64)
-    names, shares, changes = [], [], []
+    drawn, names = [], []
     for index, runs in enumerate(cells):
         policies = np.array([policy for policy, _ in runs])
         reached = (np.array([value for _, value in runs])[:, None] >= levels).astype(np.float64)
@@ -527,12 +530,9 @@ def performance_profile(
             units = [f"{index} {i}" for i in range(len(runs))]
         else:
             reached = np.stack([reached[policies == unit].mean(axis=0) for unit in units])
-        share, change = _drawn(units, reached, resamples)
+        drawn.append(_drawn(units, reached, resamples))
         names.append(units)
-        shares.append(share)
-        changes.append(change)
-    share = np.mean(shares, axis=0)
-    draws = share + tails(CONFIDENCE, degrees_of_freedom(names)) * np.mean(changes, axis=0)
+    share, draws = _over_cells(drawn, names)
     tail = (1 - CONFIDENCE) / 2
     low, high = np.clip(np.quantile(draws, (tail, 1 - tail), axis=0), 0, 1)
     return share, low, high
@@ -548,6 +548,15 @@ def _drawn(units: Sequence[str], values: Array, resamples: int) -> tuple[Array, 
     weights = weights / weights.sum(axis=1, keepdims=True)
     change = np.einsum("ru,u...->r...", weights, values - average)
     return average, np.sqrt((number + 1) / (number - 1)) * change
+
+
+def _over_cells(
+    drawn: Sequence[tuple[Array, Array]], names: Sequence[Sequence[str]]
+) -> tuple[Array, Array]:
+    """The mean over cells of what was `_drawn` of units with these names, and its draws."""
+    value = np.mean([average for average, _ in drawn], axis=0)
+    changes = np.mean([change for _, change in drawn], axis=0)
+    return value, value + tails(CONFIDENCE, degrees_of_freedom(names)) * changes
 
 
 def paired_differences(first: Mapping[Key, float], second: Mapping[Key, float]) -> dict[Key, float]:
@@ -582,8 +591,3 @@ def censored_median(values: Sequence[int | None]) -> float | None:
     """Median where None counts as later than everything; None if the median itself is censored."""
     result = float(np.median([np.inf if value is None else value for value in values]))
     return result if np.isfinite(result) else None
-
-
-def deepest_dip(differences: Sequence[float]) -> float:
-    """Lowest of the differences to the base over a run's evaluations; 0 if never below it."""
-    return float(min(0.0, *differences))

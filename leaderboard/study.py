@@ -162,9 +162,16 @@ def read_study(name_or_path: str) -> Study:
             f"{source} is not as the commit {file.declared} has it, so this commit has not "
             "declared these claims; name the one that has, or restore the file"
         )
-    digest = hashlib.sha256(source.read_bytes()).hexdigest()
-    texts = file.notice.strip(), file.details.strip(), file.declared
-    return Study(*texts, file.claim, file.statement, source.name, digest, read_list(path))
+    return Study(
+        notice=file.notice.strip(),
+        details=file.details.strip(),
+        declared=file.declared,
+        claims=file.claim,
+        statements=file.statement,
+        source=source.name,
+        sha256=hashlib.sha256(source.read_bytes()).hexdigest(),
+        listed=read_list(path),
+    )
 
 
 def read_list(study: Path) -> frozenset[str] | None:

@@ -7,11 +7,12 @@ Text from a record is shown only inside code spans, without the characters that 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
 from symsteer.leaderboard.statistics import Interval
+from symsteer.tables import markdown
 
 NOTHING = "\u2013"
 MINUS = "\u2212"
@@ -77,7 +78,12 @@ def interval(value: Interval | None, sign: bool = False, digits: int = 2) -> str
 
 def difference(value: Interval | None) -> str:
     """`+0.12 [+0.05, +0.20] ▲`: the mark says that the interval excludes 0, and on which side."""
-    return interval(value, sign=True) + (MARKS[value.sign].replace(" ", SPACE) if value else "")
+    return interval(value, sign=True) + mark_of(value).replace(" ", SPACE)
+
+
+def mark_of(value: Interval | None) -> str:
+    """▲ or ▼ where an interval lies on one side of 0."""
+    return MARKS[value.sign] if value else ""
 
 
 def stacked(value: Interval | None, sign: bool = False, marks: str = "", digits: int = 2) -> str:
@@ -93,9 +99,12 @@ def share(part: int, whole: int) -> str:
     return f"{part}/{whole}" if whole else NOTHING
 
 
-def ends(values: tuple[float, float] | None) -> str:
-    """`0.25 to 0.79`, or the one number that both are; a dash without any."""
-    return " to ".join(dict.fromkeys(map(number, values))) if values else NOTHING
+def ends(values: Sequence[float] | None, write: Callable[[float], str] = number) -> str:
+    """`0.25 to 0.79`, the smallest and the largest, or the one number that both are; a dash without
+    any."""
+    return (
+        " to ".join(dict.fromkeys((write(min(values)), write(max(values))))) if values else NOTHING
+    )
 
 
 def relative_link(path: Path, folder: Path) -> str | None:
@@ -111,10 +120,17 @@ def image(text: str, path: str) -> str:
     return f"![{text}]({quote(path)})"
 
 
-def without_empty(columns: Mapping[str, Sequence[str]]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the columns in which any row has something."""
-    shown = {name: texts for name, texts in columns.items() if set(texts) != {NOTHING}}
-    return list(shown), [list(row) for row in zip(*shown.values(), strict=True)]
+def table_text(rows: Sequence[Mapping[str, str]], left: int = 1, sparse: bool = False) -> str:
+    """A markdown table of rows, each with its texts by column; a dash where a row has none.
+
+    The first `left` columns are left-aligned. A `sparse` table is without the columns in which no
+    row has anything.
+    """
+    names = dict.fromkeys(name for row in rows for name in row)
+    texts = {name: [row.get(name, NOTHING) for row in rows] for name in names}
+    if sparse:
+        texts = {name: column for name, column in texts.items() if set(column) != {NOTHING}}
+    return markdown(list(texts), list(zip(*texts.values(), strict=True)), left)
 
 
 def folded(title: str, blocks: Sequence[str]) -> list[str]:

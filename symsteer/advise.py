@@ -6,17 +6,20 @@ import dataclasses
 import json as encoding
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from symsteer.bench.cli import Trust
 from symsteer.errors import UserError
 from symsteer.registry import allow
+from symsteer.tables import aligned
 from symsteer.terminal import printable
 
 if TYPE_CHECKING:
     from symsteer.bench.audit.result import AuditSettings
-    from symsteer.leaderboard.advice import Advice, Choice, Expected, LeaveOut, World
     from symsteer.leaderboard.defects import Audit
+    from symsteer.leaderboard.sections.unknown_task import LeaveOut
+    from symsteer.leaderboard.statistics import Interval
+    from symsteer.leaderboard.which_agent import Advice, AuditedWorld, Choice, Expected
 
 
 def advise(
@@ -51,19 +54,18 @@ def advise(
     allow(task, variant, *trust)
     if (task is None) == (audit is None):
         raise UserError("name one world: with --task and --variant, or with --audit")
-    from symsteer.leaderboard.advice import advise, leave_tasks_out
     from symsteer.leaderboard.defects import read_audit
     from symsteer.leaderboard.paths import REPRODUCTIONS, STUDY, chosen_records
+    from symsteer.leaderboard.row_numbers import summarize
+    from symsteer.leaderboard.runs import load_runs
+    from symsteer.leaderboard.sections.unknown_task import leave_tasks_out
     from symsteer.leaderboard.study import FOLDER, read_list
-    from symsteer.leaderboard.summary import load_runs, summarize
+    from symsteer.leaderboard.which_agent import advise
 
     folders = chosen_records(records, "advise", "--records RUNS")
     # Mistakes first: to read the records takes seconds, to measure a world minutes.
-    settings = None
-    if audit is not None:
-        worlds = [(world, f"measured, {audit}") for world in _audited(audit)]
-    else:
-        settings = _named(task or "", embodiment, variant, group, states)
+    settings = _named(task, embodiment, variant, group, states) if task is not None else None
+    worlds = [] if audit is None else [(world, f"measured, {audit}") for world in _audited(audit)]
     # Of the committed records, submitted ones that nobody has made again give no advice.
     listed = None if records else read_list(FOLDER / f"{STUDY}.toml")
     marks = None if records else REPRODUCTIONS
@@ -71,23 +73,20 @@ def advise(
     defects = read_audit()
     if settings is not None:
         worlds = [_world(settings, runs, defects)]
-    embodiments = list(dict.fromkeys(world.embodiment for world, _ in worlds))
+    embodiments = dict.fromkeys(world.embodiment for world, _ in worlds)
     tests = [leave_tasks_out(summaries, defects, name) for name in embodiments]
-    advices = [advise(summaries, defects, world) for world, _ in worlds]
+    advices = [(advise(summaries, defects, world), source) for world, source in worlds]
     number = sum(len(summary.runs) for summary in summaries)
-    blocks = [_text(found, source) for found, (_, source) in zip(advices, worlds, strict=True)]
-    blocks += [_test_text(test) for test in tests]
     studies = f"{len(folders)} studies" if len(folders) > 1 else "one study"
-    print(printable("\n\n".join([f"From {number} runs of {studies}.", *blocks])))
+    blocks = [f"From {number} runs of {studies}."]
+    blocks += [_text(advice, source) for advice, source in advices] + list(map(_test_text, tests))
+    print(printable("\n\n".join(blocks)))
     if json is not None:
         from symsteer.files import write_atomically
 
         data = {
             "runs": number,
-            "advice": [
-                {**dataclasses.asdict(found), "audit": source}
-                for found, (_, source) in zip(advices, worlds, strict=True)
-            ],
+            "advice": [dataclasses.asdict(one) | {"audit": source} for one, source in advices],
             "left_out": [dataclasses.asdict(test) for test in tests],
         }
         write_atomically(json, (encoding.dumps(data, indent=1, allow_nan=False) + "\n").encode())
@@ -109,26 +108,22 @@ def _named(task: str, embodiment: str, variant: str, group: str, states: int) ->
     return settings
 
 
-def _world(settings: AuditSettings, runs: Path, audit: Audit) -> tuple[World, str]:
+def _world(settings: AuditSettings, runs: Path, audit: Audit) -> tuple[AuditedWorld, str]:
     """A world with its committed or measured defect, and where that is from."""
-    from symsteer.leaderboard.advice import World
+    from symsteer.bench.audit.report import summary, summary_json
+    from symsteer.bench.audit.study import run_audits
     from symsteer.leaderboard.defects import in_order
+    from symsteer.leaderboard.which_agent import AuditedWorld
 
     place = settings.task, settings.embodiment, in_order(settings.variant), settings.group
     if defect := audit.get(place):
-        return World(*place, defect), "committed audit"
-    return _measure(settings, runs), f"measured now, {settings.count} states"
-
-
-def _measure(settings: AuditSettings, runs: Path) -> World:
-    from symsteer.bench.audit.report import summary, summary_json
-    from symsteer.bench.audit.study import run_audits
-
+        return AuditedWorld(*place, defect), "committed audit"
     (result,) = run_audits([settings], runs)
-    return next(_worlds(summary_json([summary(result)]).encode(), runs))
+    (world,) = _worlds(summary_json([summary(result)]).encode(), runs)
+    return world, f"measured now, {settings.count} states"
 
 
-def _audited(path: Path) -> list[World]:
+def _audited(path: Path) -> list[AuditedWorld]:
     """The worlds of an audit's file or folder."""
     from symsteer.bench.audit.report import read_result, summary, summary_json
 
@@ -149,12 +144,12 @@ def _audited(path: Path) -> list[World]:
         raise UserError(f"cannot read {path}: {error.strerror}; name another audit") from error
 
 
-def _worlds(data: bytes, path: Path) -> Iterator[World]:
-    from symsteer.leaderboard.advice import World
+def _worlds(data: bytes, path: Path) -> Iterator[AuditedWorld]:
     from symsteer.leaderboard.defects import parse_audit
+    from symsteer.leaderboard.which_agent import AuditedWorld
 
     for place, defect in parse_audit(data, path).items():
-        yield World(*place, defect)
+        yield AuditedWorld(*place, defect)
 
 
 # What the terminal shows.
@@ -162,38 +157,34 @@ def _worlds(data: bytes, path: Path) -> Iterator[World]:
 
 def _text(advice: Advice, source: str) -> str:
     world, defect = advice.world, advice.world.defect
-    lines = [
-        f"{world.task}, {world.embodiment}, {world.variant}, {world.group}",
-        f"defect of a decision  {_interval(defect.interval, '.3f')}, of the {defect.part}",
-        f"from                  {source}",
-        f"kind of break         {' or else '.join(world.kinds)}",
+    facts = [
+        ["defect of a decision", f"{_interval(defect.interval, '.3f')}, of the {defect.part}"],
+        ["from", source],
+        ["kind of break", " or else ".join(world.kinds)],
     ]
+    lines = [f"{world.task}, {world.embodiment}, {world.variant}, {world.group}"]
+    lines.append(aligned([], facts, left=2))
     if defect.resets_differ:
         lines.append("its initial states are broken, too, which is no part of a decision")
     if advice.expected:
         lines += ["", "Expected advantage over standard, 95 % interval; ? decides nothing:"]
-        head = ("agent", "measure", "advantage", "from", "line of")
-        lines.append(_row(*head, "cells", "policies", "tasks"))
-        lines += [_expected(one) for one in advice.expected]
+        header = ["agent", "measure", "from", "line of", "advantage", "cells", "policies", "tasks"]
+        lines.append(aligned(header, [_expected(one) for one in advice.expected], left=4))
     lines += ["", *(_choice(choice) for choice in advice.choices)]
     return "\n".join(lines)
 
 
-def _expected(one: Expected) -> str:
+def _expected(one: Expected) -> list[str]:
     shown = "-" if one.value is None else f"{one.value:+.3f}"
     if one.interval:
         shown = _interval(one.interval, "+.3f")
     mark = " ?" if one.reasons else "  "
-    numbers = (str(one.cells), str(one.policies), str(one.tasks))
-    return _row(one.agent, one.measure, shown + mark, one.source, one.kind, *numbers)
+    numbers = (str(number) for number in (one.cells, one.policies, one.tasks))
+    return [one.agent, one.measure, one.source, one.kind, shown + mark, *numbers]
 
 
-def _row(*cells: str) -> str:
-    return "{:18s} {:8s} {:>27s}  {:11s} {:16s} {:>5s} {:>8s} {:>5s}".format(*cells)
-
-
-def _interval(found: Any, digits: str) -> str:
-    value, low, high = (format(v, digits) for v in (found.value, found.low, found.high))
+def _interval(interval: Interval, digits: str) -> str:
+    value, low, high = (format(v, digits) for v in (interval.value, interval.low, interval.high))
     return f"{value} [{low}, {high}]"
 
 
@@ -209,7 +200,8 @@ def _choice(choice: Choice) -> str:
 
 def _test_text(test: LeaveOut) -> str:
     """How expectations would have been without a task's own cells."""
-    from symsteer.leaderboard.summary import MIN_SEEDS
+    from symsteer.leaderboard.rows import MIN_SEEDS
+    from symsteer.leaderboard.sections.unknown_task import best_agents, scores
 
     title = f"Tested by leaving out one task after the other ({test.embodiment})"
     if not test.agents:
@@ -217,30 +209,6 @@ def _test_text(test: LeaveOut) -> str:
             f"{title}: not possible; tasks with audited cells of at least {MIN_SEEDS} base "
             f"policies: {len(test.tasks)}."
         )
-    lines = [f"{title}, of {len(test.tasks)}:"]
-    lines.append(_tested("agent", "measure", "sign right", "of clear ones", "inside", "error"))
-    for row in test.agents:
-        lines.append(
-            _tested(
-                row.agent,
-                row.measure,
-                _share(row.right, row.cells),
-                _share(row.clear_right, row.clear),
-                _share(row.inside, row.with_interval),
-                f"{row.error:.3f}",
-            )
-        )
-    for best in test.best:
-        lines.append(
-            f"best agent by {best.measure}: right in {_share(best.right, best.cells)} cells; the "
-            f"one that is best on average elsewhere: {_share(best.usual, best.cells)}"
-        )
-    return "\n".join(lines)
-
-
-def _tested(*cells: str) -> str:
-    return "{:18s} {:8s} {:>16s} {:>16s} {:>16s} {:>8s}".format(*cells)
-
-
-def _share(part: int, whole: int) -> str:
-    return f"{part}/{whole} ({part / whole:.0%})" if whole else "-"
+    rows = scores(test)
+    table = aligned(list(rows[0]), [list(row.values()) for row in rows], left=3)
+    return f"{title}:\n{table}\n{best_agents(test)}".replace("`", "")

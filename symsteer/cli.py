@@ -134,11 +134,11 @@ def demo(out: Path = Path("runs/demo")) -> int:
     """
     from symsteer.bench.cli import sweep
     from symsteer.leaderboard.command import report
-    from symsteer.leaderboard.glance import glance
+    from symsteer.leaderboard.curves import curves_as_text
 
     exit_code = sweep("demo", out=out, together=2)
     report((out,), out=out / "leaderboard")
-    print(f"\n{glance((out,))}")
+    print(f"\n{curves_as_text((out,))}")
     print(
         f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
         f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', out)}"

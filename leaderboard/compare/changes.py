@@ -14,6 +14,10 @@ from typing import Literal
 import numpy as np
 
 from symsteer.leaderboard.compare.sides import Leftover
+from symsteer.leaderboard.keys import Key
+from symsteer.leaderboard.pairs import area_difference
+from symsteer.leaderboard.rows import MIN_SEEDS
+from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.statistics import (
     Interval,
     Sample,
@@ -21,7 +25,6 @@ from symsteer.leaderboard.statistics import (
     stratified_bootstrap,
     units_of,
 )
-from symsteer.leaderboard.summary import MIN_SEEDS, Key, Run, area_difference
 
 Measure = Literal["success", "auc", "q_bias"]
 

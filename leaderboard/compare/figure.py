@@ -11,7 +11,7 @@ from symsteer.leaderboard.compare.output import cell_names
 from symsteer.leaderboard.compare.sides import Side
 from symsteer.leaderboard.figures import by_rows
 from symsteer.leaderboard.plots import GREY, Axis, Dot, Figure, Look, Rule, cut
-from symsteer.leaderboard.summary import MIN_SEEDS
+from symsteer.leaderboard.rows import MIN_SEEDS
 from symsteer.leaderboard.svg import to_image
 
 TITLES = {"success": "success in the final evaluation", "auc": "area under the success curve"}

@@ -19,8 +19,8 @@ from symsteer.leaderboard.compare.changes import (
     PairedCell,
 )
 from symsteer.leaderboard.compare.sides import Leftover, Side, code_of
+from symsteer.leaderboard.rows import MIN_SEEDS
 from symsteer.leaderboard.statistics import Interval
-from symsteer.leaderboard.summary import MIN_SEEDS
 from symsteer.leaderboard.text import MARKS, SPACE, compact, interval, number
 from symsteer.tables import aligned
 from symsteer.terminal import printable

@@ -15,7 +15,8 @@ from pathlib import Path
 from symsteer.errors import UserError
 from symsteer.leaderboard.compare.changes import Changes, PairedCell, RunPair
 from symsteer.leaderboard.compare.sides import Leftover, Side
-from symsteer.leaderboard.summary import OPTIONS, Run, setting_texts
+from symsteer.leaderboard.keys import OPTIONS, setting_texts
+from symsteer.leaderboard.runs import Run
 
 TELLING = ("task", "embodiment", "variant", "agent", "seed", "env_steps")
 """Where one of these differs, others that differ need not be named: they may follow from it."""

@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import Literal
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.summary import Key, Row, Run, grid_of, grouped, load_runs
+from symsteer.leaderboard.grouping import grouped
+from symsteer.leaderboard.keys import Key, grid_of
+from symsteer.leaderboard.rows import AgentRow
+from symsteer.leaderboard.runs import Run, load_runs
 from symsteer.names import unknown
 
 Kind = Literal["folder", "file", "agent", "commit"]
@@ -43,7 +46,7 @@ class Side:
     name: str
     kind: Kind
     place: Path
-    rows: tuple[tuple[Key, Row], ...]
+    rows: tuple[tuple[Key, AgentRow], ...]
     leftovers: tuple[Leftover, ...]
 
     @property
@@ -120,7 +123,11 @@ def _meant(
     pool = load()
     agents = sorted({run.agent for run in pool})
     if name in agents:
-        return "agent", [run for run in pool if run.agent == name], grid_of(pool)
+        return (
+            "agent",
+            [run for run in pool if run.agent == name],
+            grid_of(run.record for run in pool),
+        )
     codes = sorted({code_of(run) for run in pool} - {""})
     prefix = name.lower()
     begun = [code for code in codes if COMMIT.fullmatch(prefix) and code.startswith(prefix)]

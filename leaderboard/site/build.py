@@ -12,8 +12,10 @@ from pathlib import Path
 from symsteer.errors import UserError
 from symsteer.files import staged, write_atomically, write_together
 from symsteer.leaderboard.defects import read_audit
-from symsteer.leaderboard.findings import analyse
 from symsteer.leaderboard.paths import reproductions_for
+from symsteer.leaderboard.row_numbers import summarize
+from symsteer.leaderboard.runs import load_runs
+from symsteer.leaderboard.sections import Findings
 from symsteer.leaderboard.site import markup
 from symsteer.leaderboard.site.docs import FOLDER, Documentation, build_documentation
 from symsteer.leaderboard.site.libraries import assets, needs
@@ -22,7 +24,6 @@ from symsteer.leaderboard.site.pages import pages
 from symsteer.leaderboard.site.results import Results
 from symsteer.leaderboard.site.run_page import run_values
 from symsteer.leaderboard.study import read_study
-from symsteer.leaderboard.summary import load_runs, summarize
 
 GENERATOR = '<meta name="generator" content="symsteer site'
 """What says of an index.html that it is ours."""
@@ -67,8 +68,8 @@ def generate(
     file = folder / SUMMARY if folder else audit
     defects = read_audit(file if file and (file.is_file() or not folder) else None)
     maps = list(maps_of(folder)) if folder else []
-    found = analyse(summary, defects, claims)
-    results = Results(summary, found, defects, Path(study).stem, reading, maps)
+    findings = Findings(summary, defects, claims)
+    results = Results(findings, Path(study).stem, reading, maps)
     files = {out / name: data for name, data in render(results).items()}
     media = [*maps, *(film for run in results.runs.values() for film in films_of(run))]
     media += [film for table in summary.tables for film in films_of_cell(table)]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from symsteer.leaderboard.plots import Dot, Figure, Trace
-from symsteer.leaderboard.summary import Run
+from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.text import MINUS, count
 
 Chart = dict[str, Any]

@@ -11,7 +11,8 @@ from pathlib import Path
 from symsteer.errors import UserError
 from symsteer.leaderboard.paths import RECORD
 from symsteer.leaderboard.report import slug
-from symsteer.leaderboard.summary import Run, Table
+from symsteer.leaderboard.rows import Table
+from symsteer.leaderboard.runs import Run
 from symsteer.variant import file_name
 
 DIGITS = 10

@@ -6,24 +6,26 @@ Addresses are relative to the site's folder; templates put `root` before them.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from symsteer.leaderboard import figures, page
-from symsteer.leaderboard.answer_page import answer_section
-from symsteer.leaderboard.claims_page import CLAIMS, claims_section, paper_section
+from symsteer.leaderboard import figures
 from symsteer.leaderboard.defects import defect_of
-from symsteer.leaderboard.map_page import map_section
+from symsteer.leaderboard.page import SECTIONS, by_title, notices, seed_notice
 from symsteer.leaderboard.plots import Figure
 from symsteer.leaderboard.records import flat
+from symsteer.leaderboard.rows import AgentRow, Table
+from symsteer.leaderboard.runs import Run
+from symsteer.leaderboard.sections import View
+from symsteer.leaderboard.sections.cells import cell_tables, status
+from symsteer.leaderboard.sections.success_in_every_cell import marks
 from symsteer.leaderboard.site import markup
 from symsteer.leaderboard.site.charts import Chart, charts
 from symsteer.leaderboard.site.media import films_of_cell
 from symsteer.leaderboard.site.results import Results, breaks, dials, strengths
 from symsteer.leaderboard.statistics import Interval
-from symsteer.leaderboard.summary import Row, Run, Table
-from symsteer.leaderboard.tables import section, status
 from symsteer.leaderboard.text import NOTHING, compact, count, difference, interval, number
 
 Values = dict[str, Any]
@@ -81,8 +83,12 @@ def overview(results: Results) -> Values:
     summary = results.summary
     records = [run.record for run in summary.runs]
     newest = max(record.ended or record.started for record in records)
-    drawn, names = _figures(results)
-    answer = answer_section(summary, results.findings, names.get((), {}))
+    view, drawn = _view(results)
+    answer = [
+        block
+        for title, blocks in by_title(view, [s for s in SECTIONS if s.where == "first"])
+        for block in (f"## {title}", *blocks)
+    ]
     return {
         "facts": {
             "runs": len(records),
@@ -92,26 +98,27 @@ def overview(results: Results) -> Values:
             "newest run": f"{newest:%Y-%m-%d}",
         },
         "notice": _notice(results),
-        "answer": markup.html(answer, {"PAPER.md": "findings.html#paper"}.get, drawn),
+        "answer": markup.html(answer, {"PAPER.md": "findings.html#the-paper-s-claims"}.get, drawn),
         "agents": [(name, results.agent(name)) for name in summary.agents],
         "matrix": [_matrix_row(results, table) for table in summary.tables],
         "rows": [_result(results, table, row) for table, row in results.rows],
     }
 
 
-def _figures(results: Results) -> tuple[dict[str, list[Chart]], dict[Any, Any]]:
-    """Charts of the figures over all cells by address; the addresses as the sections want them."""
+def _view(results: Results) -> tuple[View, dict[str, list[Chart]]]:
+    """How pages over all cells show sections, and the charts of the figures by address."""
     drawn: dict[str, list[Chart]] = {}
-    names: dict[Any, dict[str, tuple[str, str]]] = {}
+    addresses: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
     for index, figure in enumerate(figures.overall_figures(results.findings)):
         drawn[str(index)] = charts(figure)
-        names.setdefault(figure.place, {})[figure.kind] = (figure.text, str(index))
-    return drawn, names
+        addresses.setdefault(figure.place, {})[figure.kind] = (figure.text, str(index))
+    links = {path: results.run(run) for path, run in results.runs.items()}
+    return View(results.findings, links, addresses), drawn
 
 
 def _notice(results: Results) -> str:
     """What a reader must know first, as HTML; its links lead to the web alone."""
-    texts = [*page.notices(results.findings.study), page.seed_notice(results.summary)]
+    texts = [*notices(results.findings.study), seed_notice(results.summary)]
     web = ("https://", "http://")
     link = lambda href: href if href.startswith(web) else None  # noqa: E731
     return markup.html([text for text in texts if text], link) if any(texts) else ""
@@ -121,10 +128,10 @@ def _matrix_row(results: Results, table: Table) -> Values:
     cells = []
     for name in results.summary.agents:
         shown = []
-        for row in page.at_a_glance(table, name):
+        for row in table.shown(name):
             value, _, ends = interval(row.success).partition("\u00a0")
             level = round(10 * row.success.value) if row.success else ""
-            text = value + page.marks(row) if row.success else status(row)
+            text = value + marks(row) if row.success else status(row)
             shown.append({"text": text, "ends": ends, "level": level})
         cells.append(shown)
     return {"name": results.names[table.key], "href": results.cell(table.key), "cells": cells}
@@ -140,7 +147,7 @@ def _place(task: Entry, embodiment: str, broken_by: Sequence[str], variant: str)
     }
 
 
-def _result(results: Results, table: Table, row: Row) -> Line:
+def _result(results: Results, table: Table, row: AgentRow) -> Line:
     """An agent in a cell, in the tables of the first page and of the agent's own."""
     key, defect = table.key, defect_of(table.key, results.audit)
     diverged = sum(row.diverged) / len(row.diverged) if row.diverged else None
@@ -174,37 +181,17 @@ def _percents(found: Interval | None) -> str:
 
 
 def findings(results: Results) -> Values:
-    """The sections of the leaderboard's page that are about all cells."""
-    summary, found = results.summary, results.findings
-    drawn, names = _figures(results)
-    sound = page.soundness_table(summary)
-    spreads = page.spreads_section(summary, found.spreads) if found.spreads else []
-    sections = {
-        "claims": ("Claims", [CLAIMS, *claims_section(found)]),
-        "paper": ("The paper's claims", paper_section(found) if found.study.statements else []),
-        "map": (
-            "The advantage of symmetry against the defect",
-            map_section(summary, found, names),
-        ),
-        "together": (
-            "All cells together",
-            page.comparisons_section(found.comparisons, names.get((), {})),
-        ),
-        "soundness": ("Are the learners sound", [page.SOUND, sound] if sound else []),
-        "effects": ("Effects of options", page.effects_section(summary)),
-        "spreads": ("How much is the base policy's", spreads),
-        "reading": ("How to read the tables", page.reading(summary)),
-        "provenance": ("Provenance", [page.provenance_facts(summary, found.audit)]),
-    }
-    return {
-        "notice": _notice(results),
-        "sections": [
-            (anchor, title, markup.html(blocks, charts=drawn))
-            for anchor, (title, blocks) in sections.items()
-            if blocks
-        ],
-        "set_aside": [(run.record.run_id, results.run(run)) for run in summary.set_aside],
-    }
+    """Every section of the leaderboard's page that the site has no other page for."""
+    view, drawn = _view(results)
+    shown = by_title(view, [s for s in SECTIONS if s.where in ("folded", "site")])
+    link = {address: address for address in view.links.values()}.get
+    sections = [(anchor(title), title, markup.html(blocks, link, drawn)) for title, blocks in shown]
+    return {"notice": _notice(results), "sections": sections}
+
+
+def anchor(title: str) -> str:
+    """The address of a section within its page."""
+    return re.sub(r"[^a-z]+", "-", title.lower()).strip("-")
 
 
 def cell(results: Results, table: Table) -> Values:
@@ -220,7 +207,7 @@ def cell(results: Results, table: Table) -> Values:
         "dials": [(name, results.variant(name)) for name in dials(key.variant)],
         "defect": f"{_percents(defect.interval)}, {defect.part}" if defect else "not audited",
         "budget": count(key.env_steps),
-        "tables": markup.html(section(table, links), lambda href: href),
+        "tables": markup.html(cell_tables(table, links), lambda href: href),
         "charts": dict(
             zip(("success", "q", "errors", "directions"), map(charts, shown), strict=True)
         ),
@@ -260,7 +247,7 @@ def agent(results: Results, name: str) -> Values:
     compared = {
         results.names[table.key]: (row, table.best_reference)
         for table, row in rows
-        if row.success and row in page.at_a_glance(table, name)
+        if row.success and row in table.shown(name)
     }
     return {
         "name": name,

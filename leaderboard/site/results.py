@@ -8,13 +8,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from symsteer.leaderboard.defects import Audit, Defect, parts_of
-from symsteer.leaderboard.findings import Findings
+from symsteer.leaderboard.cell_names import cell_name
+from symsteer.leaderboard.defects import Audit, AuditedDefect, parts_of
+from symsteer.leaderboard.keys import ARM, SYMMETRIC_EMBODIMENT, Key
 from symsteer.leaderboard.report import slug
+from symsteer.leaderboard.rows import AgentRow, Summary, Table
+from symsteer.leaderboard.runs import Run
+from symsteer.leaderboard.sections import Findings
 from symsteer.leaderboard.site.docs import Documentation
 from symsteer.leaderboard.site.media import DIGITS, Medium
-from symsteer.leaderboard.summary import ARM, SYMMETRIC_EMBODIMENT, Key, Row, Run, Summary, Table
-from symsteer.leaderboard.tables import cell_name
 from symsteer.variant import UNBROKEN
 
 
@@ -44,12 +46,18 @@ class Results:
         maps: pictures of an audit's folder.
     """
 
-    summary: Summary
     findings: Findings
-    audit: Audit
     study: str
     docs: Documentation
     maps: Sequence[Medium] = ()
+
+    @property
+    def summary(self) -> Summary:
+        return self.findings.summary
+
+    @property
+    def audit(self) -> Audit:
+        return self.findings.audit
 
     @cached_property
     def names(self) -> dict[Key, str]:
@@ -62,12 +70,12 @@ class Results:
         return {run.path: run for run in (*self.summary.runs, *self.summary.set_aside)}
 
     @cached_property
-    def rows(self) -> list[tuple[Table, Row]]:
+    def rows(self) -> list[tuple[Table, AgentRow]]:
         """All rows with runs."""
         return [(table, row) for table in self.summary.tables for row in table.rows if row.runs]
 
     @cached_property
-    def row_of(self) -> Mapping[Path, tuple[Table, Row]]:
+    def row_of(self) -> Mapping[Path, tuple[Table, AgentRow]]:
         """Table and row of every run that counts, by the path of its record."""
         return {run.path: (table, row) for table, row in self.rows for run in row.runs}
 
@@ -105,12 +113,12 @@ class Results:
             names[path] = slug(run.record.run_id, digits=DIGITS)[:-DIGITS] + digest[:DIGITS]
         return names
 
-    def audited(self, dial: str) -> list[tuple[str, str, str, float, Defect]]:
+    def audited(self, dial: str) -> list[tuple[str, str, str, float, AuditedDefect]]:
         """Task, embodiment, group, strength and defect where a variant acts alone, in this order.
 
         With the unbroken controls, at strength 0; empty if the variant was not audited.
         """
-        alone: list[tuple[str, str, str, float, Defect]] = []
+        alone: list[tuple[str, str, str, float, AuditedDefect]] = []
         for (task, embodiment, variant, group), defect in self.audit.items():
             parts = parts_of(variant) or ()
             if [part.name for part in parts] == [dial] and parts[0].is_constant:

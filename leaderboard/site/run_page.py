@@ -9,11 +9,11 @@ from typing import Any
 
 from symsteer.leaderboard.figures import run_curves
 from symsteer.leaderboard.records import REPRODUCED, Evaluation, repeat_command
+from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.site.charts import charts, episodes, grouped
 from symsteer.leaderboard.site.media import films_of
 from symsteer.leaderboard.site.pages import options_of
 from symsteer.leaderboard.site.results import Results
-from symsteer.leaderboard.summary import Run
 from symsteer.leaderboard.text import compact, count, number
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from symsteer.leaderboard.defects import Audit, AuditedDefect
 from symsteer.leaderboard.records import (
     BasePolicy,
     Episodes,
@@ -21,6 +24,12 @@ from symsteer.leaderboard.records import (
     UsedBudget,
     WallClock,
 )
+from symsteer.leaderboard.row_numbers import summarize
+from symsteer.leaderboard.rows import Summary
+from symsteer.leaderboard.runs import Run
+from symsteer.leaderboard.sections import Findings, View
+from symsteer.leaderboard.statistics import Interval
+from symsteer.leaderboard.study import PAPER, read_study
 
 START = datetime(2026, 1, 31, 12, 0, tzinfo=UTC)
 LEARNING = ("standard", "standard-matched", "equivariant", "residual-pathway", "approximate")
@@ -223,3 +232,59 @@ def diverging(
         run_status = status if broke else "finished"
         records.append(make_record(curve, run_status, agent=agent, seed=seed, **config))
     return records
+
+
+def steered(
+    rates: Mapping[str, tuple[float, float, float]], policies: int = 5, **config: Any
+) -> list[RunRecord]:
+    """One cell for each variant, from (standard, equivariant, approximate); a policy per seed."""
+    agents = ("standard", "equivariant", "approximate")
+    records = [
+        record
+        for variant, values in rates.items()
+        for record in make_cell(dict(zip(agents, values, strict=True)), variant=variant, **config)
+    ]
+    for record in records:
+        which = f"{record.settings.task} {record.settings.seed % policies}"
+        record.base_policy.content_hash = hashlib.sha256(which.encode()).hexdigest()
+    return records
+
+
+def audit_of(
+    defects: Mapping[str, float],
+    width: float = 0.0,
+    task: str = "PickCube-v1",
+    embodiment: str = "floating",
+) -> Audit:
+    """Audited defects by variant, with intervals of a width to each side."""
+    return {
+        (task, embodiment, variant, "C8"): AuditedDefect(
+            Interval(value, value - width, value + width), "tool"
+        )
+        for variant, value in defects.items()
+    }
+
+
+def summary_of(*groups: Sequence[RunRecord]) -> Summary:
+    records = [record for group in groups for record in group]
+    return summarize([Run(Path(f"{i}.json"), record) for i, record in enumerate(records)])
+
+
+def view_of(*groups: Sequence[RunRecord], audit: Audit | None = None, study: str = PAPER) -> View:
+    """What the page shows of records, without figures and links."""
+    return View(Findings(summary_of(*groups), audit or {}, read_study(study)))
+
+
+def page_of(records: Sequence[RunRecord], study: str = PAPER) -> str:
+    """The page without figures and links, with ordinary spaces."""
+    from symsteer.leaderboard.page import render_page  # slow: it imports matplotlib
+
+    return render_page(view_of(records, study=study)).replace("\u00a0", " ")
+
+
+def table_after(text: str, heading: str) -> list[list[str]]:
+    """Cells of the first table after a line that starts with `heading`."""
+    lines = text[text.index(f"\n{heading}") :].splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("|"))
+    rows = itertools.takewhile(lambda line: line.startswith("|"), lines[start:])
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]] for row in rows]

@@ -10,8 +10,8 @@ from statistics import mean, median
 import pytest
 
 from symsteer.leaderboard.paths import PAGE_FOLDER, RESULTS, STUDY
+from symsteer.leaderboard.runs import Run, load_runs
 from symsteer.leaderboard.study import read_study
-from symsteer.leaderboard.summary import Run, load_runs
 
 INTERVAL = re.compile(r"[+\u2212]?\d\.\d+ \[[+\u2212]?\d\.\d+, [+\u2212]?\d\.\d+\]")
 SHARE = re.compile(r"\b\d+/\d+\b")

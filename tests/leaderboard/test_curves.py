@@ -1,29 +1,31 @@
+"""Curves over steps and over directions."""
+
+from __future__ import annotations
+
 import math
+from pathlib import Path
 
 import pytest
 
-from symsteer.leaderboard.curves import direction_curve
+from symsteer.leaderboard.curves import curves_as_text, direction_curve
 from symsteer.leaderboard.records import write_record
-from symsteer.leaderboard.summary import load_runs, summarize
-from tests.leaderboard.record_factory import make_evaluation, make_record
+from tests.leaderboard.record_factory import make_evaluation, make_record, summary_of
 
 
-def row_of(tmp_path, *runs):
+def row_of(*runs):
     """The row of runs that are given as successes and directions in degrees."""
+    records = []
     for seed, (successes, degrees) in enumerate(runs):
         evaluation = make_evaluation(successes)
         if degrees is not None:
             radians = [None if d is None else math.radians(d) for d in degrees]
             evaluation.episodes.direction = radians
-        record = make_record([evaluation], agent="base", seed=seed)
-        write_record(record, tmp_path / str(seed) / "record.json")
-    (table,) = summarize(load_runs([tmp_path])).tables
-    (row,) = (row for row in table.rows if row.runs)
-    return row
+        records.append(make_record([evaluation], agent="base", seed=seed))
+    return summary_of(records).tables[0].rows[0]
 
 
-def test_successes_are_counted_in_sectors(tmp_path):
-    curve = direction_curve(row_of(tmp_path, ([1, 0, 1, 1, 0], [0, 20, 30, 179, -179])))
+def test_successes_are_counted_in_sectors():
+    curve = direction_curve(row_of(([1, 0, 1, 1, 0], [0, 20, 30, 179, -179])))
     assert curve.steps == [-180, 0, 45, 180]
     assert curve.values == pytest.approx([0.5, 0.5, 1, 0.5])
     assert all(a <= b <= c for a, b, c in zip(curve.low, curve.values, curve.high, strict=True))
@@ -31,15 +33,42 @@ def test_successes_are_counted_in_sectors(tmp_path):
     assert curve.low[2] < 0.3 < curve.high[2] == 1
 
 
-def test_each_run_counts_once(tmp_path):
-    curve = direction_curve(row_of(tmp_path, ([1, 1, 1], [90, 90, 91]), ([0], [90])))
-    assert (curve.steps, curve.values) == ([90], [0.5])
+@pytest.mark.parametrize(
+    ("runs", "values"),
+    [
+        # Each run counts once.
+        ([([1, 1, 1], [90, 90, 91]), ([0], [90])], [0.5]),
+        # Episodes and runs without a direction do not count.
+        ([([1, 0, 1], [90, None, 91]), ([0], None)], [1]),
+    ],
+)
+def test_runs_count_alike(runs, values):
+    assert direction_curve(row_of(*runs)).values == values
+    assert direction_curve(row_of(([1, 0], None))) is None
 
 
-def test_episodes_and_runs_without_a_direction_do_not_count(tmp_path):
-    row = row_of(tmp_path, ([1, 0, 1], [90, None, 91]), ([0], None))
-    assert direction_curve(row).values == [1]
-
-
-def test_records_without_directions_give_no_curve(tmp_path):
-    assert direction_curve(row_of(tmp_path, ([1, 0], None))) is None
+def test_learners_have_a_curve_and_references_one_number(tmp_path: Path):
+    learning = [
+        make_evaluation([0, 0, 0, 1], 0, final=False),
+        make_evaluation([1, 1, 0, 0], 5_016, final=False),
+        make_evaluation([1, 1, 1, 1], 10_032),
+    ]
+    slower = [
+        make_evaluation([0, 0, 0, 1], 0, final=False),
+        make_evaluation([0, 0, 0, 0], 5_040, final=False),
+        make_evaluation([1, 1, 1, 0], 10_000),
+    ]
+    records = [
+        make_record(learning, seed=0, env_steps=10_000),
+        make_record(slower, seed=1, env_steps=10_000),
+        make_record([make_evaluation([1, 0, 1, 0], 3)], agent="base", env_steps=10_000),
+        make_record(learning[:2], "interrupted", seed=2, env_steps=10_000),
+    ]
+    for record in records:
+        write_record(record, tmp_path / f"{record.run_id}.json")
+    title, head, base, standard = curves_as_text([tmp_path]).splitlines()
+    assert title == "PickCube-v1 floating, unbroken"
+    assert head.split() == ["success", "after", "steps", "0k", "5k", "10k"]
+    assert base.split() == ["base", "50%"]
+    assert len(base) == len(head) == len(standard)
+    assert standard.split() == ["standard", "25%", "25%", "88%"]

@@ -14,7 +14,9 @@ from matplotlib.figure import Figure
 from symsteer.agents import AGENTS
 from symsteer.leaderboard.figures import MANY, STYLES, learning_curves
 from symsteer.leaderboard.plots import cut
-from symsteer.leaderboard.summary import Run, Table, summarize
+from symsteer.leaderboard.row_numbers import summarize
+from symsteer.leaderboard.rows import Table
+from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.svg import SHEETS, draw, plain
 from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 

@@ -29,11 +29,13 @@ from symsteer.leaderboard.records import (
     write_record,
 )
 from symsteer.leaderboard.report import generate
+from symsteer.leaderboard.row_numbers import summarize
+from symsteer.leaderboard.rows import Table
+from symsteer.leaderboard.runs import load_runs
+from symsteer.leaderboard.sections.cells import status
 from symsteer.leaderboard.site.build import generate as generate_site
 from symsteer.leaderboard.statistics import ShareDifference
 from symsteer.leaderboard.study import read_study
-from symsteer.leaderboard.summary import Table, load_runs, summarize
-from symsteer.leaderboard.tables import status
 from tests.leaderboard.command_line import main
 from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
 

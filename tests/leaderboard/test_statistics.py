@@ -21,7 +21,6 @@ from symsteer.leaderboard.statistics import (
     censored_median,
     combined,
     crossed_bootstrap,
-    deepest_dip,
     degrees_of_freedom,
     episode_weights,
     holm,
@@ -29,7 +28,6 @@ from symsteer.leaderboard.statistics import (
     mean,
     p_difference,
     p_equivalence,
-    paired_differences,
     performance_profile,
     probability_of_improvement,
     spread,
@@ -56,11 +54,6 @@ def test_weights_of_the_iqm_are_like_copies(number: int) -> None:
     # Four values, twice of one and none of another: its copy takes its place.
     copied = iqm([0.0, 1.0, 1.0, 8.0])
     assert iqm([0.0, 1.0, 5.0, 8.0], np.array([1.0, 2.0, 0.0, 1.0])) == pytest.approx(copied)
-
-
-def test_wilson_has_its_textbook_values() -> None:
-    assert wilson(0, 10) == pytest.approx((0.0, 0.27753), abs=1e-5)
-    assert wilson(81, 263) == pytest.approx((0.25527, 0.36621), abs=1e-4)
 
 
 def of(values: Iterable[float], first_seed: int = 0) -> Sample:
@@ -159,16 +152,6 @@ def test_an_episode_weighs_the_same_for_all_runs() -> None:
     # The same holds for the same episodes in two evaluations of one run.
     twice = crossed_bootstrap([Sample.pooled([*enumerate(outcomes), *enumerate(outcomes)])])
     assert (twice.low, twice.high) == pytest.approx((one.low, one.high))
-
-
-def test_a_shared_difficulty_cancels_in_differences() -> None:
-    """Episode weights are common, so that only what differs between two agents varies."""
-    generator = np.random.default_rng(4)
-    hard = generator.random(100)
-    runs = [of(hard + 0.1 + 0.001 * generator.standard_normal(100)) for _ in range(5)]
-    assert width(crossed_bootstrap(runs)) > 0.05
-    differences = [of(block.totals - hard) for sample in runs for block in sample.blocks]
-    assert width(crossed_bootstrap(differences)) < 0.001
 
 
 TRIALS = 300
@@ -304,14 +287,6 @@ def test_variance_components_of_a_nested_design() -> None:
     assert spread([by_policy(np.ones((3, 2, 4)))]).policies == 0
 
 
-def test_spread_over_seeds_widens_the_interval() -> None:
-    same = [of(np.repeat([0.0, 1.0], 50))] * 4
-    apart = [of(np.repeat([0.0, 1.0], [100 - k, k])) for k in (10, 40, 60, 90)]
-    narrow, wide = crossed_bootstrap(same), crossed_bootstrap(apart)
-    assert narrow.value == wide.value == 0.5
-    assert width(wide) > 2 * width(narrow)
-
-
 def test_the_bootstrap_repeats_and_needs_samples() -> None:
     samples = [of(np.random.default_rng(i).random(30)) for i in range(3)]
     assert crossed_bootstrap(samples) == crossed_bootstrap(samples)
@@ -320,23 +295,13 @@ def test_the_bootstrap_repeats_and_needs_samples() -> None:
             crossed_bootstrap(bad)
 
 
-def test_unanimous_episodes_get_wilsons_interval() -> None:
-    interval = success_interval([of([1.0] * 50), of([1.0] * 50)])
-    assert (interval.low, interval.high) == wilson(50, 50)
-    assert interval.value == 1.0
-    assert success_interval([of([0.0] * 50)]) == Interval(0.0, *wilson(0, 50))
-
-
 def test_success_stays_a_share() -> None:
+    """Unanimous episodes get Wilson's interval."""
     rates = (100, 100, 99, 98, 60)
     interval = success_interval([of(np.repeat([0.0, 1.0], [100 - k, k])) for k in rates])
     assert 0 < interval.low < interval.value < interval.high == 1
-
-
-def test_paired_differences_use_common_seeds_only() -> None:
-    first, second = {3: 1.0, 1: 1.0, 2: 0.0, 9: 1.0}, {1: 0.0, 2: 1.0, 3: 1.0, 7: 1.0}
-    assert paired_differences(first, second) == {1: 1.0, 2: -1.0, 3: 0.0}
-    assert paired_differences(first, {}) == {}
+    assert success_interval([of([1.0] * 50)] * 2) == Interval(1.0, *wilson(50, 50))
+    assert success_interval([of([0.0] * 50)]) == Interval(0.0, *wilson(0, 50))
 
 
 def test_pairing_narrows_the_interval() -> None:
@@ -349,21 +314,21 @@ def test_pairing_narrows_the_interval() -> None:
     assert width(paired) < 0.6 * width(unpaired)
 
 
-def test_signs_say_whether_zero_is_excluded() -> None:
-    assert Interval(0.1, 0.01, 0.2).sign == 1
-    assert Interval(-0.1, -0.2, -0.01).sign == -1
-    assert Interval(0.1, 0.0, 0.2).sign == Interval(0.0, -0.1, 0.1).sign == 0
-
-
-def test_area_under_curve() -> None:
-    assert area_under_curve([0, 100], [0.0, 1.0], 100) == pytest.approx(0.5)
-    assert area_under_curve([0, 50, 100], [0.0, 1.0, 1.0], 100) == pytest.approx(0.75)
-    assert area_under_curve([100], [0.4], 100) == pytest.approx(0.4)
-    assert area_under_curve([50], [0.4], 100) == pytest.approx(0.4)
-    # Starts late and ends early: the ends are held.
-    assert area_under_curve([20, 60], [0.2, 0.6], 100) == pytest.approx(0.04 + 0.16 + 0.24)
-    # What lies beyond the budget does not count.
-    assert area_under_curve([0, 200], [0.0, 1.0], 100) == pytest.approx(0.25)
+@pytest.mark.parametrize(
+    ("steps", "values", "area"),
+    [
+        ([0, 100], [0.0, 1.0], 0.5),
+        ([0, 50, 100], [0.0, 1.0, 1.0], 0.75),
+        ([50], [0.4], 0.4),
+        # Starts late and ends early: the ends are held.
+        ([20, 60], [0.2, 0.6], 0.04 + 0.16 + 0.24),
+        # What lies beyond the budget does not count.
+        ([0, 200], [0.0, 1.0], 0.25),
+    ],
+)
+def test_area_under_curve_is_linear(steps: list[int], values: list[float], area: float) -> None:
+    assert area_under_curve(steps, values, 100) == pytest.approx(area)
+    assert np.dot(area_weights(steps, 100), values) == pytest.approx(area)
 
 
 def test_steps_to_threshold_and_their_median() -> None:
@@ -377,13 +342,10 @@ def test_steps_to_threshold_and_their_median() -> None:
     assert censored_median([None, None, 5]) is None
 
 
-def test_the_dip_is_the_lowest_difference_or_nothing() -> None:
-    assert deepest_dip([0.1, -0.2, 0.4]) == -0.2
-    assert deepest_dip([0.1, 0.4]) == 0.0
-
-
-def test_newcombe_has_its_textbook_values() -> None:
-    """Newcombe 1998, table II, method 10."""
+def test_shares_have_their_textbook_intervals() -> None:
+    """Wilson's, and Newcombe 1998, table II, method 10."""
+    assert wilson(0, 10) == pytest.approx((0.0, 0.27753), abs=1e-5)
+    assert wilson(81, 263) == pytest.approx((0.25527, 0.36621), abs=1e-4)
     textbook = {
         ((56, 70), (48, 80)): (0.2, 0.0524, 0.3339),
         ((9, 10), (3, 10)): (0.6, 0.1705, 0.8090),
@@ -395,19 +357,11 @@ def test_newcombe_has_its_textbook_values() -> None:
         assert (found.value, found.low, found.high) == pytest.approx((value, low, high), abs=5e-5)
 
 
-def test_area_weights_give_the_area() -> None:
-    generator = np.random.default_rng(0)
-    for steps in ([0, 50, 100], [20, 60, 130], [70]):
-        values = generator.random(len(steps))
-        area = area_under_curve(steps, values.tolist(), 100)
-        assert np.dot(area_weights(steps, 100), values) == pytest.approx(area)
-
-
 def test_a_sample_weighs_its_blocks() -> None:
     first, second = of([0.0, 1.0]).blocks[0], of([1.0, 1.0, 0.0, 0.0], 10).blocks[0]
     sample = Sample((first, second), (0.25, 0.75))
     assert sample.value == pytest.approx(0.25 * 0.5 + 0.75 * 0.5)
-    assert sample.negated().value == -sample.value
+    assert Sample.weighted([sample], [-1]).value == -sample.value
     draws = sample.draw(200_000)
     assert draws.mean() == pytest.approx(0.5, abs=2e-3)
     # Dirichlet weights: p (1 - p) / (n + 1).
@@ -462,34 +416,24 @@ def test_probability_of_improvement_by_hand() -> None:
     # The mean over cells, however many runs each has.
     mixed = (on("a", [1]), on("a", [0])), (on("a", [0, 0, 0]), on("a", [1, 1, 1]))
     assert probability_of_improvement(mixed).value == pytest.approx(0.5)
+    # With one policy it is the Mann-Whitney statistic.
+    generator = np.random.default_rng(2)
+    x, y = generator.integers(0, 5, 9).tolist(), generator.integers(0, 5, 6).tolist()
+    one = probability_of_improvement([(on("a", x), on("a", y))])
+    assert one.value == pytest.approx(stats.mannwhitneyu(x, y).statistic / 54)
+    assert one.low < one.value < one.high
     # Only runs on one policy are compared; policies count alike.
     policies = (on("a", [2]) + on("b", [5, 5]), on("a", [1]) + on("b", [9, 9]) + on("c", [0]))
     assert probability_of_improvement([policies]).value == pytest.approx(0.5)
-    for bad in ([], [([], on("a", [1]))], [(on("a", [1]), on("b", [1]))]):
-        with pytest.raises(ValueError, match=r"no cell|runs of both"):
-            probability_of_improvement(bad)
-
-
-def test_where_one_side_always_wins_the_interval_is_wilsons() -> None:
+    # Where one side always wins the interval is Wilson's: of runs, or of policies in three cells.
     sure = probability_of_improvement([(on("a", [2, 3]), on("a", [0, 1, 1]))])
     assert (sure.value, sure.low, sure.high) == (1.0, *wilson(2, 2))
     runs = [(f"policy {i}", 1.0) for i in range(5)]
     never = probability_of_improvement([([(p, 0.0) for p, _ in runs], runs)] * 3)
-    # Three cells, the same five policies.
     assert (never.value, never.low, never.high) == (0.0, *wilson(0, 5))
-
-
-def test_probability_of_improvement_is_mann_whitneys() -> None:
-    generator = np.random.default_rng(2)
-    x, y = generator.integers(0, 5, 9).tolist(), generator.integers(0, 5, 6).tolist()
-    expected = stats.mannwhitneyu(x, y).statistic / 54
-    here, there = (
-        probability_of_improvement([(on("a", one), on("a", other))])
-        for one, other in ((x, y), (y, x))
-    )
-    assert here.value == pytest.approx(expected)
-    assert here.value + there.value == pytest.approx(1)
-    assert here.low < expected < here.high
+    for bad in ([], [([], on("a", [1]))], [(on("a", [1]), on("b", [1]))]):
+        with pytest.raises(ValueError, match=r"no cell|runs of both"):
+            probability_of_improvement(bad)
 
 
 def test_performance_profiles_by_hand() -> None:
@@ -504,45 +448,3 @@ def test_performance_profiles_by_hand() -> None:
     assert (share, low, high) == ([0.5], [0.0], [1.0])
     with pytest.raises(ValueError, match="runs"):
         performance_profile([[]], [0.5])
-
-
-def test_statistics_agree_with_rliable() -> None:
-    """IQM, its stratified interval, P(X > Y) and profiles of five runs on twelve tasks."""
-    library = pytest.importorskip("rliable.library")
-    metrics = pytest.importorskip("rliable.metrics")
-    generator = np.random.default_rng(0)
-    first = 0.5 + 0.3 * generator.random((5, 12))
-    second = 0.45 + 0.3 * generator.random((5, 12))
-    assert iqm(first.ravel()) == pytest.approx(metrics.aggregate_iqm(first))
-
-    def intervals(scores: object, metric: object) -> tuple[float, list[float]]:
-        state = np.random.RandomState(0)
-        value, ends = library.get_interval_estimates(
-            {"x": scores}, metric, reps=3000, random_state=state
-        )
-        return float(np.ravel(value["x"])[0]), np.ravel(ends["x"]).tolist()
-
-    column = first[:, [0]]
-    value, ends = intervals(column, lambda x: np.array([metrics.aggregate_iqm(x)]))
-    ours = crossed_bootstrap([Sample.constant(run) for run in column[:, 0]], iqm, resamples=10_000)
-    assert ours.value == pytest.approx(value)
-
-    # Theirs without the widening for five runs.
-    def narrow(cells: int, centre: object, *ours: object) -> list[object]:
-        factor = tails(0.95, 4 * cells) * np.sqrt(5 / 4)
-        return [centre + (end - centre) / factor for end in ours]
-
-    assert narrow(1, value, ours.low, ours.high) == pytest.approx(ends, abs=0.02)
-
-    value, ends = intervals((first, second), metrics.probability_of_improvement)
-    cells = [(on("a", x), on("a", y)) for x, y in zip(first.T, second.T, strict=True)]
-    ours = probability_of_improvement(cells)
-    assert ours.value == pytest.approx(value)
-    assert narrow(12, value, ours.low, ours.high) == pytest.approx(ends, abs=0.015)
-
-    levels = np.linspace(0.41, 0.89, 7)
-    share, *band = performance_profile([on("a", x) for x in first.T], levels)
-    shares, bands = library.create_performance_profile({"x": first}, levels, reps=1000)
-    assert share == pytest.approx(shares["x"])
-    for mine, theirs in zip(narrow(12, share, *band), bands["x"], strict=True):
-        assert mine == pytest.approx(theirs, abs=0.025)

@@ -24,7 +24,7 @@ from scipy.stats import spearmanr
 
 from symsteer.errors import UserError
 from symsteer.files import write_together
-from symsteer.leaderboard.paper import ROW_ORDER
+from symsteer.leaderboard.known_agents import ROW_ORDER
 from symsteer.leaderboard.records import RunRecord, read_record
 from symsteer.leaderboard.statistics import (
     Interval,

@@ -20,7 +20,7 @@ from symsteer.leaderboard.records import (
     read_record,
     read_reproductions,
 )
-from symsteer.leaderboard.summary import load_runs
+from symsteer.leaderboard.runs import load_runs
 from tests.bench.tiny_run import execute, quiet, tiny_config, without_clock
 
 

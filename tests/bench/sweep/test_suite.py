@@ -21,11 +21,11 @@ from symsteer.bench.tasks import task_class
 from symsteer.bench.tuning import FOLDER as PLANS
 from symsteer.bench.tuning.plan import read_plan
 from symsteer.errors import UserError
+from symsteer.leaderboard.keys import Key
 from symsteer.leaderboard.paths import RECORDS, RESULTS
 from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.study import FOLDER as STUDIES
 from symsteer.leaderboard.study import read_study
-from symsteer.leaderboard.summary import Key
 from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy
 

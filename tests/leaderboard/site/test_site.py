@@ -10,14 +10,18 @@ from pathlib import Path
 import pytest
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.cell_names import cell_name
+from symsteer.leaderboard.defects import read_audit
 from symsteer.leaderboard.page import render_page
+from symsteer.leaderboard.row_numbers import summarize
+from symsteer.leaderboard.runs import load_runs
+from symsteer.leaderboard.sections import Findings, View, claims
+from symsteer.leaderboard.sections.cells import render_csv
 from symsteer.leaderboard.site import build, libraries
 from symsteer.leaderboard.site.build import generate
 from symsteer.leaderboard.site.command import site as verb
 from symsteer.leaderboard.site.libraries import as_script
-from symsteer.leaderboard.study import PAPER
-from symsteer.leaderboard.summary import load_runs, summarize
-from symsteer.leaderboard.tables import cell_name, render_csv
+from symsteer.leaderboard.study import PAPER, read_study
 from symsteer.leaderboard.text import SPACE, compact, interval, number
 from tests.leaderboard.record_factory import make_evaluation, make_record
 from tests.leaderboard.site.conftest import EVIL, SIDE_BY_SIDE, picture, write_all
@@ -140,15 +144,11 @@ def test_success_by_direction_is_shown_where_records_have_directions(site: Path)
 
 
 def test_the_findings_are_those_of_the_page(site: Path) -> None:
-    from symsteer.leaderboard.defects import read_audit
-    from symsteer.leaderboard.findings import analyse
-    from symsteer.leaderboard.study import read_study
-
     summary = summarize(load_runs([site.parent / "runs"]))
-    found = analyse(summary, read_audit(), read_study(PAPER))
-    markdown = render_page(summary, found, {}, {})
+    found = Findings(summary, read_audit(), read_study(PAPER))
+    markdown = render_page(View(found))
     text = Page(site / "findings.html").text
-    for outcome in found.claims:
+    for outcome in found.of(claims.SECTION):
         assert outcome.claim.name in text
         if outcome.effect:
             middle, ends = interval(outcome.effect.interval(), sign=True, digits=3).split(SPACE, 1)

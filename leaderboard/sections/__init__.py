@@ -1,0 +1,89 @@
+"""The sections of the leaderboard: each a file that computes, renders and explains one statistic.
+
+To add one, write a file here that ends with a `Section`, name it in `page.SECTIONS`, and test it in
+`tests/leaderboard/sections/`. The page, the site and the CSV files take it from that list.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar
+
+from symsteer.leaderboard.defects import Audit
+from symsteer.leaderboard.rows import Summary
+from symsteer.leaderboard.study import Study
+from symsteer.leaderboard.text import image
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Section(Generic[Result]):
+    """One statistic, or one view of the records.
+
+    Attributes:
+        title: its heading; neighbours with the same title share it. A section without a title
+            brings its headings along.
+        compute: the statistic; the same findings give the same result.
+        render: the result as blocks of markdown, the first of them what it means and how to read
+            it; none leave the section out. Text of a record stands in code spans alone (`text`).
+        where: it is shown on the first screen of page and site, "folded" on the page and open among
+            the site's findings, or on one of them alone.
+        files: further files of the leaderboard by name, such as a CSV; an empty text is no file.
+    """
+
+    title: str
+    compute: Callable[[Findings], Result]
+    render: Callable[[Result, View], list[str]]
+    where: Literal["first", "folded", "page", "site"] = "folded"
+    files: Mapping[str, Callable[[Result, View], str]] = field(default_factory=dict, hash=False)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What is known: the records' summary, the audit of the defects, the study, every statistic."""
+
+    summary: Summary
+    audit: Audit
+    study: Study
+    _results: dict[Section[Any], Any] = field(default_factory=dict, repr=False)
+
+    def of(self, section: Section[Result]) -> Result:
+        """The result of a section, computed once.
+
+        Raises UserError for names in the study that nothing has (`claims`).
+        """
+        if section not in self._results:
+            self._results[section] = section.compute(self)
+        return self._results[section]
+
+
+Links = Mapping[Path, str | None]
+"""Address of each record relative to the page, None to show none."""
+
+Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
+"""By place, (task, embodiment), (embodiment,) or (), then by kind: description and address."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What is shown on the page or the site, and where records and figures are from there."""
+
+    findings: Findings
+    links: Links = field(default_factory=dict)
+    figures: Figures = field(default_factory=dict)
+
+    @property
+    def summary(self) -> Summary:
+        return self.findings.summary
+
+    def drawn(self, *place: str, kind: str = "") -> list[str]:
+        """The figures of a place, or the one of a kind, as blocks of markdown."""
+        figures = self.figures.get(place, {})
+        return [image(*figure) for name, figure in figures.items() if kind in ("", name)]
+
+    def blocks(self, section: Section[Any]) -> list[str]:
+        """A section as blocks of markdown."""
+        return section.render(self.findings.of(section), self)

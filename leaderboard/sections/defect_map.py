@@ -1,0 +1,238 @@
+"""The map: the advantage of symmetry against the audited defect, and its slopes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from symsteer.leaderboard.advantage_by_defect import Fit, Point, fit, points_of
+from symsteer.leaderboard.cell_names import cell_name
+from symsteer.leaderboard.defects import Audit, defect_of, parts_of
+from symsteer.leaderboard.keys import Key
+from symsteer.leaderboard.known_agents import STANDARD, USING_SYMMETRY
+from symsteer.leaderboard.pairs import MEASURES, SHORT_NAMES
+from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
+from symsteer.leaderboard.sections import Section, View, unknown_task
+from symsteer.leaderboard.text import (
+    NOTHING,
+    SPACE,
+    code,
+    difference,
+    folded,
+    mark_of,
+    number,
+    stacked,
+    table_text,
+)
+from symsteer.terminal import to_paste
+from symsteer.variant import UNBROKEN
+
+EXPLAINED = f"""\
+Each point is a cell: the advantage over `{STANDARD}`, paired by base policy and seed, against the
+*audited defect* of a decision. The defect is measured in simulation, over the steps of an action
+chunk that are executed between two decisions: how differently the world answers to turned copies of
+the same decision. It is the largest of four parts: horizontal motion of the tool and of the object
+(each as a share of its own), cost (as a share of a step's usual cost) and observation (as a share
+of the tool's motion). The colour says which. Broken initial states are no part of a decision; they
+are in the table below. Bars are 95 % intervals, hollow points have fewer than {MIN_SEEDS} paired
+runs.
+
+The *slope* is that of least squares with an intercept for each base policy: it comes from the dials
+alone, never from a comparison of policies, tasks or embodiments. Its interval draws base policies
+(runs, where a task has one policy) and episodes, and the defects within their intervals; it is
+about these cells. With fewer than {MIN_SEEDS} base policies it decides nothing. Lines in the figure
+have this slope and go through the mean of their task; the fan has the slopes of the interval. An
+advantage *ends* where the line crosses 0; between the numbers in brackets 0 is not excluded (95 %,
+Fieller's method), and a dash there means: up to the end of the measured range."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """The advantage of one agent in one measure against the defect, in one embodiment.
+
+    Attributes:
+        fit: over all dials; None if no base policy was steered at two defects.
+        dials: fits to the unbroken control and one dial, by its name.
+    """
+
+    embodiment: str
+    agent: str
+    measure: str
+    points: tuple[Point, ...] = ()
+    fit: Fit | None = None
+    dials: Mapping[str, Fit] = field(default_factory=dict)
+
+    @property
+    def reason(self) -> str:
+        """Why the slope decides nothing, whatever its interval; empty if it may."""
+        return self.fit.reason if self.fit else "no base policy was steered at two audited defects"
+
+
+@dataclass(frozen=True)
+class DefectMap:
+    """All panels, by (embodiment, agent, measure), and the tables that are not audited.
+
+    Arm and gripper have panels of their own: a defect of 0.3 of the unbroken arm is its
+    kinematics, one of 0.3 of the gripper a dial.
+    """
+
+    panels: Mapping[tuple[str, str, str], Panel]
+    unaudited: tuple[Table, ...]
+
+    @property
+    def embodiments(self) -> list[str]:
+        """Those that have points."""
+        return sorted({e for (e, _, _), panel in self.panels.items() if panel.points})
+
+    def agents(self, embodiment: str) -> list[str]:
+        """Those of `USING_SYMMETRY` that have points."""
+        agents = {a for (e, a, _), panel in self.panels.items() if e == embodiment and panel.points}
+        return [agent for agent in USING_SYMMETRY if agent in agents]
+
+    def panel(self, embodiment: str, agent: str, measure: str) -> Panel:
+        """A panel, without points if there are none."""
+        empty = Panel(embodiment, agent, measure)
+        return self.panels.get((embodiment, agent, measure), empty)
+
+
+def defect_map(summary: Summary, audit: Audit) -> DefectMap:
+    """Advantage of `USING_SYMMETRY` over `STANDARD` in audited tables, with slopes."""
+    panels = {}
+    for embodiment in sorted({table.key.embodiment for table in summary.tables}):
+        for agent in USING_SYMMETRY:
+            for measure in MEASURES:
+                points = points_of(summary, audit, embodiment, agent, measure)
+                dials = sorted({point.dial for point in points} - {UNBROKEN})
+                fits = {
+                    dial: fit([point for point in points if point.dial in (dial, UNBROKEN)])
+                    for dial in dials
+                }
+                panels[embodiment, agent, measure] = Panel(
+                    embodiment,
+                    agent,
+                    measure,
+                    points=tuple(points),
+                    fit=fit(points),
+                    dials={dial: fitted for dial, fitted in fits.items() if fitted},
+                )
+    unaudited = tuple(table for table in summary.tables if not defect_of(table.key, audit))
+    return DefectMap(panels, unaudited)
+
+
+def render(advantages: DefectMap, view: View) -> list[str]:
+    """Figures, slopes and numbers by embodiment, the test on unknown tasks, and what is missing."""
+    parts = [EXPLAINED]
+    for embodiment in advantages.embodiments:
+        panels = [
+            advantages.panel(embodiment, a, m)
+            for a in advantages.agents(embodiment)
+            for m in MEASURES
+        ]
+        numbers = folded("The map's numbers", [_numbers(view.summary, panels)])
+        parts += [f"### {code(embodiment)}", *view.drawn(embodiment), _slopes(panels)]
+        parts.append("\n\n".join(numbers))
+    parts += view.blocks(unknown_task.SECTION)
+    if not advantages.embodiments:
+        parts.append("There is no map yet: no audited cell has paired runs of these agents.")
+    if advantages.unaudited:
+        names = ", ".join(dict.fromkeys(cell_name(t, view.summary) for t in advantages.unaudited))
+        text = f"Not audited, so not in the map: {names}."
+        if commands := audit_commands([table.key for table in advantages.unaudited]):
+            measured = ", ".join(code(command, 1000) for command in commands)
+            text += (
+                f" To measure them: {measured}; then "
+                "`python -m tools.pages.audit leaderboard/results/audit/summary.json "
+                "runs/audit/summary.json`."
+            )
+        parts.append(text)
+    return parts
+
+
+def _slopes(panels: Sequence[Panel]) -> str:
+    rows = []
+    for panel in panels:
+        fits: dict[str, Fit | None] = {code(dial): fit for dial, fit in panel.dials.items()}
+        if len(fits) > 1:
+            fits = {"all": panel.fit, **fits}
+        rows += [_slope(panel, dial, fit) for dial, fit in (fits or {NOTHING: None}).items()]
+    return table_text(rows, left=3)
+
+
+def _slope(panel: Panel, dial: str, fit: Fit | None) -> dict[str, str]:
+    slope = fit.slope.interval() if fit else None
+    reason = fit.reason if fit else panel.reason
+    return {
+        "Agent": code(panel.agent),
+        "Advantage in": SHORT_NAMES[panel.measure],
+        "Dial": dial,
+        "Base policies": str(fit.policies) if fit else NOTHING,
+        # A mark would be read as a decision.
+        "Slope per 1 of defect": stacked(slope, sign=True, marks="" if reason else mark_of(slope)),
+        "Advantage ends at a defect of": _crossing(fit) if fit and not reason else NOTHING,
+        "Undecided because": reason or ("" if mark_of(slope) else "the interval contains 0"),
+    }
+
+
+def _crossing(fit: Fit) -> str:
+    """Where the fitted advantage is 0, in words."""
+    crossing = fit.crossing()
+    if crossing.value is None:
+        signs = {(1, 1): "none: above 0 everywhere", (-1, -1): "none: below 0 everywhere"}
+        return signs.get((crossing.before, crossing.after), "undecided")
+    low, high = number(crossing.low), number(crossing.high)
+    return f"{number(crossing.value)} [{low}, {high}]".replace(" ", SPACE)
+
+
+def _numbers(summary: Summary, panels: Sequence[Panel]) -> str:
+    """Defect, resets and advantages of each cell, from the least to the most broken one."""
+    agents = list(dict.fromkeys(panel.agent for panel in panels))
+    cells: dict[tuple[float, Key], dict[tuple[str, str], Point]] = {}
+    for panel in panels:
+        for point in panel.points:
+            cell = cells.setdefault((point.defect.value, point.table.key), {})
+            cell[panel.agent, panel.measure] = point
+    rows = []
+    for _, points in sorted(cells.items()):
+        any_point, *_ = points.values()
+        defect = any_point.defect
+        row = {
+            "Cell": cell_name(any_point.table, summary),
+            "Audited defect, of": f"{stacked(defect.interval, digits=3)}<br>{defect.part}",
+            "Resets": stacked(defect.resets, digits=3) if defect.resets_differ else "alike",
+        }
+        for agent in agents:
+            measured = [points[agent, m] for m in MEASURES if (agent, m) in points]
+            texts = [difference(point.advantage) for point in measured]
+            row[f"{code(agent)}: AUC,<br>success"] = "<br>".join(texts) or NOTHING
+        row["Runs"] = str(max(len(point.pairs) for point in points.values()))
+        rows.append(row)
+    return table_text(rows)
+
+
+def audit_commands(keys: Sequence[Key]) -> list[str]:
+    """Commands that measure the defects of tables, one for each task, embodiment and group.
+
+    Names that no task or variant could have are left out: text from a record must not become part
+    of a command that a reader copies.
+    """
+    wanted: dict[tuple[str, str, str], dict[str, None]] = {}
+    for key in sorted(keys):
+        words = (key.task, key.embodiment, key.variant, key.group)
+        constant = all(spec.is_constant for spec in parts_of(key.variant) or ())
+        if constant and all(re.fullmatch(r"[A-Za-z0-9][\w.:+-]*", w, re.ASCII) for w in words):
+            wanted.setdefault((key.task, key.embodiment, key.group), {})[key.variant] = None
+    return [
+        to_paste(
+            *("symsteer", "audit", "--task", task, "--embodiment", embodiment, "--group", group),
+            *("--variant", *variants, "--out", "runs/audit"),
+        )
+        for (task, embodiment, group), variants in wanted.items()
+    ]
+
+
+SECTION = Section(
+    "The advantage of symmetry against the defect",
+    lambda findings: defect_map(findings.summary, findings.audit),
+    render,
+)
