@@ -29,8 +29,9 @@ class Section(Generic[Result]):
         compute: the statistic; the same findings give the same result.
         render: the result as blocks of markdown, the first of them what it means and how to read
             it; none leave the section out. Text of a record stands in code spans alone (`text`).
-        where: it is shown on the first screen of page and site, "folded" on the page and open among
-            the site's findings, or on one of them alone.
+        where: "first" is the first screen of the page and of the site; "folded" sections are opened
+            by a reader of the page, and are the site's findings; "page" is the page alone, where
+            the site has other pages; "site" is the site alone, where the page has another file.
         files: further files of the leaderboard by name, such as a CSV; an empty text is no file.
     """
 
