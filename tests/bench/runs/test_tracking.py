@@ -57,7 +57,9 @@ def begun(monkeypatch):
     runs = []
 
     def init(**options):
-        run = SimpleNamespace(options=options, points={}, code=None, offline=False, url="there")
+        run = SimpleNamespace(
+            options=options, points={}, code=None, offline=False, url="there", dir="here"
+        )
 
         def log(values, step):
             for tag, value in values.items():
