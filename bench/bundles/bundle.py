@@ -32,7 +32,7 @@ from symsteer.bench.bundles.manifest import (
 )
 from symsteer.bench.runs.base_policy import demonstration_path, find_base
 from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.runs.stored import Run
+from symsteer.bench.runs.stored import RunFolder
 from symsteer.bench.steering.evaluation import VISITED, held_out_episodes
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import TASKS, make, task_class
@@ -77,7 +77,7 @@ def write_bundle(run: Path, out: Path) -> tuple[BundleManifest, str | None]:
     if out.is_dir():
         raise UserError(f"{out} is a folder; name a file for the bundle")
     prepare_folder(out.parent)
-    begun = Run.stored(run)
+    begun = RunFolder.stored(run)
     run, config, origin = begun.folder, begun.config, begun.files
     policy, file, task = begun.policy(), policy_path(run), task_class(config.task)
     if policy is None:

@@ -16,7 +16,7 @@ from symsteer.bench.runs.base_policy import take_base
 from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.folder import CONFIG, RECORD, is_finished
 from symsteer.bench.runs.run import check, check_all, execute
-from symsteer.bench.runs.stored import Run, extensions_of, newer_options, read_back
+from symsteer.bench.runs.stored import RunFolder, extensions_of, newer_options, read_back
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.records import (
@@ -99,10 +99,10 @@ def reproduce(
     _check_files(record, files, how.files)
     # One with a base policy that was taken does not continue one that trains it.
     name = f"reproduction-{file_hash(path)[:DIGITS]}{'-taken' if base_from else ''}"
-    if out is None or not is_finished(Run.new(config, out / name, files).folder):
+    if out is None or not is_finished(RunFolder.new(config, out / name, files).folder):
         check_all(config, how.workers)
     place = out / name if out else Path(tempfile.mkdtemp(prefix="symsteer-reproduction-"))
-    folder = Run.new(config, place, files).folder
+    folder = RunFolder.new(config, place, files).folder
     report(f"repeating {record.run_id} in {place}")
     report(f"the recorded run took {record.wall_clock.total / 60:.1f} minutes")
     here = Provenance.collect(config.device, torch.get_num_threads(), extensions_of(config))

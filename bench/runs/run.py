@@ -26,7 +26,7 @@ from symsteer.bench.runs.folder import (
 )
 from symsteer.bench.runs.observers import ProgressFile, RecordWriter, TerminalProgress
 from symsteer.bench.runs.scalars import Scalars
-from symsteer.bench.runs.stored import Run, restored
+from symsteer.bench.runs.stored import RunFolder, restored
 from symsteer.bench.runs.trainer import Trainer, budget_of
 from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import build, evaluation_variants, read
@@ -117,25 +117,25 @@ def resume(folder: Path, how: Execution) -> Path:
         UserError: if the folder is not a run's, the run is finished, its checkpoint is damaged, or
             another process is working on it, or this machine lacks its device.
     """
-    run = Run.stored(folder)
+    run = RunFolder.stored(folder)
     check_all(run.config, how.workers, begun=f"the run {run.folder.name}")
     with opened(run, replace(how, out=run.folder.parent)) as trainer:
         trainer.play()
     return run.folder
 
 
-def new_run(config: RunConfig, how: Execution) -> Run:
+def new_run(config: RunConfig, how: Execution) -> RunFolder:
     """The run of a configuration, after all checks; nothing is built."""
     if how.base_policy is not None:
         if how.demos is not None:
             raise UserError("a base policy of yours needs no demonstrations; leave one of them out")
         config = with_policy_of(config, how.base_policy)
     check_all(config, how.workers)
-    return Run.new(config, how.out, how.files)
+    return RunFolder.new(config, how.out, how.files)
 
 
 @contextlib.contextmanager
-def opened(run: Run, how: Execution, together: int = 1) -> Iterator[Trainer]:
+def opened(run: RunFolder, how: Execution, together: int = 1) -> Iterator[Trainer]:
     """The trainer of a run that this process alone works on; it is told of errors.
 
     Args:

@@ -30,8 +30,8 @@ REGISTRIES = {registry.kind: registry for registry in (AGENTS, POLICIES, TASKS, 
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run and the folder that is its own, whether it exists or not.
+class RunFolder:
+    """The folder of a run, whether it exists or not, and what is run there.
 
     Attributes:
         folder: of the run; its name is the run's name.
@@ -116,7 +116,7 @@ def restored(folder: Path) -> Restored:
     Raises:
         UserError: if the folder is not a run's, it has no checkpoint yet, or a file is damaged.
     """
-    run = Run.stored(folder)
+    run = RunFolder.stored(folder)
     if not torch.cuda.is_available():
         run = dataclasses.replace(run, config=dataclasses.replace(run.config, device="cpu"))
     state = load_checkpoint(run.folder)

@@ -23,7 +23,7 @@ from symsteer.bench.runs.checkpoint import Counters, fitting, save_checkpoint
 from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.evaluator import Evaluator, Steered, new_agent
 from symsteer.bench.runs.folder import CHECKPOINT
-from symsteer.bench.runs.stored import Run
+from symsteer.bench.runs.stored import RunFolder
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import task_class
 from symsteer.bench.variants import evaluation_variants
@@ -92,7 +92,7 @@ class Trainer(Steered):
 
     def __init__(
         self,
-        run: Run,
+        run: RunFolder,
         policy: ChunkPolicy,
         checkpoint: Mapping[str, Any] | None,
         observers: Sequence[Observer],
