@@ -2,9 +2,27 @@
 
 import os
 
+import pytest
+
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
 
 import torch  # noqa: E402  (reads the number of threads when it is imported)
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Calls the program with words: gives its exit code, and what it has written."""
+    from symsteer.cli import main
+
+    def call(*words):
+        monkeypatch.setattr("sys.argv", ["symsteer", *map(str, words)])
+        try:
+            code = main()
+        except SystemExit as error:
+            code = int(error.code or 0)
+        return code, capsys.readouterr()
+
+    return call

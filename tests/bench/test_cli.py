@@ -24,19 +24,11 @@ from symsteer.bench import cli
 from symsteer.bench.demos import collect
 from symsteer.bench.sweep.survey import look
 from symsteer.bench.tasks import task_class
-from symsteer.cli import GROUPS, VERBS, _threads, main
+from symsteer.cli import GROUPS, VERBS, _threads
 from symsteer.leaderboard.records import Episodes, write_record
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 from tests.leaderboard.record_factory import make_evaluation, make_record
-
-
-def symsteer(monkeypatch, *arguments) -> int:
-    monkeypatch.setattr(sys, "argv", ["symsteer", *map(str, arguments)])
-    try:
-        return main()
-    except SystemExit as error:
-        return int(error.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -44,35 +36,43 @@ def demos(tmp_path_factory):
     return collect("PickCube-v1", "floating", 2, "clean", 0, tmp_path_factory.mktemp("d") / "a.h5")
 
 
-def sentence(capsys) -> str:
-    """The one line on stderr."""
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("error: ")
-    assert "Traceback" not in lines[0]
-    return lines[0]
+def refused(command, *words) -> str:
+    """The one line on stderr about a mistake."""
+    code, shown = command(*words)
+    assert code == 2
+    (line,) = shown.err.strip().splitlines()
+    assert line.startswith("error: ")
+    return line
+
+
+RUN = ("run", "--quiet")
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--task", "PickCub-v1"], "PickCube-v1"),
-        (["--embodiment", "hand"], "floating, panda"),
-        (["--variant", "gravity:1"], "gravity_tilt"),
-        (["--variant", "action_gain:2"], "[0, 1]"),
-        (["--agent", "ppo"], "equivariant"),
-        (["--agent.group", "E8"], "C8"),
-        (["--agent.preset", "frist"], "did you mean 'first'"),
-        (["--policy.name", "plian"], "did you mean 'plain'"),
-        (["--env-steps", "0"], "env_steps: Input should be greater than"),
-        (["--seed", str(2**32)], "seed: Input should be less than"),
-        (["--agent", "residual-pathway", "--agent.penalty", "inf"], "penalty is inf"),
+        ((*RUN, "--task", "PickCub-v1"), "PickCube-v1"),
+        ((*RUN, "--embodiment", "hand"), "floating, panda"),
+        ((*RUN, "--variant", "gravity:1"), "gravity_tilt"),
+        ((*RUN, "--variant", "action_gain:2"), "[0, 1]"),
+        ((*RUN, "--agent", "ppo"), "equivariant"),
+        ((*RUN, "--agent.group", "E8"), "C8"),
+        ((*RUN, "--agent.preset", "frist"), "did you mean 'first'"),
+        ((*RUN, "--policy.name", "plian"), "did you mean 'plain'"),
+        ((*RUN, "--env-steps", "0"), "env_steps: Input should be greater than"),
+        ((*RUN, "--seed", str(2**32)), "seed: Input should be less than"),
+        ((*RUN, "--agent", "residual-pathway", "--agent.penalty", "inf"), "penalty is inf"),
+        (("demos", "/proc/nowhere/a.h5"), "/proc/nowhere cannot be written"),
+        (("demos", "a.h5", "--seed", "-1"), "seed"),
+        (("demos", "a.txt"), ".h5"),
+        (("demos", "a.h5", "--count", "0"), "at least 1"),
+        (("sweep", "smoke", "--out", "/proc/nowhere"), "/proc/nowhere"),
+        (("sweep", "dmeo"), "demo"),
     ],
 )
-def test_mistakes_in_a_run(arguments, words, monkeypatch, capsys, tmp_path):
+def test_mistakes(arguments, words, command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert symsteer(monkeypatch, "run", "--quiet", *arguments) == 2
-    assert words in sentence(capsys)
+    assert words in refused(command, *arguments)
     assert not any(tmp_path.rglob("record.json"))
 
 
@@ -93,110 +93,77 @@ def with_nan(path):
         (with_nan, "PickCube-v1", "bad.h5"),
     ],
 )
-def test_demonstrations_that_do_not_fit(damage, task, words, demos, monkeypatch, capsys, tmp_path):
+def test_demonstrations_that_do_not_fit(damage, task, words, demos, command, tmp_path):
     bad = tmp_path / "bad.h5"
     for suffix in (".h5", ".json"):
         bad.with_suffix(suffix).write_bytes(demos.with_suffix(suffix).read_bytes())
     damage(bad)
     arguments = ("--task", task, "--demos", bad, "--demonstrations.count", 2)
-    assert symsteer(monkeypatch, "run", "--quiet", *arguments, "--out", tmp_path / "runs") == 2
-    assert words in sentence(capsys)
+    assert words in refused(command, *RUN, *arguments, "--out", tmp_path / "runs")
     assert not (tmp_path / "runs").is_dir() or not any((tmp_path / "runs").iterdir())
 
 
-def test_a_checkpoint_of_another_layout(monkeypatch, capsys, tmp_path):
+def test_a_checkpoint_of_another_layout(command, tmp_path):
     task = task_class("PushCube-v1")
     options = EquivariantOptions(channels=8, width=16, depth=1)
     policy = EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
     path = save_policy(policy, tmp_path / "push.safetensors")
-    arguments = ("run", "--quiet", "--base-policy", path, "--out", tmp_path / "runs")
-    assert symsteer(monkeypatch, *arguments) == 2
-    assert "observation layout" in sentence(capsys)
+    words = refused(command, *RUN, "--base-policy", path, "--out", tmp_path / "runs")
+    assert "observation layout" in words
 
 
-def test_report_checks_and_verifies_from_any_folder(monkeypatch, capsys, tmp_path):
+def test_report_checks_and_verifies_from_any_folder(command, monkeypatch, tmp_path):
     (tmp_path / "--odd").mkdir()
     for name in ("a.json", "--odd/b.json"):
         (tmp_path / name).write_text(json.dumps({"hello": 1}))
     monkeypatch.chdir(tmp_path)
-    assert symsteer(monkeypatch, "report", "--check", "a.json", "./--odd") == 2
-    shown = capsys.readouterr().out
-    assert shown.count("NOT ADMISSIBLE") == 2
-    assert "0 of 2 records are admissible" in shown
+    code, shown = command("report", "--check", "a.json", "./--odd")
+    assert (code, shown.out.count("NOT ADMISSIBLE")) == (2, 2)
+    assert "0 of 2 records are admissible" in shown.out
     committed = Path(__file__).parents[2] / "leaderboard" / "results" / "records"
     record = next(committed.rglob("*.json"))
-    assert symsteer(monkeypatch, "report", record, "--verify", "--out", tmp_path / "page") == 1
-    assert "LEADERBOARD.md: missing" in capsys.readouterr().out
-    assert symsteer(monkeypatch, "report", "--verify", "--check") == 2
+    code, shown = command("report", record, "--verify", "--out", tmp_path / "page")
+    assert code == 1
+    assert "LEADERBOARD.md: missing" in shown.out
+    assert command("report", "--verify", "--check")[0] == 2
     assert {path.name for path in tmp_path.iterdir()} == {"a.json", "--odd"}
-    capsys.readouterr()
-    assert symsteer(monkeypatch, "report", "a.json", "--out", tmp_path / "page") == 2
-    assert "a.json" in sentence(capsys)
+    assert "a.json" in refused(command, "report", "a.json", "--out", tmp_path / "page")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["/proc/nowhere/a.h5"], "/proc/nowhere cannot be written"),
-        (["a.h5", "--seed", "-1"], "seed"),
-        (["a.txt"], ".h5"),
-        (["a.h5", "--count", "0"], "at least 1"),
-    ],
-)
-def test_mistakes_in_demos(arguments, words, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    assert symsteer(monkeypatch, "demos", *arguments) == 2
-    assert words in sentence(capsys)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["sweep", "smoke", "--out", "/proc/nowhere"], "/proc/nowhere"),
-        (["sweep", "dmeo"], "demo"),
-        (["swep", "smoke"], "did you mean 'sweep'"),
-    ],
-)
-def test_mistakes_in_a_sweep(arguments, words, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    assert symsteer(monkeypatch, *arguments) == 2
-    assert words in sentence(capsys)
-
-
-def test_list_names_everything(monkeypatch, capsys):
-    assert symsteer(monkeypatch, "list") == 0
-    out = capsys.readouterr().out
-    lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
+def test_list_names_everything(command):
+    code, shown = command("list")
+    assert code == 0
+    lines = {line.split()[0]: line for line in shown.out.splitlines() if line.startswith("  ")}
     for word in ("StackCube-v1", "panda", "action_gain", "residual-pathway", "plain", "demo"):
         assert len(lines[word].split()) > 3, word
 
 
-def test_demos_are_written(monkeypatch, capsys, tmp_path):
+def test_demos_are_written(command, tmp_path):
     path = tmp_path / "push.h5"
-    arguments = ("demos", path, "--task", "PushCube-v1", "--count", 2, "--mode", "clean")
-    assert symsteer(monkeypatch, *arguments) == 0
-    assert "wrote 2 demonstrations" in capsys.readouterr().out
+    code, shown = command("demos", path, "--task", "PushCube-v1", "--count", 2, "--mode", "clean")
+    assert code == 0
+    assert "wrote 2 demonstrations" in shown.out
     assert path.with_suffix(".json").is_file()
 
 
-def test_the_overview_names_every_verb(monkeypatch, capsys):
+def test_the_overview_names_every_verb(command):
     for arguments in ((), ("--help",)):
-        assert symsteer(monkeypatch, *arguments) == 0
-        out = capsys.readouterr().out
-        titles = re.findall(r"^(\w.*):$", out, re.MULTILINE)
-        assert titles == list(GROUPS)
-        assert re.findall(r"^  ([\w-]+) ", out, re.MULTILINE) == list(VERBS)
+        code, shown = command(*arguments)
+        assert code == 0
+        assert re.findall(r"^(\w.*):$", shown.out, re.MULTILINE) == list(GROUPS)
+        assert re.findall(r"^  ([\w-]+) ", shown.out, re.MULTILINE) == list(VERBS)
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "run"])
-def test_every_verb_has_help(verb, monkeypatch, capsys):
-    assert symsteer(monkeypatch, verb, "--help") == 0
-    assert f"usage: symsteer {verb} " in capsys.readouterr().out
+def test_every_verb_has_help(verb, command):
+    code, shown = command(verb, "--help")
+    assert code == 0
+    assert f"usage: symsteer {verb} " in shown.out
 
 
-def test_the_version(monkeypatch, capsys):
-    assert symsteer(monkeypatch, "--version") == 0
-    assert capsys.readouterr().out == f"symsteer {version('symsteer')}\n"
+def test_the_version(command):
+    code, shown = command("--version")
+    assert (code, shown.out) == (0, f"symsteer {version('symsteer')}\n")
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["list"], ["sweep", "--help"]])
@@ -215,27 +182,32 @@ def test_names_and_help_cost_no_import_of_torch_or_maniskill(arguments):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_doctor_names_what_there_is(monkeypatch, capsys):
-    assert symsteer(monkeypatch, "doctor") == 0
-    out = capsys.readouterr().out
-    assert "CUDA" in out
-    assert "rendering" in out.lower()
+def test_doctor_names_what_there_is(command):
+    code, shown = command("doctor")
+    assert code == 0
+    assert "CUDA" in shown.out
+    assert "rendering" in shown.out.lower()
 
 
-def test_commands_can_be_pasted(monkeypatch, capsys, tmp_path):
+def test_commands_can_be_pasted(command, capsys, tmp_path):
     out = tmp_path / "my runs; x$(y)'s"
     out.mkdir()
-    assert symsteer(monkeypatch, "status", out) == 0
-    *_, command = capsys.readouterr().out.partition("start some: ")
-    assert shlex.split(command) == ["symsteer", "sweep", "SUITE", "--out", str(out)]
+    _, shown = command("status", out)
+    assert shlex.split(shown.out.partition("start some: ")[2]) == [
+        "symsteer",
+        "sweep",
+        "SUITE",
+        "--out",
+        str(out),
+    ]
     write_record(make_record(), out / "run" / "record.json")
     bench.cli._print_places(out / "run")
     board, page = capsys.readouterr().out.splitlines()[1:]
     assert shlex.split(board)[1:4] == ["tensorboard", "--logdir", str(out)]
     expected = ["symsteer", "report", str(out), "--out", str(out / "leaderboard")]
     assert shlex.split(page)[1:] == expected
-    assert symsteer(monkeypatch, "new", "agent", "mine", "--out", out) == 0
-    move = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("cd "))
+    _, shown = command("new", "agent", "mine", "--out", out)
+    move = next(line for line in shown.out.splitlines() if line.startswith("cd "))
     assert shlex.split(move) == ["cd", str(out)]
 
 

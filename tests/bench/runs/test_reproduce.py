@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from symsteer.bench.runs.reproduce import conditions, reproduce
-from symsteer.cli import main
 from symsteer.leaderboard.records import (
     config_hash,
     dump_record,
@@ -22,15 +21,6 @@ from symsteer.leaderboard.records import (
 )
 from symsteer.leaderboard.runs import load_runs
 from tests.bench.tiny_run import execute, quiet, tiny_config, without_clock
-
-
-@pytest.fixture
-def call(monkeypatch, capsys):
-    def called(*arguments):
-        monkeypatch.setattr("sys.argv", ["symsteer", "reproduce", *map(str, arguments)])
-        return main(), capsys.readouterr()
-
-    return called
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +50,7 @@ def changed(finished, tmp_path):
 
 
 @pytest.mark.long
-def test_a_run_is_made_again_and_agrees_exactly(repeated, tmp_path, call):
+def test_a_run_is_made_again_and_agrees_exactly(repeated, tmp_path, command):
     folder, again = repeated
     assert without_clock(folder) == without_clock(again)
     record = folder / "record.json"
@@ -68,7 +58,7 @@ def test_a_run_is_made_again_and_agrees_exactly(repeated, tmp_path, call):
     assert any((again.parent / "base").iterdir()), "the base policy was not made anew"
     marks = tmp_path / "marks"
     # The same command finds the finished run in its place.
-    code, shown = call(folder, "--out", again.parent.parent, "--into", marks)
+    code, shown = command("reproduce", folder, "--out", again.parent.parent, "--into", marks)
     assert code == 0
     assert "compared without making it again" in shown.err
     assert "Everything agrees exactly." in shown.out
@@ -117,40 +107,40 @@ def succeed(data):
         (succeed, ("the final success differs", r", 0\.000 here \(-1\.000 \[")),
     ],
 )
-def test_episodes_that_were_changed_are_found(edit, words, changed, tmp_path, call):
-    code, shown = call(changed(edit), "--out", tmp_path / "out")
+def test_episodes_that_were_changed_are_found(edit, words, changed, tmp_path, command):
+    code, shown = command("reproduce", changed(edit), "--out", tmp_path / "out")
     assert code == 1
     for text in words:
         assert re.search(text, shown.out, re.MULTILINE), text
 
 
-def test_files_that_the_run_began_from_are_checked(finished, tmp_path, call):
+def test_files_that_the_run_began_from_are_checked(finished, tmp_path, command):
     config, folder = finished
     policy = folder / "policy.safetensors"
     evaluation = dataclasses.replace(config.evaluation, every=240)
     own = tiny_config(agent="zero", env_steps=240, evaluation=evaluation)
     run = execute(own, tmp_path / "runs", base_policy=policy)
-    code, shown = call(run)
+    code, shown = command("reproduce", run)
     assert code == 2
     assert "began from a policy file" in shown.err
     assert "--base-policy FILE.safetensors" in shown.err
     other = tmp_path / "other.safetensors"
     other.write_bytes(policy.read_bytes() + b"\0")
-    code, shown = call(run, "--base-policy", other)
+    code, shown = command("reproduce", run, "--base-policy", other)
     assert code == 2
     assert "has the hash" in shown.err
-    code, shown = call(run, "--base-policy", policy, "--base-from", tmp_path)
+    code, shown = command("reproduce", run, "--base-policy", policy, "--base-from", tmp_path)
     assert code == 2
     assert "leave --base-from out" in shown.err
-    code, shown = call(folder, "--demos", policy)
+    code, shown = command("reproduce", folder, "--demos", policy)
     assert code == 2
     assert "began from no demonstrations file; leave --demos out" in shown.err
     out = tmp_path / "out"
-    code, shown = call(run, "--base-policy", policy, "--out", out)
+    code, shown = command("reproduce", run, "--base-policy", policy, "--out", out)
     assert code == 0
 
 
-def test_of_submitted_records_one_is_drawn(changed, tmp_path, call, monkeypatch):
+def test_of_submitted_records_one_is_drawn(changed, tmp_path, command, monkeypatch):
     path = changed(lambda data: data.update(run_id="first"))
     folder = tmp_path / "submitted"
     folder.mkdir()
@@ -159,13 +149,13 @@ def test_of_submitted_records_one_is_drawn(changed, tmp_path, call, monkeypatch)
         (folder / name).write_text("{}")
     offered = []
     monkeypatch.setattr("secrets.choice", lambda found: offered.extend(found) or found[0])
-    code, shown = call(folder, "--out", tmp_path / "out")
+    code, shown = command("reproduce", folder, "--out", tmp_path / "out")
     assert code == 0
     assert "drawn at random from 3 records: first.json" in shown.err
     assert [one.name for one in offered] == ["first.json", "second.json", "third.json"]
 
 
-def test_the_base_policy_of_other_runs_is_taken(finished, tmp_path, call):
+def test_the_base_policy_of_other_runs_is_taken(finished, tmp_path, command):
     folder = finished[1]
     # An older version with fewer options gave another name to the same policy.
     runs, name = tmp_path / "older", "PickCube-v1-floating-edp-older"
@@ -174,17 +164,17 @@ def test_the_base_policy_of_other_runs_is_taken(finished, tmp_path, call):
     policy.parent.rename(runs / "base" / name)
     policy = runs / "base" / name / policy.name
     arguments = (folder, "--out", tmp_path / "out", "--base-from")
-    code, shown = call(*arguments, tmp_path / "nowhere")
+    code, shown = command("reproduce", *arguments, tmp_path / "nowhere")
     assert code == 2
     assert "does not have the base policy" in shown.err
     other = json.loads((folder / "record.json").read_text())
     other["base_policy"]["content_hash"] = "ab" * 32
     (tmp_path / "other.json").write_text(json.dumps(other))
-    code, shown = call(tmp_path / "other.json", *arguments[1:], runs)
+    code, shown = command("reproduce", tmp_path / "other.json", *arguments[1:], runs)
     assert code == 2
     assert "does not have the base policy abababababab" in shown.err
     assert not (tmp_path / "out").exists()
-    code, shown = call(*arguments, runs)
+    code, shown = command("reproduce", *arguments, runs)
     assert code == 0
     assert "are those of other runs, not made anew" in shown.out
     (place,) = (tmp_path / "out").iterdir()
@@ -194,7 +184,7 @@ def test_the_base_policy_of_other_runs_is_taken(finished, tmp_path, call):
     assert copy.read_bytes() == policy.read_bytes()
 
 
-def test_what_cannot_be_repeated_is_one_sentence(finished, tmp_path, call):
+def test_what_cannot_be_repeated_is_one_sentence(finished, tmp_path, command):
     folder = finished[1]
     record = read_record(folder / "record.json")
 
@@ -203,7 +193,7 @@ def test_what_cannot_be_repeated_is_one_sentence(finished, tmp_path, call):
         copy.__dict__["config_hash"] = config_hash(copy.config)
         path = tmp_path / "record.json"
         path.write_text(dump_record(copy))
-        code, shown = call(path, "--out", tmp_path / "out")
+        code, shown = command("reproduce", path, "--out", tmp_path / "out")
         assert (code, shown.out) == (2, "")
         assert shown.err.startswith("error: ")
         assert shown.err.count("\n") == 1
@@ -223,7 +213,7 @@ def test_what_cannot_be_repeated_is_one_sentence(finished, tmp_path, call):
     unfinished.mkdir()
     (unfinished / "config.json").write_text("{}")
     for path in (tmp_path / "nowhere", tmp_path.parent, unfinished):
-        code, shown = call(path)
+        code, shown = command("reproduce", path)
         assert code == 2
         assert "record.json" in shown.err or "nowhere" in shown.err
     assert not (tmp_path / "out").exists()
