@@ -164,9 +164,15 @@ def reproduction_of(path: Path, again: Path, conditions: Sequence[str]) -> Repro
     """Compare the record at `path` with that of the repeated run at `again`."""
     record, repeated = read_record(path), read_record(again)
     differences, success, area = compare_records(record, repeated)
+    alike: Verdict = "alike" if success.low <= 0 <= success.high else "different"
     return Reproduction(
-        verdict=_verdict(differences, success),
-        record=_original(path, record),
+        verdict=alike if differences else "exact",
+        record=Original(
+            run_id=record.run_id,
+            sha256=file_hash(path),
+            config_hash=record.config_hash,
+            commit=record.provenance.commit,
+        ),
         repeated=Repeated(
             sha256=file_hash(again),
             started=repeated.started,
@@ -177,15 +183,6 @@ def reproduction_of(path: Path, again: Path, conditions: Sequence[str]) -> Repro
         success=success,
         area=area,
         differences=differences,
-    )
-
-
-def _original(path: Path, record: RunRecord) -> Original:
-    return Original(
-        run_id=record.run_id,
-        sha256=file_hash(path),
-        config_hash=record.config_hash,
-        commit=record.provenance.commit,
     )
 
 
@@ -232,7 +229,8 @@ def check_reproduction(
         found: the reproduction.
         path: of its file.
         record: of the record that it names.
-        vouched: whether a maintainers' list has it: then it may be without the repeated record.
+        vouched: whether a maintainers' list has the hash of this file: then it may be without the
+            repeated record.
         alone: whether one that no list has counts as well.
 
     Raises:
@@ -244,44 +242,29 @@ def check_reproduction(
             f"{path} does not count, because the list of the study, which maintainers keep, lacks "
             "it: add its line to the list (docs/submit.md), or remove it"
         )
+    if vouched and not again.is_file():
+        return
     cure = "make it again with `symsteer reproduce RECORD --into`, or remove it"
-    if not vouched and not again.is_file():
+    if not again.is_file():
         raise UserError(
             f"{path} cannot be computed again, because the repeated record {again.name} is not "
             f"beside it: {cure}"
         )
+    wanted, made = (flat(with_retired(read_record(file).config)) for file in (record, again))
     try:
-        agrees = _rounded(_wanted(found, record, again)) == _rounded(found)
+        agrees = wanted.items() <= made.items() and _rounded(
+            reproduction_of(record, again, found.conditions)
+        ) == _rounded(found)
     except ValueError:  # one of them is not finished, or they are the same file
         agrees = False
     if not agrees:
         raise UserError(f"{path} says something else than the records that it is about: {cure}")
 
 
-def _wanted(found: Reproduction, record: Path, again: Path) -> Reproduction:
-    """What the two records say; without the repeated one, what it must say of the record."""
-    one = read_record(record)
-    if again.is_file():
-        if not flat(one.config).items() <= flat(with_retired(read_record(again).config)).items():
-            raise ValueError("another run")
-        return reproduction_of(record, again, found.conditions)
-    _, success, area = compare_records(one, one)
-    success = found.success.model_copy(update={"recorded": success.recorded})
-    area = found.area.model_copy(update={"recorded": area.recorded})
-    known = {"verdict": _verdict(found.differences, success), "record": _original(record, one)}
-    return found.model_copy(update=known | {"success": success, "area": area})
-
-
 def _rounded(reproduction: Reproduction) -> Any:
     """Plain data without the last digits, which differ between versions of libraries."""
     text = dump_reproduction(reproduction)
     return json.loads(text, parse_float=lambda number: f"{float(number):.9f}")
-
-
-def _verdict(differences: Sequence[Difference], success: Success) -> Verdict:
-    if not differences:
-        return "exact"
-    return "alike" if success.low <= 0 <= success.high else "different"
 
 
 _MISSING = object()

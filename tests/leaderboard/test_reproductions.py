@@ -191,22 +191,21 @@ def test_the_verdicts_and_the_round_trip_of_a_file(results: Path) -> None:
 
 
 def test_rows_and_runs_are_marked(results: Path) -> None:
-    records, out, marks = results / "records", results / "board", results / "marks"
+    records, marks = results / "records", results / "marks"
     plain = {path.name: path.read_bytes() for path in generate([records], results / "plain")}
-    written = {path.name: path for path in generate([records], out, reproductions=marks)}
-    page = written["LEADERBOARD.md"].read_text()
-    row = next(line for line in page.splitlines() if "0.80" in line and "`equivariant`" in line)
-    (cell,) = [c for c in page.replace("\u00a0", " ").split(" | ") if "1 reproduced exactly" in c]
-    assert "5 finished, 1 reproduced exactly, 1 reproduced alike" in cell
-    assert row
+    written = {
+        path.name: path.read_text()
+        for path in generate([records], results / "board", reproductions=marks)
+        if path.suffix in (".md", ".csv")
+    }
+    page = written["LEADERBOARD.md"].replace("\u00a0", " ")
+    assert page.count("5 finished, 1 reproduced exactly, 1 reproduced alike") == 1
     assert "made again from their records" in page
-    listed = csv.DictReader(io.StringIO(written["records.csv"].read_text()))
-    verdicts = [record["reproduced"] for record in listed if record["reproduced"]]
-    assert sorted(verdicts) == ["alike", "exact"]
-    rows = list(csv.DictReader(io.StringIO(written["leaderboard.csv"].read_text())))
+    listed = csv.DictReader(io.StringIO(written["records.csv"]))
+    assert sorted(filter(None, (run["reproduced"] for run in listed))) == ["alike", "exact"]
     counted = {
-        r["agent"]: (r["reproduced_exactly"], r["reproduced_alike"], r["not_reproduced"])
-        for r in rows
+        row["agent"]: (row["reproduced_exactly"], row["reproduced_alike"], row["not_reproduced"])
+        for row in csv.DictReader(io.StringIO(written["leaderboard.csv"]))
     }
     assert counted["equivariant"] == ("1", "1", "0")
     assert counted["standard"] == ("0", "0", "0")
@@ -344,7 +343,7 @@ def test_an_unfinished_repeated_run_is_one_sentence(results: Path) -> None:
 def test_without_the_repeated_record_the_list_decides(
     results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The oldest reproductions lack it; what they say of the record is compared."""
+    """The oldest reproductions lack it."""
     for path in repeated_of(results):
         path.unlink()
     own = sorted((results / "records").iterdir())
@@ -355,14 +354,6 @@ def test_without_the_repeated_record_the_list_decides(
     assert sorted(r.reproduction.verdict for r in counted if r.reproduction) == ["alike", "exact"]
     monkeypatch.setattr(study, "FOLDER", results)
     assert len(load_runs([results / "records"], results / "marks")) == 15
-    mark = {one.verdict: p for p, one in marks_of(results).items()}["alike"]
-    text = mark.read_bytes()
-    for changes in [OTHER_NUMBERS[n] for n in (0, 3, 4, 5)]:
-        edited(mark, **changes)
-        vouched = {*map(file_hash, own), *map(file_hash, marks_of(results))}
-        with pytest.raises(UserError, match="says something else"):
-            load_runs([results / "records"], results / "marks", vouched)
-        mark.write_bytes(text)
 
 
 # Marks of submitted runs
