@@ -24,6 +24,7 @@ import json
 import os
 import re
 import sys
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -334,11 +335,8 @@ def _line(error: Exception, module: str) -> str:
     if isinstance(error, SyntaxError):  # its message names the line already
         return ""
     path = getattr(sys.modules.get(module), "__file__", None) or _file_of(module)
-    lines, trace = [], error.__traceback__
-    while trace:
-        if path and trace.tb_frame.f_code.co_filename == str(path):
-            lines.append(f", line {trace.tb_lineno}")
-        trace = trace.tb_next
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [f", line {frame.lineno}" for frame in frames if frame.filename == path]
     return lines[-1] if lines else ""
 
 

@@ -61,13 +61,9 @@ def test_a_folder_of_unchanged_results_is_identical(place, symsteer):
     assert out.split("\n\n")[1].startswith("IDENTICAL: all pairs agree bit for bit")
     assert "30 pairs in 6 cells" in out
     assert out.endswith("verdict: identical\n")
-
-
-def test_identical_episodes_of_other_diagnostics(place, symsteer):
-    a, b = runs_of([[1, 0]]), runs_of([[1, 0]])
-    b[0].evaluations[0].diagnostics = {"q_bias": 2.0}
-    save(place / "a", a), save(place / "b", b)
-    _, out, _ = symsteer("a", "b")
+    records[-1].evaluations[0].diagnostics = {"q_bias": 2.0}
+    save(place / "changed", records)
+    _, out, _ = symsteer("runs", "changed")
     assert "but not in all diagnostics" in " ".join(out.split())
 
 
