@@ -12,7 +12,7 @@ from symsteer.errors import UserError, first_problem
 from symsteer.files import write_atomically
 from symsteer.leaderboard.records.migrations import migrated
 from symsteer.leaderboard.records.schema import SCHEMA_VERSION, RunRecord
-from symsteer.leaderboard.records.values import canonical_json
+from symsteer.leaderboard.records.values import json_lines
 
 MAX_BYTES = 64 * 2**20
 """A record has some ten to a few hundred kilobytes; a larger file is something else."""
@@ -20,15 +20,7 @@ MAX_BYTES = 64 * 2**20
 
 def dump_record(record: RunRecord) -> str:
     """The text of a record: strict JSON, sorted keys, one line per block and per evaluation."""
-    data = record.model_dump(mode="json", by_alias=True)
-    lines = []
-    for key, value in data.items():
-        if key == "evaluations" and value:
-            rows = ",\n".join("  " + canonical_json(row) for row in value)
-            lines.append(f'"evaluations": [\n{rows}\n ]')
-        else:
-            lines.append(f'"{key}": {canonical_json(value)}')
-    return "{\n " + ",\n ".join(lines) + "\n}\n"
+    return json_lines(record.model_dump(mode="json", by_alias=True))
 
 
 def write_record(record: RunRecord, path: Path | str) -> None:

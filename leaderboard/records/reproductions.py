@@ -34,8 +34,8 @@ from symsteer.leaderboard.records.values import (
     Sha256,
     Share,
     Text,
-    canonical_json,
     flat,
+    json_lines,
 )
 
 Verdict = Literal["exact", "alike", "different"]
@@ -188,9 +188,7 @@ def reproduction_of(path: Path, again: Path, conditions: Sequence[str]) -> Repro
 
 def dump_reproduction(reproduction: Reproduction) -> bytes:
     """The file of a reproduction: strict JSON, a line for each key."""
-    data = reproduction.model_dump(mode="json")
-    lines = [f'"{key}": {canonical_json(value)}' for key, value in data.items()]
-    return ("{\n " + ",\n ".join(lines) + "\n}\n").encode()
+    return json_lines(reproduction.model_dump(mode="json")).encode()
 
 
 def read_reproductions(folder: Path) -> dict[str, Reproduction]:

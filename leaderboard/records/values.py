@@ -162,6 +162,18 @@ def canonical_json(data: Any) -> str:
     return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
+def json_lines(data: Mapping[str, Any]) -> str:
+    """The same in one line for each key, and for each of `evaluations`."""
+    lines = []
+    for key, value in data.items():
+        if key == "evaluations" and value:
+            rows = ",\n".join("  " + canonical_json(row) for row in value)
+            lines.append(f'"evaluations": [\n{rows}\n ]')
+        else:
+            lines.append(f'"{key}": {canonical_json(value)}')
+    return "{\n " + ",\n ".join(lines) + "\n}\n"
+
+
 def config_hash(config: Mapping[str, Any]) -> str:
     """sha256 over the canonical JSON of a resolved configuration, in hexadecimal."""
     return hashlib.sha256(canonical_json(config).encode()).hexdigest()

@@ -53,28 +53,23 @@ def files_end_at(size):
 
 
 @pytest.fixture
-def read_only(tmp_path):
+def read_only():
     """Make a folder read-only, also for root; gives a function."""
-    mounted, changed = [], []
+    with contextlib.ExitStack() as undo:
 
-    def lock(folder):
-        if os.geteuid():
-            folder.chmod(0o555)
-            changed.append(folder)
-            return folder
-        for options in (["--bind"], ["-o", "remount,bind,ro"]):
-            command = ["mount", *options, str(folder), str(folder)]
-            if subprocess.run(command, capture_output=True, check=False).returncode:
-                pytest.skip("root can write everywhere, and nothing can be mounted here")
-            if options == ["--bind"]:
-                mounted.append(folder)
-        return folder
+        def lock(folder):
+            if os.geteuid():
+                folder.chmod(0o555)
+                undo.callback(folder.chmod, 0o755)
+                return
+            for options in (["--bind"], ["-o", "remount,bind,ro"]):
+                command = ["mount", *options, str(folder), str(folder)]
+                if subprocess.run(command, capture_output=True, check=False).returncode:
+                    pytest.skip("root can write everywhere, and nothing can be mounted here")
+                if options == ["--bind"]:
+                    undo.callback(subprocess.run, ["umount", str(folder)], check=True)
 
-    yield lock
-    for folder in mounted:
-        subprocess.run(["umount", str(folder)], check=True)
-    for folder in changed:
-        folder.chmod(0o755)
+        yield lock
 
 
 # What is watched.
