@@ -7,7 +7,6 @@ true. Numbers that are invented and agree with each other are found by making a 
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import math
 import re
@@ -38,6 +37,7 @@ from symsteer.leaderboard.records import (
     flat,
     portable,
     read_record,
+    run_id_of,
     with_retired,
 )
 from symsteer.leaderboard.records.provenance import checkout, git
@@ -46,7 +46,7 @@ from symsteer.leaderboard.records.schema import Q_VALUES
 from symsteer.leaderboard.records.values import Count, Sha256
 from symsteer.leaderboard.rows import MIN_SEEDS
 from symsteer.leaderboard.study import all_listed
-from symsteer.variant import file_name, parse_variant, specs_at, variant_text
+from symsteer.variant import parse_variant, specs_at, variant_text
 
 MIN_EPISODES = 100
 """Held-out episodes of a submitted record's final evaluation."""
@@ -126,12 +126,8 @@ class Judged:
         self.known_world = all(spec.name in catalogue.VARIANTS for spec in self.specs)
         kept = [spec for spec in present if spec.name not in catalogue.TRAINING_ONLY]
         self.evaluated_in = variant_text(kept)
-        s, own = self.settings, {k: v for k, v in record.config.items() if k not in DERIVED}
-        digest = hashlib.sha256(canonical_json([own, record.config.get("files")]).encode())
-        names = map(file_name, (s.task, s.embodiment, s.variant, s.agent, f"s{s.seed}"))
-        self.run_id = "-".join([*names, digest.hexdigest()[:12]])
         self.seeds = {"run": c.seed, "policy": c.policy_seed, "first_held_out": HELD_OUT_SEED}
-        self.seeds["demonstrations"] = s.demonstrations.seed
+        self.seeds["demonstrations"] = self.settings.demonstrations.seed
 
 
 @dataclass
@@ -398,7 +394,7 @@ RULES: dict[str, Check] = {
     "its code can be looked up | everybody can read and run it": _unknown_code,
     "names are SymSteer's, or extensions' | a row is of its agent's code": _unknown_name,
     "its name is its configuration's | a record describes the run that it names": lambda j: (
-        j.record.run_id != j.run_id and f"it is that of {j.run_id}"
+        (wanted := run_id_of(j.record.config)) != j.record.run_id and f"it is that of {wanted}"
     ),
     "seeds are the configuration's | agents are compared on equal seeds": lambda j: (
         j.record.seeds != j.seeds

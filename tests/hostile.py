@@ -18,9 +18,7 @@ from safetensors.torch import save_file
 
 from symsteer.bench.bundles.fetch import read_bundle
 from symsteer.bench.bundles.manifest import MANIFEST
-from symsteer.bench.runs.config import content_key
-from symsteer.leaderboard.records import DERIVED, config_hash
-from symsteer.variant import file_name
+from symsteer.leaderboard.records import config_hash, run_id_of
 
 EVIL = "evilmod:Evil"
 
@@ -165,9 +163,7 @@ def _run(runs: Path, intact: Path, config: dict[str, Any], kind: str) -> None:
         data["policy"]["name"] = EVIL
     else:
         data[kind] = f"{EVIL}:0.5" if kind == "variant" else EVIL
-    own = {key: value for key, value in data.items() if key not in DERIVED}
-    words = (data["task"], data["embodiment"], data["variant"], data["agent"], f"s{data['seed']}")
-    name = file_name(f"{'-'.join(words)}-{content_key(own, data.get('files', {}))}")
+    name = run_id_of({"files": {}, **data})
     folder = runs / (name if kind != "policy" else f"{name}-policy=Evil")
     shutil.copytree(intact, folder)
     (folder / "config.json").write_text(json.dumps(data))

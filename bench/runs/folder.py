@@ -15,11 +15,10 @@ from typing import Any, Literal
 
 from filelock import FileLock, Timeout
 
-from symsteer.bench.runs.config import RunConfig, content_key
+from symsteer.bench.runs.config import RunConfig
 from symsteer.errors import UserError
 from symsteer.files import shallow, write_atomically
-from symsteer.leaderboard.records import read_record
-from symsteer.variant import file_name
+from symsteer.leaderboard.records import read_record, run_id_of
 
 State = Literal["missing", "running", "interrupted", "failed", "finished"]
 
@@ -41,9 +40,7 @@ def run_id(
         origin: content hashes of demonstrations or a policy that came from files.
         stored: the configuration as plain data, of a run that may have options that are no more.
     """
-    variant, agent, task = map(file_name, (config.variant, config.agent, config.task))
-    key = content_key(stored or config.to_json(), origin)
-    return f"{task}-{config.embodiment}-{variant}-{agent}-s{config.seed}-{key}"
+    return run_id_of({**(stored or config.to_json()), "files": origin})
 
 
 def is_finished(folder: Path) -> bool:

@@ -11,7 +11,7 @@ compares a run with its repetition. This package imports nothing of the leaderbo
 
 from symsteer.leaderboard.records.files import dump_record, read_record, write_record
 from symsteer.leaderboard.records.provenance import Provenance, RecordedExtension
-from symsteer.leaderboard.records.repeat import DERIVED, FILES, repeat_command
+from symsteer.leaderboard.records.repeat import FILES, repeat_command
 from symsteer.leaderboard.records.reproductions import (
     PARTS,
     REPEATED,
@@ -42,7 +42,14 @@ from symsteer.leaderboard.records.schema import (
     UsedBudget,
     WallClock,
 )
-from symsteer.leaderboard.records.values import canonical_json, config_hash, flat, portable
+from symsteer.leaderboard.records.values import (
+    DERIVED,
+    canonical_json,
+    config_hash,
+    flat,
+    portable,
+    run_id_of,
+)
 
 __all__ = [
     "DERIVED",
@@ -81,6 +88,7 @@ __all__ = [
     "read_reproductions",
     "repeat_command",
     "reproduction_of",
+    "run_id_of",
     "with_retired",
     "without_retired",
     "write_record",

@@ -7,11 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from symsteer.leaderboard.records.retired import without_retired
-from symsteer.leaderboard.records.values import flat
+from symsteer.leaderboard.records.values import DERIVED, flat
 from symsteer.terminal import option_words, to_paste
-
-DERIVED = ("evaluation_variant", "files")
-"""Keys that the run adds to its configuration."""
 
 KEYS = frozenset(
     {

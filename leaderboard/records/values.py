@@ -16,6 +16,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, model_validator
 
+from symsteer.variant import file_name
+
+DERIVED = ("evaluation_variant", "files")
+"""Keys that a run adds to its configuration."""
+
 MAX_TEXT = 2000
 
 LARGEST_COUNT = 2**53
@@ -177,6 +182,15 @@ def json_lines(data: Mapping[str, Any]) -> str:
 def config_hash(config: Mapping[str, Any]) -> str:
     """sha256 over the canonical JSON of a resolved configuration, in hexadecimal."""
     return hashlib.sha256(canonical_json(config).encode()).hexdigest()
+
+
+def run_id_of(config: Mapping[str, Any]) -> str:
+    """The name of a run: readable, and unique for its resolved configuration."""
+    own = {key: value for key, value in config.items() if key not in DERIVED}
+    digest = hashlib.sha256(canonical_json([own, config.get("files")]).encode()).hexdigest()
+    words = (*(config[key] for key in ("task", "embodiment", "variant", "agent")), config["seed"])
+    task, embodiment, variant, agent, seed = map(file_name, map(str, words))
+    return f"{task}-{embodiment}-{variant}-{agent}-s{seed}-{digest[:12]}"
 
 
 def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
