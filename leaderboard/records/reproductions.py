@@ -10,8 +10,7 @@ import hashlib
 import json
 import math
 from codecs import BOM_UTF8
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -22,7 +21,7 @@ from symsteer.leaderboard.records.curves import area_under_curve
 from symsteer.leaderboard.records.files import read_record
 from symsteer.leaderboard.records.provenance import Provenance
 from symsteer.leaderboard.records.retired import with_retired
-from symsteer.leaderboard.records.schema import Evaluation, RunRecord
+from symsteer.leaderboard.records.schema import RunRecord
 from symsteer.leaderboard.records.shares import newcombe
 from symsteer.leaderboard.records.values import (
     Count,
@@ -36,6 +35,7 @@ from symsteer.leaderboard.records.values import (
     Text,
     flat,
     json_lines,
+    leaves,
 )
 
 Verdict = Literal["exact", "alike", "different"]
@@ -145,7 +145,7 @@ def compare_records(record: RunRecord, again: RunRecord) -> tuple[list[Differenc
     What the record does not have, such as a diagnostic that is newer, is not compared. Raises
     ValueError for a run that is not finished.
     """
-    differences = [_difference(part, _values(part, record, again)) for part in PARTS]
+    differences = [_difference(part, record, again) for part in PARTS]
     shares, areas = [], []
     for run in (record, again):
         if run.final is None:
@@ -267,63 +267,56 @@ def _rounded(reproduction: Reproduction) -> Any:
 
 _MISSING = object()
 
-Value = tuple[int | None, str, Any, Any]
-"""Step of the evaluation if it has one, name, the recorded value and the repeated one."""
+Place = tuple[int | None, str]
+"""Number of the evaluation if it is in one, and name of a value."""
 
 
-def _values(part: Part, record: RunRecord, again: RunRecord) -> Iterator[Value]:
-    """Every value of a part."""
+def _values(run: RunRecord, part: Part) -> dict[Place, Any]:
+    """The values of a part."""
     if part not in OF_EVALUATIONS:
         key = part.lower().replace(" ", "_")
-        mine = record.model_dump(include={key}, exclude=IGNORED, exclude_none=True)
-        theirs = again.model_dump(include={key}, exclude=IGNORED)
-        yield from _leaves(None, mine.get(key), theirs.get(key))
-        return
-    for one, other in zip_longest(record.evaluations, again.evaluations):
-        if one is None:
-            yield other.env_steps, "evaluation", _MISSING, other.env_steps
-            continue
-        mine, theirs = (_measured(e, part) if e else {} for e in (one, other))
-        known = {key: value for key, value in mine.items() if value is not None}
-        yield from _leaves(one.env_steps, known, theirs)
+        data = run.model_dump(include={key}, exclude=IGNORED)[key]
+        return {(None, name): value for name, value in leaves(data)}
+    values = {}
+    for number, evaluation in enumerate(run.evaluations):
+        if part == "diagnostics":
+            data = {"diagnostics": evaluation.diagnostics, "nonfinite": evaluation.nonfinite}
+        else:
+            data = evaluation.model_dump(include={"env_steps", "decisions", "updates"})
+            data |= evaluation.episodes.model_dump(by_alias=True)
+        values |= {(number, name): value for name, value in leaves(data)}
+    return values
 
 
-def _measured(evaluation: Evaluation, part: Part) -> dict[str, Any]:
-    """What is compared of an evaluation."""
-    if part == "diagnostics":
-        return {"diagnostics": evaluation.diagnostics, "nonfinite": evaluation.nonfinite}
-    place = {name: getattr(evaluation, name) for name in ("env_steps", "decisions", "updates")}
-    return place | evaluation.episodes.model_dump(by_alias=True)
+def _difference(part: Part, record: RunRecord, again: RunRecord) -> Difference:
+    recorded, repeated = _values(record, part), _values(again, part)
+    columns = {name.partition(".")[0] for (_, name), value in recorded.items() if value is not None}
 
+    def is_compared(place: Place) -> bool:
+        """Not what the record lacks, but for items of its columns and numbers that are none."""
+        if recorded.get(place) is not None:
+            return True
+        column = place[1].partition(".")[0]
+        if part == "diagnostics":
+            known = place in recorded or column == "nonfinite"
+            return known and repeated.get(place) is not None
+        return part == "episodes" and column in columns
 
-def _leaves(step: int | None, recorded: Any, repeated: Any, name: str = "") -> Iterator[Value]:
-    """Every value of nested data that the record has, and items of its lists that it lacks."""
-    if isinstance(recorded, Mapping):
-        theirs = repeated if isinstance(repeated, Mapping) else {}
-        more = theirs.keys() - recorded.keys() if name == "nonfinite" else ()
-        for key in (*recorded, *more):
-            place = f"{name}.{key}" if name else key
-            one, other = recorded.get(key, _MISSING), theirs.get(key, _MISSING)
-            yield from _leaves(step, one, other, place)
-    elif isinstance(recorded, list):
-        others = repeated if isinstance(repeated, list) else []
-        for index, (one, other) in enumerate(zip_longest(recorded, others, fillvalue=_MISSING)):
-            yield step, f"{name}.{index}", one, other
-    elif recorded is not None or repeated not in (None, _MISSING):
-        yield step, name, recorded, repeated
-
-
-def _difference(part: Part, values: Iterable[Value]) -> Difference:
-    values = list(values)
-    differing = [value for value in values if value[2] != value[3]]
+    places = [place for place in dict.fromkeys((*recorded, *repeated)) if is_compared(place)]
+    values = [(p, recorded.get(p, _MISSING), repeated.get(p, _MISSING)) for p in places]
+    differing = [value for value in values if value[1] != value[2]]
     sizes = [
         abs(float(one - other))
-        for _, _, one, other in differing
+        for _, one, other in differing
         if isinstance(one, int | float) and isinstance(other, int | float)
     ]
-    first, example = None, ""
+    first: int | None = None
+    example = ""
     if differing:
-        first, name, one, other = differing[0]
+        (number, name), one, other = differing[0]
+        if number is not None:
+            run = record if number < len(record.evaluations) else again
+            first = run.evaluations[number].env_steps
         example = f"{name.removeprefix('diagnostics.')}: {_shown(one)} -> {_shown(other)}"
     return Difference(
         part=part,

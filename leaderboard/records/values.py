@@ -146,20 +146,21 @@ class MeasuredBlock(RecordBlock):
 
     @model_validator(mode="after")
     def _flags_point_at_null(self) -> Self:
-        values = dict(_leaves(self.model_dump(by_alias=True))) if self.nonfinite else {}
+        values = leaves(self.model_dump(by_alias=True)) if self.nonfinite else ()
+        nulls = {place.replace("/", ".") for place, value in values if value is None}
         for path in self.nonfinite:
-            if values.get(path, 0) is not None:
+            if path.replace("/", ".") not in nulls:
                 raise ValueError(f"nonfinite names {path!r}, which is no null of this block")
         return self
 
 
-def _leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value of nested data that holds no others, and its place."""
+def leaves(data: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value of nested data that holds no others, and its place: keys joined by dots."""
     if isinstance(data, dict | list):
         for key, value in data.items() if isinstance(data, dict) else enumerate(data):
-            yield from _leaves(value, f"{path}/{key}" if path else str(key))
+            yield from leaves(value, f"{place}.{key}" if place else str(key))
     else:
-        yield path, data
+        yield place, data
 
 
 def canonical_json(data: Any) -> str:

@@ -120,7 +120,7 @@ DIAGNOSTICS = ("evaluations", 2, "diagnostics")
         (put("q_correlation", 0.5, *DIAGNOSTICS), "diagnostics", 50_000, 1),
         (
             lambda record: record.evaluations.append(make_evaluation([1, 0], 60_000)),
-            *("episodes", 60_000, 1),
+            *("episodes", 60_000, None),
         ),
         (play_more, "episodes", 25_000, None),
         (lambda record: record.evaluations.pop(1), "episodes", 25_000, None),
