@@ -277,7 +277,7 @@ def _values(run: RunRecord, part: Part) -> dict[Place, Any]:
         key = part.lower().replace(" ", "_")
         data = run.model_dump(include={key}, exclude=IGNORED)[key]
         return {(None, name): value for name, value in leaves(data)}
-    values = {}
+    values: dict[Place, Any] = {}
     for number, evaluation in enumerate(run.evaluations):
         if part == "diagnostics":
             data = {"diagnostics": evaluation.diagnostics, "nonfinite": evaluation.nonfinite}
