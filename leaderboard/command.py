@@ -54,7 +54,7 @@ def report(
         raise UserError("--verify and --check cannot be given together; give one of them")
     paths = chosen_records(records, "report")
     if check:
-        return _show_verdicts(paths)
+        return _show_admissions(paths)
     # Here, so that the help of all commands does not wait for matplotlib and scipy.
     from symsteer.leaderboard import report
     from symsteer.leaderboard.study import PAPER
@@ -153,7 +153,7 @@ def _show_differences(result: Verification) -> int:
     return 1
 
 
-def _show_verdicts(paths: Sequence[Path]) -> int:
+def _show_admissions(paths: Sequence[Path]) -> int:
     from symsteer.leaderboard import admission
 
     admissions = admission.check(paths, RECORDS)
