@@ -32,7 +32,7 @@ POLICIES = (
 REFERENCES = ("base", "zero", "golden-ticket")
 
 RETIRED_AGENTS: dict[str, Role] = {"approximate": "learner", "best-of-n-kernel": "learner"}
-"""Agents whose records stay when SymSteer has them no more: `approximate` is that of version 0.1."""
+"""Agents whose records stay when SymSteer has them no more; `approximate` is of version 0.1."""
 
 AGENTS: dict[str, Role] = {
     **dict.fromkeys(REFERENCES, "reference"),
