@@ -322,11 +322,12 @@ def runs(results: Results) -> Values:
 
 def _run(results: Results, run: Run) -> Line:
     record, settings, commit = run.record, run.record.settings, run.record.provenance.commit
+    name = record.run_id
     table, row = results.row_of.get(run.path) or (None, None)
     broken_by = breaks(table.key) if table else dials(settings.variant)
     page_of_agent = results.agent(run.agent) if run.agent in results.summary.roles else None
     return {
-        "Run": Entry(record.run_id, results.run(run)),
+        "Run": Entry(name if len(name) < 15 else f"…{name[-12:]}", results.run(run)),
         **_place(Entry(settings.task), settings.embodiment, broken_by, settings.variant),
         "Agent": Entry(row.label if row else run.agent, page_of_agent, facet=run.agent),
         "Seed": measured(run.seed, str),
