@@ -340,29 +340,29 @@ def _of_cells(
 
 def _title(table: Table, tables: Sequence[Table]) -> str:
     key, keys = table.key, [other.key for other in tables]
-    parts = list(key.broken_by) or ["unbroken"]
+    differing = list(key.broken_by) or ["unbroken"]
     if len({other.base + other.group for other in keys}) > 1:
-        parts.append(f"{key.base} {key.group}".strip())
+        differing.append(f"{key.base} {key.group}".strip())
     if len({other.mode for other in keys}) > 1:
-        parts.append(f"{key.mode} demonstrations")
-    parts += beside_variant(key, keys)
+        differing.append(f"{key.mode} demonstrations")
+    differing += beside_variant(key, keys)
     lines = []
-    for words in (parts, key.settings.split(", ")):
-        # Lines break between the parts, not within them.
+    for words in (differing, key.settings.split(", ")):
+        # Lines break between the words, not within them.
         text = ", ".join(word.replace(" ", SPACE) for word in words)
         lines += wrap(text, TITLE_WIDTH, max_lines=3, placeholder="...")
     return "\n".join(lines)
 
 
-def advantage_map(found: DefectMap, embodiment: str) -> Figure:
+def advantage_map(defect_map: DefectMap, embodiment: str) -> Figure:
     """Advantage over the standard agent against the audited defect: agents by measures.
 
     The colour says which part of a decision the defect is of, the marker the task; bars are 95 %
     intervals, hollow points have few runs. A line per task has the slope within base policies and
     goes through the task's mean; the fan around it has the slopes of the 95 % interval.
     """
-    agents = found.agents(embodiment)
-    panels = [found.panel(embodiment, a, m) for a in agents for m in MEASURES]
+    agents = defect_map.agents(embodiment)
+    panels = [defect_map.panel(embodiment, a, m) for a in agents for m in MEASURES]
     points = [point for panel in panels for point in panel.points]
     tasks = sorted({point.table.key.task for point in points})
     markers = {task: MARKERS[i % len(MARKERS)] for i, task in enumerate(tasks)}
@@ -415,16 +415,16 @@ def _fit(fit: Fit) -> list[Trace]:
     return traces
 
 
-def gained(found: Sequence[Gain]) -> Figure:
+def gained(gains: Sequence[Gain]) -> Figure:
     """Advantage over the standard agent by kind of break, with 95 % intervals; hollow: few runs.
 
     In brackets stand the smallest and the largest audited defect of a kind's cells.
     """
-    agents = list(dict.fromkeys(gain.agent for gain in found))
-    defects = {gain.kind: gain.defects for gain in found}
+    agents = list(dict.fromkeys(gain.agent for gain in gains))
+    defects = {gain.kind: gain.defects for gain in gains}
     kinds = list(defects)
     columns: dict[str, list[Dot]] = {name: [] for name in MEASURE_NAMES.values()}
-    for gain in found:
+    for gain in gains:
         shift = agents.index(gain.agent) - (len(agents) - 1) / 2
         look = look_of(gain.agent, width=1.2, size=5, hollow=not gain.enough)
         text = f"{gain.cells} cells, {gain.pairs} pairs of runs"
@@ -512,11 +512,11 @@ def improvement(by_group: Mapping[str, Sequence[Improvement]], cells: Mapping[st
 def standing(rows: Mapping[str, tuple[AgentRow, AgentRow | None]]) -> Figure:
     """Success of an agent in each cell, by its name, beside that of the best reference."""
     dots = []
-    for index, (own, reference) in enumerate(rows.values()):
+    for index, (row, reference) in enumerate(rows.values()):
         best = Look(GREY, "D", "none", width=0.8, hollow=True)
-        look = replace(look_of(own.agent, width=1.7), dash="none")
-        if own.success:
-            dots.append(Dot(cut(own.agent), own.success, index, look))
+        look = replace(look_of(row.agent, width=1.7), dash="none")
+        if row.success:
+            dots.append(Dot(cut(row.agent), row.success, index, look))
         if reference and reference.success:
             dots.append(Dot("best reference", reference.success, index + 0.2, best))
     labels, axis = [cut(name, 60) for name in rows], Axis("success in the final window", SHARE)
@@ -532,11 +532,15 @@ def audited_defects(cells: Sequence[tuple[str, str, str, float, AuditedDefect]])
     """
     traces = []
     for index, place in enumerate(sorted({cell[:3] for cell in cells})):
-        found = [(strength, d.interval) for *at, strength, d in cells if tuple(at) == place]
-        ends = [[d.value for _, d in found], [d.low for _, d in found], [d.high for _, d in found]]
+        measured = [(strength, d.interval) for *at, strength, d in cells if tuple(at) == place]
+        ends = [
+            [d.value for _, d in measured],
+            [d.low for _, d in measured],
+            [d.high for _, d in measured],
+        ]
         color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
         look = Look(color, marker, width=1.7, size=4)
-        curve = Curve([strength for strength, _ in found], *ends)
+        curve = Curve([strength for strength, _ in measured], *ends)
         traces.append(_with_band(cut(", ".join(place)), curve, look))
     x, y = Axis("strength", (-0.04, 1.04)), Axis("audited defect of a decision")
     return Figure([Plot(x, y, traces)], text="Defect of a decision over the strength")

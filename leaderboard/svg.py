@@ -209,8 +209,8 @@ def _draw_legend(drawn: mpl_figure.Figure, figure: Figure) -> None:
 
 def _legend_width(names: Sequence[str], columns: int) -> int:
     """In characters; matplotlib fills column after column, the first ones with one entry more."""
-    parts = np.array_split([len(name) for name in names], columns)
-    return sum(int(part.max()) + HANDLE for part in parts)
+    widths = np.array_split([len(name) for name in names], columns)
+    return sum(int(width.max()) + HANDLE for width in widths)
 
 
 def _thousands(value: float, _position: int | None = None) -> str:

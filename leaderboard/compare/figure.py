@@ -33,7 +33,7 @@ def described(a: Side, b: Side, changes: Changes) -> Figure:
     """Plots for success and AUC: cells from top to bottom, the mean over them below a line."""
     names = cell_names(changes.cells)
     labels = [cut(" ".join(name), 60) for name in names]
-    rows, rules = [found.measures for found in changes.cells], [Rule(0, is_vertical=True)]
+    rows, rules = [changed.measures for changed in changes.cells], [Rule(0, is_vertical=True)]
     if len(rows) > 1:
         rules.append(Rule(len(rows) - 0.5))
         labels.append("mean over cells")

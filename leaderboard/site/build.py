@@ -57,8 +57,8 @@ def generate(
             cannot be written, or documentation with an error.
     """
     out = Path(os.path.realpath(out))
-    reading = Documentation.of_checkout(docs)
-    needs("jinja2", "markdown_it", *(["mkdocs", "material"] if reading.is_built else []))
+    documentation = Documentation.of_checkout(docs)
+    needs("jinja2", "markdown_it", *(["mkdocs", "material"] if documentation.is_built else []))
     _check_folder(out)
     claims = read_study(study)
     marks = reproductions_for(records, reproductions)
@@ -69,7 +69,7 @@ def generate(
     defects = read_audit(file if file and (file.is_file() or not folder) else None)
     maps = list(maps_of(folder)) if folder else []
     findings = Findings(summary, defects, claims)
-    results = Results(findings, Path(study).stem, reading, maps)
+    results = Results(findings, Path(study).stem, documentation, maps)
     files = {out / name: data for name, data in render(results).items()}
     media = [*maps, *(film for run in results.runs.values() for film in films_of(run))]
     media += [film for table in summary.tables for film in films_of_cell(table)]
@@ -77,7 +77,7 @@ def generate(
     write_together(files, _stale(out, {*files, *copies}), durable=False)
     for target, source in copies.items():
         write_atomically(target, source.read_bytes(), durable=False)
-    if not reading.is_built:
+    if not documentation.is_built:
         # That of an earlier site, which no page links any more.
         shutil.rmtree(out / FOLDER, ignore_errors=True)
     else:
@@ -119,5 +119,5 @@ def _check_folder(out: Path) -> None:
 
 def _stale(out: Path, wanted: set[Path]) -> list[Path]:
     """Files of an earlier site in `out` that this one does not have."""
-    found = (path for folder in FOLDERS for path in sorted((out / folder).glob("*")))
-    return [path for path in found if OWN.fullmatch(path.name) and path not in wanted]
+    files = (path for folder in FOLDERS for path in sorted((out / folder).glob("*")))
+    return [path for path in files if OWN.fullmatch(path.name) and path not in wanted]

@@ -19,22 +19,22 @@ def charts(figure: Figure) -> list[Chart]:
     """The plots of a figure that show something."""
     plots = [replace(plot, traces=[t for t in plot.traces if len(t.x)]) for plot in figure.plots]
     marks: list[list[Trace | Dot]] = [[*plot.traces, *plot.dots] for plot in plots]
-    every = [mark for own in marks for mark in own]
+    every = [mark for of_plot in marks for mark in of_plot]
     legend = figure.legend or {m.name: m.look for m in every if not getattr(m, "label", "")}
     drawn = {mark.name for mark in every}
-    found = []
-    for plot, own in zip(plots, marks, strict=True):
-        names = {mark.name for mark in own}
+    shown = []
+    for plot, of_plot in zip(plots, marks, strict=True):
+        names = {mark.name for mark in of_plot}
         # Entries that no line or dot has explain colours and markers.
         entries = [
             {"name": name, "look": _plain(look), "drawn": name in names}
             for name, look in legend.items()
             if name in names or name not in drawn
         ]
-        if own:
+        if of_plot:
             title = {"title": plot.title if len(plots) > 1 else figure.text, "text": figure.text}
-            found.append(_plain(plot) | title | {"legend": entries})
-    return found
+            shown.append(_plain(plot) | title | {"legend": entries})
+    return shown
 
 
 def _plain(value: Any) -> Any:
@@ -80,8 +80,8 @@ def episodes(run: Run) -> Chart:
         outcomes = zip(columns.success_once, columns.success_at_end, strict=True)
         levels = [1 + end if once else 0 for once, end in outcomes]
         results = (columns.seed, levels, _plain(columns.return_), columns.episode_len)
-        own = {seed: result for seed, *result in zip(*results, strict=True)}
-        rows.append({"name": grouped(step), "cells": [own.get(seed) for seed in seeds]})
+        by_seed = {seed: result for seed, *result in zip(*results, strict=True)}
+        rows.append({"name": grouped(step), "cells": [by_seed.get(seed) for seed in seeds]})
     title = "Every held-out episode of every evaluation"
     return {"seeds": seeds, "rows": rows, "title": title, "text": title}
 

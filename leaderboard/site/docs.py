@@ -56,12 +56,14 @@ def build_documentation(out: Path) -> None:
     Raises:
         UserError: for a page that MkDocs refuses.
     """
-    # Not with --quiet: MkDocs counts the warnings that it logs.
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--config-file", str(CONFIG)]
+    # Without --quiet, because MkDocs counts the warnings that it logs; with -P, because the current
+    # folder may have modules of strangers.
+    command = [sys.executable, "-P", "-m", "mkdocs", "build", "--strict"]
     # The variable stops an advertisement of the theme's successor.
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     options: dict[str, Any] = {"env": environment, "capture_output": True, "text": True}
-    built = subprocess.run([*command, "--site-dir", str(out)], check=False, **options)
+    paths = ["--config-file", str(CONFIG), "--site-dir", str(out)]
+    built = subprocess.run([*command, *paths], check=False, **options)
     if built.returncode:
         said = [line for line in built.stderr.splitlines() if not line.startswith("INFO")]
         raise UserError(

@@ -39,8 +39,8 @@ def needs(*packages: str) -> None:
 def assets() -> dict[str, bytes]:
     """Contents by address."""
     tables = _packaged("itables", "html/dt_bundle.js").decode()
-    found = {f"assets/{path.name}": path.read_bytes() for path in sorted(STATIC.iterdir())}
-    return found | {
+    static = {f"assets/{path.name}": path.read_bytes() for path in sorted(STATIC.iterdir())}
+    return static | {
         "assets/plotly.min.js": _packaged("plotly", "package_data/plotly.min.js"),
         "assets/datatables.js": as_script(tables).encode(),
         "assets/datatables.css": _packaged("itables", "html/dt_bundle.css"),

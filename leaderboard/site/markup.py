@@ -49,7 +49,7 @@ def environment() -> Environment:
     """The templates of the pages."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    found = Environment(
+    environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
         finalize=shown,
@@ -57,9 +57,9 @@ def environment() -> Environment:
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    found.globals["numbers_of"] = numbers
-    found.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    return found
+    environment.globals["numbers_of"] = numbers
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    return environment
 
 
 def html(
@@ -76,19 +76,19 @@ def html(
     """
     from markupsafe import Markup, escape
 
-    parts: list[str] = []
+    pieces: list[str] = []
     for block in "\n\n".join(blocks).split("\n\n"):
         image = IMAGE.fullmatch(block)
         if begun := FOLDED.fullmatch(block):
-            parts.append(f"<details><summary>{escape(begun[1])}</summary>")
+            pieces.append(f"<details><summary>{escape(begun[1])}</summary>")
         elif block == "</details>":
-            parts.append(block)
+            pieces.append(block)
         elif image and charts and image[1] in charts:
             template: Any = environment().get_template("macros.html").module
-            parts.append(template.charts(charts[image[1]]))
+            pieces.append(template.charts(charts[image[1]]))
         else:
-            parts.append(_parser().render(block, {"link": link, "open": []}))
-    return Markup("\n".join(parts))
+            pieces.append(_parser().render(block, {"link": link, "open": []}))
+    return Markup("\n".join(pieces))
 
 
 @functools.cache

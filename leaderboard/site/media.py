@@ -77,10 +77,10 @@ def maps_of(folder: Path) -> Iterator[Medium]:
     Raises:
         UserError: for a folder without maps, or a map without its result.
     """
-    found = [*sorted(folder.glob(f"*/{MAP}")), *folder.glob(MAP)]
-    if not found:
+    paths = [*sorted(folder.glob(f"*/{MAP}")), *folder.glob(MAP)]
+    if not paths:
         raise UserError(f"{folder} holds no {MAP}: name the folder of `symsteer audit --out`")
-    for path in found:
+    for path in paths:
         result = path.with_name(RESULT)
         try:
             settings = json.loads(result.read_text("utf-8-sig"))["settings"]

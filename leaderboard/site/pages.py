@@ -174,10 +174,10 @@ def _percent(value: float | None) -> str:
     return NOTHING if value is None else f"{100 * value:.2g}\u202f%"
 
 
-def _percents(found: Interval | None) -> str:
-    if found is None:
+def _percents(measured: Interval | None) -> str:
+    if measured is None:
         return NOTHING
-    return f"{_percent(found.value)} [{100 * found.low:.2g}, {100 * found.high:.2g}]"
+    return f"{_percent(measured.value)} [{100 * measured.low:.2g}, {100 * measured.high:.2g}]"
 
 
 def findings(results: Results) -> Values:
@@ -293,8 +293,8 @@ def variant(results: Results, name: str) -> Values:
     """One way to break the symmetry: how much it breaks, and the cells that have it."""
     audited = results.audited(name)
     # The strongest first.
-    maps = [found for found in results.maps if name in dials(found.variant)]
-    maps.sort(key=lambda found: strengths(found.variant), reverse=True)
+    maps = [one for one in results.maps if name in dials(one.variant)]
+    maps.sort(key=lambda one: strengths(one.variant), reverse=True)
     return {
         "name": name,
         "page": results.docs.page("variants.md"),
