@@ -184,9 +184,8 @@ def _success(row: AgentRow) -> list[Trace]:
 def _single_success(name: str, run: Run, detail: bool = False) -> Trace:
     values = [evaluation.success_once for evaluation in run.curve.values()]
     thin = Look(look_of(run.agent).color, "", "-" if run.finished else ":", 0.7, alpha=0.35)
-    cross = 0 if run.finished else 5
-    more: dict[str, Any] = {"label": _run_name(run), "single": True, "detail": detail}
-    return Trace(name, list(run.curve), values, thin, cross=cross, **more)
+    x, label, cross = list(run.curve), _run_name(run), 0 if run.finished else 5
+    return Trace(name, x, values, thin, label=label, single=True, cross=cross, detail=detail)
 
 
 def _with_band(name: str, curve: Curve, look: Look) -> Trace:
@@ -240,8 +239,8 @@ def _single_q(name: str, run: Run, detail: bool = False) -> Trace:
     label = _run_name(run) + (", Q not finite" if lost else "")
     cross = 7 if lost or not run.finished else 0
     thin = Look(look_of(run.agent).color, width=0.8, alpha=0.5)
-    more: dict[str, Any] = {"label": label, "single": True, "detail": detail}
-    return Trace(name, *series(run, "q_mean"), thin, cross=cross, **more)
+    x, values = series(run, "q_mean")
+    return Trace(name, x, values, thin, label=label, single=True, cross=cross, detail=detail)
 
 
 def _q_plot(plot: Plot, feasible: tuple[float, float] | None) -> Plot:
@@ -333,9 +332,17 @@ def _of_cells(
 ) -> Figure:
     """The plots of the cells of a task and embodiment."""
     place, columns = (tables[0].key.task, tables[0].key.embodiment), min(COLUMNS, len(tables))
-    height = 0.75 + 2.75 * -(-len(plots) // columns)
-    more: dict[str, Any] = {"columns": columns, "same_y": same_y, "kind": kind, "text": text}
-    return Figure(plots, legend, cut(", ".join(place)), height, place=place, **more)
+    return Figure(
+        plots,
+        legend,
+        title=cut(", ".join(place)),
+        height=0.75 + 2.75 * -(-len(plots) // columns),
+        columns=columns,
+        same_y=same_y,
+        kind=kind,
+        place=place,
+        text=text,
+    )
 
 
 def _title(table: Table, tables: Sequence[Table]) -> str:
@@ -435,24 +442,30 @@ def gained(gains: Sequence[Gain]) -> Figure:
     names = [cut(kind.replace("`", ""), 44) for kind in kinds]
     brackets = [f" ({ends(between)})" if between else "" for between in defects.values()]
     labels = [name + bracket for name, bracket in zip(names, brackets, strict=True)]
-    more: dict[str, Any] = {"kind": "answer", "height": 0.9 + 0.28 * len(kinds)}
-    more["text"] = "Advantage of symmetry over the standard agent, by kind of break"
-    more["legend"] = {agent: look_of(agent) for agent in agents}
-    return by_rows(labels, columns, Axis(), [Rule(0, is_vertical=True)], grid=False, **more)
+    return replace(
+        by_rows(labels, columns, Axis(), 0, grid=False),
+        legend={agent: look_of(agent) for agent in agents},
+        height=0.9 + 0.28 * len(kinds),
+        kind="answer",
+        text="Advantage of symmetry over the standard agent, by kind of break",
+    )
 
 
 def by_rows(
     labels: Sequence[str],
     columns: Mapping[str, Sequence[Dot]],
     x: Axis,
-    rules: Sequence[Rule] = (),
+    undecided: float | None = None,
     grid: bool = True,
-    **more: Any,
 ) -> Figure:
-    """Intervals in named rows, from top to bottom; plots by their titles stand side by side."""
+    """Intervals in named rows, from top to bottom; plots by their titles stand side by side.
+
+    Those that contain the value `undecided`, at which a rule stands, decide nothing.
+    """
+    rules = [] if undecided is None else [Rule(undecided, is_vertical=True)]
     y = Axis(labels=labels, grid=grid)
     plots = [Plot(x, y, [], dots, rules, title) for title, dots in columns.items()]
-    return Figure(plots, columns=len(plots), same_y=True, **more)
+    return Figure(plots, columns=len(plots), same_y=True)
 
 
 def profile_plots(by_group: Mapping[str, Sequence[Profile]], cells: Mapping[str, int]) -> Figure:
@@ -472,8 +485,15 @@ def profile_plots(by_group: Mapping[str, Sequence[Profile]], cells: Mapping[str,
             x, y = Axis(title, _from_start(profiles)), Axis("share of runs at or above", SHARE)
             plot = Plot(x, y, traces, [], [Rule(0, is_vertical=True)], _group(group, cells))
             plots.append(replace(plot, is_crowded=sum(bool(t.band) for t in traces) >= MANY))
-    named: dict[str, Any] = {"kind": "profiles", "text": "Performance profiles"}
-    return Figure(plots, legend, height=3.3, columns=len(plots), same_y=True, **named)
+    return Figure(
+        plots,
+        legend,
+        height=3.3,
+        columns=len(plots),
+        same_y=True,
+        kind="profiles",
+        text="Performance profiles",
+    )
 
 
 def _from_start(profiles: Sequence[Profile]) -> tuple[float, float]:
@@ -504,9 +524,12 @@ def improvement(by_group: Mapping[str, Sequence[Improvement]], cells: Mapping[st
             dot = Dot("", pair.probability, place, look, remark=remark, thick=True)
             columns.setdefault(_group(group, cells), []).append(dot)
     labels = [f"{cut(first, 24)} > {cut(second, 24)}" for first, second in names]
-    more: dict[str, Any] = {"kind": "improvement", "text": "Probability of improvement"}
-    rules, height = [Rule(0.5, is_vertical=True)], 1.1 + 0.3 * len(names)
-    return by_rows(labels, columns, Axis("P(X > Y)", SHARE), rules, height=height, **more)
+    return replace(
+        by_rows(labels, columns, Axis("P(X > Y)", SHARE), undecided=0.5),
+        height=1.1 + 0.3 * len(names),
+        kind="improvement",
+        text="Probability of improvement",
+    )
 
 
 def standing(rows: Mapping[str, tuple[AgentRow, AgentRow | None]]) -> Figure:
@@ -520,7 +543,7 @@ def standing(rows: Mapping[str, tuple[AgentRow, AgentRow | None]]) -> Figure:
         if reference and reference.success:
             dots.append(Dot("best reference", reference.success, index + 0.2, best))
     labels, axis = [cut(name, 60) for name in rows], Axis("success in the final window", SHARE)
-    return by_rows(labels, {"": dots}, axis, text="Success in each cell")
+    return replace(by_rows(labels, {"": dots}, axis), text="Success in each cell")
 
 
 def audited_defects(cells: Sequence[tuple[str, str, str, float, AuditedDefect]]) -> Figure:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from symsteer.leaderboard.compare.changes import DECISIVE, Change, Changes
 from symsteer.leaderboard.compare.output import cell_names
@@ -33,13 +32,12 @@ def described(a: Side, b: Side, changes: Changes) -> Figure:
     """Plots for success and AUC: cells from top to bottom, the mean over them below a line."""
     names = cell_names(changes.cells)
     labels = [cut(" ".join(name), 60) for name in names]
-    rows, rules = [changed.measures for changed in changes.cells], [Rule(0, is_vertical=True)]
+    rows = [changed.measures for changed in changes.cells]
+    rules = [Rule(-changes.margin, is_vertical=True, dash=":")] if changes.margin else []
     if len(rows) > 1:
         rules.append(Rule(len(rows) - 0.5))
         labels.append("mean over cells")
         rows.append(changes.overall)
-    if changes.margin:
-        rules.append(Rule(-changes.margin, is_vertical=True, dash=":"))
     columns = {
         TITLES[name]: [_dot(height, row[name]) for height, row in enumerate(rows) if name in row]
         for name in DECISIVE
@@ -50,9 +48,15 @@ def described(a: Side, b: Side, changes: Changes) -> Figure:
         legend[HOLLOW] = Look(GREY, "o", "none", size=6.5, hollow=True)
     if changes.margin:
         legend["margin"] = Look("#333333", dash=":", width=0.9)
-    title, axis = f"A: {_end(a.name)}\nB: {_end(b.name)}", Axis("B - A, 95 % interval")
-    more: dict[str, Any] = {"legend": legend, "legend_columns": 4, "title": title}
-    return by_rows(labels, columns, axis, rules, height=1.9 + 0.3 * len(rows), **more)
+    figure = by_rows(labels, columns, Axis("B - A, 95 % interval"), undecided=0)
+    return replace(
+        figure,
+        plots=[replace(plot, rules=[*plot.rules, *rules]) for plot in figure.plots],
+        legend=legend,
+        title=f"A: {_end(a.name)}\nB: {_end(b.name)}",
+        height=1.9 + 0.3 * len(rows),
+        legend_columns=4,
+    )
 
 
 def _end(name: str, limit: int = 90) -> str:

@@ -278,7 +278,7 @@
     };
     const dashes = { dash: "6 3", dot: "1.5 3", dashdot: "6 3 1.5 3", longdash: "9 3" };
     const look = series.look, color = shade(look.color), symbol = symbolOf(look);
-    if (look.edge) add("path", { d: "M5 2h20v8H5z", fill: color, stroke: shade(look.edge) });
+    if (look.edge) add("path", { d: "M5 2h20v8H5z", fill: look.edge === look.color ? color : faint(shade(look.edge), 0.3), stroke: shade(look.edge) });
     else if (series.dash) add("line", { x1: 0, x2: 30, y1: 6, y2: 6, stroke: color, "stroke-width": 2.4, "stroke-dasharray": dashes[series.dash] || "none" });
     const shape = { square: "M11 2h8v8h-8z", diamond: "M15 1l5 5-5 5-5-5z", "triangle-up": "M15 1l5 9H10z", "triangle-down": "M15 11l5-9H10z", x: "M11 2l8 8M19 2l-8 8", cross: "M15 1v10M10 6h10" }[symbol?.replace("-open", "")];
     const fill = look.hollow ? css("--raised") : color;
