@@ -20,7 +20,7 @@ from symsteer.leaderboard.runs import Run, load_runs
 from symsteer.leaderboard.sections import Findings, View
 from symsteer.leaderboard.sections.verdicts import PAPER_TITLE
 from symsteer.leaderboard.study import PAPER, Study, read_study
-from symsteer.leaderboard.svg import to_svg
+from symsteer.leaderboard.svg import to_image
 from symsteer.leaderboard.text import relative_link
 from symsteer.leaderboard.verification import Verification, differences
 
@@ -97,11 +97,11 @@ def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[s
     findings = Findings(summarize(runs), audit, study)
     files: dict[str, bytes] = {}
     figures: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
-    for drawing in render_figures(findings):
-        stem = "-".join([drawing.kind, *([slug(*drawing.place)] if drawing.place else [])])
+    for figure in render_figures(findings):
+        stem = "-".join([figure.kind, *([slug(*figure.place)] if figure.place else [])])
         name = f"figures/{stem}.svg"
-        files[name] = to_svg(drawing)
-        figures.setdefault(drawing.place, {})[drawing.kind] = (drawing.text, name)
+        files[name] = to_image(figure)
+        figures.setdefault(figure.place, {})[figure.kind] = (figure.text, name)
     links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
     view = View(findings, links, figures)
     texts = {"LEADERBOARD.md": render_page(view), **other_files(view)}

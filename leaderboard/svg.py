@@ -60,12 +60,7 @@ FORMATS: dict[str, dict[str, Any]] = {
 """Without dates or versions; the same figure gives the same bytes."""
 
 
-def to_svg(figure: Figure) -> bytes:
-    """The figure as SVG."""
-    return to_image(figure, "svg")
-
-
-def to_image(figure: Figure, kind: str) -> bytes:
+def to_image(figure: Figure, kind: str = "svg") -> bytes:
     """The figure as the content of a file of a kind of `FORMATS`."""
     buffer = io.BytesIO()
     with mpl_style.context(SHEETS):
