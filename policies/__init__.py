@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from symsteer.policies.normalizer import Normalizer, clip_blocks
     from symsteer.policies.training.demonstrations import make_chunks
     from symsteer.policies.training.denoising import DiffusionPolicy
-    from symsteer.policies.training.gradient import GradientPolicy
-    from symsteer.policies.training.optimizer import GradientOptions
+    from symsteer.policies.training.gradient import GradientOptions, GradientPolicy
 
 __all__ = [
     "POLICIES",
@@ -46,7 +45,7 @@ __getattr__ = lazily(
         "DiffusionPolicy": "training.denoising",
         "Episode": "contract",
         "Field": "geometry",
-        "GradientOptions": "training.optimizer",
+        "GradientOptions": "training.gradient",
         "GradientPolicy": "training.gradient",
         "Group": "geometry",
         "Layout": "geometry",

@@ -363,6 +363,21 @@ class Group:
             )
         return cls(int(match[2]), match[1] == "D")
 
+    @classmethod
+    def parse_rotations(cls, name: str) -> Group:
+        """Read the name of a finite group of rotations, C_n.
+
+        Raises:
+            UserError: if it names another group, or none.
+        """
+        group = cls.parse(name)
+        if group.reflections or not group.rotations:
+            raise UserError(
+                "this policy commutes with rotations alone; its symmetry must be C_n, e.g. C8, not "
+                f"{name}"
+            )
+        return group
+
     def __str__(self) -> str:
         kind = "D" if self.reflections else "C"
         return f"{kind}{self.rotations}" if self.rotations else "SO2"

@@ -8,7 +8,6 @@ This part of the steerability report needs no simulator; success over noise draw
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 
@@ -21,7 +20,6 @@ DESIRED_ACTION_STD = 0.3
 
 STILL = 1e-2
 """Action blocks that vary less in the demonstrations are left out of the mean."""
-
 
 NUDGE = 1e-3
 """Length of the change of an observation in :func:`jumps`: a millimetre, if it moves a position."""
@@ -74,13 +72,13 @@ def jumps(policy: ChunkPolicy, observations: torch.Tensor, seed: int = 0) -> dic
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(count, policy.horizon, layout.dim, generator=generator).to(observations)
     own = policy.decode(observations, noise)[:, : policy.execute]
-    found = []
+    largest = []
     for _ in range(NUDGES):
         change = torch.randn(observations.shape, generator=generator).to(observations)
         change *= NUDGE / change.norm(dim=1, keepdim=True)
         moved = policy.decode(observations + change, noise)[:, : policy.execute]
-        found.append((moved - own).norm(dim=-1).amax(dim=1))
-    changes = torch.cat(found).double()
+        largest.append((moved - own).norm(dim=-1).amax(dim=1))
+    changes = torch.cat(largest).double()
     median = changes.median()
     return {
         "median": median.item(),
@@ -92,26 +90,20 @@ def jumps(policy: ChunkPolicy, observations: torch.Tensor, seed: int = 0) -> dic
 @torch.no_grad()
 def action_spread(
     policy: ChunkPolicy, observations: torch.Tensor, draws: int = 16, seed: int = 0
-) -> dict[str, Any]:
+) -> float:
     """Standard deviation of the executed actions over the noise, relative to the demonstrations'.
 
     For each irrep block: the root mean square, over observations, executed steps and components,
     of the standard deviation over ``draws`` standard normal noises, divided by the block's
-    standard deviation over all demonstrated actions. 0: the actions depend on the observations
-    only. 1: at a fixed observation they vary as much as all demonstrated actions. Invariant under
-    rotations.
+    standard deviation over all demonstrated actions. The result is the mean over the blocks that
+    move in the demonstrations. 0: the actions depend on the observations only. 1: at a fixed
+    observation they vary as much as all demonstrated actions. Invariant under rotations.
 
     Args:
         policy: the base policy.
         observations: ``[N, obs_dim]``, environment units; states that the policy visits.
         draws: noises per observation, at least 2.
         seed: of the noises.
-
-    Returns:
-        ``action_std`` (mean over the blocks that move in the demonstrations),
-        ``action_std_by_field`` (mean over the field's blocks; ``None`` where nothing moves),
-        ``raw_std_by_field`` (environment units), ``observations``, ``draws`` and ``seed``;
-        JSON-ready.
 
     Raises:
         UserError: if there are no observations or fewer than 2 draws.
@@ -127,28 +119,9 @@ def action_spread(
     actions = torch.stack([policy.decode(observations, w.to(observations)) for w in noise])
     variance = actions[:, :, : policy.execute].var(dim=0).mean(dim=(0, 1))
     deviation = policy.act_normalizer.deviation
-    ratios: list[float] = []
-    by_field: dict[str, float | None] = {}
-    for field in layout.fields:
-        blocks = [
-            math.sqrt(float(v.mean())) / float(d[0])
-            for v, d in zip(
-                variance[layout.slice(field.name)].split(field.block_dim),
-                deviation[layout.slice(field.name)].split(field.block_dim),
-                strict=True,
-            )
-            if d[0] >= STILL
-        ]
-        ratios += blocks
-        by_field[field.name] = sum(blocks) / len(blocks) if blocks else None
-    return {
-        "action_std": sum(ratios) / len(ratios) if ratios else 0.0,
-        "action_std_by_field": by_field,
-        "raw_std_by_field": {
-            field.name: math.sqrt(float(variance[layout.slice(field.name)].mean()))
-            for field in layout.fields
-        },
-        "observations": count,
-        "draws": draws,
-        "seed": seed,
-    }
+    ratios = [
+        math.sqrt(float(variance[block].mean())) / float(deviation[block][0])
+        for block in layout.blocks
+        if deviation[block][0] >= STILL
+    ]
+    return sum(ratios) / len(ratios) if ratios else 0.0

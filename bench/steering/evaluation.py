@@ -266,7 +266,7 @@ def steerability(
     success = result.episodes["success_once"].float().view(states, draws)
     # The states that the first draw of every initial state visits before its first success.
     visited = result.obs[:, ::draws][result.running[:, ::draws]]
-    action_std = action_spread(policy, visited, draws, seed)["action_std"]
+    action_std = action_spread(policy, visited, draws, seed)
     some = evenly(visited, VISITED)
     solvable = (success.amax(dim=1) > 0).float().mean().item()
     reasons = []

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import abc
 import copy
+import math
 from typing import Self
 
 import torch
 from torch import nn
+from torch.nn import functional
 
 from symsteer.policies.geometry import Group
+
+TIME_FEATURES = 64
 
 
 class Denoiser(nn.Module, abc.ABC):
@@ -27,9 +31,23 @@ class Denoiser(nn.Module, abc.ABC):
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         """What the network sees of the observation; ``[B, obs_dim] -> [B, ...]``."""
 
-    @abc.abstractmethod
     def encode_time(self, t: torch.Tensor) -> torch.Tensor:
-        """What it sees of the noise level; ``[B] -> [B, ...]``."""
+        """What it sees of the noise level; ``[B] -> [B, ...]``.
+
+        By default the numbers of :meth:`add_time_layers`, from sines and cosines at many rates.
+        """
+        half = TIME_FEATURES // 2
+        rates = torch.exp(
+            torch.arange(half, device=t.device, dtype=torch.float64) * (-math.log(1e4) / half)
+        )
+        phases = t[:, None].double() * rates
+        features = torch.cat([phases.sin(), phases.cos()], dim=-1).to(self.time_in.weight.dtype)
+        return self.time_out(functional.silu(self.time_in(features)))
+
+    def add_time_layers(self, numbers: int) -> None:
+        """Make the layers of :meth:`encode_time`, which then gives ``[B, numbers]``."""
+        self.time_in = nn.Linear(TIME_FEATURES, TIME_FEATURES)
+        self.time_out = nn.Linear(TIME_FEATURES, numbers, bias=False)
 
     @abc.abstractmethod
     def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:

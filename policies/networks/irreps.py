@@ -196,56 +196,59 @@ class EquivariantMap(nn.Module):
         return torch.cat([out[..., :1] + self.bias[:, None], out[..., 1:]], dim=-1)
 
 
-class Enter(nn.Module):
-    """A vector ``[..., dim]`` to features ``[..., channels, dim]``, degree by degree."""
+class _Ends(nn.Module):
+    """Weights between the irreps of a vector and features, degree by degree."""
 
-    def __init__(self, irreps: Irreps, layout: Layout, channels: int):
+    def __init__(self, irreps: Irreps, layout: Layout, channels: int, enters: bool):
         super().__init__()
         self.irreps, self.channels = irreps, channels
         parts = 2 if irreps.complex_weights else 1
         self.weights = nn.ParameterDict()
         for degree, place in irreps.embedding(layout).items():
-            bound = math.sqrt(3 / (len(place) * parts))
-            weight = torch.empty(parts, channels, len(place)).uniform_(-bound, bound)
+            shape = (channels, len(place)) if enters else (len(place), channels)
+            count = shape[1] * parts
+            bound = math.sqrt(3 / count) if enters else 1 / math.sqrt(count)
+            weight = torch.empty(parts, *shape).uniform_(-bound, bound)
             self.weights[str(degree)] = nn.Parameter(weight)
             self.register_buffer(f"place{degree}", place, persistent=False)
+
+    def mixed(self, key: str, block: torch.Tensor) -> torch.Tensor:
+        """Irreps ``[..., n, dims[degree]]`` of one degree, mixed with each other."""
+        weight = self.weights[key]
+        mixed = weight[0] @ block
+        if len(weight) > 1 and key != "0":
+            mixed = mixed + weight[1] @ turned_pairs(block)
+        return mixed
+
+
+class Enter(_Ends):
+    """A vector ``[..., dim]`` to features ``[..., channels, dim]``."""
+
+    def __init__(self, irreps: Irreps, layout: Layout, channels: int):
+        super().__init__(irreps, layout, channels, enters=True)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         out = x.new_zeros(*x.shape[:-1], self.channels, self.irreps.dim)
-        for key, weight in self.weights.items():
+        for key in self.weights:
             block = torch.einsum("ndv,...v->...nd", getattr(self, f"place{key}").to(x), x)
-            mixed = weight[0] @ block
-            if len(weight) > 1 and key != "0":
-                mixed = mixed + weight[1] @ turned_pairs(block)
-            out[..., self.irreps.slice(int(key))] = mixed
+            out[..., self.irreps.slice(int(key))] = self.mixed(key, block)
         return out
 
 
-class Leave(nn.Module):
+class Leave(_Ends):
     """Features ``[..., channels, dim]`` to a vector ``[..., dim]``, with a bias of degree 0."""
 
     def __init__(self, irreps: Irreps, layout: Layout, channels: int):
-        super().__init__()
-        self.irreps, self.layout = irreps, layout
-        parts = 2 if irreps.complex_weights else 1
-        self.weights = nn.ParameterDict()
-        for degree, place in irreps.embedding(layout).items():
-            bound = 1 / math.sqrt(channels * parts)
-            weight = torch.empty(parts, len(place), channels).uniform_(-bound, bound)
-            self.weights[str(degree)] = nn.Parameter(weight)
-            self.register_buffer(f"place{degree}", place, persistent=False)
-        scalars = irreps.embedding(layout).get(0, ())
-        self.bias = nn.Parameter(torch.zeros(len(scalars)))
+        super().__init__(irreps, layout, channels, enters=False)
+        self.layout = layout
+        self.bias = nn.Parameter(torch.zeros(len(irreps.embedding(layout).get(0, ()))))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         out = x.new_zeros(*x.shape[:-2], self.layout.dim)
-        for key, weight in self.weights.items():
-            block = x[..., self.irreps.slice(int(key))]
-            mixed = weight[0] @ block
+        for key in self.weights:
+            mixed = self.mixed(key, x[..., self.irreps.slice(int(key))])
             if key == "0":
                 mixed = mixed + self.bias[:, None]
-            elif len(weight) > 1:
-                mixed = mixed + weight[1] @ turned_pairs(block)
             out = out + torch.einsum("ndv,...nd->...v", getattr(self, f"place{key}").to(x), mixed)
         return out
 

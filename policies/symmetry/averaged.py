@@ -19,7 +19,7 @@ from torch import nn
 
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
-from symsteer.policies.symmetry.lifted import EquivariantOptions, lifted_denoiser
+from symsteer.policies.symmetry.lifted import EquivariantOptions, LiftedDenoiser
 from symsteer.policies.symmetry.unconstrained import TRIVIAL, matched_size
 from symsteer.policies.training.denoising import DiffusionPolicy
 
@@ -102,4 +102,4 @@ class FrameAveragedDiffusionPolicy(DiffusionPolicy):
     def make_inner(self) -> Denoiser:
         """The network that is averaged, untrained; a subclass may take any other one."""
         trivial = Group.parse(TRIVIAL)
-        return lifted_denoiser(self.options, self.obs_layout, self.chunk_layout, trivial)
+        return LiftedDenoiser(self.options, self.obs_layout, self.chunk_layout, trivial)

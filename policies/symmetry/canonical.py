@@ -19,7 +19,6 @@ from typing import Any, Self
 
 import torch
 
-from symsteer.errors import UserError
 from symsteer.policies.contract import Episode, Progress
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.normalizer import Normalizer
@@ -43,11 +42,7 @@ class CanonicalOptions(PlainOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if Group.parse(self.symmetry).reflections or not Group.parse(self.symmetry).rotations:
-            raise UserError(
-                "the canonical policy commutes with rotations alone; its symmetry must be C_n, "
-                f"e.g. C8, not {self.symmetry}"
-            )
+        Group.parse_rotations(self.symmetry)
 
 
 class CanonicalDiffusionPolicy(PlainDiffusionPolicy):

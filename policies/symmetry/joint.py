@@ -31,7 +31,6 @@ from symsteer.policies.symmetry.lifted import (
     EquivariantDiffusionPolicy,
     EquivariantOptions,
     LiftedDenoiser,
-    lifted_denoiser,
 )
 from symsteer.policies.symmetry.unconstrained import PlainDiffusionPolicy, PlainOptions
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
@@ -84,13 +83,13 @@ def merged_observation(
 class TaskDenoiser(LiftedDenoiser):
     """A lifted denoiser of several tasks.
 
-    Args:
-        obs_layout: of a merged observation.
-        args: as for the denoiser of one task.
+    Its arguments are those of the denoiser of one task; the observation is a merged one.
     """
 
-    def __init__(self, obs_layout: Layout, *args: Any):
-        super().__init__(Layout(obs_layout.fields[:-1]), *args)
+    def __init__(
+        self, options: DenoisingOptions, obs_layout: Layout, act_layout: Layout, group: Group
+    ):
+        super().__init__(options, Layout(obs_layout.fields[:-1]), act_layout, group)
         self.tasks = obs_layout.fields[-1].multiplicity
         channels, films = self.condition.in_features, self.condition.out_features
         self.task_in = nn.Linear(self.tasks, 2 * channels, bias=False)
@@ -158,9 +157,7 @@ class Joint(DiffusionPolicy):
         if self.obs_layout.fields[-1].name != TASK:
             return super().make_denoiser()  # type: ignore[safe-super, return-value]
         group = Group.parse(self.options.group)
-        return lifted_denoiser(
-            self.options, self.obs_layout, self.chunk_layout, group, TaskDenoiser
-        )
+        return TaskDenoiser(self.options, self.obs_layout, self.chunk_layout, group)
 
     @classmethod
     def fit_tasks(

@@ -12,7 +12,6 @@ in the middle. With the trivial group C1 there is one slice: an ordinary diffusi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -30,7 +29,6 @@ from symsteer.policies.networks.equivariant import (
 )
 from symsteer.policies.networks.points import PointEncoder
 from symsteer.policies.networks.slices import FixedResidualMLP, ResidualMLP, TemporalUNet
-from symsteer.policies.networks.times import TIME_FEATURES, time_features
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
 
 
@@ -38,33 +36,22 @@ class LiftedDenoiser(Denoiser):
     """A denoiser that commutes with a finite group.
 
     Args:
+        options: horizon and sizes, for each group element. A cloud of points in the observation
+            has an encoder of its own.
         obs_layout: geometry of one (normalised) observation.
         act_layout: geometry of one (normalised) action.
-        horizon: actions in a chunk, Tp.
         group: a finite group.
-        network: ``mlp`` (residual MLP on the whole chunk) or ``unet`` (temporal U-Net).
-        channels: regular fields of the observation embedding. A cloud of points in the observation
-            has an encoder of its own.
-        width: features in each slice of the chunk.
-        depth: residual blocks of the MLP.
     """
 
     def __init__(
-        self,
-        obs_layout: Layout,
-        act_layout: Layout,
-        horizon: int,
-        group: Group,
-        network: str = "mlp",
-        channels: int = 64,
-        width: int = 64,
-        depth: int = 3,
+        self, options: DenoisingOptions, obs_layout: Layout, act_layout: Layout, group: Group
     ):
         super().__init__()
-        self.horizon, self.group = horizon, group
+        self.group = group
+        channels, width = options.channels, options.width
         # The MLP sees the chunk as one long vector, the U-Net as a sequence of actions.
-        self.flat = network == "mlp"
-        layout = act_layout.repeat(horizon) if self.flat else act_layout
+        self.flat = options.network == "mlp"
+        layout = act_layout.repeat(options.horizon) if self.flat else act_layout
         make = self.make_layer
         self.cloud = obs_layout.cloud
         told = self.cloud.rest if self.cloud else obs_layout
@@ -72,11 +59,10 @@ class LiftedDenoiser(Denoiser):
         self.obs_mix = make(RegularLinear(group, channels, channels))
         self.points = PointEncoder(self.cloud.point, group, channels) if self.cloud else None
         self.chunk_lift = make(Lift(layout, group, width))
-        self.slice_network = ResidualMLP(width, depth) if self.flat else TemporalUNet(width)
+        self.slice_network = ResidualMLP(width, options.depth) if self.flat else TemporalUNet(width)
         self.project = make(Project(group, width, layout))
         self.condition = nn.Linear(channels, self.slice_network.condition_dim)
-        self.time_in = nn.Linear(TIME_FEATURES, TIME_FEATURES)
-        self.time_out = nn.Linear(TIME_FEATURES, self.slice_network.condition_dim, bias=False)
+        self.add_time_layers(self.slice_network.condition_dim)
 
     def make_layer(self, layer: EquivariantLayer) -> nn.Module:
         """The layer that is used; a subclass may put its own in the place of this one."""
@@ -96,8 +82,7 @@ class LiftedDenoiser(Denoiser):
 
     def encode_time(self, t: torch.Tensor) -> torch.Tensor:
         """What the network sees of the noise level; ``[B] -> [B, 1, condition]``."""
-        features = time_features(t, self.time_in.weight.dtype)
-        return self.time_out(functional.silu(self.time_in(features)))[:, None]
+        return super().encode_time(t)[:, None]
 
     def forward(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
         """Predict; ``x [B, Tp, Da]``, ``context [B, order, c]``, ``time [B or 1, 1, c]``."""
@@ -151,26 +136,5 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
 
     def make_denoiser(self) -> LiftedDenoiser:
         """The lifted network over the options' group."""
-        return lifted_denoiser(
-            self.options, self.obs_layout, self.chunk_layout, Group.parse(self.options.group)
-        )
-
-
-def lifted_denoiser(
-    options: DenoisingOptions,
-    obs_layout: Layout,
-    act_layout: Layout,
-    group: Group,
-    kind: Callable[..., LiftedDenoiser] = LiftedDenoiser,
-) -> LiftedDenoiser:
-    """The network that the options describe, over ``group``."""
-    return kind(
-        obs_layout,
-        act_layout,
-        options.horizon,
-        group,
-        options.network,
-        options.channels,
-        options.width,
-        options.depth,
-    )
+        group = Group.parse(self.options.group)
+        return LiftedDenoiser(self.options, self.obs_layout, self.chunk_layout, group)

@@ -14,7 +14,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import nn
@@ -35,7 +34,6 @@ from symsteer.policies.networks.irreps import (
     PlanarIrreps,
     SpatialIrreps,
 )
-from symsteer.policies.networks.times import TIME_FEATURES, time_features
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
 
 NORMAL = ("normal_xy", "normal_z")
@@ -68,29 +66,18 @@ class IrrepDenoiser(Denoiser):
 
     Args:
         irreps: of the features.
+        options: horizon and sizes; ``depth`` is that of the chunk, the observation has two blocks.
         obs_layout: geometry of one (normalised) observation.
         act_layout: geometry of one (normalised) action.
-        horizon: actions in a chunk, Tp.
-        group: the finite group that is announced to agents.
-        channels: irreps of each degree, for the observation.
-        width: the same for the chunk.
-        depth: blocks for the chunk; the observation has two.
     """
 
     def __init__(
-        self,
-        irreps: Irreps,
-        obs_layout: Layout,
-        act_layout: Layout,
-        horizon: int,
-        group: Group,
-        channels: int,
-        width: int,
-        depth: int,
+        self, irreps: Irreps, options: SteerableOptions, obs_layout: Layout, act_layout: Layout
     ):
         super().__init__()
-        self.irreps, self.group, self.channels = irreps, group, channels
-        layout = act_layout.repeat(horizon)
+        self.irreps, self.group = irreps, Group.parse(options.symmetry)
+        channels, width, depth = options.channels, options.width, options.depth
+        layout = act_layout.repeat(options.horizon)
         self.obs_in = Enter(irreps, obs_layout, channels)
         self.obs_blocks = nn.ModuleList(Mixing(irreps, channels) for _ in range(2))
         self.obs_out = EquivariantMap(irreps, channels, width)
@@ -100,8 +87,7 @@ class IrrepDenoiser(Denoiser):
         self.chunk_out = Leave(irreps, layout, width)
         films = depth * Film(irreps, width).condition_dim
         self.condition = nn.Linear(channels, films)
-        self.time_in = nn.Linear(TIME_FEATURES, TIME_FEATURES)
-        self.time_out = nn.Linear(TIME_FEATURES, films, bias=False)
+        self.add_time_layers(films)
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         """Features for the chunk and FiLM of the invariants, ``[B, width * dim + films]``."""
@@ -110,11 +96,6 @@ class IrrepDenoiser(Denoiser):
             h = block(h)
         films = self.condition(functional.silu(h[..., 0]))
         return torch.cat([self.obs_out(h).flatten(1), films], dim=-1)
-
-    def encode_time(self, t: torch.Tensor) -> torch.Tensor:
-        """FiLM of the noise level, ``[B, films]``."""
-        features = time_features(t, self.time_in.weight.dtype)
-        return self.time_out(functional.silu(self.time_in(features)))
 
     def features(self, x: torch.Tensor, context: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
         """What a chunk is read from; ``x [B, Tp, Da] -> [B, width, dim]``."""
@@ -148,10 +129,10 @@ class SpatialDenoiser(IrrepDenoiser):
     normal: torch.Tensor
 
     def __init__(
-        self, irreps: Irreps, obs_layout: Layout, act_layout: Layout, horizon: int, *args: Any
+        self, irreps: Irreps, options: SteerableOptions, obs_layout: Layout, act_layout: Layout
     ):
-        super().__init__(irreps, obs_layout, act_layout, horizon, *args)
-        vectors = irreps.embedding(act_layout.repeat(horizon))[1]
+        super().__init__(irreps, options, obs_layout, act_layout)
+        vectors = irreps.embedding(act_layout.repeat(options.horizon))[1]
         self.along = nn.Linear(2 * self.chunk_in.channels, len(vectors))
         self.register_buffer("vectors", vectors.flatten(0, 1), persistent=False)
         # Vectors in space are the first ones of the embedding.
@@ -196,12 +177,7 @@ class SteerableOptions(DenoisingOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        group = Group.parse(self.symmetry)
-        if group.reflections or not group.rotations:
-            raise UserError(
-                "this policy commutes with rotations alone; its symmetry must be C_n, e.g. C8, not "
-                f"{self.symmetry}"
-            )
+        Group.parse_rotations(self.symmetry)
         if self.network != "mlp":
             raise UserError("a policy with irreps has a network of its own; leave network as it is")
 
@@ -228,7 +204,7 @@ class PlanarSteerablePolicy(DiffusionPolicy):
     def make_denoiser(self) -> IrrepDenoiser:
         """The network with planar irreps."""
         irreps = PlanarIrreps(self.options.max_frequency)
-        return _denoiser(self, irreps, self.obs_layout, IrrepDenoiser)
+        return IrrepDenoiser(irreps, self.options, self.obs_layout, self.chunk_layout)
 
 
 class SphericalPolicy(DiffusionPolicy):
@@ -253,10 +229,10 @@ class SphericalPolicy(DiffusionPolicy):
         if self.options.action_frame:
             raise UserError("an action_frame turns in the plane; the spherical policy has none")
         layout, kind = self.obs_layout, SpatialDenoiser
-        if not any(pair == NORMAL for pair in layout.spatial_vectors()):
+        if NORMAL not in layout.spatial_vectors():
             layout = Layout([*layout.fields, Field(NORMAL[0], 1), Field(NORMAL[1], 0)])
             kind = LevelDenoiser
-        return _denoiser(self, SpatialIrreps(), layout, kind)
+        return kind(SpatialIrreps(), self.options, layout, self.chunk_layout)
 
 
 class LevelDenoiser(SpatialDenoiser):
@@ -265,19 +241,3 @@ class LevelDenoiser(SpatialDenoiser):
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         vertical = obs.new_tensor([0.0, 0.0, 1.0]).expand(len(obs), 3)
         return super().encode(torch.cat([obs, vertical], dim=-1))
-
-
-def _denoiser(
-    policy: DiffusionPolicy, irreps: Irreps, obs_layout: Layout, kind: type[IrrepDenoiser]
-) -> IrrepDenoiser:
-    options = policy.options
-    return kind(
-        irreps,
-        obs_layout,
-        policy.chunk_layout,
-        options.horizon,
-        Group.parse(options.symmetry),
-        options.channels,
-        options.width,
-        options.depth,
-    )

@@ -15,7 +15,7 @@ import torch
 
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import parameter_count
-from symsteer.policies.symmetry.lifted import LiftedDenoiser, lifted_denoiser
+from symsteer.policies.symmetry.lifted import LiftedDenoiser
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
 
 TRIVIAL = "C1"
@@ -65,7 +65,7 @@ class PlainDiffusionPolicy(DiffusionPolicy):
     def make_denoiser(self) -> LiftedDenoiser:
         """The same network over the trivial group."""
         group = Group.parse(TRIVIAL)
-        return lifted_denoiser(self.options, self.obs_layout, self.chunk_layout, group)
+        return LiftedDenoiser(self.options, self.obs_layout, self.chunk_layout, group)
 
 
 def matched_size(options: P, obs_layout: Layout, act_layout: Layout, group: Group) -> P:
@@ -76,7 +76,7 @@ def matched_size(options: P, obs_layout: Layout, act_layout: Layout, group: Grou
 
     def count(options: DenoisingOptions, group: Group) -> int:
         with torch.device("meta"):
-            return parameter_count(lifted_denoiser(options, obs_layout, act_layout, group))
+            return parameter_count(LiftedDenoiser(options, obs_layout, act_layout, group))
 
     channels, width = options.channels, options.width
     target = count(options, group)

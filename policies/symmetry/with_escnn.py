@@ -8,8 +8,6 @@ observation (:meth:`EscnnDiffusionPolicy.make_encoder`).
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
@@ -18,7 +16,7 @@ from torch.nn import functional
 
 from symsteer.policies.geometry import Field, Group, Layout, escnn_modules
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift, Project, RegularLinear
-from symsteer.policies.symmetry.lifted import EquivariantOptions, LiftedDenoiser, lifted_denoiser
+from symsteer.policies.symmetry.lifted import EquivariantOptions, LiftedDenoiser
 from symsteer.policies.training.denoising import DiffusionPolicy
 
 if TYPE_CHECKING:
@@ -115,13 +113,13 @@ class EscnnDenoiser(LiftedDenoiser):
     """The lifted denoiser with escnn's layers, and any escnn network as its encoder.
 
     Args:
-        args, kwargs: those of the lifted denoiser.
         encoder: from the observation's type to ``channels`` regular fields; None: the two layers of
             the lifted denoiser.
+        args: those of the lifted denoiser.
     """
 
-    def __init__(self, *args: Any, encoder: EquivariantModule | None = None, **kwargs: Any):
-        super().__init__(*args, **kwargs)
+    def __init__(self, encoder: EquivariantModule | None, *args: Any):
+        super().__init__(*args)
         self.encoder = encoder
         if encoder is not None:
             self.obs_lift = self.obs_mix = nn.Identity()
@@ -144,25 +142,19 @@ class EscnnDenoiser(LiftedDenoiser):
             return super().train(mode)
 
 
-@dataclass(frozen=True)
-class EscnnOptions(EquivariantOptions):
-    """Options of the equivariant diffusion policy with escnn's layers."""
-
-
 class EscnnDiffusionPolicy(DiffusionPolicy):
     """Equivariant diffusion policy with escnn's layers; needs escnn."""
 
     name = "escnn"
-    Options = EscnnOptions
-    options: EscnnOptions
+    Options = EquivariantOptions
+    options: EquivariantOptions
 
     def make_denoiser(self) -> LiftedDenoiser:
         """The lifted network over the options' group, with :meth:`make_encoder`."""
         options, group = self.options, Group.parse(self.options.group)
         seen = self.obs_layout.field_type(group)
         encoder = self.make_encoder(seen, regular_fields(seen, options.channels))
-        kind = functools.partial(EscnnDenoiser, encoder=encoder)
-        return lifted_denoiser(options, self.obs_layout, self.chunk_layout, group, kind)
+        return EscnnDenoiser(encoder, options, self.obs_layout, self.chunk_layout, group)
 
     def make_encoder(self, seen: FieldType, embedding: FieldType) -> EquivariantModule | None:
         """An escnn module from normalised observations to regular fields; a subclass may say which.

@@ -26,8 +26,7 @@ from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.training.diffusion import Diffusion, Prediction, Process
 from symsteer.policies.training.frames import Frame
-from symsteer.policies.training.gradient import GradientPolicy
-from symsteer.policies.training.optimizer import GradientOptions
+from symsteer.policies.training.gradient import GradientOptions, GradientPolicy
 from symsteer.policies.training.orbit import orbit_targets
 
 Network = Literal["mlp", "unet"]
