@@ -35,9 +35,9 @@ def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
     preset, path = read_model(name, "preset", FOLDER, RootModel[dict[str, dict[str, Any]]])
     tables = preset.root
     valid = [field.name for field in dataclasses.fields(options)]
-    own = tables.get(agent, {})
-    check(f"option of {agent}", own, valid, path.name)
-    return {key: value for key, value in tables.get("all", {}).items() if key in valid} | own
+    special = tables.get(agent, {})
+    check(f"option of {agent}", special, valid, path.name)
+    return {key: value for key, value in tables.get("all", {}).items() if key in valid} | special
 
 
 def tuned(agent: type[T]) -> type[T]:
@@ -45,15 +45,15 @@ def tuned(agent: type[T]) -> type[T]:
 
     Agents without a table there keep their defaults.
     """
-    base, found = agent.Options, preset_options("tuned", agent.name, agent.Options)
+    base, chosen = agent.Options, preset_options("tuned", agent.name, agent.Options)
     # As types: names of types mean nothing in the agent's module.
     types = get_type_hints(base)
     agent.Options = dataclasses.make_dataclass(
         "Options",
         [
-            (field.name, types[field.name], found[field.name])
+            (field.name, types[field.name], chosen[field.name])
             for field in dataclasses.fields(base)
-            if field.name in found
+            if field.name in chosen
         ],
         bases=(base,),
         frozen=True,

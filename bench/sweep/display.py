@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,6 +41,8 @@ class Display(contextlib.AbstractContextManager, Watcher):
         self.out, self.workers, self.output, self.seen = plan.out, workers, output, dict(seen)
         todo = [run for run, sighting in seen.items() if sighting.state != "finished"]
         self.counts = Counter({"finished": len(seen) - len(todo)})
+        # The default lock is a system semaphore. A killed process would not remove it.
+        tqdm.set_lock(threading.RLock())
         self.begun: dict[Line, datetime] = {}
         self.bars: dict[Line, tqdm] = {}
         self.whole = self._bar(plan.name, len(seen))

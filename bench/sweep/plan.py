@@ -140,8 +140,8 @@ def _differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     told = {*BASIC, *(k for k in FOLLOWERS if all(one[k] == one["seed"] for one in settings))}
     return [
         key
-        for key, found in values.items()
-        if key not in told and any(len(texts) > 1 for texts in found.values())
+        for key, by_owner in values.items()
+        if key not in told and any(len(texts) > 1 for texts in by_owner.values())
     ]
 
 
@@ -156,9 +156,14 @@ def write_sweep(plan: Plan, workers: int, failures: Mapping[str, str]) -> None:
     Raises:
         UserError: if it cannot be written.
     """
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    about = plan.name, plan.description, workers, now
-    file = SweepFile(*about, tuple(plan.configs), dict(failures))
+    file = SweepFile(
+        suite=plan.name,
+        description=plan.description,
+        workers=workers,
+        updated=datetime.now(UTC).isoformat(timespec="seconds"),
+        runs=tuple(plan.configs),
+        failures=dict(failures),
+    )
     write_json(sweep_path(plan.out, plan.name), asdict(file))
 
 

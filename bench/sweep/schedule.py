@@ -90,9 +90,9 @@ def tasks_of(plan: Plan, todo: list[PlannedRun], together: int = 1) -> list[Task
                 place = (config.task, config.embodiment, wanted)
                 demos = demonstrations.setdefault(place, Task("demonstrations", words, []))
                 base.needs.append(demos)
-        if found := bases[key]:
-            base_of[run] = found
-            for shared in (found, *found.needs):
+        if needed := bases[key]:
+            base_of[run] = needed
+            for shared in (needed, *needed.needs):
                 shared.runs.append(run)
     teams = []
     for team in teams_of(plan, todo, together):

@@ -109,11 +109,13 @@ class _Options:
         kind = self.registry.get(name).Options
         valid = self.valid.setdefault(name, [field.name for field in fields(kind)])
         self.names[name] = None
-        own = table.get(name, {})
-        options = table | own if isinstance(own, dict) else table
+        of_name = table.get(name, {})
+        options = table | of_name if isinstance(of_name, dict) else table
         preset: dict[str, Any] = {}
         if "preset" in options and "preset" in self.reserved:
-            preset = preset_options(self._text(options["preset"], "preset"), name, kind)
+            source = self._text(options["preset"], "preset")
+            preset = preset_options(source, name, kind)
+            build_config({"agent": name, "agent_options": preset}, f"preset {source}")
         chosen = {
             key: value
             for key, value in options.items()

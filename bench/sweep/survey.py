@@ -78,12 +78,12 @@ def look(folder: Path) -> Sighting:
         success += ", Q not finite" if record.nonfinite_q else ""
         success += f", not finite: {record.not_finite}" if record.not_finite else ""
     return Sighting(
-        state,
-        record.wall_clock.total,
-        record.budget.env_steps,
-        success,
-        record.failure,
-        progress,
+        state=state,
+        seconds=record.wall_clock.total,
+        env_steps=record.budget.env_steps,
+        success=success,
+        failure=record.failure,
+        progress=progress,
     )
 
 

@@ -105,9 +105,9 @@ class Tuner:
     def _exchange(self) -> None:
         """Let every agent try the settings of the others, with its best own options."""
         best = {agent: s.best.options for agent, s in self.searches.items() if s.best}
-        for agent, own in best.items():
+        for agent, mine in best.items():
             settings = [
-                {**own, **{key: value for key, value in options.items() if key in own}}
+                {**mine, **{key: value for key, value in options.items() if key in mine}}
                 for other, options in best.items()
                 if other != agent
             ]

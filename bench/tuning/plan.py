@@ -169,13 +169,13 @@ class TuningPlan(BaseModel):
 
     def _space_of(self, agent: str, known: list[str]) -> Space:
         """The options of an agent that are tuned: the shared ones that it has, and its own."""
-        own = self.space.get(agent, {})
-        check(f"option of {agent}", own, known, "space")
+        special = self.space.get(agent, {})
+        check(f"option of {agent}", special, known, "space")
         shared = {key: self.space[key] for key in self.space if key in known}
         space = {
             name: _distribution(name, values)
-            for name, values in (shared | own).items()
-            if values != [] or name not in own
+            for name, values in (shared | special).items()
+            if values != [] or name not in special
         }
         for name, values in space.items():
             for end in (*_ends(values), self.start.get(name)):

@@ -164,12 +164,18 @@ def choose(trials: Sequence[TrialResult]) -> Chosen | None:
         return None
     ranks = mean_ranks([trial.scores for trial in complete])
     best = int(np.argmin(ranks))
-    found = complete[best]
-    by_task = {}
-    for task in dict.fromkeys(score.task for score in found.scores):
-        own = [[score for score in trial.scores if score.task == task] for trial in complete]
-        by_task[task] = complete[int(np.argmin(mean_ranks(own)))].number
-    return Chosen(found.agent, found.number, found.options, ranks[best], ranks[0], by_task)
+    trial, by_task = complete[best], {}
+    for task in dict.fromkeys(score.task for score in trial.scores):
+        cells = [[score for score in one.scores if score.task == task] for one in complete]
+        by_task[task] = complete[int(np.argmin(mean_ranks(cells)))].number
+    return Chosen(
+        agent=trial.agent,
+        trial=trial.number,
+        options=trial.options,
+        rank=ranks[best],
+        start_rank=ranks[0],
+        by_task=by_task,
+    )
 
 
 def best_single(chosen: Chosen, start: Sequence[Score]) -> str | None:

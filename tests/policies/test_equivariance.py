@@ -1,11 +1,12 @@
 """decode(g s, g w) = g decode(s, w): exactly, for every element; and not for wrong layouts."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
+from symsteer.policies.geometry import Group, Layout, equivariance_error
 from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy
 from tests.marks import long_except
@@ -32,27 +33,10 @@ def decode_error(policy, world, group, dtype, obs_layout=None, act_layout=None):
     )
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("network", ["mlp", "unet"])
-@pytest.mark.parametrize("name", ["C4", "C8", "D4"])
-class TestEquivariance:
-    def test_at_initialization(self, world, name, network, dtype):
-        policy = world.untrained(group=name, network=network).to(dtype)
-        error = decode_error(policy, world, Group.parse(name), dtype)
-        assert error <= TOLERANCE[dtype]
-
-    def test_after_training(self, trained, world, name, network, dtype):
-        policy = trained(group=name, network=network)
-        policy.to(dtype)
-        try:
-            error = decode_error(policy, world, Group.parse(name), dtype)
-        finally:
-            policy.float()
-        assert error <= TOLERANCE[dtype]
-
-
 IRREPS = {"channels": 8, "width": 8, "depth": 1, "zero_output": False}
 WAYS = {
+    **{name: {"group": name} for name in ("C4", "C8", "D4", "C16", "D8")},
+    **{f"{name}, U-Net": {"group": name, "network": "unet"} for name in ("C4", "C8", "D4")},
     "frame-averaged": {"policy": "frame-averaged", "group": "C8"},
     "frame-averaged, D4": {"policy": "frame-averaged", "group": "D4"},
     "frame-averaged, U-Net": {"policy": "frame-averaged", "group": "C4", "network": "unet"},
@@ -63,13 +47,12 @@ WAYS = {
     "escnn, U-Net": {"policy": "escnn", "group": "C4", "network": "unet"},
     "so2": {"policy": "so2", **IRREPS},
     "spherical": {"policy": "spherical", **IRREPS},
-    "C16": {"group": "C16"},
-    "D8": {"group": "D8"},
     "relative actions": {"group": "D4", "action_frame": "goal"},
     "averaged, relative actions": {"policy": "frame-averaged", "action_frame": "tcp"},
     "flow": {"group": "C8", "process": "flow"},
     "velocity": {"group": "C8", "process": "flow", "prediction": "velocity"},
     "orbit": {"group": "D4", "orbit_targets": True, "observation_noise": 0.1},
+    "epsilon": {"group": "C8", "prediction": "epsilon"},
 }
 
 USUAL_WAYS = [way for way in WAYS if way not in ("escnn, D4", "escnn, U-Net")]
@@ -79,15 +62,18 @@ USUAL_WAYS = [way for way in WAYS if way not in ("escnn, D4", "escnn, U-Net")]
 @pytest.mark.parametrize("way", long_except(list(WAYS), *USUAL_WAYS))
 def test_every_way_to_be_symmetric_is_exact(trained, world, way, dtype):
     """Before and after training."""
-    fields = {**WAYS[way]}
+    fields, tolerance = {**WAYS[way]}, TOLERANCE[dtype]
     name = fields.pop("policy", "edp")
-    for policy in (world.untrained(name, **fields), trained(name, **fields)):
+    if way == "epsilon" and dtype == torch.float32:
+        # sqrt(a_t) = 5e-4 at the first level divides the rounding errors.
+        tolerance = 5e-3
+    for policy in (world.untrained(name, **fields), trained(name, **fields, steps=30)):
         policy.to(dtype)
         try:
             assert policy.group.order > 1
-            assert decode_error(policy, world, policy.group, dtype) <= TOLERANCE[dtype]
+            assert decode_error(policy, world, policy.group, dtype) <= tolerance
             if name in ("canonical", "so2", "spherical"):
-                assert decode_error(policy, world, Group.parse("C5"), dtype) <= TOLERANCE[dtype]
+                assert decode_error(policy, world, Group.parse("C5"), dtype) <= tolerance
         finally:
             policy.float()
 
@@ -101,7 +87,7 @@ def test_the_frame_of_a_chunk_is_needed(trained, world, monkeypatch):
 
 def test_a_frame_may_be_an_odd_vector(world):
     """Columns of a mirrored rotation change sign; the frame then turns by half a turn."""
-    odd = Layout([Field(f.name, f.frequency, f.multiplicity, f.name == "goal") for f in OBS.fields])
+    odd = changed(changed(OBS, "goal", odd=True), "twist", odd=False)
     torch.manual_seed(0)
     options = world.options(group="D4", action_frame="goal")
     policy = EquivariantDiffusionPolicy(options, odd, world.act_layout)
@@ -126,17 +112,6 @@ def test_bounds_are_active_in_these_tests(trained, world, network):
     assert actions.abs().max() <= 1
 
 
-def test_epsilon_prediction_is_equivariant_too(trained, world):
-    policy = trained(group="C8", prediction="epsilon")
-    # sqrt(a_t) = 5e-4 at the first level divides the rounding errors.
-    assert decode_error(policy, world, policy.group, torch.float32) <= 5e-3
-    policy.double()
-    try:
-        assert decode_error(policy, world, policy.group, torch.float64) <= 1e-10
-    finally:
-        policy.float()
-
-
 @pytest.mark.parametrize("name", ["C8", "D4"])
 def test_other_angles_are_not_symmetries(trained, world, name):
     """The group is all that is built in; so the error of other angles is not zero."""
@@ -144,44 +119,26 @@ def test_other_angles_are_not_symmetries(trained, world, name):
     assert decode_error(policy, world, Group.parse("C5"), torch.float32) > 1e-3
 
 
-def swapped_frequency(layout, name, frequency):
-    return Layout(
-        [
-            Field(f.name, frequency if f.name == name else f.frequency, f.multiplicity, f.odd)
-            for f in layout.fields
-        ]
-    )
-
-
-def as_scalars(layout, name):
-    return Layout([Field(f.name, 0, 2) if f.name == name else f for f in layout.fields])
-
-
-def without_odd(layout, name):
-    return Layout(
-        [
-            Field(f.name, f.frequency, f.multiplicity, f.odd and f.name != name)
-            for f in layout.fields
-        ]
-    )
+def changed(layout, name, **changes):
+    return Layout([replace(f, **changes) if f.name == name else f for f in layout.fields])
 
 
 WRONG_LAYOUTS = {
-    "observation's rod turns twice as fast": ("obs", lambda o: swapped_frequency(o, "rod", 1)),
-    "observation's goal is a vector": ("obs", lambda o: as_scalars(o, "goal")),
-    "action's tilt turns once": ("act", lambda a: swapped_frequency(a, "tilt", 2)),
-    "action's xy is a vector": ("act", lambda a: as_scalars(a, "xy")),
-    "action's yaw is odd": ("act", lambda a: without_odd(a, "yaw")),
-    "action's tilt is odd": ("act", lambda a: without_odd(a, "tilt")),
+    "observation's rod turns twice as fast": ("obs", "rod", {"frequency": 1}),
+    "observation's goal is a vector": ("obs", "goal", {"frequency": 0, "multiplicity": 2}),
+    "action's tilt turns once": ("act", "tilt", {"frequency": 2}),
+    "action's xy is a vector": ("act", "xy", {"frequency": 0, "multiplicity": 2}),
+    "action's yaw is odd": ("act", "yaw", {"odd": False}),
+    "action's tilt is odd": ("act", "tilt", {"odd": False}),
 }
 
 
 @pytest.mark.parametrize("mistake", WRONG_LAYOUTS)
 def test_a_wrong_layout_shows(world, mistake):
     """The policy believes one layout; the world turns by the right one."""
-    which, wrong = WRONG_LAYOUTS[mistake]
+    which, name, changes = WRONG_LAYOUTS[mistake]
     layouts = {"obs": world.obs_layout, "act": world.act_layout}
-    layouts[which] = wrong(layouts[which])
+    layouts[which] = changed(layouts[which], name, **changes)
     torch.manual_seed(0)
     options = world.options(group="D4")
     policy = EquivariantDiffusionPolicy(options, layouts["obs"], layouts["act"])

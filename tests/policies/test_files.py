@@ -7,6 +7,7 @@ import hashlib
 import json
 import operator
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -33,16 +34,12 @@ def decode(policy, world):
     [
         {"group": "C8"},
         {"group": "D4", "network": "unet"},
-        {"name": "plain", "network": "unet"},
         {"name": "plain-augmented", "augmentation": "SO2", "hold": ("gripper", "z")},
-        {"name": "frame-averaged", "group": "C4"},
-        {"name": "canonical"},
-        {"name": "escnn", "group": "D4"},
         {"process": "flow", "prediction": "velocity", "action_frame": "goal"},
     ],
 )
 def test_round_trip_is_bit_equal(trained, world, tmp_path, fields):
-    policy = trained(**fields)
+    policy = trained(**fields, steps=5)
     policy.report = {"success": 0.25}
     path = save_policy(policy, tmp_path / "run", extra={"note": [1, "two"]})
     assert path == tmp_path / "run" / "policy.safetensors"
@@ -98,14 +95,16 @@ def test_a_failed_write_leaves_the_old_file(trained, tmp_path, monkeypatch):
 
 @pytest.fixture
 def saved(trained, tmp_path):
-    return save_policy(trained(group="C8"), tmp_path)
+    return save_policy(trained(group="C8"), tmp_path, extra={"success": 0.25})
 
 
-def rewrite(path, metadata=None, drop=None, scale=None):
+def rewrite(path, metadata=None, drop=None, scale=None, edit=None):
     """The same file with other metadata or tensors."""
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         meta = {**file.metadata(), **(metadata or {})}
+    if edit:
+        meta["policy"] = meta["policy"].replace(*edit)
     if drop:
         del tensors[drop]
     if scale:
@@ -113,36 +112,37 @@ def rewrite(path, metadata=None, drop=None, scale=None):
     save_file(tensors, path, meta)
 
 
-def refuse(path, *words, **expectations):
-    with pytest.raises(UserError) as error:
+def refuse(path, words, **expectations):
+    with pytest.raises(UserError, match=words) as error:
         load_policy(path, **expectations)
-    message = str(error.value)
-    assert "\n" not in message
-    assert all(word in message for word in words), message
+    assert "\n" not in str(error.value)
 
 
-def test_missing_file(tmp_path):
-    refuse(tmp_path / "nothing", "no policy at")
+DAMAGES = {
+    "no file": (lambda path: path.unlink(), "no policy at"),
+    "cut off": (lambda path: path.write_bytes(path.read_bytes()[:200]), "truncated"),
+    "end missing": (lambda path: path.write_bytes(path.read_bytes()[:-100]), "truncated"),
+    "empty": (lambda path: path.write_bytes(b""), "truncated"),
+    "a text": (lambda path: path.write_text("just a long enough text"), "no safetensors file"),
+    "other tensors": (lambda path: save_file({"x": torch.zeros(3)}, path), "no SymSteer policy"),
+    "version": (lambda path: rewrite(path, {"version": "99"}), "version 99.* up to 3"),
+    "report": (
+        lambda path: rewrite(path, edit=('"success": 0.25', '"success": 0.95')),
+        "does not match its checksum",
+    ),
+    "weight missing": (
+        lambda path: rewrite(path, drop="denoiser.project.weight"),
+        r"damaged.*project\.weight",
+    ),
+    "weight": (lambda path: rewrite(path, scale="denoiser.project.weight"), "checksum"),
+}
 
 
-@pytest.mark.parametrize("keep", [0, 5, 200, -100])
-def test_truncated_file(saved, keep):
-    saved.write_bytes(saved.read_bytes()[:keep])
-    refuse(saved, "truncated")
-
-
-def test_other_files(saved, tmp_path):
-    foreign = tmp_path / "foreign.safetensors"
-    save_file({"x": torch.zeros(3)}, foreign)
-    refuse(foreign, "no SymSteer policy")
-    text = tmp_path / "text.safetensors"
-    text.write_text("not tensors at all, just a long enough text")
-    refuse(text, "no safetensors file")
-
-
-def test_other_version(saved):
-    rewrite(saved, {"version": "99"})
-    refuse(saved, "version 99", "up to 3")
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_refused(saved, damage):
+    destroy, words = DAMAGES[damage]
+    destroy(saved)
+    refuse(saved, words)
 
 
 @pytest.mark.parametrize(
@@ -155,30 +155,12 @@ def test_damaged_description(saved, description):
     refuse(saved, "damaged")
 
 
-def test_an_edited_report_is_noticed(trained, tmp_path):
-    path = save_policy(trained(group="C8"), tmp_path, extra={"success": 0.25})
-    with safe_open(path, framework="pt") as file:
-        description = file.metadata()["policy"]
-    rewrite(path, {"policy": description.replace('"success": 0.25', '"success": 0.95')})
-    refuse(path, "does not match its checksum")
-
-
-def test_damaged_tensors(saved):
-    rewrite(saved, drop="denoiser.project.weight")
-    refuse(saved, "damaged", "project.weight")
-
-
-def test_altered_tensors(saved):
-    rewrite(saved, scale="denoiser.project.weight")
-    refuse(saved, "checksum")
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["denoiser.project.weight", "act_normalizer.scale"])
 def test_a_policy_that_decodes_to_nan_is_refused(trained, tmp_path, name, value):
     policy = copy.deepcopy(trained(group="C8"))
     policy.state_dict()[name].flatten()[0] = value
-    refuse(save_policy(policy, tmp_path), "decodes to NaN or infinity", "train it again")
+    refuse(save_policy(policy, tmp_path), "decodes to NaN or infinity.*train it again")
 
 
 @pytest.mark.parametrize("name", POLICIES.builtin)
@@ -219,13 +201,13 @@ def test_a_description_of_another_form_is_refused(saved, place, value, words):
     text = json.dumps(found)
     digest = hashlib.sha256(text.encode()).hexdigest()
     rewrite(saved, {"policy": text, "policy_sha256": digest})
-    refuse(saved, str(saved), words)
+    refuse(saved, f"{saved} .*{re.escape(words)}")
 
 
 def test_other_layouts(saved, world):
     other = Layout([Field("tcp", 1), Field("else", 0)])
-    refuse(saved, "observation layout", "else", expect_obs_layout=other)
-    refuse(saved, "action layout", "else", expect_act_layout=other)
+    refuse(saved, "observation layout.*else", expect_obs_layout=other)
+    refuse(saved, "action layout.*else", expect_act_layout=other)
     load_policy(saved, expect_obs_layout=world.obs_layout, expect_act_layout=world.act_layout)
 
 
@@ -261,7 +243,7 @@ def test_the_policy_of_the_documentation(world, tmp_path, monkeypatch):
         loaded.options = kind.Options(horizon=4, execute=2)
         assert loaded.content_hash() != policy.content_hash()
     monkeypatch.delitem(sys.modules, "stranger")
-    refuse(path, "'stranger:Mean'", "package stranger", "not installed")
+    refuse(path, "'stranger:Mean'.*package stranger.*not installed")
 
 
 def test_a_policy_that_no_other_program_can_import_is_not_saved(world, tmp_path):

@@ -163,18 +163,3 @@ def test_layers_commute_with_the_group(name, dtype, tolerance):
         assert torch.allclose(moved_hidden, hidden[:, permutation], atol=tolerance)
         moved_out = project(moved_hidden)
         assert torch.allclose(moved_out, LAYOUT.transform(out, angle, reflect), atol=tolerance)
-
-
-@pytest.mark.parametrize("name", ["C3", "C8", "D4"])
-def test_layers_span_all_of_escnns_equivariant_maps(name):
-    nn = pytest.importorskip("escnn.nn")
-    group = Group.parse(name)
-    irreps = LAYOUT.field_type(group)
-    space = irreps.gspace
-    regular = nn.FieldType(space, [space.regular_repr] * 2)
-    lift = Lift(LAYOUT, group, 2)
-    assert lift.weight.numel() == nn.Linear(irreps, regular, bias=False).weights.numel()
-    linear = RegularLinear(group, 2, 2)
-    assert linear.weight.numel() == nn.Linear(regular, regular, bias=False).weights.numel()
-    project = Project(group, 2, LAYOUT)
-    assert project.weight.numel() == nn.Linear(regular, irreps, bias=False).weights.numel()

@@ -30,14 +30,9 @@ def test_chunks_end_with_a_held_gripper_and_no_motion(world):
     assert (last[1:, moving] == 0).all()
     _, free = make_chunks([(obs, actions)], world.act_layout, 4)
     assert (free[4, 1:] == 0).all()
-
-
-def test_chunks_never_mix_episodes(world):
-    episodes = world.episodes(3, length=6)
-    together = make_chunks(episodes, world.act_layout, 8, ("gripper",))
-    alone = [make_chunks([e], world.act_layout, 8, ("gripper",)) for e in episodes]
-    for i in range(2):
-        assert torch.equal(together[i], torch.cat([a[i] for a in alone]))
+    # Episodes are never mixed.
+    both = make_chunks([(obs, actions), (-obs, -actions)], world.act_layout, 4, hold=("gripper",))
+    assert torch.equal(both[1], torch.cat([chunks, -chunks]))
 
 
 @pytest.mark.parametrize("name", ["SO2", "C8", "D4"])
@@ -78,7 +73,7 @@ def test_augmented_training_sees_turned_pairs(world):
 
 @pytest.mark.parametrize("name", list(POLICIES.builtin))
 def test_the_same_seed_gives_the_same_policy(world, name):
-    first, second, other = (world.fit(name, seed) for seed in (3, 3, 4))
+    first, second, other = (world.fit(name, seed, steps=5) for seed in (3, 3, 4))
     assert first.content_hash() == second.content_hash()
     assert first.training_record["losses"] == second.training_record["losses"]
     assert first.content_hash() != other.content_hash()
@@ -104,18 +99,6 @@ def test_the_anchor_is_the_vector_that_stays_away_from_zero(world):
             changed.append((obs, actions))
         assert world.fit("canonical", steps=2, episodes=changed).options.anchor == steady
     assert world.fit("canonical", steps=2, anchor="goal").options.anchor == "goal"
-
-
-def test_the_canonical_policy_jumps_where_its_anchor_vanishes_and_only_there(trained, world):
-    policy = trained("canonical", anchor="goal")
-    obs, noise = world.observations(16), torch.randn(16, 8, 7)
-    for name, jumps in (("goal", True), ("tcp", False)):
-        sides = []
-        for sign in (-1, 1):
-            near = obs.clone()
-            near[:, world.obs_layout.slice(name)] = sign * torch.tensor([1e-4, 0.0])
-            sides.append(policy.decode(near, noise))
-        assert ((sides[0] - sides[1]).abs().max() > 0.1) == jumps
 
 
 def test_the_averaged_network_is_the_mean_over_the_group(trained, world):
@@ -150,8 +133,10 @@ def test_the_policy_keeps_averaged_weights(world):
     assert 0 < distance(averaged, start) < distance(last, start)
 
 
-@pytest.mark.parametrize("network", ["mlp", "unet"])
-@pytest.mark.parametrize("name", ["edp", "escnn", "frame-averaged", "canonical", "plain-augmented"])
+@pytest.mark.parametrize(
+    ("name", "network"),
+    [("edp", "unet"), ("escnn", "mlp"), ("frame-averaged", "mlp"), ("canonical", "mlp")],
+)
 def test_an_output_from_zero_forgets_the_noise_until_it_is_trained(world, name, network):
     obs = world.observations(3)
     noises = [torch.randn(3, 8, world.act_layout.dim) for _ in range(2)]
@@ -170,13 +155,6 @@ def test_a_network_of_another_package_must_tell_its_output_layer(world, monkeypa
         world.untrained("edp", zero_output=True)
 
 
-def test_training_leaves_the_global_generator_alone(world):
-    torch.manual_seed(5)
-    before = torch.get_rng_state()
-    world.fit(steps=2)
-    assert torch.equal(before, torch.get_rng_state())
-
-
 @pytest.mark.parametrize("network", ["mlp", "unet"])
 def test_it_learns_the_controller(trained, world, network):
     policy = trained(group="C8", network=network)
@@ -192,8 +170,9 @@ def test_it_learns_the_controller(trained, world, network):
 
 
 def test_record_progress_and_frozen_weights(world):
-    calls = []
+    calls, before = [], torch.get_rng_state()
     policy = world.fit(progress=lambda *call: calls.append(call))
+    assert torch.equal(before, torch.get_rng_state())
     assert isinstance(policy, ChunkPolicy)
     assert calls[-1][:2] == (30, 30)
     record = policy.training_record

@@ -11,11 +11,7 @@ from tests.policies.test_equivariance import decode_error
 
 nn = pytest.importorskip("escnn.nn")
 
-from symsteer.policies.symmetry.with_escnn import (  # noqa: E402
-    EscnnDiffusionPolicy,
-    EscnnLayer,
-    regular_fields,
-)
+from symsteer.policies.symmetry.with_escnn import EscnnDiffusionPolicy, EscnnLayer  # noqa: E402
 
 
 class Encoded(EscnnDiffusionPolicy):
@@ -62,16 +58,6 @@ def test_it_starts_as_edp_of_the_same_seed(world, name):
     assert torch.allclose(theirs.decode(obs, noise), ours.decode(obs, noise), atol=1e-5)
 
 
-def test_fields_are_ordered_as_ours(world):
-    """The same coefficients on inputs that are permuted by the group give permuted outputs."""
-    group = Group.parse("D4")
-    layer = EscnnLayer(RegularLinear(group, 3, 5)).double()
-    x = torch.randn(2, group.order, 3, dtype=torch.float64)
-    for g in range(group.order):
-        before = group.multiplication[group.inverse[g]]
-        assert torch.allclose(layer(x[:, before]), layer(x)[:, before], atol=1e-5)
-
-
 def test_an_escnn_network_may_encode_the_observation(world, tmp_path):
     options = small_options("escnn", steps=30, batch_size=32)
     episodes = world.episodes(6, noise=0.2)
@@ -84,8 +70,3 @@ def test_an_escnn_network_may_encode_the_observation(world, tmp_path):
     assert torch.equal(again.decode(obs, noise), policy.decode(obs, noise))
     losses = [loss for _, loss in policy.training_record["losses"]]
     assert losses[-1] < losses[0]
-
-
-def test_regular_fields(world):
-    seen = world.obs_layout.field_type(Group.parse("C4"))
-    assert regular_fields(seen, 3).size == 12

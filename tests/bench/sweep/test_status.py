@@ -122,29 +122,23 @@ def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
     assert capsys.readouterr().out == text + "\n"
 
 
-def test_runs_of_no_sweep_are_reported_too(sweep, undisturbed, tmp_path):
-    other = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0"
-    shutil.copytree(undisturbed, other)
-    assert [len(status.runs) for status in read_status(tmp_path).sweeps] == [5, 1]
-    sweep_path(tmp_path, "tiny").unlink()
-    [status] = read_status(tmp_path).sweeps
-    # The two that never began have left nothing.
-    assert len(status.runs) == 4
-
-
 def test_runs_and_sweeps_are_found_at_any_depth(sweep, undisturbed, tmp_path_factory):
     """As ``symsteer status runs`` after ``symsteer demo``, whose runs are in runs/demo."""
-    top = tmp_path_factory.mktemp("top")
+    top, name = tmp_path_factory.mktemp("top"), "PickCube-v1-floating-none-equivariant-s7-0"
     (top / "deep").mkdir()
     sweep.out.rename(top / "deep" / "demo")
-    shutil.copytree(undisturbed, top / "single" / "PickCube-v1-floating-none-equivariant-s7-0")
+    shutil.copytree(undisturbed, top / "single" / name)
     listed, others = read_status(top).sweeps
     assert listed.title == "deep/demo: tiny: five"
     assert [len(listed.in_state(state)) for state in ("finished", "missing")] == [1, 1]
     assert others.title == "runs of no sweep"
-    assert [run.run_id for run in others.runs] == ["PickCube-v1-floating-none-equivariant-s7-0"]
+    assert [run.run_id for run in others.runs] == [name]
     [only] = read_status(top, "tiny").sweeps
     assert only.title == listed.title
+    # Without their list, the two that never began have left nothing.
+    sweep_path(top / "deep" / "demo", "tiny").unlink()
+    [status] = read_status(top).sweeps
+    assert len(status.runs) == 4
     (top / "deep" / "demo").rename(sweep.out)
 
 
@@ -152,14 +146,20 @@ def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, ca
     other = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0"
     shutil.copytree(undisturbed, other)
     (other / CONFIG).write_text("{")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / CONFIG).write_text("[1]")
+    # What is not of SymSteer is no damage.
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / CONFIG).write_text('{"task": ["PickCube-v1"]}')
     sweep_path(tmp_path, "older").write_text("[]")
     monkeypatch.setattr("sys.argv", ["symsteer", "status", str(tmp_path)])
     assert main() == 2
     out, errors = capsys.readouterr()
     assert out.startswith("tiny: five (5 runs)\n  finished         1\n")
-    one, two = errors.splitlines()
-    assert re.match(r"error: \S+older.json is not the list of a sweep; run the sweep again", one)
-    assert re.match(r"error: \S+config.json cannot be read .*; restore it", two)
+    one, two, three = sorted(errors.splitlines())
+    assert re.match(r"error: \S+7-0/config.json cannot be read .*; restore it", one)
+    assert re.match(r"error: \S+a/config.json is not the configuration of a run", two)
+    assert re.match(r"error: \S+older.json is not the list of a sweep; run the sweep again", three)
     with pytest.raises(UserError, match=CONFIG):
         read_status(other)
 
@@ -168,16 +168,6 @@ def test_the_status_of_a_run_by_its_own_folder(undisturbed):
     text = to_text(read_status(undisturbed).sweeps, undisturbed)
     assert text.startswith("run (1 runs)")
     assert "finished         1" in text
-
-
-def test_folders_of_something_else_are_left_alone(undisturbed, tmp_path):
-    for name, data in (("a", "[1]"), ("b", '{"task": ["PickCube-v1"]}')):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / CONFIG).write_text(data)
-    overview = read_status(tmp_path)
-    assert overview.sweeps == []
-    assert len(overview.damage) == 1
-    assert "not the configuration of a run" in str(overview.damage[0])
 
 
 def test_mistakes_with_status(sweep, tmp_path):
@@ -310,21 +300,3 @@ def test_a_base_policy_of_several_tasks_is_built_once(tmp_path):
     plan = make_plan(Suite("shared", "", configs), tmp_path)
     kinds = [task.kind for task in tasks_of(plan, plan.runs)]
     assert kinds == ["demonstrations"] * 2 + ["base policy"] * 2 + ["run"] * 4
-
-
-def test_equal_demonstrations_and_bases_are_built_once(tmp_path):
-    one = tiny_config()
-    configs = (
-        one,
-        replace(one, seed=1),
-        replace(one, variant="wind:1"),
-        tiny_config(policy_name="plain"),
-        replace(one, task="PushCube-v1"),
-    )
-    plan = make_plan(Suite("shared", "", configs), tmp_path)
-    tasks = tasks_of(plan, plan.runs)
-    assert [task.kind for task in tasks] == ["demonstrations"] * 2 + ["base policy"] * 3 + [
-        "run"
-    ] * 5
-    assert [len(task.needs) for task in tasks] == [0] * 2 + [1] * 8
-    assert [len(task.runs) for task in tasks[:5]] == [4, 1, 3, 1, 1]
