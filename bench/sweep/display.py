@@ -97,22 +97,28 @@ class Display(contextlib.AbstractContextManager, Watcher):
         """Draw the bar of a task, or of one of its runs."""
         line = (task, run)
         if run is None:
-            bar = self.bars.get(line) or self.bars.setdefault(line, self._bar(task.label))
-            elapsed = duration((datetime.now(UTC) - self.begun[line]).total_seconds())
-            bar.set_description_str(f"{task.kind} {task.label}: for {elapsed}")
-            return
+            label, total, done = f"{task.kind} {task.label}", None, 0
+            text = f"for {duration((datetime.now(UTC) - self.begun[line]).total_seconds())}"
+        else:
+            self.seen[run] = sighting = self._sighted(run, self.begun[line])
+            # On a cluster, tasks without progress wait for a processor.
+            if not (self.workers or sighting.progress):
+                return
+            label, total, text = self.labels[run], run.env_steps, sighting.doing()
+            done = round(sighting.share * run.env_steps)
+        # Not `or`: a bar without a total has no truth value.
+        if line not in self.bars:
+            self.bars[line] = self._bar(label, total)
+        self.bars[line].n = done
+        self.bars[line].set_description_str(f"{label}: {text}")
+
+    def _sighted(self, run: PlannedRun, begun: datetime) -> Sighting:
+        """A running run, with its progress unless an earlier process wrote that."""
         progress = read_progress(self.out / run.run_id)
         with contextlib.suppress(KeyError, TypeError, ValueError):
-            # An earlier process may have written it.
-            if progress and datetime.fromisoformat(progress["updated"]) < self.begun[line] - SKEW:
+            if progress and datetime.fromisoformat(progress["updated"]) < begun - SKEW:
                 progress = None
-        self.seen[run] = sighting = replace(self.seen[run], state="running", progress=progress)
-        # On a cluster, tasks without progress wait for a processor.
-        if self.workers or progress:
-            label = self.labels[run]
-            bar = self.bars.get(line) or self.bars.setdefault(line, self._bar(label, run.env_steps))
-            bar.n = round(sighting.share * run.env_steps)
-            bar.set_description_str(f"{label}: {sighting.doing()}")
+        return replace(self.seen[run], state="running", progress=progress)
 
     def _bar(self, label: str, total: int | None = None) -> tqdm:
         # None: none where the output is no terminal.

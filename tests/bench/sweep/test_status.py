@@ -214,7 +214,8 @@ def test_a_terminal_has_a_bar_for_each_running_run_and_one_for_all(sweep, displa
     base = Task("base policy", "edp for PickCube-v1", list(sweep.runs[3:]))
     shown, terminal, lines = display(terminal=True)
     with shown:
-        shown.refresh([team, base])
+        for _ in range(2):
+            shown.refresh([team, base])
         written = terminal.getvalue()
         shown.retried(team, Result("failed", "why"))
         shown.ended(EndedRun(sweep.runs[1], "failed", "why"))
