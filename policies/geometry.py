@@ -276,7 +276,7 @@ class Layout:
         Raises:
             UserError: if escnn is not installed.
         """
-        escnn = _escnn()
+        escnn = escnn_package()
         space = escnn.gspaces.no_base_space(
             group.escnn_group(max(f.frequency for f in self.fields))
         )
@@ -437,7 +437,7 @@ class Group:
         Raises:
             UserError: if escnn is not installed.
         """
-        group = _escnn().group
+        group = escnn_package().group
         if self.rotations == 0:
             return group.so2_group(max(maximum_frequency, 1))
         if self.reflections:
@@ -504,16 +504,12 @@ def group_average(
     return torch.stack(outputs).mean(0)
 
 
-def escnn_modules() -> Any:
-    """The module ``escnn.nn``.
+def escnn_package() -> Any:
+    """The package ``escnn``, with ``escnn.nn``.
 
     Raises:
-        UserError: if escnn is not installed.
+        UserError: if it is not installed.
     """
-    return _escnn().nn
-
-
-def _escnn() -> Any:
     try:
         import escnn.gspaces
         import escnn.nn
@@ -563,5 +559,5 @@ def _escnn_representation(
     name = f"frequency{field.frequency}{'odd' if field.odd else ''}"
     known = fibergroup.representations
     if name not in known:
-        known[name] = _escnn().group.Representation(fibergroup, name, irreps, basis)
+        known[name] = escnn_package().group.Representation(fibergroup, name, irreps, basis)
     return known[name]

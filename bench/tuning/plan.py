@@ -45,7 +45,9 @@ from symsteer.names import check
 LATER = ("description", "trials", "further", "exchange", "batch", "singles")
 """What may change after the first trial."""
 
-Cells = Annotated[Grids, PlainSerializer(lambda grids: grids[0] if len(grids) == 1 else grids)]
+WrittenGrids = Annotated[
+    Grids, PlainSerializer(lambda grids: grids[0] if len(grids) == 1 else grids)
+]
 """Grids as in a suite, which are written as in the file."""
 
 Count = Annotated[int, Field(strict=True, ge=1, le=10**6)]
@@ -74,9 +76,9 @@ class TuningPlan(BaseModel):
     """Cells after which a trial may be given up."""
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 0
     """Of the search."""
-    grid: Cells
+    grid: WrittenGrids
     run: Table = {}
-    confirm: Cells
+    confirm: WrittenGrids
     start: Table = {}
     further: tuple[Table, ...] = ()
     space: Annotated[Table, Field(min_length=1)]

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from symsteer.policies.geometry import Field, Group, Layout, escnn_modules
+from symsteer.policies.geometry import Field, Group, Layout, escnn_package
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift, Project, RegularLinear
 from symsteer.policies.symmetry.lifted import EquivariantOptions, LiftedDenoiser
 from symsteer.policies.training.denoising import DiffusionPolicy
@@ -48,7 +48,7 @@ class EscnnLayer(nn.Module):
         self.geometry = ours.without_parameters()
         self.layout, self.ends, self.order = layout, ends, ours.group.order
         vector = layout.field_type(ours.group)
-        linear = escnn_modules().Linear(
+        linear = escnn_package().nn.Linear(
             *(regular_fields(vector, count) if count else vector for count in ends),
             initialize=False,
         )
@@ -106,7 +106,7 @@ class EscnnLayer(nn.Module):
 
 def regular_fields(like: FieldType, count: int) -> FieldType:
     """``count`` regular fields over the space of a type."""
-    return escnn_modules().FieldType(like.gspace, [like.gspace.regular_repr] * count)
+    return escnn_package().nn.FieldType(like.gspace, [like.gspace.regular_repr] * count)
 
 
 class EscnnDenoiser(LiftedDenoiser):
@@ -133,7 +133,7 @@ class EscnnDenoiser(LiftedDenoiser):
         """The encoder's regular fields, ``[B, order, channels]``."""
         if self.encoder is None:
             return super().embed(obs)
-        seen = escnn_modules().GeometricTensor(obs, self.encoder.in_type)
+        seen = escnn_package().nn.GeometricTensor(obs, self.encoder.in_type)
         return self.encoder(seen).tensor.unflatten(1, (-1, self.group.order)).mT
 
     def train(self, mode: bool = True) -> Self:

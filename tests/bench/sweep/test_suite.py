@@ -167,18 +167,19 @@ def test_agents_and_variants_of_a_seed_share_its_base_policy(tmp_path):
         [grid]
         agent = ["zero", "equivariant"]
         variant = ["none", "wind:1"]
+        "policy.name" = ["edp", "plain"]
         seed = [2, 3]
     """
 
     def shared(text: str) -> list[str]:
         plan = make_plan(load_suite(write(tmp_path, text)), tmp_path)
         # The seeds are not repeated in the runs' labels.
-        assert not any(run.extra for run in plan.runs)
+        assert all(list(run.extra) == ["policy.name"] for run in plan.runs)
         return [task.kind for task in tasks_of(plan, plan.runs) if task.kind != "run"]
 
-    assert shared(grid) == ["demonstrations"] * 2 + ["base policy"] * 2
+    assert shared(grid) == ["demonstrations"] * 2 + ["base policy"] * 4
     one = "[run]\npolicy_seed = 7\ndemonstrations.seed = 7"
-    assert shared(grid + one) == ["demonstrations", "base policy"]
+    assert shared(grid + one) == ["demonstrations"] + ["base policy"] * 2
 
 
 def test_an_option_applies_to_the_agents_that_have_it(tmp_path):
