@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from optuna.trial import Trial, TrialState
 
@@ -32,6 +32,8 @@ from symsteer.bench.tuning.trials import (
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
 from symsteer.terminal import to_paste
+
+Key = TypeVar("Key")
 
 
 class Tuner:
@@ -116,22 +118,21 @@ class Tuner:
     def _round(self, batch: Sequence[tuple[Search, Trial]]) -> None:
         """Execute trials: first a few cells of each, then the others of those that are good."""
         probe = self.plan.probe
-        cells = [self.plan.cells(search.agent, trial.params) for search, trial in batch]
-        kept = []
-        probed = self._scores([configs[:probe] for configs in cells])
-        for (search, trial), configs, scores in zip(batch, cells, probed, strict=True):
+        cells = {one: self.plan.cells(one[0].agent, one[1].params) for one in batch}
+        kept = {}
+        probed = self._scores({one: configs[:probe] for one, configs in cells.items()})
+        for (search, trial), scores in probed.items():
             if len(scores) < probe:
                 search.end(trial, TrialState.FAIL, scores)
             elif search.gives_up(trial, scores):
                 search.end(trial, TrialState.PRUNED, scores)
             else:
-                kept.append((search, trial, configs))
-        scored = self._scores([configs for _, _, configs in kept])
-        for (search, trial, configs), scores in zip(kept, scored, strict=True):
-            done = len(scores) == len(configs)
+                kept[search, trial] = cells[search, trial]
+        for (search, trial), scores in self._scores(kept).items():
+            done = len(scores) == len(kept[search, trial])
             search.end(trial, TrialState.COMPLETE if done else TrialState.FAIL, scores)
 
-    def _scores(self, cells: Sequence[Sequence[RunConfig]]) -> list[list[Score]]:
+    def _scores(self, cells: Mapping[Key, Sequence[RunConfig]]) -> dict[Key, list[Score]]:
         """Execute runs that have no score yet; the scores of each group of runs.
 
         A run that fails is the fault of its options: it is shown, and has no score.
@@ -139,7 +140,7 @@ class Tuner:
         Raises:
             UserError: if another process works on a run; its trial is not lost.
         """
-        configs = dict.fromkeys(config for group in cells for config in group)
+        configs = dict.fromkeys(config for group in cells.values() for config in group)
         runs = tuple(config for config in configs if not self._score(config))
         if runs:
             suite = Suite(f"tune-{self.plan.name}", self.plan.description, runs)
@@ -147,8 +148,8 @@ class Tuner:
             for end in run_plan(plan, self.workers, self.ray, self.together):
                 if end.status == "elsewhere":
                     raise UserError(
-                        f"another process works on {end.run.label}; start the search again "
-                        "when it has ended"
+                        f"another process works on {end.run.label}; start the search again when it "
+                        "has ended"
                     )
                 if end.status == "failed":
                     print(f"failed: {end.run.label}: {end.reason}", file=sys.stderr)
@@ -156,7 +157,10 @@ class Tuner:
                 self._score(config)
             scores = {name: vars(score) for name, score in self._known.items()}
             write_json(self.places["scores"], scores)
-        return [[score for one in group if (score := self._score(one))] for group in cells]
+        return {
+            key: [score for one in group if (score := self._score(one))]
+            for key, group in cells.items()
+        }
 
     def _score(self, config: RunConfig) -> Score | None:
         name = run_id(config, {})
@@ -174,7 +178,7 @@ class Tuner:
             for name, value in choice.options.items()
             if value != first[name]
         }
-        scores = dict(zip(cells, self._scores(list(cells.values())), strict=True))
+        scores = self._scores(cells)
         return [
             replace(
                 choice,
@@ -195,7 +199,7 @@ class Tuner:
             for choice in chosen
             for setting, configs in self._fresh_cells(choice).items()
         }
-        scores = dict(zip(cells, self._scores(list(cells.values())), strict=True))
+        scores = self._scores(cells)
         return [
             replace(choice, fresh={s: scores[a, s] for a, s in cells if a == choice.agent})
             for choice in chosen
