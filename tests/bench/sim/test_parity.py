@@ -5,146 +5,141 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.bench.sim.conftest import Kit
+from symsteer.bench.sim.trees import rows_of
+from tests.bench.sim.scenes import TASKS, actions, batched, come_down, rollout, stock
 
 STEPS = 20
+PUSHED = {"atol": 1e-3, "rtol": 0}
+"""In contact, two stock runs from states that differ by 1e-7 also differ by up to this."""
 
 
-@pytest.mark.parametrize("task", Kit.tasks)
-def test_follows_stock(kit, task):
+def close(ours, theirs, **tolerance):
+    torch.testing.assert_close(ours, theirs, **{"atol": 1e-5, "rtol": 0, **tolerance})
+
+
+def pair(task, num_envs, i=1, **settings):
+    """Ours and stock, both in the state of our environment ``i``."""
+    env, one = batched(task, num_envs, **settings), stock(task, **settings)
+    env.reset(seed=list(range(1, num_envs + 1)), options={"reconfigure": True})
+    one.reset(seed=4)
+    one.set_state_dict(rows_of(env.get_state_dict(), slice(i, i + 1)))
+    return env, one
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_follows_stock(task):
     """Same state, same joint-space actions: states within 1e-5 over 20 steps, same outcome."""
-    env, stock = kit.batched(task, 3), kit.stock(task)
-    env.reset(seed=[1, 2, 3])
-    stock.reset(seed=4)
-    i = 1
-    stock.set_state_dict(kit.rows(env.get_state_dict(), i))
-    start = kit.flat(env.get_state_dict())[i]
-    actions = kit.actions(env, STEPS)
+    env, one = pair(task, 3)
+    i, start, moves = 1, env.get_state()[1], actions(env, STEPS)
     if task == "PushT":
         # Its stick starts millimetres above the table. Lift it: an impact magnifies a difference
         # of 1e-7 to 1e-3 in a velocity.
-        actions[..., 1] = -actions[..., 1].abs()
-    for action in actions:
+        moves[..., 1] = -moves[..., 1].abs()
+    for action in moves:
         obs, reward, terminated, _, info = env.step(action)
-        stock_obs, stock_reward, stock_terminated, _, stock_info = stock.step(action[i : i + 1])
-        state, stock_state = kit.flat(env.get_state_dict()), kit.flat(stock.get_state_dict())
-        torch.testing.assert_close(state[i], stock_state[0], atol=1e-5, rtol=0)
-        torch.testing.assert_close(obs[i], stock_obs[0], atol=1e-5, rtol=0)
-        torch.testing.assert_close(reward[i], stock_reward[0], atol=1e-5, rtol=0)
+        stock_obs, stock_reward, stock_terminated, _, stock_info = one.step(action[i : i + 1])
+        close(env.get_state()[i], one.get_state()[0])
+        close(obs[i], stock_obs[0])
+        close(reward[i], stock_reward[0])
         assert terminated[i] == stock_terminated[0]
         assert set(info) == set(stock_info)
         for name, value in stock_info.items():
             assert info[name][i] == value[0], name
-    assert (state[i] - start).abs().max() > 0.1  # the robot did move
+    assert (env.get_state()[i] - start).abs().max() > 0.1  # the robot did move
 
 
-def test_success_equals_stock(kit):
+def test_success_equals_stock():
     """Both report success in the same state, and sleeping bodies do not differ."""
-    env, stock = kit.batched("PickCube", 2), kit.stock("PickCube")
-    env.reset(seed=[1, 2])
-    stock.reset(seed=3)
+    env, one = pair("PickCube", 3)
     state = env.get_state_dict()
-    state["actors"]["cube"][1, :3] = torch.tensor([0.3, 0.3, 0.02])
-    state["actors"]["goal_site"][1, :3] = torch.tensor([0.3, 0.3, 0.02])
+    for name in ("cube", "goal_site"):
+        state["actors"][name][1, :3] = torch.tensor([0.3, 0.3, 0.02])
     env.set_state_dict(state)
-    stock.set_state_dict(kit.rows(state, 1))
-    still = torch.zeros(2, env.single_action_space.shape[0])
+    one.set_state_dict(rows_of(state, slice(1, 2)))
+    still = torch.zeros(3, env.single_action_space.shape[0])
     for _ in range(STEPS):
         _, reward, _, _, info = env.step(still)
-        _, stock_reward, _, _, stock_info = stock.step(still[:1])
+        _, stock_reward, _, _, stock_info = one.step(still[:1])
         assert info["success"][1] == stock_info["success"][0]
-        torch.testing.assert_close(reward[1], stock_reward[0], atol=1e-5, rtol=0)
-    assert info["success"].tolist() == [False, True]
+        close(reward[1], stock_reward[0])
+    assert info["success"].tolist() == [False, True, False]
 
 
-def test_held_robot_stays_awake(kit):
+def test_held_robot_stays_awake():
     """Holding one target for seconds keeps the robot awake, as stock ManiSkill does."""
-    env = kit.batched("PickCube", 2, control_mode="pd_joint_pos")
-    stock = kit.stock("PickCube", control_mode="pd_joint_pos")
-    env.reset(seed=[1, 2])
-    stock.reset(seed=3)
-    stock.set_state_dict(kit.rows(env.get_state_dict(), 1))
-    hold = torch.cat([env.agent.robot.get_qpos()[:, :7], torch.ones(2, 1)], dim=1)
+    env, one = pair("PickCube", 3, control_mode="pd_joint_pos")
+    hold = torch.cat([env.agent.robot.get_qpos()[:, :7], torch.ones(3, 1)], dim=1)
     for _ in range(60):
         env.step(hold)
-        stock.step(hold[1:])
-    for e in (env, stock):
+        one.step(hold[1:2])
+    for e in (env, one):
         assert not any(robot.links[0].sleeping for robot in e.agent.robot._objs)
-    state, stock_state = kit.flat(env.get_state_dict()), kit.flat(stock.get_state_dict())
-    torch.testing.assert_close(state[1], stock_state[0], atol=1e-6, rtol=0)
+    close(env.get_state()[1], one.get_state()[0], atol=1e-6)
 
 
-def test_contact_impulses_equal_stock(kit):
+def test_contact_impulses_equal_stock():
     """Pair and body queries during a grasp report what stock ManiSkill computes."""
-    env = kit.batched("PickCube", 3, control_mode="pd_ee_delta_pose")
+    env = batched("PickCube", 3, control_mode="pd_ee_delta_pose")
     env.reset(seed=[1, 2, 3])
-    kit.grasp_pose(env)
-    before_contact = env.get_state_dict()
-    qpos = env.agent.robot.get_qpos().clone()
-    env = kit.batched("PickCube", 3, control_mode="pd_joint_pos")
-    stock = kit.stock("PickCube", control_mode="pd_joint_pos")
-    env.set_state_dict(before_contact)
+    come_down(env)
+    before_contact, qpos = env.get_state_dict(), env.agent.robot.get_qpos().clone()
     i = 2
-    stock.set_state_dict(kit.rows(before_contact, i))
-    close = torch.cat([qpos[:, :7], -torch.ones(3, 1)], dim=1)
+    env, one = pair("PickCube", 3, control_mode="pd_joint_pos")
+    env.set_state_dict(before_contact)
+    one.set_state_dict(rows_of(before_contact, slice(i, i + 1)))
+    grasp = torch.cat([qpos[:, :7], -torch.ones(3, 1)], dim=1)
     largest = 0.0
     for _ in range(6):
-        _, _, _, _, info = env.step(close)
-        _, _, _, _, stock_info = stock.step(close[i : i + 1])
+        info = env.step(grasp)[-1]
+        stock_info = one.step(grasp[i : i + 1])[-1]
         for finger in ("finger1_link", "finger2_link"):
-            ours, theirs = getattr(env.agent, finger), getattr(stock.agent, finger)
+            ours, theirs = getattr(env.agent, finger), getattr(one.agent, finger)
             force = env.scene.get_pairwise_contact_forces(ours, env.cube)
-            stock_force = stock.scene.get_pairwise_contact_forces(theirs, stock.cube)
-            torch.testing.assert_close(force[i], stock_force[0].float(), atol=0.2, rtol=0.02)
-            reverse = env.scene.get_pairwise_contact_forces(env.cube, ours)
-            torch.testing.assert_close(reverse, -force)
+            stock_force = one.scene.get_pairwise_contact_forces(theirs, one.cube)
+            close(force[i], stock_force[0].float(), atol=0.2, rtol=0.02)
+            close(env.scene.get_pairwise_contact_forces(env.cube, ours), -force)
             net, stock_net = ours.get_net_contact_forces(), theirs.get_net_contact_forces()
-            torch.testing.assert_close(net[i], stock_net[0].float(), atol=0.2, rtol=0.02)
+            close(net[i], stock_net[0].float(), atol=0.2, rtol=0.02)
             largest = max(largest, force[i].norm().item())
         names = [env.agent.finger1_link.name, env.agent.finger2_link.name]
         both = env.agent.robot.get_net_contact_impulses(names)
-        torch.testing.assert_close(both[:, 1], env.agent.finger2_link.get_net_contact_impulses())
+        close(both[:, 1], env.agent.finger2_link.get_net_contact_impulses())
         assert info["is_grasped"][i] == stock_info["is_grasped"][0]
     assert largest > 5  # newtons: there was something to compare
     assert info["is_grasped"].all()
 
 
-def test_stock_is_left_alone(kit):
+def test_stock_is_left_alone():
     """A stock environment gives the same numbers with and without ours in the process."""
-    stock = kit.stock("PickCube", control_mode="pd_ee_delta_pose")
-    stock.reset(seed=1)
-    actions = kit.actions(stock, 5)
-    alone = kit.rollout(stock, actions)
-    env = kit.batched("PickCube", 2, control_mode="pd_ee_delta_pose")
-    env.step(kit.actions(env, 1)[0])
-    again = kit.stock("PickCube", control_mode="pd_ee_delta_pose")
+    settings = {"control_mode": "pd_ee_delta_pose"}
+    one = stock("PickCube", **settings)
+    one.reset(seed=1)
+    moves = actions(one, 5)
+    alone = rollout(one, moves)
+    env = batched("PickCube", 3, **settings)
+    env.step(actions(env, 1)[0])
+    again = stock("PickCube", **settings)
     again.reset(seed=1)
     assert not again.gpu_sim_enabled
     assert not again.agent.controller.controllers["arm"].kinematics.use_gpu_ik
-    torch.testing.assert_close(kit.rollout(again, actions), alone, atol=0, rtol=0)
+    assert torch.equal(rollout(again, moves), alone)
 
 
-def test_pushed_object_follows_stock(kit):
-    """PushT's stick pushes the T. In contact, two stock runs from states that differ by 1e-7 also
-    differ by up to 1e-3."""
-    env, stock = kit.batched("PushT", 2), kit.stock("PushT")
-    env.reset(seed=[1, 2])
-    stock.reset(seed=4)
+def test_pushed_object_follows_stock():
+    """PushT's stick pushes the T."""
+    env, one = pair("PushT", 3)
     state = env.get_state_dict()
     body = state["actors"]["Tee"]
     # Beside the tool, which the first joint then sweeps towards it.
     body[1, :2] = env.agent.tcp.pose.p[1, :2] + torch.tensor([0.0, 0.08])
     start = body[1, :2].clone()
     env.set_state_dict(state)
-    stock.set_state_dict(kit.rows(state, 1))
-    sweep = torch.zeros(2, env.single_action_space.shape[0])
+    one.set_state_dict(rows_of(state, slice(1, 2)))
+    sweep = torch.zeros(3, env.single_action_space.shape[0])
     sweep[:, 0] = 0.4
     for _ in range(12):
-        _, reward, _, _, _ = env.step(sweep)
-        _, stock_reward, _, _, _ = stock.step(sweep[1:])
-    moved = env.get_state_dict()["actors"]["Tee"][1, :7]
-    assert (moved[:2] - start).norm() > 0.02
-    torch.testing.assert_close(
-        moved, stock.get_state_dict()["actors"]["Tee"][0, :7], atol=1e-3, rtol=0
-    )
-    torch.testing.assert_close(reward[1], stock_reward[0], atol=1e-2, rtol=0)
+        reward, stock_reward = env.step(sweep)[1], one.step(sweep[1:2])[1]
+    moved, theirs = (e.get_state_dict()["actors"]["Tee"][:, :7] for e in (env, one))
+    assert (moved[1, :2] - start).norm() > 0.02
+    close(moved[1], theirs[0], **PUSHED)
+    close(reward[1], stock_reward[0], atol=1e-2)

@@ -9,20 +9,18 @@ import sys
 import time
 from typing import Any
 
-import gymnasium as gym
 import pytest
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
-from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from symsteer.bench.sim import create
 from symsteer.bench.sim.errors import WorkerError, WorkerLostError
-from symsteer.bench.sim.parallel import ShardedEnv, divide
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make
 from symsteer.bench.variants import VARIANTS
 from symsteer.errors import UserError
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
+from tests.bench.shared import assert_same
 from tests.bench.steering.test_latent_env import NoiseIsAction
 
 TASK = "PickCube-v1"
@@ -33,23 +31,6 @@ def both(num_envs: int, workers: int = 2, **options: Any) -> tuple[Any, Any]:
     task = options.pop("task", TASK)
     one = make(task, num_envs=num_envs, **options)
     return one, make(task, num_envs=num_envs, workers=workers, **options)
-
-
-def assert_same(a: Any, b: Any) -> None:
-    """Equal to the last bit, in structure, type and value."""
-    if isinstance(a, dict):
-        assert list(a) == list(b)
-        for key in a:
-            assert_same(a[key], b[key])
-    elif isinstance(a, list | tuple):
-        assert len(a) == len(b)
-        for x, y in zip(a, b, strict=True):
-            assert_same(x, y)
-    elif isinstance(a, torch.Tensor):
-        assert a.dtype == b.dtype
-        assert torch.equal(a, b)
-    else:
-        assert a == b
 
 
 def actions(steps: int, num_envs: int, seed: int = 0) -> torch.Tensor:
@@ -68,11 +49,6 @@ def pair():
     two.close()
 
 
-def test_divide():
-    assert divide(7, 3) == [slice(0, 3), slice(3, 5), slice(5, 7)]
-    assert divide(4, 4) == [slice(i, i + 1) for i in range(4)]
-
-
 def test_same_trajectories(pair):
     """Seeds of every kind, partial resets in any order, contacts, per-environment strengths."""
     resets = {
@@ -88,10 +64,17 @@ def test_same_trajectories(pair):
         if step in resets:
             assert_same(*(env.reset(**resets[step]) for env in pair))
             assert_same(*(env.get_state_dict() for env in pair))
-        assert_same(*(env.step(action) for env in pair))
+        if step in (5, 8):
+            for env in pair:
+                env.pause(torch.tensor([step == 5, False, False, step == 5, False]))
+        seen, kept = (env.step(action) for env in pair)
+        assert_same(seen, kept)
         assert_same(*(env.elapsed_steps for env in pair))
     assert_same(*(env.get_info() for env in pair))
-    assert_same(*(env.get_obs() for env in pair))
+    obs, again = (env.get_obs() for env in pair)
+    assert_same(obs, again)
+    pair[1].step(action)
+    assert_same(obs, again)  # a result is the caller's own
 
 
 def test_same_before_the_first_reset_and_other_kinds_of_action():
@@ -176,40 +159,11 @@ def test_a_chunk_is_its_steps(pair):
     assert_same(one.elapsed_steps, two.elapsed_steps)
 
 
-def test_results_are_the_callers_own(pair):
-    two = pair[1]
-    obs, *_ = two.step(actions(1, 5)[0])
-    kept = obs.clone()
-    two.step(actions(2, 5)[1])
-    assert torch.equal(obs, kept)
-
-
-def test_paused_environments():
-    one, two = both(4)
-    seeds, moves = [3, 4, 5, 6], actions(6, 4)
-    paused = torch.tensor([False, True, True, False])
-    for env in (one, two):
-        env.reset(seed=seeds)
-    for number, action in enumerate(moves):
-        if number == 2:
-            before = one.get_state_dict()["actors"]["cube"][paused].clone()
-            for env in (one, two):
-                env.unwrapped.pause(paused)
-        assert_same(one.step(action), two.step(action))
-    assert torch.equal(one.get_state_dict()["actors"]["cube"][paused], before)
-    two.close()
-
-
-def decided(one: Any, two: Any, execute: int) -> tuple[LatentNoiseEnv, LatentNoiseEnv]:
-    """Latent-noise environments in which the first two decisions of a test are the same."""
-    return tuple(LatentNoiseEnv(env, NoiseIsAction(execute)) for env in (one, two))
-
-
 @pytest.mark.parametrize("solved", [[1, 3], [0, 1, 2, 3]])
 def test_same_latent_noise_environment(solved):
     """Successes within a chunk, in some and in all environments, and time limits."""
     one, two = both(4)
-    pairs = decided(one, two, execute=4)
+    pairs = [LatentNoiseEnv(env, NoiseIsAction(4)) for env in (one, two)]
     seeds = [3, 4, 5, 6]
     assert_same(*(env.reset(seeds) for env in pairs))
     state = one.get_state_dict()
@@ -241,23 +195,6 @@ def test_same_with_a_policy():
     two.close()
 
 
-def test_gymnasium_and_maniskills_vector_environment():
-    """``gym.make(..., workers=2)`` in ManiSkill's wrapper: automatic resets, metrics."""
-    options: dict[str, Any] = {"num_envs": 3, "variant": "action_gain", "strength": 0.5}
-    envs = [
-        ManiSkillVectorEnv(
-            gym.make(f"SymSteer/{TASK}", max_episode_steps=4, workers=workers, **options),
-            record_metrics=True,
-        )
-        for workers in (1, 2)
-    ]
-    assert isinstance(envs[1].unwrapped, ShardedEnv)
-    assert_same(*(env.reset(seed=2) for env in envs))
-    for action in actions(9, 3):
-        assert_same(*(env.step(action) for env in envs))
-    envs[1].close()
-
-
 def test_stock_tasks_do_not_repeat_themselves():
     """Without a seed, workers draw different episodes of tasks that use torch's generator."""
     env = create(PickCubeEnv, 2, workers=2, robot_uids="panda", obs_mode="state")
@@ -278,7 +215,6 @@ def test_attributes_that_only_workers_have(pair):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"workers": 0}, "at least 1 and at most"),
         ({"workers": 5}, "at most the number of environments, 4"),
         ({"workers": 2, "sim": "cuda"}, "leave workers out"),
         (

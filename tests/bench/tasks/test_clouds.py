@@ -1,9 +1,6 @@
 """Tasks that cameras see: clouds of points turn with the scene, and a policy learns from them."""
 
 import math
-import os
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -77,15 +74,10 @@ def test_an_audit_names_the_task_to_take():
         AuditSettings(task=SEEN[0]).check()
 
 
+@pytest.mark.skipif(rendering_works(), reason="there is a Vulkan driver here")
 def test_without_a_driver_a_sentence_says_what_is_missing():
-    code = f"from symsteer.bench.tasks import make; make({SEEN[0]!r}, num_envs=1)"
-    none = dict.fromkeys(("VK_ICD_FILENAMES", "VK_DRIVER_FILES"), "/nonexistent.json")
-    found = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, **none}, capture_output=True, text=True
-    )
-    assert found.stderr.splitlines()[-1].startswith(
-        "symsteer.errors.UserError: Rendering needs a Vulkan driver"
-    )
+    with pytest.raises(UserError, match="Rendering needs a Vulkan driver"):
+        make(SEEN[0], num_envs=1)
 
 
 @pytest.fixture(scope="module", params=SEEN)

@@ -13,16 +13,16 @@ from symsteer.bench.sim.rotations import (
     rotation_vector_to_matrix,
     transform_quaternion,
 )
-from symsteer.bench.tasks import make
 from symsteer.bench.tasks.floating import ACTION_LAYOUT, PlanarPoseControllerConfig, bound_blocks
 from symsteer.policies.geometry import Group
+from tests.bench.shared import shared
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def env():
-    env = make("PickCube-v1", num_envs=16)
-    yield env
-    env.close()
+    env = shared("PickCube-v1", 16)
+    env.reset(seed=list(range(16)))
+    return env
 
 
 def test_bound_blocks_shortens_norms_and_is_idempotent():
@@ -48,7 +48,6 @@ def test_the_controller_follows(env, name):
         "tilt": config.tilt_step,
         "yaw": config.yaw_step,
     }[name]
-    env.reset(seed=list(range(16)))
     before = env.agent.tcp_pose.raw_pose.clone()
     action = torch.zeros(16, 7)
     bearing = torch.arange(16) * (2 * math.pi / 16)
@@ -73,7 +72,6 @@ def test_the_controller_follows(env, name):
 
 
 def test_positive_rotations_are_right_handed(env):
-    env.reset(seed=list(range(16)))
     before = quaternion_to_matrix(env.agent.tcp_pose.q)
     action = torch.zeros(16, 7)
     action[:, ACTION_LAYOUT.slice("yaw")] = 1.0
@@ -83,7 +81,6 @@ def test_positive_rotations_are_right_handed(env):
 
 
 def test_a_blocked_gripper_does_not_wind_up(env):
-    env.reset(seed=list(range(16)))
     down = torch.zeros(16, 7)
     down[:, ACTION_LAYOUT.slice("z")] = -1.0
     for _ in range(15):
@@ -95,7 +92,6 @@ def test_a_blocked_gripper_does_not_wind_up(env):
 
 
 def test_tilt_and_reach_are_limited(env):
-    env.reset(seed=list(range(16)))
     action = torch.zeros(16, 7)
     action[:, ACTION_LAYOUT.slice("tilt")] = torch.tensor([0.6, 0.8])
     action[:, ACTION_LAYOUT.slice("xy")] = torch.tensor([0.6, -0.8])
@@ -111,7 +107,6 @@ def test_tilt_and_reach_are_limited(env):
 
 
 def test_is_static_ignores_direction(env):
-    env.reset(seed=list(range(16)))
     state = env.get_state_dict()
     bearing = torch.arange(16) * (2 * math.pi / 16)
     for speed, expected in ((0.19, True), (0.21, False)):
@@ -146,8 +141,9 @@ def test_euler_rates_give_the_angular_velocity():
 
 def test_rotation_vectors_and_quaternions_agree():
     v = torch.tensor([[0.0, 0.0, 0.7], [0.0, 0.0, 0.0], [0.3, -0.2, 0.5]], dtype=torch.float64)
-    matrices = rotation_vector_to_matrix(v)
-    assert torch.allclose(matrices, torch.linalg.matrix_exp(_cross(v)), atol=1e-12)
+    # Rows of the cross product's matrix.
+    cross = torch.linalg.cross(v[:, None], torch.eye(3, dtype=torch.float64)[None]).mT
+    assert torch.allclose(rotation_vector_to_matrix(v), torch.linalg.matrix_exp(cross), atol=1e-12)
 
 
 @pytest.mark.parametrize("element", [(0.7, False), (0.7, True), (0.0, True)])
@@ -162,16 +158,4 @@ def test_mirrored_orientations_are_conjugated(element):
     expected = turn @ mirror @ quaternion_to_matrix(q) @ mirror
     assert torch.allclose(
         quaternion_to_matrix(transform_quaternion(q, angle, reflect)), expected, atol=1e-12
-    )
-
-
-def _cross(v):
-    zero = torch.zeros_like(v[:, 0])
-    return torch.stack(
-        [
-            torch.stack([zero, -v[:, 2], v[:, 1]], dim=1),
-            torch.stack([v[:, 2], zero, -v[:, 0]], dim=1),
-            torch.stack([-v[:, 1], v[:, 0], zero], dim=1),
-        ],
-        dim=1,
     )

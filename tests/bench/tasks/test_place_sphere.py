@@ -7,19 +7,18 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from symsteer.bench.sim.rotations import quaternion_multiply, yaw_quaternion
-from symsteer.bench.tasks import make
 from symsteer.bench.tasks.experts import Expert
+from tests.bench.shared import shared
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def env():
-    env = make("PlaceSphere-v1", num_envs=32)
-    yield env
-    env.close()
+    env = shared("PlaceSphere-v1", 32)
+    env.reset(seed=list(range(32)))
+    return env
 
 
 def test_resets_leave_room_for_the_fingers(env):
-    env.reset(seed=list(range(32)))
     gap = (env.obj.pose.p - env.bin.pose.p)[:, :2].norm(dim=1)
     low, high = env.distance_range
     assert (gap >= low - 1e-6).all()
@@ -30,7 +29,6 @@ def test_resets_leave_room_for_the_fingers(env):
 
 
 def test_quarter_turns_of_the_bin_and_turns_of_the_sphere_are_not_seen(env):
-    env.reset(seed=list(range(32)))
     before = env.get_obs().clone()
     quarter = yaw_quaternion(torch.full((32,), math.pi / 2))
     place = env.bin.pose

@@ -13,17 +13,18 @@ from symsteer.bench.sim.rotations import (
     wrap,
     yaw_quaternion,
 )
-from symsteer.bench.tasks import make
+from symsteer.bench.sim.trees import join_trees, rows_of
 from symsteer.bench.tasks.experts import Expert
+from tests.bench.shared import shared
 
 COUNT = 24
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def env():
-    env = make("PokeCube-v1", num_envs=COUNT, reward_mode="dense")
-    yield env
-    env.close()
+    env = shared("PokeCube-v1", COUNT, reward_mode="dense")
+    env.reset(seed=list(range(COUNT)))
+    return env
 
 
 def direction(env):
@@ -33,17 +34,12 @@ def direction(env):
 def turned(env, angles):
     """The present state with each environment turned by its own angle."""
 
-    def pick(trees):
-        if isinstance(trees[0], dict):
-            return {key: pick([tree[key] for tree in trees]) for key in trees[0]}
-        return torch.stack([tree[i] for i, tree in enumerate(trees)])
-
     state = env.get_state_dict()
-    return pick([env.transform_state(state, float(angle)) for angle in angles])
+    turned = [rows_of(env.transform_state(state, float(a)), [i]) for i, a in enumerate(angles)]
+    return join_trees(turned)
 
 
 def test_the_scene_is_stocks_seen_along_the_direction(env):
-    env.reset(seed=list(range(COUNT)))
     ahead = direction(env)
     side = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=1)
     assert torch.allclose(quaternion_to_matrix(env.peg.pose.q)[:, :2, 0], ahead, atol=1e-6)
@@ -63,7 +59,6 @@ def test_the_scene_is_stocks_seen_along_the_direction(env):
 
 def test_evaluation_and_reward_are_stocks_along_x_and_do_not_turn(env):
     """Over whole episodes of the expert, so that every term of the reward is met."""
-    env.reset(seed=list(range(COUNT)))
     expert = Expert(env)
     terms = {"is_peg_grasped": 0, "is_peg_cube_fit": 0, "is_cube_placed": 0, "success": 0}
     rewards = []
@@ -101,7 +96,6 @@ def test_evaluation_and_reward_are_stocks_along_x_and_do_not_turn(env):
 
 def test_stock_along_other_directions_is_not_what_it_is_along_x(env):
     """Why two quantities are replaced at all."""
-    env.reset(seed=list(range(COUNT)))
     ahead = direction(env)
     stock = PokeCubeEnv.evaluate(env)
     ours = env.evaluate()
@@ -115,7 +109,6 @@ def test_stock_along_other_directions_is_not_what_it_is_along_x(env):
 
 
 def test_a_half_turned_peg_and_a_quarter_turned_cube_look_the_same(env):
-    env.reset(seed=list(range(COUNT)))
     for _ in range(10):
         env.step(2 * torch.rand(COUNT, 7, generator=torch.Generator().manual_seed(0)) - 1)
     before = env.get_obs().clone()
@@ -130,7 +123,6 @@ def test_a_half_turned_peg_and_a_quarter_turned_cube_look_the_same(env):
 
 
 def test_the_nearer_end_is_observed(env):
-    env.reset(seed=list(range(COUNT)))
     ahead = direction(env)
     tip = env.peg.pose.p[:, :2] + env.peg_half_length * ahead
     where = env.observation_layout.slice("peg_end_to_cube_xy")

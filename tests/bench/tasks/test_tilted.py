@@ -16,13 +16,16 @@ from symsteer.bench.sim.rotations import (
     quaternion_to_matrix,
     rotation_vector_to_matrix,
 )
+from symsteer.bench.sim.trees import map_trees, rows_of
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.tilted import in_space
 from symsteer.errors import UserError
 from symsteer.policies import POLICIES
 from symsteer.policies.geometry import Field, Group
+from tests.bench.shared import assert_same, shared
 
 TASKS = ["PickCube-v1", "PushCube-v1"]
+PLACES = [("PickCube-v1", "panda"), ("PushCube-v1", "floating")]
 LEVEL = torch.tensor([1.0, 0.0, 0.0, 0.0])
 
 
@@ -44,18 +47,19 @@ def random_actions(count, steps, seed=0):
     return torch.rand(steps, count, 7, generator=generator) * 2 - 1
 
 
-def same_bodies(a, b):
-    for kind in ("actors", "articulations"):
-        for name, value in a[kind].items():
-            assert torch.equal(value, b[kind][name]), name
+def bodies(env):
+    """Robot and actors; they are those of the flat task."""
+    return {kind: env.get_state_dict()[kind] for kind in ("actors", "articulations")}
 
 
 def close_bodies(a, b):
     """Poses and joint angles; velocities are less smooth."""
-    for kind in ("actors", "articulations"):
-        for name, value in a[kind].items():
-            poses = slice(0, 7 if kind == "actors" else (13 + value.shape[1]) // 2)
-            assert torch.allclose(value[:, poses], b[kind][name][:, poses], atol=2e-4), name
+
+    def close(value, other):
+        poses = slice(0, 7 if value.shape[1] == 13 else (13 + value.shape[1]) // 2)
+        assert torch.allclose(value[:, poses], other[:, poses], atol=2e-4)
+
+    map_trees(close, bodies(a), bodies(b))
 
 
 def vector(env, obs, name):
@@ -63,17 +67,16 @@ def vector(env, obs, name):
     return torch.cat(parts, dim=1)
 
 
-@pytest.mark.parametrize("embodiment", ["floating", "panda"])
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(("task", "embodiment"), PLACES)
 def test_bodies_start_as_in_the_flat_task(task, embodiment):
     """Also in later episodes, and where a variant draws its strength from the same key."""
-    settings = {"num_envs": 4, "embodiment": embodiment, "variant": "wind:0.2..0.8"}
-    flat, tilted = make(task, **settings), make(f"Tilted{task}", **settings)
+    settings = {"embodiment": embodiment, "variant": "wind:0.2..0.8"}
+    flat, tilted = (make(name, num_envs=4, **settings) for name in (task, f"Tilted{task}"))
     for options in ({}, {"env_idx": [2, 0]}, {"reconfigure": True}):
         for seed in (list(range(len(options.get("env_idx", range(4))))), None):
             for env in (flat, tilted):
                 env.reset(seed=seed, options=dict(options))
-            same_bodies(flat.get_state_dict(), tilted.get_state_dict())
+            assert_same(bodies(flat), bodies(tilted))
             assert torch.equal(flat.variants[0].amount, tilted.variants[0].amount)
     strength = (tilted.variants[0].amount - 0.2) / 0.6
     height = (2 * tilted.frame[:, 1:].square().sum(dim=1)) / (1 - math.cos(math.radians(30)))
@@ -99,24 +102,24 @@ def test_the_normal_is_uniform_on_a_cap():
 
 
 def test_each_episode_has_its_own_frame_and_a_seed_determines_it():
-    env = make("TiltedPickCube-v1", num_envs=3)
-    env.reset(seed=[1, 2, 3])
+    env = shared("TiltedPickCube-v1", 4)
+    env.reset(seed=[1, 2, 3, 4])
     first = env.frame.clone()
     env.reset(options={"env_idx": [1]})
-    assert torch.equal(env.frame[[0, 2]], first[[0, 2]])
+    assert torch.equal(env.frame[[0, 2, 3]], first[[0, 2, 3]])
     assert not torch.equal(env.frame[1], first[1])
     env.reset()
     assert (env.frame != first).any(dim=1).all()
     # In any place, and in other processes.
-    shared = make("TiltedPickCube-v1", num_envs=3, workers=2)
-    shared.reset(seed=[3, 2, 1])
-    assert torch.equal(shared.get_state_dict()["frame"], first.flip(0))
-    shared.close()
+    divided = make("TiltedPickCube-v1", num_envs=3, workers=2)
+    divided.reset(seed=[3, 2, 1])
+    assert torch.equal(divided.get_state_dict()["frame"], first[:3].flip(0))
+    divided.close()
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_level_table_is_the_flat_task_to_the_bit(task):
-    flat, tilted = make(task, num_envs=4), make(f"Tilted{task}", num_envs=4)
+    flat, tilted = shared(task, 4), shared(f"Tilted{task}", 4)
     for env in (flat, tilted):
         env.reset(seed=[5, 6, 7, 8])
     reframed(tilted, LEVEL)
@@ -124,7 +127,7 @@ def test_a_level_table_is_the_flat_task_to_the_bit(task):
     for action in random_actions(4, 12):
         theirs, reward, *_ = flat.step(action)
         obs, again, *_ = tilted.step(action)
-        same_bodies(flat.get_state_dict(), tilted.get_state_dict())
+        assert_same(bodies(flat), bodies(tilted))
         assert torch.equal(reward, again)
     seen = 0
     for field in flat.observation_layout.fields:
@@ -139,11 +142,13 @@ def test_a_level_table_is_the_flat_task_to_the_bit(task):
     assert seen == flat.observation_layout.dim - 2
 
 
-@pytest.mark.parametrize("embodiment", ["floating", "panda"])
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(("task", "embodiment"), PLACES)
 def test_turned_actions_in_a_turned_world_do_the_same(task, embodiment):
     """For frames of the task and for any rotation of space."""
-    flat, tilted = (make(n, num_envs=6, embodiment=embodiment) for n in (task, f"Tilted{task}"))
+    flat, tilted, level = (
+        shared(name, 6, number, embodiment=embodiment)
+        for number, name in enumerate((task, f"Tilted{task}", f"Tilted{task}"))
+    )
     for env in (flat, tilted):
         env.reset(seed=list(range(6)))
     frames = tilted.frame.clone()
@@ -151,20 +156,19 @@ def test_turned_actions_in_a_turned_world_do_the_same(task, embodiment):
     reframed(tilted, frames)
     matrix = quaternion_to_matrix(frames)
     layout = tilted.observation_layout
-    level = make(f"Tilted{task}", num_envs=6, embodiment=embodiment)
     for action in random_actions(6, 10, seed=1):
         flat.step(action)
         obs, *_ = tilted.step(tilted.action_layout.turn(action, matrix))
-        close_bodies(flat.get_state_dict(), tilted.get_state_dict())
+        close_bodies(flat, tilted)
         level.set_state_dict({**flat.get_state_dict(), "frame": LEVEL.expand(6, 4)})
         assert torch.allclose(obs, layout.turn(level.get_obs(), matrix), atol=2e-4)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_observation_turns_as_its_layout_says(task):
-    env = make(f"Tilted{task}", num_envs=5)
-    env.reset(seed=list(range(5)))
-    for action in random_actions(5, 6, seed=2):
+    env = shared(f"Tilted{task}", 4)
+    env.reset(seed=list(range(4)))
+    for action in random_actions(4, 6, seed=2):
         env.step(action)
     obs, frame, layout = env.get_obs().clone(), env.frame.clone(), env.observation_layout
     inside = {name for pair in layout.spatial_vectors() for name in pair}
@@ -174,20 +178,20 @@ def test_the_observation_turns_as_its_layout_says(task):
         "grasp_yaw_sin",
     }
     for turn in turns(4):
-        turn = turn.expand(5, 4)
+        turn = turn.expand(4, 4)
         moved = reframed(env, quaternion_multiply(turn, frame))
         assert torch.allclose(moved, layout.turn(obs, quaternion_to_matrix(turn)), atol=1e-6)
         assert (moved - obs).abs().max() > 0.1
 
 
 def test_actions_are_displacements_and_turns_in_the_laboratory():
-    env = make("TiltedPickCube-v1", num_envs=3)
-    obs, _ = env.reset(seed=[1, 2, 3])
-    obs = reframed(env, turns(3, seed=3))
-    move = torch.tensor([[0.3, -0.5, 0.2]]).expand(3, 3)
+    env = shared("TiltedPickCube-v1", 4)
+    env.reset(seed=[1, 2, 3, 4])
+    obs = reframed(env, turns(4, seed=3))
+    move = torch.tensor([[0.3, -0.5, 0.2]]).expand(4, 3)
     normal = vector(env, obs, "normal")
     # Half a radian about the table's normal, in ten steps of a quarter of 0.2 rad.
-    action = torch.cat([move, 0.25 * normal, torch.ones(3, 1)], dim=1)
+    action = torch.cat([move, 0.25 * normal, torch.ones(4, 1)], dim=1)
     for _ in range(10):
         later, *_ = env.step(action)
         action[:, :3] = 0
@@ -198,11 +202,11 @@ def test_actions_are_displacements_and_turns_in_the_laboratory():
     for axis in "xyz":
         before, after = (vector(env, o, f"tcp_{axis}_axis") for o in (obs, later))
         assert torch.allclose(after, (turn @ before[..., None])[..., 0], atol=0.02), axis
-        assert torch.allclose(after.norm(dim=1), torch.ones(3))
+        assert torch.allclose(after.norm(dim=1), torch.ones(4))
 
 
 def test_vectors_of_the_observation_fit_together():
-    env = make("TiltedPickCube-v1", num_envs=4)
+    env = shared("TiltedPickCube-v1", 4)
     obs, _ = env.reset(seed=[1, 2, 3, 4])
     tcp, cube, goal = (vector(env, obs, name) for name in ("tcp", "cube", "goal"))
     assert torch.allclose(vector(env, obs, "tcp_to_cube"), cube - tcp, atol=1e-6)
@@ -213,7 +217,7 @@ def test_vectors_of_the_observation_fit_together():
     # The tool looks at the table; the cube lies on it, 2 cm above.
     assert torch.allclose(z, -normal, atol=1e-5)
     assert torch.allclose((cube * normal).sum(dim=1), torch.full((4,), 0.02), atol=1e-5)
-    push = make("TiltedPushCube-v1", num_envs=4)
+    push = shared("TiltedPushCube-v1", 4)
     obs, _ = push.reset(seed=[1, 2, 3, 4])
     ahead, normal = vector(push, obs, "cube_to_goal"), vector(push, obs, "normal")
     assert torch.allclose(ahead.norm(dim=1), torch.full((4,), 0.2), atol=1e-5)
@@ -222,7 +226,7 @@ def test_vectors_of_the_observation_fit_together():
 
 def test_a_cubes_yaw_is_known_from_the_fingers():
     """What stands in place of its yaw turns four times as fast, and not with the world."""
-    env = make("TiltedPushCube-v1", num_envs=1)
+    env = shared("TiltedPushCube-v1", 1)
     env.reset(seed=[0])
     state = env.get_state_dict()
     seen = []
@@ -241,7 +245,7 @@ def test_a_cubes_yaw_is_known_from_the_fingers():
 @pytest.mark.parametrize("task", TASKS)
 def test_a_symmetric_policy_in_a_turned_world_takes_the_turned_path(task):
     """Any rotation of space, whole decisions of an untrained policy."""
-    env = make(f"Tilted{task}", num_envs=8)
+    env = shared(f"Tilted{task}", 8)
     kind = POLICIES.get("spherical")
     torch.manual_seed(0)
     options = kind.Options(channels=8, width=8, zero_output=False)
@@ -267,7 +271,7 @@ def test_a_symmetric_policy_in_a_turned_world_takes_the_turned_path(task):
 
 
 def test_a_state_without_its_frame_is_refused():
-    flat, env = make("PickCube-v1", num_envs=2), make("TiltedPickCube-v1", num_envs=2)
+    flat, env = shared("PickCube-v1", 4), shared("TiltedPickCube-v1", 4)
     for state in (flat.get_state_dict(), {**flat.get_state_dict(), "controller": {}}):
         with pytest.raises(UserError, match="'frame'; take states from its own get_state_dict"):
             env.set_state_dict(state)
@@ -276,25 +280,19 @@ def test_a_state_without_its_frame_is_refused():
 
 
 def test_rows_of_a_state_bring_their_frames():
-    env = make("TiltedPickCube-v1", num_envs=3)
-    env.reset(seed=[1, 2, 3])
+    env = shared("TiltedPickCube-v1", 4)
+    env.reset(seed=[1, 2, 3, 4])
     state = env.get_state_dict()
-    env.reset(seed=[4, 5, 6])
-    kept = env.frame[1].clone()
-    rows = {"actors": {}, "articulations": {}, "controller": {"root": {}}}
-    index = torch.tensor([0, 1])
-    for kind in ("actors", "articulations"):
-        rows[kind] = {name: value[index] for name, value in state[kind].items()}
-    target = state["controller"]["root"]["target_qpos"][index]
-    rows["controller"]["root"]["target_qpos"] = target
-    env.set_state_dict({**rows, "frame": state["frame"][index]}, torch.tensor([2, 0]))
-    assert torch.equal(env.frame[[2, 0]], state["frame"][index])
-    assert torch.equal(env.frame[1], kept)
+    env.reset(seed=[5, 6, 7, 8])
+    kept = env.frame[[1, 3]].clone()
+    env.set_state_dict(rows_of(state, [0, 1]), torch.tensor([2, 0]))
+    assert torch.equal(env.frame[[2, 0]], state["frame"][[0, 1]])
+    assert torch.equal(env.frame[[1, 3]], kept)
 
 
 def test_turning_a_state_keeps_the_smallest_rotation():
     """A turned episode is one that the task may draw: its frame has no heading of its own."""
-    env = make("TiltedPickCube-v1", num_envs=4)
+    env = shared("TiltedPickCube-v1", 4)
     env.reset(seed=[1, 2, 3, 4])
     for element in Group.parse("D4").elements:
         turned = env.transform_state(env.get_state_dict(), *element)["frame"]
@@ -302,15 +300,14 @@ def test_turning_a_state_keeps_the_smallest_rotation():
         assert turned[:, 3].abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_demonstrations_are_in_the_laboratory_and_succeed_again(task, tmp_path):
-    name = f"Tilted{task}"
+def test_demonstrations_are_in_the_laboratory_and_succeed_again(tmp_path):
+    name = "TiltedPickCube-v1"
     path = collect(name, "floating", 6, "diverse", 3, tmp_path / "demos.h5")
     demos = load(path, name, "floating")
     layout = demos.action_layout
     lengths = torch.cat([a for _, a in demos.episodes])[:, layout.slice("xy").start : 3].norm(dim=1)
     assert 0.9 < lengths.max() <= 1 + 1e-5
-    env = make(name, num_envs=6)
+    env = shared(name, 6, 1, embodiment="floating")
     records = json.loads(path.with_suffix(".json").read_text())["episodes"]
     obs, _ = env.reset(seed=[r["episode_seed"] for r in records])
     solved = torch.zeros(6, dtype=torch.bool)
@@ -322,12 +319,6 @@ def test_demonstrations_are_in_the_laboratory_and_succeed_again(task, tmp_path):
         obs, *_, info = env.step(torch.stack(chosen))
         solved |= info["success"]
     assert solved.all()
-
-
-def test_the_flat_tasks_demonstrations_are_refused(tmp_path):
-    path = collect("PickCube-v1", "floating", 1, "clean", 0, tmp_path / "flat.h5")
-    with pytest.raises(UserError, match="of PickCube-v1, but TiltedPickCube-v1 is wanted"):
-        load(path, "TiltedPickCube-v1", "floating")
 
 
 @pytest.mark.long
@@ -357,14 +348,10 @@ def test_the_audit_measures_the_flat_tasks_physics(embodiment):
         assert tilted.decision.value == pytest.approx(flat.decision.value, rel=0.5)
 
 
-def test_layouts_are_known_without_an_environment():
+def test_a_vector_without_a_place_in_space_is_refused():
     layout = task_class("TiltedPickCube-v1").observation_layout
     assert layout.spatial_vectors()[0] == ("normal_xy", "normal_z")
     assert len(layout.spatial_vectors()) == 9
-    assert max(field.frequency for field in layout.fields) == 1
-
-
-def test_a_vector_without_a_place_in_space_is_refused():
     fields = (Field("goal_xy", 1), Field("bar", 2), Field("width", 0))
     assert [field.name for field in in_space(fields)] == ["goal_xy", "goal_z", "width"]
     with pytest.raises(UserError, match="'push' has no place in space; name it push_xy"):

@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 
-from symsteer.bench.tasks import SymmetricTask, make
+from symsteer.bench.tasks import SymmetricTask
+from tests.bench.shared import shared
 
 G = 9.81
 CONTROL_STEP = 0.05
@@ -16,9 +17,10 @@ CONTROL_STEP = 0.05
 def scene(variant: str = "none", strength: Any = None, **options: Any) -> SymmetricTask:
     """Environments of PickCube (or of ``task``), one for each strength, after a reset."""
     count = len(strength) if torch.is_tensor(strength) else 2
+    strength = tuple(strength.tolist()) if torch.is_tensor(strength) else strength
     options = {"task": "PickCube-v1", "num_envs": count, **options}
-    env = make(variant=variant, strength=strength, **options)
-    env.reset(seed=list(range(env.num_envs)))
+    env = shared(variant=variant, strength=strength, **options)
+    env.reset(seed=list(range(env.num_envs)), options={"reconfigure": True})
     return env
 
 

@@ -3,10 +3,9 @@
 import math
 
 import pytest
-import sapien.physx as physx
 import torch
 
-from symsteer.bench.tasks import make, task_class
+from symsteer.bench.tasks import make
 from symsteer.bench.variants.friction_patch import CENTER
 from symsteer.bench.variants.obstacle import GAP, HALF_WIDTH
 from tests.bench.state_tasks import STATE_TASKS
@@ -88,8 +87,8 @@ def test_tilt_drags_what_is_let_go():
 @pytest.mark.parametrize("task", STATE_TASKS)
 def test_untouched_objects_stay(task, variant):
     """Within 1 mm over a whole episode; also a sphere, which does not roll there."""
-    env = make(task, num_envs=4, variant=variant)
-    env.reset(seed=list(range(4)))
+    env = make(task, num_envs=2, variant=variant)
+    env.reset(seed=[0, 1])
     before = {body.name: body.pose.p.clone() for body in env.moving_bodies}
     for _ in range(env.max_episode_steps):
         env.step(act(env, z=1.0))
@@ -189,32 +188,3 @@ def test_post_is_no_part_of_the_state():
     for post in posts:
         expected = torch.tensor(env.variants[0].position)
         assert torch.allclose(post.pose.p[:, :2], expected.expand(len(post.pose.p), 2))
-
-
-@pytest.mark.parametrize("task", STATE_TASKS)
-def test_objects_start_inside_the_spawn_extent(task):
-    """As a whole, in many resets: the post stands outside of it."""
-    env = make(task, num_envs=24)
-    env.reset(seed=list(range(24)))
-    reach = 0.0
-    for actor in env.scene.actors.values():
-        if actor.px_body_type == "static" or actor is env.table_scene.table:
-            continue
-        for body in actor._bodies:
-            for shape in body.collision_shapes:
-                reach = max(reach, _reach(shape, body.entity.pose * shape.local_pose))
-    env.close()
-    extent = task_class(task).spawn_extent
-    assert reach < extent, f"an object of {task} reaches out to {reach:.3f} m"
-    assert extent < 0.3
-
-
-def _reach(shape, pose):
-    """Largest distance of a shape from the vertical axis through the origin."""
-    if isinstance(shape, physx.PhysxCollisionShapeSphere):
-        return math.hypot(*pose.p[:2]) + shape.radius
-    assert isinstance(shape, physx.PhysxCollisionShapeBox)
-    corners = torch.cartesian_prod(*[torch.tensor([-h, h]) for h in shape.half_size.tolist()])
-    matrix = torch.from_numpy(pose.to_transformation_matrix())
-    points = corners @ matrix[:3, :3].T + matrix[:3, 3]
-    return points[:, :2].norm(dim=1).max().item()

@@ -53,9 +53,9 @@ def test_levels_become_numbers_wherever_a_strength_can_stand():
         assert with_numbers(other, *PLACE) == other
 
 
-def test_the_audited_defect_rises_with_the_level_in_every_task():
-    (row,) = {tuple(strength("action_gain", level, "PushT-v1", "floating") for level in LEVELS)}
-    assert list(row) == sorted(set(row))
+def test_the_audited_strength_rises_with_the_level():
+    strengths = [strength("action_gain", level, "PushT-v1", "floating") for level in LEVELS]
+    assert strengths == sorted(set(strengths))
 
 
 def test_runs_audits_and_environments_take_levels():

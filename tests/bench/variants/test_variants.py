@@ -2,7 +2,6 @@
 
 import functools
 
-import gymnasium as gym
 import pytest
 import torch
 
@@ -141,14 +140,6 @@ def test_every_variant_says_what_its_strength_means(name):
 # ------------------------------------------------------------------- strength 0
 
 
-def clone(tree):
-    return {k: clone(v) for k, v in tree.items()} if isinstance(tree, dict) else tree.clone()
-
-
-def flat(tree):
-    return [leaf for v in tree.values() for leaf in flat(v)] if isinstance(tree, dict) else [tree]
-
-
 @functools.cache
 def script(embodiment):
     """Actions of the expert with some noise: the cube is touched and pushed."""
@@ -181,7 +172,7 @@ def play(embodiment, **kwargs):
         step(action)
     shown.append(env.reset(options={"env_idx": torch.tensor([0, 1])})[0].clone())
     step(script(embodiment)[0])
-    shown.extend(flat(clone(env.get_state_dict())))
+    shown.append(env.get_state().clone())
     env.close()
     return shown
 
@@ -225,7 +216,7 @@ def test_strength_one_shows(name):
 @pytest.mark.parametrize("embodiment", ["floating", pytest.param("panda", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "obstacle"])
 def test_an_episode_that_draws_a_strength_is_one_of_that_strength(name, embodiment):
-    actions = script(embodiment)
+    actions = script(embodiment)[:8]
 
     def episodes(variant, strength=None):
         """Two episodes of three environments; of the last one the first episode goes on."""
@@ -268,23 +259,6 @@ def test_they_compose():
     moved = (env.agent.tcp_pose.p - before)[:, 0]
     assert torch.allclose(moved, torch.full((2,), 0.09 * 0.4), atol=2e-3)
     assert [v.name for v in env.variants] == ["gravity_tilt", "action_gain", "perception_bias"]
-
-
-def test_gym_make_takes_them():
-    env = gym.make(
-        "SymSteer/PickCube-v1", num_envs=2, variant="wind:0.5+frame_rotation:0.2+obstacle:1"
-    )
-    assert [v.strength for v in env.unwrapped.variants] == pytest.approx([0.5, 0.2, 1.0])
-    env.reset(seed=[0, 1])
-    obs, *_ = env.step(env.action_space.sample())
-    assert obs.isfinite().all()
-    env.close()
-    strengths = torch.tensor([0.0, 1.0])
-    env = gym.make("SymSteer/PickCube-v1", num_envs=2, variant="wind", strength=strengths)
-    assert torch.equal(env.unwrapped.variants[0].amount, strengths)
-    env.close()
-    with pytest.raises(UserError, match="valid: none, gravity_tilt"):
-        gym.make("SymSteer/PickCube-v1", variant="earthquake:1")
 
 
 def test_policy_actions_are_not_changed_in_place():

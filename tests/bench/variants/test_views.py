@@ -9,6 +9,7 @@ from symsteer.bench.audit.states import Turner
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.policies.geometry import Group
+from tests.bench.shared import shared
 from tests.bench.variants.scenes import act, fields, scene
 
 STRENGTHS = torch.tensor([0.0, 0.5, 1.0])
@@ -39,20 +40,19 @@ def test_action_gain_scales_one_axis():
         assert torch.allclose(moved, 0.09 * gains, atol=2e-3)
 
 
-@pytest.mark.parametrize("xy", [(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)])
-def test_actuator_offset_is_the_same_for_every_action(xy):
+def test_actuator_offset_is_the_same_for_every_action():
     """9 mm a step along +x at strength 1, also beside a full step in any direction."""
     env = scene("actuator_offset", STRENGTHS)
-    env.reset(seed=SEEDS)
-    before = env.agent.tcp_pose.p.clone()
-    for _ in range(5):
-        env.step(act(env, xy=xy))
-    moved = env.agent.tcp_pose.p - before
-    drift = moved - moved[:1]
-    expected = torch.zeros(3, 3)
-    expected[:, 0] = 5 * 0.009 * STRENGTHS
-    # The hand trails its target by up to a tenth of a step.
-    assert torch.allclose(drift, expected, atol=2e-3)
+    for xy in ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)):
+        env.reset(seed=SEEDS)
+        before = env.agent.tcp_pose.p.clone()
+        for _ in range(5):
+            env.step(act(env, xy=xy))
+        moved = env.agent.tcp_pose.p - before
+        expected = torch.zeros(3, 3)
+        expected[:, 0] = 5 * 0.009 * STRENGTHS
+        # The hand trails its target by up to a tenth of a step.
+        assert torch.allclose(moved - moved[:1], expected, atol=2e-3)
 
 
 def test_actuator_offset_of_the_arm():
@@ -255,7 +255,7 @@ def test_spawn_sector_turns_the_scene_into_a_wedge(task):
     count = 24
     strengths = torch.tensor([0.0, 0.5, 1.0]).repeat(count // 3)
     seeds = list(range(count))
-    plain = make(task, num_envs=count)
+    plain = shared(task, count)
     env = make(task, num_envs=count, variant="spawn_sector", strength=strengths)
     for e in (plain, env):
         e.reset(seed=seeds)
