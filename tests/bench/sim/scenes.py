@@ -10,8 +10,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
 from symsteer.bench.sim import create, prepare_headless
-from symsteer.bench.throughput import stock_class
 from tests.bench.state_tasks import STATE_TASKS
+from tools.speed.simulation import stock_class
 
 TASKS = {
     name.removesuffix("-v1"): stock_class(name)
