@@ -30,6 +30,7 @@ from symsteer.bench.sim import rendering_works
 from symsteer.bench.tasks import TASKS, make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
+from tests.bench.shared import assert_same
 from tests.bench.state_tasks import STATE_TASKS
 
 BATCHED = "SymSteer/PickCube-v1"
@@ -84,28 +85,25 @@ def test_render_modes_are_those_of_this_machine():
 
 @pytest.mark.parametrize("task", STATE_TASKS)
 def test_every_task_has_an_id_for_numpy(task):
+    """``CPUGymWrapper`` around the batched id is the same environment."""
     env = gym.make(single_id(task), **BROKEN)
     batched = CPUGymWrapper(gym.make(f"SymSteer/{task}", num_envs=1, **BROKEN))
+    env.action_space.seed(0)
+    action, traces = env.action_space.sample(), []
     for one in (env, batched):
         assert one.spec.max_episode_steps == task_class(task).max_episode_steps
-        one.action_space.seed(0)
         obs, info = one.reset(seed=5)
-        assert isinstance(info, dict)
-        action = one.action_space.sample()
-        steps = [one.step(action) for _ in range(3)]
-        for array in (obs, *(step[0] for step in steps)):
+        steps = [(obs, 0.0, False, False, info), *(one.step(action) for _ in range(2))]
+        for array, reward, terminated, truncated, info in steps:
             assert type(array) is np.ndarray
             assert array.dtype == np.float32
-            assert array.shape == (task_class(task).observation_layout.dim,)
             assert array in one.observation_space
-        for _, reward, terminated, truncated, info in steps:
-            assert isinstance(reward, float)
-            assert isinstance(terminated, bool)
-            assert isinstance(truncated, bool)
+            assert [type(x) for x in (reward, terminated, truncated)] == [float, bool, bool]
+            assert isinstance(info, dict)
             assert not any(torch.is_tensor(value) for value in info.values())
-    # Both are the same environment.
-    np.testing.assert_array_equal(env.reset(seed=5)[0], batched.reset(seed=5)[0])
-    np.testing.assert_array_equal(env.step(action)[0], batched.step(action)[0])
+        traces.append([step[0] for step in steps])
+        one.close()
+    np.testing.assert_array_equal(*traces)
 
 
 def rollout(env, seed, steps=60):
@@ -345,11 +343,6 @@ def test_cuda_where_there_is_none(options):
         gym.make(BATCHED, num_envs=2, **options)
 
 
-def test_none_means_not_given():
-    env = gym.make(BATCHED, variant=None, embodiment=None, strength=None, obs_mode=None)
-    assert env.unwrapped.variants == ()
-
-
 def test_unknown_ids_are_answered_by_gymnasium():
     with pytest.raises(gym.error.NameNotFound, match="Did you mean: `PickCube`"):
         gym.make("SymSteer/PickCub-v1")
@@ -362,20 +355,25 @@ def test_a_single_environment_is_single():
         gym.make(SINGLE, num_envs=2)
 
 
+@pytest.fixture(scope="module")
+def two():
+    env = gym.make(BATCHED, num_envs=2, variant=None, embodiment=None, strength=None)
+    env.reset(seed=0)
+    assert env.unwrapped.variants == ()  # None means not given
+    yield env
+    env.close()
+
+
 @pytest.mark.parametrize("rows", [[2], [-1], [0, 0], [True, False]])
-def test_rows_of_a_partial_reset_must_be_there(rows):
-    env = gym.make(BATCHED, num_envs=2)
-    env.reset(seed=0)
+def test_rows_of_a_partial_reset_must_be_there(two, rows):
     with pytest.raises(UserError, match=r"env_idx lists environments by number.*from 0 to 1"):
-        env.reset(options={"env_idx": rows})
-    env.step(torch.zeros(2, 7))
+        two.reset(options={"env_idx": rows})
+    two.step(torch.zeros(2, 7))
 
 
-def test_actions_are_arrays():
-    env = gym.make(BATCHED, num_envs=2)
-    env.reset(seed=0)
+def test_actions_are_arrays(two):
     with pytest.raises(UserError, match=r"tensor or array of shape \(2, 7\), not a list"):
-        env.step([[0.0] * 7] * 2)
+        two.step([[0.0] * 7] * 2)
 
 
 @pytest.mark.parametrize("options", [{}, BROKEN])
@@ -398,17 +396,11 @@ def test_vector_spaces_and_tensors():
     assert env.observation_space.shape == (4, dim)
     assert env.unwrapped.single_observation_space.shape == (dim,)
     assert env.action_space.shape == (4, 7)
-    obs, info = env.reset(seed=[0, 1, 2, 3])
-    obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    env.reset(seed=[0, 1, 2, 3])
+    obs, *ends, info = env.step(env.action_space.sample())
     assert obs.shape == (4, dim)
-    for value, dtype in [
-        (reward, torch.float32),
-        (terminated, torch.bool),
-        (truncated, torch.bool),
-    ]:
-        assert value.shape == (4,)
-        assert value.dtype == dtype
-    assert info["success"].shape == (4,)
+    assert [x.dtype for x in ends] == [torch.float32, torch.bool, torch.bool]
+    assert all(x.shape == (4,) for x in (*ends, info["success"]))
     assert env.unwrapped.variants[0].strength.tolist() == pytest.approx([0, 0.2, 0.5, 1])
 
 
@@ -452,13 +444,6 @@ def test_maniskills_vector_wrapper_records_episodes(ignore_terminations):
             if not ignore_terminations:
                 assert not episode["success_once"][0]
     assert episodes == 2 * n if ignore_terminations else episodes > 3 * n
-
-
-def test_maniskills_vector_wrapper_makes_ids():
-    env = ManiSkillVectorEnv(BATCHED, num_envs=3, **BROKEN)
-    obs, _ = env.reset(seed=1)
-    assert obs.shape == (3, env.single_observation_space.shape[0])
-    assert env.unwrapped.variants[0].strength == 0.5
 
 
 @pytest.mark.parametrize("numpy", [False, True])
@@ -528,29 +513,25 @@ def test_environments_in_processes_are_those_of_a_batch():
 
 
 def test_environments_spread_over_workers_are_those_of_one_process():
-    one, two = (
+    envs = [
         ManiSkillVectorEnv(
             gym.make(BATCHED, num_envs=3, max_episode_steps=4, workers=workers, **BROKEN),
             record_metrics=True,
         )
         for workers in (1, 2)
-    )
+    ]
     try:
-        assert two.single_observation_space == one.single_observation_space
-        assert torch.equal(two.reset(seed=[3, 4, 5])[0], one.reset(seed=[3, 4, 5])[0])
-        one.action_space.seed(0)
+        assert envs[0].single_observation_space == envs[1].single_observation_space
+        assert_same(*(env.reset(seed=[3, 4, 5]) for env in envs))
+        envs[0].action_space.seed(0)
         for step in range(9):
-            action = one.action_space.sample()
-            (ours, *_, info), (theirs, *_, other) = two.step(action), one.step(action)
-            assert torch.equal(ours, theirs)
-            assert ("final_info" in info) == (step in (3, 7))
-            if "final_info" in info:
-                episode, expected = info["final_info"]["episode"], other["final_info"]["episode"]
-                assert episode.keys() == expected.keys()
-                assert all(torch.equal(episode[key], expected[key]) for key in expected)
+            action = envs[0].action_space.sample()
+            results = [env.step(action) for env in envs]
+            assert_same(*results)
+            assert ("final_info" in results[0][-1]) == (step in (3, 7))
     finally:
-        one.close()
-        two.close()
+        for env in envs:
+            env.close()
 
 
 def blocks():
