@@ -62,7 +62,7 @@ class _AbsentError(Exception):
 
 
 def probe() -> list[Check]:
-    """Check processors, memory, packages, system libraries, CUDA, PhysX on GPU and rendering.
+    """Check memory, packages, system libraries, CUDA, PhysX on GPU and rendering.
 
     Never raises: an unexpected error of a check is its finding.
     """
@@ -78,11 +78,6 @@ def _checked(name: str, required: bool, find: Callable[[], str]) -> Check:
         return Check(name, required, False, f"{type(error).__name__}: {error}")
 
 
-def _processors() -> str:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{cores} usable; one simulation process uses one"
-
-
 def _memory() -> str:
     usable = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     container = Path("/sys/fs/cgroup/memory.max")
@@ -93,13 +88,6 @@ def _memory() -> str:
             f"{usable:.1f} GiB", "a demo run needs about 4 GiB: close other programs"
         )
     return f"{usable:.1f} GiB"
-
-
-def _python() -> str:
-    found = ".".join(map(str, sys.version_info[:3]))
-    if sys.version_info[:2] != (3, 11):
-        raise _AbsentError(found, "install Python 3.11")
-    return found
 
 
 def _versions() -> str:
@@ -228,9 +216,7 @@ def _rendering() -> str:
 
 
 _CHECKS: dict[str, tuple[bool, Callable[[], str]]] = {
-    "processors": (False, _processors),
     "memory": (False, _memory),
-    "python": (True, _python),
     "package versions": (True, _versions),
     "optional packages": (False, _extras),
     "ManiSkill": (True, _maniskill),

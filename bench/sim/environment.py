@@ -7,6 +7,7 @@ import gc
 import weakref
 from collections.abc import Iterable
 from functools import cache
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import sapien
@@ -62,14 +63,8 @@ def _count(scenes: Iterable[BatchedScene]) -> int:
     return sum(len(scene.sub_scenes) for scene in scenes)
 
 
-class _BatchedDevice:
-    """Simulation device that makes ManiSkill take its GPU branch, which applies buffers."""
-
-    def is_cuda(self) -> bool:
-        return True
-
-    def is_cpu(self) -> bool:
-        return False
+# Makes ManiSkill take its GPU branch, which applies buffers.
+_BATCHED_DEVICE = SimpleNamespace(is_cuda=lambda: True, is_cpu=lambda: False)
 
 
 class BatchedCpuMixin(Unique, BaseEnv):
@@ -80,8 +75,8 @@ class BatchedCpuMixin(Unique, BaseEnv):
     for them; they need a Vulkan driver.
 
     Raises:
-        UserError: another simulator is asked for, ManiSkill or SAPIEN does not have the pinned
-            version, or cameras are asked for without a Vulkan driver.
+        UserError: ManiSkill or SAPIEN does not have the pinned version, or cameras are asked for
+            without a Vulkan driver.
     """
 
     def __init__(
@@ -89,18 +84,9 @@ class BatchedCpuMixin(Unique, BaseEnv):
         *args: Any,
         obs_mode: str | None = None,
         render_mode: str | None = None,
-        sim_backend: str = "auto",
         render_backend: str | None = None,
-        parallel_in_single_scene: bool = False,
         **kwargs: Any,
     ) -> None:
-        if sim_backend not in ("auto", "cpu", "physx_cpu"):
-            raise UserError(
-                f'sim_backend "{sim_backend}" contradicts batched CPU physics: '
-                "leave it out, or create the environment with sim='cuda'."
-            )
-        if parallel_in_single_scene:
-            raise UserError("parallel_in_single_scene needs the GPU simulation: use sim='cuda'.")
         check_versions()
         patches.install()
         prepare_headless()
@@ -131,13 +117,8 @@ class BatchedCpuMixin(Unique, BaseEnv):
             render_backend="none" if self._camera_device is None else self._camera_device.name,
         )
 
-    @property
-    def _sim_device(self) -> _BatchedDevice:
-        return _BatchedDevice()
-
-    @_sim_device.setter
-    def _sim_device(self, device: sapien.Device) -> None:
-        """Ignore the plain CPU device that `BaseEnv` assigns."""
+    # `BaseEnv` assigns a plain CPU device.
+    _sim_device = property(lambda self: _BATCHED_DEVICE, lambda self, device: None)
 
     def _clear(self) -> None:
         """Drop the scenes. ManiSkill collects garbage each time, this only if many wait for it."""
@@ -222,26 +203,22 @@ class CudaMixin(Unique, BaseEnv):
     def __init__(
         self,
         *args: Any,
-        sim_backend: str = "auto",
-        render_backend: str | None = None,
-        render_mode: str | None = None,
         obs_mode: str | None = None,
+        render_mode: str | None = None,
+        render_backend: str | None = None,
         **kwargs: Any,
     ) -> None:
-        if sim_backend == "auto":
-            sim_backend = "physx_cuda"
-        self._held: dict[str, tuple[Actor, torch.Tensor]] = {}
         check_cuda()
         check_versions()
         prepare_headless()
-        if render_backend is None:
-            render_backend = "gpu" if _needs_cameras(self, render_mode, obs_mode) else "none"
+        self._held: dict[str, tuple[Actor, torch.Tensor]] = {}
+        cameras = _needs_cameras(self, render_mode, obs_mode)
         super().__init__(
             *args,
-            sim_backend=sim_backend,
-            render_backend=render_backend,
-            render_mode=render_mode,
             obs_mode=obs_mode,
+            render_mode=render_mode,
+            sim_backend="physx_cuda",
+            render_backend=render_backend or ("gpu" if cameras else "none"),
             **kwargs,
         )
 
@@ -297,13 +274,8 @@ def make_env_class(env_cls: type[BaseEnv], sim: Simulator = "cpu") -> type[BaseE
     if sim not in ("cpu", "cuda"):
         raise UserError(f'Unknown simulator "{sim}": choose "cpu" or "cuda".')
     mixin = BatchedCpuMixin if sim == "cpu" else CudaMixin
-    if issubclass(env_cls, mixin):
-        return env_cls
-    return type(
-        f"{env_cls.__name__}_{sim}",
-        (mixin, env_cls),
-        {"__module__": env_cls.__module__, "__doc__": env_cls.__doc__},
-    )
+    members = {"__module__": env_cls.__module__, "__doc__": env_cls.__doc__}
+    return type(f"{env_cls.__name__}_{sim}", (mixin, env_cls), members)
 
 
 def create_in_process(

@@ -22,18 +22,9 @@ _NOISE = (
 # ManiSkill logs this about objects of its own tasks, which get their pose at the first reset.
 _LOGGED_NOISE = "No initial pose set for actor builder"
 
-_VISUAL_METHODS = (
-    "add_plane_visual",
-    "add_box_visual",
-    "add_capsule_visual",
-    "add_cylinder_visual",
-    "add_sphere_visual",
-    "add_visual_from_file",
-)
 
-
-class InertMaterial:
-    """Replaces ``sapien.render.RenderMaterial``: accepts any argument, stores any attribute."""
+class Inert:
+    """Replaces SAPIEN's render materials and textures: takes any argument, stores any attribute."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.__dict__.update(kwargs)
@@ -42,13 +33,6 @@ class InertMaterial:
         if name.startswith("set_"):
             return lambda *args, **kwargs: None
         raise AttributeError(name)
-
-
-class InertTexture:
-    """Replaces ``sapien.render.RenderTexture2D``; does not read the image."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        pass
 
 
 @lru_cache(maxsize=1)
@@ -108,7 +92,8 @@ def _install_stand_ins() -> None:
 
     modules: tuple[Any, ...] = (sapien.render, urdf_loader, mjcf_loader)
     for module in modules:
-        module.RenderMaterial, module.RenderTexture2D = InertMaterial, InertTexture
-    for name in _VISUAL_METHODS:
+        module.RenderMaterial = module.RenderTexture2D = Inert
+    shapes = ("plane", "box", "capsule", "cylinder", "sphere")
+    for name in (*(f"add_{shape}_visual" for shape in shapes), "add_visual_from_file"):
         setattr(sapien.ActorBuilder, name, add_nothing)
     ActorBuilder.add_plane_repeated_visual = add_nothing

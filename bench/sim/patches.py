@@ -45,19 +45,12 @@ def install() -> None:
         return torch.tensor([struct.px.body_index(b) for b in struct._bodies])
 
     def articulation_rows(struct: Any) -> torch.Tensor:
-        return torch.tensor(
-            [struct.px.articulation_index(a) for a in struct._objs], dtype=torch.int32
-        )
-
-    def joint_rows(struct: Any) -> torch.Tensor:
-        return torch.tensor(
-            [struct.px.articulation_index(a) for a in struct._physx_articulations],
-            dtype=torch.int32,
-        )
+        objects = getattr(struct, "_physx_articulations", None) or struct._objs
+        return torch.tensor([struct.px.articulation_index(a) for a in objects], dtype=torch.int32)
 
     _dispatch_property(PhysxRigidBodyComponentStruct, "_body_data_index", body_rows)
     _dispatch_property(Articulation, "_data_index", articulation_rows)
-    _dispatch_property(ArticulationJoint, "_data_index", joint_rows)
+    _dispatch_property(ArticulationJoint, "_data_index", articulation_rows)
 
     stock_setup_cpu = Kinematics._setup_cpu
 

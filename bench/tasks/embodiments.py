@@ -103,15 +103,8 @@ class Embodiment:
         return state
 
     def shift_robot(self, state: torch.Tensor, offset: torch.Tensor) -> torch.Tensor:
-        """Move the hand of articulation states ``[N, 13 + 2 dof]`` by ``offset [N, 2]`` metres.
-
-        Raises:
-            UserError: if the robot cannot take the shifted states.
-        """
-        raise UserError(
-            f"states of the {self.name!r} embodiment cannot be shifted exactly: its base is "
-            "fixed; use embodiment 'floating'"
-        )
+        """Move the hand of articulation states ``[N, 13 + 2 dof]`` by ``offset [N, 2]`` metres."""
+        raise NotImplementedError
 
     def shift_controller(self, state: dict, offset: torch.Tensor) -> dict:
         """Move the controller's targets by ``offset [N, 2]`` metres."""

@@ -22,7 +22,7 @@ from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.embodiments import BODIES
 from symsteer.bench.variants import build, read
 from symsteer.errors import UserError
-from symsteer.names import unknown
+from symsteer.names import check as check_names
 from symsteer.variant import UNBROKEN, VariantSpec
 
 _SIMULATORS = {
@@ -93,14 +93,13 @@ def make(
         obs_mode=obs_mode,
         reward_mode=reward_mode,
     )
-    if workers == 1:
-        return create(env_class, num_envs, **kwargs)
-    if len(specs) == 1 and isinstance(specs[0].strength, tuple):
+    if workers > 1 and len(specs) == 1 and isinstance(specs[0].strength, tuple):
         kwargs.update(variant=specs[0].name, strength=torch.as_tensor(specs[0].strength))
     env = create(env_class, num_envs, workers=workers, **kwargs)
-    env.variants = build(specs)
-    for part in env.variants:
-        part.env = env
+    if workers > 1:
+        env.variants = build(specs)
+        for variant_of_all in env.variants:
+            variant_of_all.env = env
     return env
 
 
@@ -118,10 +117,8 @@ def make_batched(task: str, num_envs: int = 1, **kwargs: Any) -> SymmetricTask:
     options = {name: value for name, value in kwargs.items() if value is not None}
     _check(task, num_envs, options)
     backend = str(options.pop("sim_backend", "auto")).partition(":")[0]
-    if (
-        backend != "auto"
-        and options.setdefault("sim", _SIMULATORS[backend]) != _SIMULATORS[backend]
-    ):
+    sim = _SIMULATORS[backend]
+    if sim and options.setdefault("sim", sim) != sim:
         raise UserError(
             f"sim={options['sim']!r} contradicts sim_backend={backend!r}; leave one of them out"
         )
@@ -162,9 +159,7 @@ def _check(task: str, num_envs: Any, options: dict[str, Any]) -> None:
     env_class = task_class(task)
     constructors = [vars(c)["__init__"] for c in env_class.__mro__ if "__init__" in vars(c)]
     names = _keywords(make, *constructors) - {"self", "task", "task_id"}
-    for name in options:
-        if name not in names:
-            raise unknown("option", name, sorted(names))
+    check_names("option", options, sorted(names))
     if not isinstance(num_envs, Integral):
         raise UserError(f"num_envs must be a whole number; it is {num_envs!r}")
     for name, valid in {
@@ -174,25 +169,23 @@ def _check(task: str, num_envs: Any, options: dict[str, Any]) -> None:
         "obs_mode": _OBS_MODES,
     }.items():
         # Several kinds of observation are joined by "+", a device follows a simulator after ":".
-        for part in str(options.get(name, valid[0])).partition(":")[0].split("+"):
-            if part not in valid:
-                raise unknown(name, part, valid)
+        given = str(options.get(name, valid[0])).partition(":")[0]
+        check_names(name, given.split("+"), valid)
     variant = options.get("variant", UNBROKEN)
     if not isinstance(variant, str) and not all(isinstance(v, VariantSpec) for v in variant):
         raise UserError(
             f"variant is a text such as 'action_gain:0.5', several joined by '+'; it is {variant!r}"
         )
-    body = BODIES.get(options.get("embodiment", "floating"))
-    if body and options.get("robot_uids", body.robot_uid) != body.robot_uid:
+    embodiment = options.get("embodiment", "floating")
+    check_embodiment(embodiment)
+    body = BODIES[embodiment]
+    if options.get("robot_uids", body.robot_uid) != body.robot_uid:
         raise UserError(
             f"robot_uids={options['robot_uids']!r} is not the robot of embodiment {body.name!r}; "
             f"leave robot_uids out and choose an embodiment: {', '.join(BODIES)}"
         )
-    if (
-        body
-        and variant not in (UNBROKEN, ())
-        and options.get("control_mode", body.control_mode) != body.control_mode
-    ):
+    broken = variant not in (UNBROKEN, ())
+    if broken and options.get("control_mode", body.control_mode) != body.control_mode:
         raise UserError(
             f"variants act on control mode {body.control_mode!r}, not on "
             f"{options['control_mode']!r}; leave control_mode out"

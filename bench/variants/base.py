@@ -3,10 +3,7 @@
 A variant acts through its hooks, which the task calls inside ``env.step`` and ``env.reset``, so
 that it acts for every user of ``gym.make``. At strength 0 no hook is called. Where strengths
 differ between environments, a hook leaves those of strength 0 unchanged: they are the unbroken
-task to the bit (on the CPU). Where each episode draws its strength, ``amount`` changes at resets.
-
-To add one, write a file in this folder with a subclass of :class:`Variant` and name it in
-``symsteer.bench.variants.VARIANTS``, or offer the class as an entry point ``symsteer.variants``.
+task to the bit (on the CPU).
 """
 
 from __future__ import annotations

@@ -68,17 +68,15 @@ def signals_wait(*numbers: int) -> Iterator[None]:
 @contextmanager
 def _worker_settings() -> Iterator[None]:
     """What the fork server inherits: one thread, no import from here, SIGINT blocked."""
-    before = {name: os.environ.get(name) for name in _SETTINGS}
+    before = dict(os.environ)
     os.environ.update(_SETTINGS)
     try:
         with signals_wait(signal.SIGINT):
             yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _SETTINGS.keys() - before.keys():
+            del os.environ[name]
+        os.environ.update(before)
 
 
 @contextmanager
@@ -88,8 +86,7 @@ def _without_main_module() -> Iterator[None]:
     A new process imports the main module again if that has a spec or a file.
     """
     main = vars(sys.modules["__main__"])
-    names = ("__spec__", "__file__")
-    hidden: dict[str, Any] = {name: main[name] for name in names if name in main}
+    hidden: dict[str, Any] = {name: main[name] for name in ("__spec__", "__file__") if name in main}
     main.update(dict.fromkeys(hidden))
     try:
         yield

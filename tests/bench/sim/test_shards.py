@@ -19,7 +19,6 @@ from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make
 from symsteer.bench.variants import VARIANTS
 from symsteer.errors import UserError
-from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
 from tests.bench.shared import assert_same
 from tests.bench.steering.test_latent_env import NoiseIsAction
 
@@ -179,19 +178,6 @@ def test_same_latent_noise_environment(solved):
         if i == 0:
             assert ours["terminal"].nonzero().flatten().tolist() == solved
     assert pairs[0].control_steps == pairs[1].control_steps
-    two.close()
-
-
-def test_same_with_a_policy():
-    one, two = both(3, workers=3)
-    torch.manual_seed(0)
-    options = EquivariantOptions(channels=8, width=16, depth=1, execute=4, sampling_steps=2)
-    policy = EquivariantDiffusionPolicy(options, one.observation_layout, one.action_layout)
-    envs = [LatentNoiseEnv(env, policy, ignore_terminations=True) for env in (one, two)]
-    assert_same(*(env.reset([1, 2, 3]) for env in envs))
-    for w in torch.randn(13, 3, policy.horizon, 7):
-        assert_same(*(vars(env.step(w)) for env in envs))
-    assert envs[0].control_steps == envs[1].control_steps == 3 * one.max_episode_steps
     two.close()
 
 

@@ -10,6 +10,7 @@ from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.policies.geometry import Group
 from tests.bench.shared import shared
+from tests.bench.steering.test_latent_env import NoiseIsAction
 from tests.bench.variants.scenes import act, fields, scene
 
 STRENGTHS = torch.tensor([0.0, 0.5, 1.0])
@@ -129,58 +130,47 @@ def test_frame_rotation_commutes_with_rotations_and_not_with_reflections():
 
 def test_noise_is_that_of_the_episode_and_the_step():
     env, _ = alike("observation_noise")
-    reference = scene(num_envs=3)
+    reference, alone = scene(num_envs=3), scene("observation_noise", torch.tensor([1.0]))
     reference.reset(seed=SEEDS)
-    for _ in range(2):
-        action = act(env, xy=(0.5, 0.5))
-        obs, truth = env.step(action)[0].clone(), reference.step(action)[0]
-        assert torch.equal(env.get_obs(), obs), "asked twice"
-        noise = {k: v - fields(env, truth)[k] for k, v in fields(env, obs).items()}
-        for name, value in noise.items():
-            if name in ("cube_xy", "tcp_to_cube_xy"):
-                # One draw, scaled by the strength.
-                assert torch.allclose(value[1], value[2] / 2, atol=1e-6)
-                assert value[2].abs().max() > 1e-4
-            elif name != "cube_to_goal_xy":
-                assert not value.any(), name
-    alone = scene("observation_noise", torch.tensor([1.0]))
     alone.reset(seed=[4])
     for _ in range(2):
-        single = alone.step(act(alone, xy=(0.5, 0.5)))[0]
+        action = act(env, xy=(0.5, 0.5))
+        obs, truth = env.step(action)[0].clone(), fields(env, reference.step(action)[0])
+        assert torch.equal(env.get_obs(), obs), "asked twice"
+        for name, value in fields(env, obs).items():
+            noise = value - truth[name]
+            if name in ("cube_xy", "tcp_to_cube_xy"):
+                # One draw, scaled by the strength.
+                assert torch.allclose(noise[1], noise[2] / 2, atol=1e-6)
+                assert noise[2].abs().max() > 1e-4
+            elif name != "cube_to_goal_xy":
+                assert not noise.any(), name
+        single = alone.step(action[:1])[0]
     assert torch.equal(single[0], obs[2]), "the number of environments plays a part"
 
 
 def test_noise_is_fresh_in_every_step_and_episode_and_larger_along_x():
-    count = 64
+    count, draws = 64, []
     env = scene("observation_noise:1", num_envs=count)
-    draws = []
-
-    def noise():
-        xy = fields(env, env.get_obs())["cube_xy"]
-        draws.append((xy - env.manipulated.pose.p[:, :2]).clone())
-
-    for episode in range(3):
+    for seeds in (list(range(count)), None, None, list(range(count))):
         # Without seeds ManiSkill keeps an environment's seed; the noise must not repeat.
-        env.reset(**({"seed": list(range(count))} if episode == 0 else {}))
-        noise()
-        for _ in range(5):
+        env.reset(seed=seeds)
+        for _ in range(6):
+            xy = fields(env, env.get_obs())["cube_xy"]
+            draws.append((xy - env.manipulated.pose.p[:, :2]).clone())
             env.step(act(env))
-            noise()
-    sample = torch.stack(draws)
+    assert torch.equal(draws.pop(18), draws[0])
+    sample = torch.stack(draws[:18])
     assert len(sample.view(-1, 2).unique(dim=0)) == 18 * count
     n = sample.numel() // 2
     std = sample.view(-1, 2).std(dim=0)
     # Five standard errors of a standard deviation.
     assert torch.allclose(std, torch.tensor([0.01, 0.0025]), rtol=5 / math.sqrt(2 * n))
-    assert (sample.view(-1, 2).mean(dim=0).abs() < 5 * std / math.sqrt(n)).all()
     # Neither steps nor axes have to do with one another.
-    scaled = sample / std
-    limit = 5 / math.sqrt(n)
+    scaled, limit = sample / std, 5 / math.sqrt(n)
+    assert (scaled.view(-1, 2).mean(dim=0).abs() < limit).all()
     assert (scaled[1:] * scaled[:-1]).mean().abs() < limit
     assert scaled.prod(dim=-1).mean().abs() < limit
-    env.reset(seed=list(range(count)))
-    again = fields(env, env.get_obs())["cube_xy"] - env.manipulated.pose.p[:, :2]
-    assert torch.equal(again, draws[0])
 
 
 # ----------------------------------------------------------------------- reward
@@ -218,30 +208,16 @@ def test_success_costs_nothing():
     assert reward[1] == 1
 
 
-class TowardsPlusX(torch.nn.Module):
-    """A decoder whose every chunk moves along +x."""
-
-    def __init__(self, env):
-        super().__init__()
-        self.horizon = self.execute = 4
-        self.obs_layout, self.act_layout = env.observation_layout, env.action_layout
-        self.action = act(env, xy=(1.0, 0.0))
-        self.device = torch.device("cpu")
-
-    def decode(self, obs, noise):
-        return self.action[:, None].repeat(1, self.execute, 1)
-
-
 def test_steering_agents_pay_for_it():
     env = scene("directional_reward", STRENGTHS)
-    latent = LatentNoiseEnv(env, TowardsPlusX(env))
+    latent = LatentNoiseEnv(env, NoiseIsAction(4))
     latent.reset(SEEDS)
     low, _ = task_class("PickCube-v1").feasible_return(0.9, 4, step_cost=2.0)
     assert low == pytest.approx(2 * -40.0)
-    noise = torch.zeros(3, 4, 7)
-    latent.step(noise)
+    towards_plus_x = act(env, xy=(1.0, 0.0))[:, None].repeat(1, 4, 1)
+    latent.step(towards_plus_x)
     before = env.agent.tcp_pose.p.clone()
-    reward = latent.step(noise).reward
+    reward = latent.step(towards_plus_x).reward
     moved = (env.agent.tcp_pose.p - before)[:, 0]
     assert reward[0] == -4
     assert torch.allclose(reward, -4 - STRENGTHS * moved / 0.03, atol=0.05)
