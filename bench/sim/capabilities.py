@@ -108,11 +108,11 @@ def _extras() -> str:
         names = []
     extras = [name for name in names if name != _DEVELOPMENT]
     absent = [name for name in extras if not all(map(_satisfied, _requirements(name)))]
-    found = (", ".join(name for name in extras if name not in absent) or "none") + " found"
+    present = (", ".join(name for name in extras if name not in absent) or "none") + " found"
     if absent:
         cure = _install(f"'symsteer[{','.join(absent)}]'")
-        raise _AbsentError(f"{found}; absent: {', '.join(absent)}", f"optional: {cure}")
-    return found
+        raise _AbsentError(f"{present}; absent: {', '.join(absent)}", f"optional: {cure}")
+    return present
 
 
 def _install(packages: str) -> str:
@@ -132,10 +132,10 @@ def _requirements(extra: str) -> list[Requirement]:
     def needed(requirement: Requirement, extra: str) -> bool:
         return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
-    found = [Requirement(text) for text in texts]
+    requirements = [Requirement(text) for text in texts]
     if not extra:
-        return [r for r in found if needed(r, "")]
-    return [r for r in found if needed(r, extra) and not needed(r, "")]
+        return [r for r in requirements if needed(r, "")]
+    return [r for r in requirements if needed(r, extra) and not needed(r, "")]
 
 
 def _installed(package: str) -> str:

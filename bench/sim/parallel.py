@@ -58,8 +58,8 @@ def create(
 
 def divide(total: int, workers: int) -> list[slice]:
     """Rows of each worker: sizes differ by at most one, larger ones first."""
-    parts = np.array_split(np.arange(total), workers)
-    return [slice(int(part[0]), int(part[-1]) + 1) for part in parts]
+    shards = np.array_split(np.arange(total), workers)
+    return [slice(int(shard[0]), int(shard[-1]) + 1) for shard in shards]
 
 
 class NotHereError(UserError, AttributeError):

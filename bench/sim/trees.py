@@ -17,8 +17,8 @@ def map_trees(function: Callable[..., Any], *trees: Any) -> Any:
         return {key: map_trees(function, *(tree[key] for tree in trees)) for key in first}
     if is_dataclass(first) and not isinstance(first, type):
         names = [f.name for f in fields(first)]
-        parts = {n: map_trees(function, *(getattr(tree, n) for tree in trees)) for n in names}
-        return type(first)(**parts)
+        values = {n: map_trees(function, *(getattr(tree, n) for tree in trees)) for n in names}
+        return type(first)(**values)
     return function(*trees)
 
 
@@ -62,6 +62,6 @@ def merge(
     if isinstance(last, dict):
         return {key: merge([tree[key] for tree in trees], counts, combine) for key in last}
     if isinstance(last, list | tuple):
-        return type(last)(merge(parts, counts, combine) for parts in zip(*trees, strict=True))
+        return type(last)(merge(items, counts, combine) for items in zip(*trees, strict=True))
     have_rows = isinstance(last, torch.Tensor) and last.ndim and len(last) == counts[-1]
     return combine(list(trees)) if have_rows else last

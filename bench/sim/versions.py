@@ -12,8 +12,8 @@ PINNED = {"mani-skill": "3.0.1", "sapien": "3.0.3"}
 def check_versions() -> None:
     """Raise `UserError` unless the installed simulator has the pinned versions."""
     for package, wanted in PINNED.items():
-        if (found := version(package)) != wanted:
+        if (installed := version(package)) != wanted:
             raise UserError(
-                f"SymSteer is written for {package} {wanted}, but {found} is installed: "
+                f"SymSteer is written for {package} {wanted}, but {installed} is installed: "
                 f'run "pip install {package}=={wanted}".'
             )

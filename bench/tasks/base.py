@@ -135,8 +135,8 @@ class SymmetricTask(BaseEnv):
         self.embodiment = embodiment
         self.body: Embodiment = BODIES[embodiment]
         self.variants = parse(variant, strength, (self.task_id, embodiment))
-        for part in self.variants:
-            part.env = self
+        for acting in self.variants:
+            acting.env = self
         self._reset_rows: torch.Tensor | None = None
         self._closed = False
         kwargs.setdefault("control_mode", self.body.control_mode)
@@ -339,10 +339,10 @@ class SymmetricTask(BaseEnv):
             return
         self._forces_held = True
         for body in self.moving_bodies:
-            parts = [v.force(body) for v in overriding(self.variants, "force")]
-            forces = [force for force in parts if force is not None]
-            if forces:
-                self.hold_force(body, torch.stack(forces).sum(dim=0))
+            forces = [v.force(body) for v in overriding(self.variants, "force")]
+            present = [force for force in forces if force is not None]
+            if present:
+                self.hold_force(body, torch.stack(present).sum(dim=0))
 
     @_in_batched_branch
     def get_info(self) -> dict:

@@ -65,11 +65,11 @@ class Seen(SymmetricTask):
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        found = []
+        cameras = []
         for k in range(CAMERAS):
             bearing = 2 * math.pi * (k + 0.5) / CAMERAS
             eye = [DISTANCE * math.cos(bearing), DISTANCE * math.sin(bearing), DISTANCE]
-            found.append(
+            cameras.append(
                 CameraConfig(
                     uid=f"corner_{k}",
                     pose=look_at(eye, [0.0, 0.0, 0.0]),
@@ -80,7 +80,7 @@ class Seen(SymmetricTask):
                     far=5.0,
                 )
             )
-        return found
+        return cameras
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         flat = super()._observe_task()

@@ -83,6 +83,32 @@ def disc(u: np.ndarray, radius: float) -> np.ndarray:
     return np.stack([r * np.cos(bearing), r * np.sin(bearing)], axis=1)
 
 
+def ahead_of(yaw: np.ndarray) -> np.ndarray:
+    """Unit vectors ``[N, 2]`` in the direction ``yaw [N]`` (rad)."""
+    return np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+
+
+def pair(
+    u: np.ndarray, radius: float, distance: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two points ``[N, 2]`` whose midpoint is uniform in a disc and whose bearing is uniform.
+
+    Args:
+        u: uniform numbers ``[N, 4]``.
+        radius: of the disc, metres.
+        distance: between the points, from and to, metres.
+    """
+    low, high = distance
+    half = (low + (high - low) * u[:, 3]) / 2
+    middle, offset = disc(u[:, :2], radius), half[:, None] * ahead_of(2 * np.pi * u[:, 2])
+    return middle + offset, middle - offset
+
+
+def left_of(ahead: Any) -> Any:
+    """Horizontal vectors ``[N, 2]``, array or tensor, turned by a quarter turn."""
+    return (torch if torch.is_tensor(ahead) else np).stack([-ahead[:, 1], ahead[:, 0]], 1)
+
+
 def flat_pose(xy: np.ndarray, z: np.ndarray | float, yaw: np.ndarray, device: Any) -> Pose:
     """Poses upright at ``xy [N, 2]``, height ``z`` (m), turned by ``yaw [N]`` (rad)."""
     zero = np.zeros_like(yaw)

@@ -50,14 +50,14 @@ def bound_blocks(action: torch.Tensor, layout: Layout) -> torch.Tensor:
     The rule depends on norms only, so it commutes with rotations and reflections. Applying it
     twice gives the same bits as applying it once.
     """
-    parts = []
+    bounded = []
     for block in layout.blocks:
-        part = action[..., block]
-        norm = part.norm(dim=-1, keepdim=True)
+        values = action[..., block]
+        norm = values.norm(dim=-1, keepdim=True)
         # The margin keeps a block that was scaled to length 1 (up to rounding) from being
         # scaled again.
-        parts.append(torch.where(norm > 1 + 1e-6, part / norm.clamp_min(1e-12), part))
-    return torch.cat(parts, dim=-1)
+        bounded.append(torch.where(norm > 1 + 1e-6, values / norm.clamp_min(1e-12), values))
+    return torch.cat(bounded, dim=-1)
 
 
 class PlanarPoseController(PDJointPosController):

@@ -98,8 +98,8 @@ def make(
     env = create(env_class, num_envs, workers=workers, **kwargs)
     if workers > 1:
         env.variants = build(specs)
-        for variant_of_all in env.variants:
-            variant_of_all.env = env
+        for acting in env.variants:
+            acting.env = env
     return env
 
 

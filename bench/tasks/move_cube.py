@@ -14,11 +14,13 @@ from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, HOVER, Intent, funnel
 from symsteer.bench.tasks.features import (
+    ahead_of,
     disc,
     flat_pose,
     fourfold_yaw,
     goal_disc_pose,
     in_parts,
+    left_of,
     vector_fields,
 )
 from symsteer.policies.geometry import Field
@@ -55,8 +57,7 @@ class MoveCube(SymmetricTask):
         u = rng.uniform(size=3)
         xy, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
         self.obj.set_pose(flat_pose(xy, self.cube_half_size, yaw, self.device))
-        ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        goal = xy + (0.1 + self.goal_radius) * ahead
+        goal = xy + (0.1 + self.goal_radius) * ahead_of(yaw)
         self.goal_region.set_pose(goal_disc_pose(goal, yaw, self.device))
 
     def direction(self) -> torch.Tensor:
@@ -91,7 +92,7 @@ class MoveCube(SymmetricTask):
         tcp, cube = self.agent.tcp_pose.p, self.obj.pose.p + offset
         to_goal = self.goal_region.pose.p[:, :2] - self.obj.pose.p[:, :2]
         ahead = to_goal / to_goal.norm(dim=1, keepdim=True).clamp_min(1e-6)
-        side = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=1)
+        side = left_of(ahead)
         relative = tcp[:, :2] - cube[:, :2]
         along, across = (relative * ahead).sum(dim=1), (relative * side).sum(dim=1)
         # Behind the cube, near its line to the goal: go down and push, steering back to the line.

@@ -10,7 +10,7 @@ from mani_skill.envs.tasks.tabletop.place_sphere import PlaceSphereEnv
 
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, finger_width, funnel, grasp_at
-from symsteer.bench.tasks.features import disc, flat_pose, fourfold_yaw, in_parts, vector_fields
+from symsteer.bench.tasks.features import flat_pose, fourfold_yaw, in_parts, pair, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -44,14 +44,10 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
 
     def _place_objects(self, rng: Any, count: int) -> None:
         u = rng.uniform(size=5)
-        middle, bearing = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
-        low, high = self.distance_range
-        half = (low + (high - low) * u[:, 3]) / 2
-        offset = half[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        at_sphere, at_bin = pair(u, self.spawn_radius, self.distance_range)
         still, yaw = np.zeros(count), 2 * np.pi * u[:, 4]
-        self.obj.set_pose(flat_pose(middle + offset, self.radius, still, self.device))
-        floor = self.block_half_size[0]
-        self.bin.set_pose(flat_pose(middle - offset, floor, yaw, self.device))
+        self.obj.set_pose(flat_pose(at_sphere, self.radius, still, self.device))
+        self.bin.set_pose(flat_pose(at_bin, self.block_half_size[0], yaw, self.device))
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         tcp = self.seen(self.agent.tcp_pose, "tool").p

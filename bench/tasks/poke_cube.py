@@ -14,12 +14,14 @@ from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, OPEN, Intent, choose, funnel, grasp_at, yaw_along
 from symsteer.bench.tasks.features import (
     GRASP_YAW,
+    ahead_of,
     bar_grasp_yaw,
     disc,
     flat_pose,
     fourfold_yaw,
     goal_disc_pose,
     in_parts,
+    left_of,
     twofold_yaw,
     vector_fields,
 )
@@ -75,9 +77,8 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
     def _place_objects(self, rng: Any, count: int) -> None:
         u = rng.uniform(size=5)
         middle, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
-        ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        side = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-        aside = self.across * (u[:, 3:4] - 0.5) * side
+        ahead = ahead_of(yaw)
+        aside = self.across * (u[:, 3:4] - 0.5) * left_of(ahead)
         peg = middle - self.peg_behind * ahead - aside
         cube = middle + (self.peg_to_cube - self.peg_behind) * ahead + aside
         self.peg.set_pose(flat_pose(peg, self.peg_half_width, yaw, self.device))
@@ -130,7 +131,7 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         to_goal = (self.goal_region.pose.p - cube)[:, :2]
         distance = to_goal.norm(dim=1)
         ahead = to_goal / distance[:, None].clamp_min(1e-6)
-        side = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=1)
+        side = left_of(ahead)
 
         axis = quaternion_to_matrix(peg.q)[:, :, 0]
         # Where the fingers are along the peg.

@@ -12,11 +12,11 @@ from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, finger_width, funnel, grasp
 from symsteer.bench.tasks.features import (
     GRASP_YAW,
-    disc,
     flat_pose,
     fourfold_yaw,
     grasp_yaw,
     in_parts,
+    pair,
     vector_fields,
 )
 from symsteer.policies.geometry import Field
@@ -50,14 +50,10 @@ class StackCube(SymmetricTask, StackCubeEnv):
 
     def _place_objects(self, rng: Any, count: int) -> None:
         u = rng.uniform(size=6)
-        middle, bearing = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
-        low, high = self.distance_range
-        half = (low + (high - low) * u[:, 3]) / 2
-        offset = half[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        at_a, at_b = pair(u, self.spawn_radius, self.distance_range)
         height = float(self.cube_half_size[2])
-        yaw_a, yaw_b = 2 * np.pi * u[:, 4], 2 * np.pi * u[:, 5]
-        self.cubeA.set_pose(flat_pose(middle + offset, height, yaw_a, self.device))
-        self.cubeB.set_pose(flat_pose(middle - offset, height, yaw_b, self.device))
+        self.cubeA.set_pose(flat_pose(at_a, height, 2 * np.pi * u[:, 4], self.device))
+        self.cubeB.set_pose(flat_pose(at_b, height, 2 * np.pi * u[:, 5], self.device))
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         tcp = self.seen(self.agent.tcp_pose, "tool")

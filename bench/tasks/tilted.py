@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from mani_skill.utils import common
 
@@ -47,10 +46,10 @@ def in_space(fields: Sequence[Field]) -> tuple[Field, ...]:
         UserError: if a vector is not named ``NAME_xy``, as vectors in space are.
     """
     names = {field.name for field in fields}
-    found = []
+    kept = []
     for field in fields:
         if field.frequency < 2:
-            found.append(field)
+            kept.append(field)
         if field.frequency == 1 and not field.name.endswith("_xy"):
             raise UserError(
                 f"the vector {field.name!r} has no place in space; name it {field.name}_xy, or "
@@ -58,8 +57,8 @@ def in_space(fields: Sequence[Field]) -> tuple[Field, ...]:
             )
         vertical = field.name.removesuffix("xy") + "z"
         if field.frequency == 1 and vertical not in names:
-            found.append(Field(vertical, 0, odd=field.odd))
-    return tuple(found)
+            kept.append(Field(vertical, 0, odd=field.odd))
+    return tuple(kept)
 
 
 class Tilted(SymmetricTask):
@@ -93,8 +92,8 @@ class Tilted(SymmetricTask):
         height, bearing = uniform(key, 2 * STREAM), 2 * math.pi * uniform(key, 2 * STREAM + 1)
         half = torch.acos(1 - height * (1 - math.cos(LARGEST_TILT))) / 2
         about = [torch.cos(bearing), torch.sin(bearing), torch.zeros_like(bearing)]
-        parts = [torch.cos(half), *(torch.sin(half) * part for part in about)]
-        self.frame[env_idx] = torch.stack(parts, dim=1).to(self.frame)
+        quaternion = [torch.cos(half), *(torch.sin(half) * component for component in about)]
+        self.frame[env_idx] = torch.stack(quaternion, dim=1).to(self.frame)
 
     # ------------------------------------------------------------- observation
 
@@ -128,8 +127,8 @@ class Tilted(SymmetricTask):
 
     def _step_action(self, action: Any) -> Any:
         vectors = self.agent.control_mode == self.body.control_mode
-        if vectors and isinstance(action, np.ndarray | torch.Tensor):
-            action = common.to_tensor(action, device=self.device).reshape(self.num_envs, -1)
+        if vectors and isinstance(action, torch.Tensor):
+            action = action.reshape(self.num_envs, -1)
             back = quaternion_to_matrix(self.frame).transpose(1, 2)
             action = self.action_layout.turn(action, back)
         return super()._step_action(action)

@@ -38,15 +38,15 @@ def with_numbers(text: str, task: str, embodiment: str) -> str:
     Raises:
         UserError: if the task was not audited with a variant, or no strength has such a defect.
     """
-    parts = []
+    texts = []
     for part in parts_of(text):
         name, colon, number = part.rpartition(":")
 
-        def found(match: re.Match[str], name: str = name) -> str:
+        def strength_of(match: re.Match[str], name: str = name) -> str:
             return f"{strength(name, match[0], task, embodiment):g}"
 
-        parts.append(f"{name}:{_WORD.sub(found, number)}" if colon else part)
-    return "+".join(parts)
+        texts.append(f"{name}:{_WORD.sub(strength_of, number)}" if colon else part)
+    return "+".join(texts)
 
 
 Points = dict[tuple[str, str], dict[str, dict[float, float]]]
@@ -128,14 +128,14 @@ def points_of(rows: Sequence[Mapping[str, Any]]) -> Points:
         for row in rows
         if row["variant"] == UNBROKEN
     }
-    found: Points = {}
+    audited: Points = {}
     for row in rows:
         name, _, number = row["variant"].partition(":")
         place = row["task"], row["embodiment"]
         if number and "+" not in number and place in unbroken:
-            points = found.setdefault(place, {}).setdefault(name, {0.0: unbroken[place]})
+            points = audited.setdefault(place, {}).setdefault(name, {0.0: unbroken[place]})
             points[float(number)] = row["decision"][0]
-    return found
+    return audited
 
 
 @functools.cache

@@ -208,15 +208,13 @@ def test_rewards_are_dense_where_the_id_says_so():
     ids = [i for i in gym.registry if i.startswith("SymSteer/")]
     assert len(ids) == 4 * len(TASKS.names())
     for task in TASKS:
-        stem = task.removesuffix("-v1")
-        for kind, mode in (("", "sparse"), ("-dense", "normalized_dense")):
-            for single in ("", "-single"):
-                spec = gym.spec(f"SymSteer/{stem}{single}{kind}-v1")
-                assert spec.kwargs.get("reward_mode", "sparse") == mode
-                assert mode in task_class(task).SUPPORTED_REWARD_MODES
-                assert spec.max_episode_steps == task_class(task).max_episode_steps
+        for kind in ("", "-single", "-dense", "-single-dense"):
+            spec = gym.spec(f"SymSteer/{task.replace('-v', f'{kind}-v')}")
+            mode = spec.kwargs.get("reward_mode", "sparse")
+            assert mode == ("normalized_dense" if kind.endswith("dense") else "sparse")
+            assert mode in task_class(task).SUPPORTED_REWARD_MODES
+            assert spec.max_episode_steps == task_class(task).max_episode_steps
     dense = gym.make("SymSteer/PickCube-single-dense-v1")
-    assert dense.unwrapped.reward_mode == "normalized_dense"
     dense.reset(seed=0)
     assert 0 < dense.step(dense.action_space.sample())[1] < 1
     assert gym.make(dense.spec, reward_mode="sparse").unwrapped.reward_mode == "sparse"
@@ -343,13 +341,6 @@ def test_cuda_where_there_is_none(options):
         gym.make(BATCHED, num_envs=2, **options)
 
 
-def test_unknown_ids_are_answered_by_gymnasium():
-    with pytest.raises(gym.error.NameNotFound, match="Did you mean: `PickCube`"):
-        gym.make("SymSteer/PickCub-v1")
-    with pytest.raises(gym.error.NamespaceNotFound, match="Did you mean: `SymSteer`"):
-        gym.make("SymSter/PickCube-v1")
-
-
 def test_a_single_environment_is_single():
     with pytest.raises(UserError, match="leave num_envs out"):
         gym.make(SINGLE, num_envs=2)
@@ -463,9 +454,8 @@ def test_maniskills_recorder_writes_trajectories(tmp_path, numpy):
     assert described["env_info"]["max_episode_steps"] == 3
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_maniskills_other_wrappers(n):
-    dim = task_class("PickCube-v1").observation_layout.dim
+def test_maniskills_other_wrappers():
+    n, dim = 3, task_class("PickCube-v1").observation_layout.dim
     stacked = FrameStack(gym.make(BATCHED, num_envs=n), num_stack=2)
     stacked.reset(seed=0)
     assert stacked.step(torch.zeros(n, 7))[0].shape == (n, 2, dim)
@@ -473,21 +463,17 @@ def test_maniskills_other_wrappers(n):
     repeated.reset(seed=0)
     assert repeated.step(torch.zeros(n, 7))[4]["elapsed_steps"].tolist() == [3] * n
     cached = CachedResetWrapper(gym.make(BATCHED, num_envs=n), config={"num_resets": n, "seed": 0})
-    obs, _ = cached.reset()
-    assert obs.shape == (n, dim)
+    assert cached.reset()[0].shape == (n, dim)
     assert cached.step(torch.zeros(n, 7))[0].shape == (n, dim)
 
 
-def thunk():
-    def make_env():
-        return CPUGymWrapper(gym.make(BATCHED, num_envs=1, **BROKEN), record_metrics=True)
-
-    return make_env
+def single_broken():
+    return CPUGymWrapper(gym.make(BATCHED, num_envs=1, **BROKEN), record_metrics=True)
 
 
 def test_environments_in_processes_are_those_of_a_batch():
     seeds = [3, 9]
-    envs = gym.vector.AsyncVectorEnv([thunk() for _ in seeds])
+    envs = gym.vector.AsyncVectorEnv([single_broken] * 2)
     ours = gym.make(BATCHED, num_envs=2, **BROKEN)
     try:
         obs, _ = envs.reset(seed=seeds)

@@ -20,7 +20,6 @@ from symsteer.bench.sim.trees import map_trees, rows_of
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.tilted import in_space
 from symsteer.errors import UserError
-from symsteer.policies import POLICIES
 from symsteer.policies.geometry import Field, Group
 from tests.bench.shared import assert_same, shared
 
@@ -240,34 +239,6 @@ def test_a_cubes_yaw_is_known_from_the_fingers():
         seen.append(math.atan2(parts[1], parts[0]))
     assert math.remainder(seen[1] - seen[0] - 0.4, math.tau) == pytest.approx(0, abs=1e-4)
     assert math.remainder(seen[2] - seen[0], math.tau) == pytest.approx(0, abs=1e-4)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_a_symmetric_policy_in_a_turned_world_takes_the_turned_path(task):
-    """Any rotation of space, whole decisions of an untrained policy."""
-    env = shared(f"Tilted{task}", 8)
-    kind = POLICIES.get("spherical")
-    torch.manual_seed(0)
-    options = kind.Options(channels=8, width=8, zero_output=False)
-    policy = kind(options, env.observation_layout, env.action_layout)
-    noise = torch.randn(4, 1, 8, 7, generator=torch.Generator().manual_seed(0))
-    env.reset(seed=[3] * 8)
-    turn = torch.cat([LEVEL[None], turns(7)])
-    obs = reframed(env, quaternion_multiply(turn, env.frame))
-    moved = 0.0
-    for chunk in noise:
-        noises = chunk.expand(8, 8, 7).flatten(0, 1)
-        matrix = quaternion_to_matrix(turn).repeat_interleave(8, dim=0)
-        noises = env.action_layout.turn(noises, matrix).unflatten(0, (8, 8))
-        actions = policy.decode(obs, noises)
-        moved = max(moved, actions[..., :6].abs().max())
-        for step in range(4):
-            obs, *_ = env.step(actions[:, step])
-    assert moved > 0.1
-    tool = env.agent.tcp_pose.p
-    assert (tool - tool[:1]).norm(dim=1).max() < 1e-4
-    x = vector(env, obs, "tcp_x_axis")
-    assert (x - x[:1]).norm(dim=1).max() > 0.5
 
 
 def test_a_state_without_its_frame_is_refused():

@@ -44,13 +44,6 @@ def test_tilt_pulls_on_all_objects_and_not_on_the_hand():
     assert torch.allclose(env.agent.tcp_pose.p, tool, atol=1e-4)
 
 
-def test_arm_feels_no_gravity():
-    """Hence nothing of a tilt either."""
-    env = scene(embodiment="panda")
-    links = [body for link in env.agent.robot.links for body in link._bodies]
-    assert all(body.disable_gravity for body in links)
-
-
 def test_stacked_cubes_rest_on_a_slope():
     """ManiSkill's test of rest sees it too; steeper than 27 degrees the stack tips over."""
     env = scene("gravity_tilt", torch.tensor([0.0, 0.5, 1.0]), task="StackCube-v1")
@@ -116,16 +109,6 @@ def test_wind_blows_on_the_manipulated_object_alone():
     expected[:, 2] = -G * 3 * CONTROL_STEP
     assert torch.allclose(velocity, expected, atol=2e-3)
     assert torch.allclose(env.cubeB.pose.p, other, atol=1e-4)
-
-
-def test_wind_bends_the_path_of_a_sliding_cube():
-    env = scene("wind", STRENGTHS)
-    place(env, (0.0, 0.15, env.cube_half_size), (0.0, 0.5, 0.0))
-    for _ in range(5):
-        env.step(act(env, z=1.0))
-    x = env.manipulated.pose.p[:, 0]
-    assert abs(x[0]) < 1e-3
-    assert 5e-3 < x[1] < x[2]
 
 
 def test_rough_patch_stops_what_slides_over_it():
