@@ -16,7 +16,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from symsteer.bench.sim.environment import Simulator, create_in_process
 from symsteer.bench.sim.errors import Unique, WorkerError
 from symsteer.bench.sim.seeds import reset_order
-from symsteer.bench.sim.shards.workers import Workers
+from symsteer.bench.sim.shards.workers import WorkerGroup
 from symsteer.bench.sim.trees import merge, select
 from symsteer.errors import UserError
 
@@ -111,7 +111,7 @@ class ShardedEnv(Unique, gym.Env):
             f"worker {i + 1} of {workers} (environments {rows.start} to {rows.stop - 1})"
             for i, rows in enumerate(self._shards)
         ]
-        self._workers = Workers(names, preload=env_cls.__module__)
+        self._workers = WorkerGroup(names, preload=env_cls.__module__)
         self._end = weakref.finalize(self, self._workers.close)
         recipes: list[tuple | None] = []
         for i, rows in enumerate(self._shards):

@@ -23,7 +23,7 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils import common
 from mani_skill.utils.structs import Actor, Pose
 
-from symsteer.bench.sim import rendering_works
+from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.sim.rotations import (
     planar_matrix,
     quaternion_to_matrix,

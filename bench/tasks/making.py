@@ -15,8 +15,9 @@ from mani_skill import logger
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
-from symsteer.bench.sim import create, rendering_works
 from symsteer.bench.sim.environment import Simulator
+from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.sim.parallel import create
 from symsteer.bench.tasks import check_embodiment, task_class, task_name
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.embodiments import BODIES

@@ -89,6 +89,11 @@ class Variant:
         mask = self.active.view(-1, *[1] * (original.ndim - 1))
         return torch.where(mask, changed, original)
 
+    def moved(self, pose: Pose, shift: torch.Tensor) -> Pose:
+        """``pose`` shifted by ``shift [N, 2]`` metres where the strength is above zero."""
+        p = pose.p + torch.nn.functional.pad(shift, (0, 1))
+        return type(pose).create_from_pq(self.only_active(p, pose.p), pose.q)
+
     # ------------------------------------------------------------------- hooks
 
     def strengths_changed(self) -> None:

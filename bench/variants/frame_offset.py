@@ -21,5 +21,4 @@ class FrameOffset(Variant):
         return torch.stack([0.05 * self.amount, torch.zeros_like(self.amount)], dim=1)
 
     def perceive(self, pose: Pose, role: Role) -> Pose:
-        shift = torch.nn.functional.pad(self.origin(), (0, 1))
-        return Pose.create_from_pq(self.only_active(pose.p - shift, pose.p), pose.q)
+        return self.moved(pose, -self.origin())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from mani_skill.utils.structs import Pose
 
 from symsteer.bench.variants.base import Role, Variant
@@ -27,6 +26,4 @@ class ObservationNoise(Variant):
         if role != "object":
             return pose
         normal = normal_pairs(self.env.episode_key, self.env.elapsed_steps)
-        noise = normal * normal.new_tensor([STD_X, STD_Y]) * self.amount[:, None]
-        seen = pose.p + torch.nn.functional.pad(noise, (0, 1))
-        return Pose.create_from_pq(self.only_active(seen, pose.p), pose.q)
+        return self.moved(pose, normal * normal.new_tensor([STD_X, STD_Y]) * self.amount[:, None])

@@ -19,6 +19,4 @@ class PerceptionBias(Variant):
     def perceive(self, pose: Pose, role: Role) -> Pose:
         if role != "object":
             return pose
-        still = torch.zeros_like(self.amount)
-        bias = torch.stack([0.02 * self.amount, still, still], dim=1)
-        return Pose.create_from_pq(self.only_active(pose.p + bias, pose.p), pose.q)
+        return self.moved(pose, torch.stack([0.02 * self.amount, 0 * self.amount], dim=1))

@@ -26,7 +26,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from stable_baselines3 import SAC
 
-from symsteer.bench.sim import rendering_works
+from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import TASKS, make, task_class
 from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError

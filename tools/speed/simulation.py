@@ -31,9 +31,9 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
-from symsteer.bench.sim import create, prepare_headless
 from symsteer.bench.sim.environment import MAX_SCENES
-from symsteer.bench.sim.parallel import divide
+from symsteer.bench.sim.headless import prepare_headless
+from symsteer.bench.sim.parallel import create, divide
 from symsteer.bench.sim.shards.processes import start_process
 from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError

@@ -18,7 +18,7 @@ _CLOSE_SECONDS = 5.0
 """A worker that has not ended this long after its connection was closed is killed."""
 
 
-class Workers:
+class WorkerGroup:
     """Worker processes, each of which answers one request at a time.
 
     Args:

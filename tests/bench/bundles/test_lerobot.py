@@ -18,7 +18,7 @@ from symsteer.bench.bundles.film import PIXELS, RENDERING
 from symsteer.bench.bundles.lerobot import write_dataset
 from symsteer.bench.demos import load
 from symsteer.bench.demos.files import checksum
-from symsteer.bench.sim import rendering_works
+from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import make, task_class
 from symsteer.cli import main
 from symsteer.errors import UserError

@@ -15,7 +15,7 @@ from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 from mani_skill.trajectory.utils import dict_to_list_of_dicts
 
 from symsteer.bench.demos import MODES, Diversity, collect, load
-from symsteer.bench.sim import make_env_class
+from symsteer.bench.sim.environment import make_env_class
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
 

@@ -9,7 +9,8 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
-from symsteer.bench.sim import create, prepare_headless
+from symsteer.bench.sim.headless import prepare_headless
+from symsteer.bench.sim.parallel import create
 from tests.bench.state_tasks import STATE_TASKS
 from tools.speed.simulation import stock_class
 

@@ -13,8 +13,8 @@ from mani_skill.envs.tasks.tabletop.two_robot_pick_cube import TwoRobotPickCube
 from mani_skill.utils.building.ground import build_ground
 from mani_skill.utils.structs.actor import Actor
 
-from symsteer.bench.sim import create
 from symsteer.bench.sim.kinematics import SerialChain
+from symsteer.bench.sim.parallel import create
 from tests.bench.sim.scenes import batched
 
 

@@ -12,9 +12,11 @@ import pytest
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
-from symsteer.bench.sim import capabilities, create, rendering_works, versions
+from symsteer.bench.sim import capabilities, versions
 from symsteer.bench.sim import environment as batched
 from symsteer.bench.sim.capabilities import probe
+from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.sim.parallel import create
 from symsteer.errors import UserError
 
 NO_VULKAN = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
@@ -38,7 +40,9 @@ def test_headless_without_vulkan():
     """
     code = """
 import gc
-from symsteer.bench.sim import create, environment, prepare_headless, rendering_works
+from symsteer.bench.sim import environment
+from symsteer.bench.sim.headless import prepare_headless, rendering_works
+from symsteer.bench.sim.parallel import create
 from symsteer.errors import UserError
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv

@@ -13,8 +13,8 @@ import pytest
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
-from symsteer.bench.sim import create
 from symsteer.bench.sim.errors import WorkerError, WorkerLostError
+from symsteer.bench.sim.parallel import create
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make
 from symsteer.bench.variants import VARIANTS

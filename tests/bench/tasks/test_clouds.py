@@ -7,7 +7,7 @@ import torch
 
 from symsteer.bench.audit.result import AuditSettings
 from symsteer.bench.demos import collect, load
-from symsteer.bench.sim import rendering_works
+from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.clouds import POINTS, thinned
 from symsteer.errors import UserError

@@ -7,7 +7,7 @@ import torch
 from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.utils.structs import Pose
 
-from symsteer.bench.sim import create
+from symsteer.bench.sim.parallel import create
 from symsteer.bench.sim.rotations import quaternion_to_matrix, yaw_quaternion
 from symsteer.bench.tasks.experts import Expert
 from symsteer.policies.geometry import Group
