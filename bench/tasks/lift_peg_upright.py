@@ -36,18 +36,10 @@ from symsteer.policies.geometry import Field
 class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
     """Set a lying peg upright.
 
-    ManiSkill's LiftPegUpright-v1 with rotation-symmetric resets and success.
-
-    Reset: the peg lies with its centre uniform in a disc of 10 cm radius and its direction
-    uniform on the circle (stock: a square, always along x). Success is stock's (axis within
-    0.08 rad of the vertical, centre within 5 mm of half the peg's length) with the tilt measured
-    from the axis itself. Stock takes it from an Euler angle, which is that tilt only while the
-    peg leans about its own body z axis; for some bearings it counts any peg as upright. The
-    dense reward is ManiSkill's, which is invariant.
-
-    The peg is a box with a square section whose two ends differ in colour only: it is its own
-    image under half turns, so its axis is observed up to its sign, as the three irreps of the
-    symmetric traceless tensor of the axis.
+    ManiSkill's LiftPegUpright-v1 with rotation-symmetric resets and success, for which the tilt is
+    measured from the peg's axis itself (docs/tasks/lift-peg-upright.md). The peg is its own image
+    under half turns, so its axis is observed up to its sign, as the three irreps of the symmetric
+    traceless tensor of the axis.
     """
 
     task_id = "LiftPegUpright-v1"

@@ -111,11 +111,8 @@ class MoveCube(SymmetricTask):
 class PushCube(MoveCube, PushCubeEnv):
     """Push a cube into a disc on the table, in any direction.
 
-    ManiSkill's PushCube-v1 turned by a uniform angle in every episode.
-
-    Stock PushCube always pushes along +x, in reset and dense reward; here the direction is
-    uniform (see :class:`MoveCube`). Success (cube within 10 cm of the goal, on the table) is
-    ManiSkill's; the dense reward has ManiSkill's terms with its +x replaced by the direction.
+    ManiSkill's PushCube-v1 turned by a uniform angle in every episode (docs/tasks/push-cube.md).
+    The dense reward has ManiSkill's terms with its +x replaced by the direction.
     """
 
     task_id = "PushCube-v1"
@@ -132,13 +129,9 @@ class PushCube(MoveCube, PushCubeEnv):
 class PullCube(MoveCube, PullCubeEnv):
     """Pull a cube into a disc on the table, in any direction.
 
-    ManiSkill's PullCube-v1 turned by a uniform angle in every episode.
-
-    Stock PullCube always pulls along -x, towards the arm, in reset and dense reward; here the
-    direction is uniform (see :class:`MoveCube`), which leaves two differences from PushCube:
-    success (cube within 10 cm of the goal) does not depend on the cube's height, and the dense
-    reward wants the tool 1 cm instead of 0.5 cm behind the cube. Success is ManiSkill's; the
-    dense reward has ManiSkill's terms with its -x replaced by the direction.
+    ManiSkill's PullCube-v1 turned by a uniform angle in every episode (docs/tasks/pull-cube.md).
+    Two differences from PushCube remain: success does not depend on the cube's height, and the
+    dense reward wants the tool 1 cm instead of 0.5 cm behind the cube.
     """
 
     task_id = "PullCube-v1"

@@ -26,11 +26,7 @@ from symsteer.policies.geometry import Field
 class PickCube(SymmetricTask, PickCubeEnv):
     """Pick up a cube and hold it at a goal in the air.
 
-    ManiSkill's PickCube-v1 with rotation-symmetric resets.
-
-    Reset: cube uniform in a disc of 10 cm radius about the centre with uniform yaw; goal uniform
-    in a disc of 10 cm radius, 0 to 20 cm above the cube's resting height (stock: squares, 0 to
-    30 cm). Success (goal within 2.5 cm, robot static) and reward are ManiSkill's.
+    ManiSkill's PickCube-v1 with rotation-symmetric resets (docs/tasks/pick-cube.md).
     """
 
     task_id = "PickCube-v1"

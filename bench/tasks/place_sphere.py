@@ -17,15 +17,8 @@ from symsteer.policies.geometry import Field
 class PlaceSphere(SymmetricTask, PlaceSphereEnv):
     """Put a sphere into a shallow bin and let go.
 
-    ManiSkill's PlaceSphere-v1 with rotation-symmetric resets.
-
-    Reset: the midpoint of sphere and bin is uniform in a disc of 7 cm radius about the centre,
-    their bearing uniform on the circle, their distance uniform in 11 to 18 cm (so that open
-    fingers around the sphere clear the bin at any yaw), the bin's yaw uniform
-    (stock: sphere and bin in two rectangles side by side along x, bin parallel to the axes).
-    Success (sphere at rest in the bin, within 5 mm of its centre, let go) and reward are
-    ManiSkill's. A square bin is its own image under quarter turns: its yaw has frequency 4. A
-    sphere has no orientation to observe.
+    ManiSkill's PlaceSphere-v1 with rotation-symmetric resets (docs/tasks/place-sphere.md). From
+    11 cm on, open fingers around the sphere clear the bin at any yaw.
     """
 
     task_id = "PlaceSphere-v1"

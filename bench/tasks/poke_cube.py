@@ -31,25 +31,10 @@ from symsteer.policies.geometry import Field
 class PokeCube(SymmetricTask, PokeCubeEnv):
     """Poke a cube into a disc on the table with a peg, in any direction.
 
-    ManiSkill's PokeCube-v1 turned by a uniform angle in every episode.
-
-    Stock PokeCube always pokes along +x. Here the direction is uniform on the circle; seen along
-    it, the peg (24 cm long, lying on the table, parallel to the direction) has its middle 7 cm
-    before a point uniform in a disc of 5 cm radius about the centre, the cube stands 22 cm ahead
-    of the peg's middle and the goal 10 cm ahead of the cube, as in stock; peg and cube are up to
-    10 cm apart across (stock: up to 20 cm), and the cube is turned by up to 30 degrees against
-    the direction, as in stock. The goal disc's pose carries the direction (its body z axis).
-
-    The peg is its own image under a half turn, colours included: its yaw is observed with
-    frequency 2, and its end that is nearer to the cube is observed relative to the cube.
-    ManiSkill calls the end at the frame's +x the head; at a reset the head is the end that faces
-    the cube. Only the dense reward uses the head.
-
-    Success (cube within 5 cm of the goal, robot static) is ManiSkill's. Two quantities of its
-    dense reward that pin the world's axes are replaced by what they are in the stock scene: the
-    head's position (stock adds 12 cm along the world's x to the peg's middle, for any yaw)
-    and the angle between peg and cube (stock subtracts Euler angles; here it is the
-    one to the cube's nearest face).
+    ManiSkill's PokeCube-v1 turned by a uniform angle in every episode, with two quantities of its
+    dense reward that pin the world's axes replaced (docs/tasks/poke-cube.md). The goal disc's pose
+    carries the direction (its body z axis). The peg is its own image under a half turn, colours
+    included; ManiSkill calls its end at the frame's +x the head, which faces the cube at a reset.
     """
 
     task_id = "PokeCube-v1"

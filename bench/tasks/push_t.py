@@ -30,21 +30,10 @@ HORIZONTAL = Layout([Field("xy", 1)])
 class PushT(SymmetricTask, PushTEnv):
     """Bring a T-shaped block onto a T drawn on the table.
 
-    ManiSkill's PushT-v1 with a goal anywhere and any gripper.
-
-    Reset: block and goal are uniform in discs of 10 and 5 cm radius, each with uniform yaw
-    (stock: one fixed goal, block in a rectangle beside it, yaw uniform). The goal is the pose
-    of ManiSkill's goal actor, hence part of the simulation state; stock keeps it in constants.
-
-    Success (the block covers 90 % of the goal in ManiSkill's drawing of both) and dense reward
-    are ManiSkill's, with these replacements: they read the goal from its actor; the yaw comes
-    from an arc tangent (stock's arc cosine loses half the digits where the yaw is near zero, and
-    is not a number where rounding makes the quaternion's w exceed 1); and the overlap is the mean
-    of two, of block and goal and of their mirror images, because the drawing is one pixel
-    (4.7 mm) off in both directions. Stock marks where its stick must return to; nothing has to
-    return here, so the marker lies under the goal.
-
-    Block and goal are their own mirror image across their body y-z plane.
+    ManiSkill's PushT-v1 with a goal anywhere, which is the pose of its goal actor, and any gripper.
+    Success and dense reward are made symmetric (docs/tasks/push-t.md): the yaw comes from an arc
+    tangent, and the overlap is the mean of two, of block and goal and of their mirror images,
+    because ManiSkill's drawing is one pixel (4.7 mm) off. Stock's marker lies under the goal.
     """
 
     task_id = "PushT-v1"

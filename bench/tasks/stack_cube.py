@@ -25,11 +25,7 @@ from symsteer.policies.geometry import Field
 class StackCube(SymmetricTask, StackCubeEnv):
     """Stack one cube on another and let go.
 
-    ManiSkill's StackCube-v1 with rotation-symmetric resets.
-
-    Reset: the midpoint of the two cubes is uniform in a disc of 7 cm radius about the centre,
-    their bearing uniform on the circle, their distance uniform in 8 to 16 cm, both yaws uniform.
-    Success (A rests on B, let go) and reward are ManiSkill's.
+    ManiSkill's StackCube-v1 with rotation-symmetric resets (docs/tasks/stack-cube.md).
     """
 
     task_id = "StackCube-v1"
