@@ -483,12 +483,11 @@ class SymmetricTask(BaseEnv):
         Raises:
             UserError: for an embodiment whose states do not turn with the world (``panda``).
         """
-        fixed = {self.table_scene.table.name}
-        robot = self.agent.robot.name
+        table, robot = self.table_scene.table.name, self.agent.robot.name
         turned = {
             "actors": {
                 name: value
-                if name in fixed
+                if name == table
                 else _transform_body(value, angle, reflect, name in self.mirrored_across_yz)
                 for name, value in state["actors"].items()
             },
@@ -498,9 +497,8 @@ class SymmetricTask(BaseEnv):
             },
         }
         if "controller" in state:
-            turned["controller"] = self.body.transform_controller(
-                state["controller"], angle, reflect
-            )
+            controller = self.body.transform_controller(state["controller"], angle, reflect)
+            turned["controller"] = controller
         return turned
 
     # ------------------------------------------------------------------ returns

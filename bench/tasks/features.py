@@ -106,7 +106,9 @@ def pair(
 
 def left_of(ahead: Any) -> Any:
     """Horizontal vectors ``[N, 2]``, array or tensor, turned by a quarter turn."""
-    return (torch if torch.is_tensor(ahead) else np).stack([-ahead[:, 1], ahead[:, 0]], 1)
+    left = ahead[:, [1, 0]]
+    left[:, 0] *= -1
+    return left
 
 
 def flat_pose(xy: np.ndarray, z: np.ndarray | float, yaw: np.ndarray, device: Any) -> Pose:
