@@ -156,6 +156,7 @@ def script(embodiment):
     return actions
 
 
+@functools.cache
 def play(embodiment, **kwargs):
     """All that an episode, a partial reset and some more steps show: ``[N, ...]`` tensors."""
     env = make(
@@ -177,15 +178,9 @@ def play(embodiment, **kwargs):
     return shown
 
 
-@functools.cache
-def unbroken(embodiment):
-    return play(embodiment)
-
-
-@functools.cache
 def one_of_three(name, embodiment):
     """The variant acts in the second environment alone."""
-    return play(embodiment, variant=name, strength=torch.tensor([0.0, 1.0, 0.0]))
+    return play(embodiment, variant=name, strength=(0.0, 1.0, 0.0))
 
 
 @pytest.mark.parametrize("embodiment", ["floating", pytest.param("panda", marks=pytest.mark.slow)])
@@ -193,20 +188,20 @@ def one_of_three(name, embodiment):
 def test_strength_zero_is_the_unbroken_task_to_the_bit(name, embodiment):
     """Also beside environments in which the variant acts."""
     mixed = one_of_three(name, embodiment)
-    for plain, broken in zip(unbroken(embodiment), mixed, strict=True):
+    for plain, broken in zip(play(embodiment), mixed, strict=True):
         assert torch.equal(plain[[0, 2]], broken[[0, 2]])
 
 
 def test_strength_zero_of_all_is_the_unbroken_task_to_the_bit():
     everything = play("floating", variant="+".join(f"{name}:0" for name in NAMES))
-    for plain, zero in zip(unbroken("floating"), everything, strict=True):
+    for plain, zero in zip(play("floating"), everything, strict=True):
         assert torch.equal(plain, zero)
 
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n not in ("obstacle", "friction_patch")])
 def test_strength_one_shows(name):
     """The two local ones have tests of their own where they act."""
-    pairs = zip(unbroken("floating"), one_of_three(name, "floating"), strict=True)
+    pairs = zip(play("floating"), one_of_three(name, "floating"), strict=True)
     assert not all(torch.equal(plain[1], broken[1]) for plain, broken in pairs)
 
 
