@@ -24,7 +24,9 @@ from mani_skill.utils.wrappers.frame_stack import FrameStack
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+from mani_skill.vector.wrappers.sb3 import ManiSkillSB3VectorEnv
 from stable_baselines3 import SAC
+from stable_baselines3.common.env_checker import check_env as check_sb3_env
 
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import TASKS, make, task_class
@@ -35,6 +37,7 @@ from tests.bench.state_tasks import STATE_TASKS
 
 BATCHED = "SymSteer/PickCube-v1"
 SINGLE = "SymSteer/PickCube-single-v1"
+PAGE = Path(__file__).parents[2] / "docs" / "gymnasium.md"
 BROKEN = {"variant": "action_gain", "strength": 0.5}
 
 # What gymnasium's checker says about every ManiSkill environment: it is wrapped, and its
@@ -511,10 +514,50 @@ def test_environments_spread_over_workers_are_those_of_one_process():
             env.close()
 
 
+def test_stable_baselines3s_checker_passes():
+    check_sb3_env(gym.make("SymSteer/PushCube-single-dense-v1", **BROKEN), warn=True)
+
+
+def test_maniskills_wrapper_for_stable_baselines3():
+    env = ManiSkillSB3VectorEnv(gym.make("SymSteer/PushCube-dense-v1", num_envs=3, **BROKEN))
+    env.seed(0)
+    first = env.reset()
+    assert first.shape == (3, env.observation_space.shape[0])
+    ends = 0
+    for _ in range(50 + 1):
+        obs, rewards, dones, infos = env.step(np.stack([env.action_space.sample()] * 3))
+        ends += dones.sum()
+    assert (rewards.shape, obs.shape, len(infos)) == ((3,), first.shape, 3)
+    assert ends >= 3
+
+
+def test_cleanrls_ppo_wraps_the_documented_id():
+    """Its wrappers and vector environment, with the three changes that docs/gymnasium.md gives."""
+    (env_id,) = set(re.findall(r"--env-id (symsteer\S+)", PAGE.read_text()))
+
+    def thunk():
+        env = gym.wrappers.FlattenObservation(gym.make(env_id))
+        env = gym.wrappers.ClipAction(gym.wrappers.RecordEpisodeStatistics(env))
+        env = gym.wrappers.NormalizeObservation(env)
+        clip = (lambda obs: np.clip(obs, -10, 10), env.observation_space)
+        env = gym.wrappers.NormalizeReward(gym.wrappers.TransformObservation(env, *clip))
+        return gym.wrappers.TransformReward(env, lambda reward: np.clip(reward, -10, 10))
+
+    envs = gym.vector.SyncVectorEnv(autoreset_mode="SameStep", env_fns=[thunk, thunk])
+    envs.reset(seed=1)
+    rewards = []
+    for _ in range(50):
+        _, reward, *_, infos = envs.step(envs.action_space.sample())
+        rewards.append(reward)
+    assert np.std(rewards) > 0, "the reward is dense"
+    ended = np.flatnonzero(infos["_final_info"])
+    assert [infos["final_info"]["episode"]["l"][i] for i in ended] == [50, 50]
+    envs.close()
+
+
 def blocks():
     """Python blocks of the page, by their number."""
-    page = Path(__file__).parents[2] / "docs" / "gymnasium.md"
-    return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
 
 
 @pytest.mark.parametrize(
