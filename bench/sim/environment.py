@@ -276,16 +276,3 @@ def make_env_class(env_cls: type[BaseEnv], sim: Simulator = "cpu") -> type[BaseE
     mixin = BatchedCpuMixin if sim == "cpu" else CudaMixin
     members = {"__module__": env_cls.__module__, "__doc__": env_cls.__doc__}
     return type(f"{env_cls.__name__}_{sim}", (mixin, env_cls), members)
-
-
-def create_in_process(
-    env_cls: type[BaseEnv],
-    num_envs: int,
-    sim: Simulator = "cpu",
-    render: bool = False,
-    **kwargs: Any,
-) -> BaseEnv:
-    """Make N parallel environments in this process; see `symsteer.bench.sim.create`."""
-    if render:
-        kwargs.setdefault("render_mode", "rgb_array")
-    return make_env_class(env_cls, sim)(num_envs=num_envs, **kwargs)  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from symsteer.bench.sim.environment import Simulator, create_in_process
+from symsteer.bench.sim.environment import Simulator, make_env_class
 from symsteer.bench.sim.errors import Unique, WorkerError
 from symsteer.bench.sim.seeds import reset_order
 from symsteer.bench.sim.shards.workers import WorkerGroup
@@ -46,14 +46,16 @@ def create(
     """
     if num_envs < 1:
         raise UserError(f"num_envs is {num_envs}, but at least one environment is needed.")
+    if render:
+        kwargs.setdefault("render_mode", "rgb_array")
     if workers == 1:
-        return create_in_process(env_cls, num_envs, sim, render, **kwargs)
+        return make_env_class(env_cls, sim)(num_envs=num_envs, **kwargs)  # type: ignore[arg-type]
     if sim != "cpu":
         raise UserError(
             f"workers={workers} divides CPU physics among processes; the GPU simulates all "
             "environments in one: leave workers out, or use sim='cpu'"
         )
-    return cast(BaseEnv, ShardedEnv(env_cls, num_envs, workers, render=render, **kwargs))
+    return cast(BaseEnv, ShardedEnv(env_cls, num_envs, workers, **kwargs))
 
 
 def divide(total: int, workers: int) -> list[slice]:
@@ -82,8 +84,7 @@ class ShardedEnv(Unique, gym.Env):
         env_cls: task class that can be imported by its name.
         num_envs: N; if W does not divide it, shards differ by one environment.
         workers: W, at most N; more than the cores costs time and memory.
-        kwargs: further arguments of `environment.create_in_process`; tensors with N rows have one
-            for each environment.
+        kwargs: further arguments of the class; tensors with N rows have one for each environment.
 
     Raises:
         UserError: the number of workers is out of range, an argument cannot be sent to another

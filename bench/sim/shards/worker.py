@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from symsteer.bench.sim.environment import create_in_process
+from symsteer.bench.sim.environment import make_env_class
 from symsteer.bench.sim.errors import WorkerError
 from symsteer.bench.sim.trees import merge
 from symsteer.errors import UserError
@@ -111,7 +111,7 @@ class Worker:
             start: index of the first environment among those of all shards.
             count: how many there are.
             seed: of the process's global random generators.
-            kwargs: further arguments of `environment.create_in_process`.
+            kwargs: further arguments of the class.
 
         Returns:
             The attributes that do not change.
@@ -135,7 +135,7 @@ class Worker:
             def _set_episode_rng(self, seed: Any, env_idx: Any) -> None:
                 super()._set_episode_rng(self._shifted(seed), env_idx)
 
-        self.env = create_in_process(Shard, count, **kwargs)
+        self.env = make_env_class(Shard)(num_envs=count, **kwargs)
         return {name: getattr(self.env, name) for name in FACTS if hasattr(self.env, name)}
 
     def step_chunk(self, actions: torch.Tensor) -> tuple:
