@@ -181,8 +181,7 @@ def film(
     """
     allow(variant, *trust)
     from symsteer.bench.runs.film import film
-    from symsteer.bench.sim.capabilities import RENDERING_CURE
-    from symsteer.bench.sim.headless import rendering_works
+    from symsteer.bench.sim.headless import RENDERING_CURE, rendering_works
 
     path = film(folders, variant, episodes, out)
     if not rendering_works():

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
+from symsteer.bench.sim.headless import RENDERING_CURE, silence_import_noise
 from symsteer.bench.sim.versions import PINNED
 
 _RENDER_PROBE = (
@@ -24,12 +25,6 @@ _RENDER_PROBE = (
     "print(sapien.render.RenderSystem().device.name)"
 )
 _PROBE_SECONDS = 60
-
-RENDERING_CURE = (
-    "install your GPU's Vulkan driver, or (software rendering) apt install chromium and set "
-    "VK_ICD_FILENAMES to /usr/lib/chromium/vk_swiftshader_icd.json"
-)
-"""How to get pictures and videos."""
 
 _ROOT = Path(__file__).resolve().parents[2]
 _IN_CHECKOUT = (_ROOT / "Makefile").is_file() and (_ROOT / "pyproject.toml").is_file()
@@ -151,8 +146,6 @@ def _satisfied(requirement: Requirement) -> bool:
 
 
 def _maniskill() -> str:
-    from symsteer.bench.sim.headless import silence_import_noise
-
     silence_import_noise()
     try:
         importlib.import_module("mani_skill.envs")

@@ -11,6 +11,12 @@ import warnings
 from functools import lru_cache
 from typing import Any
 
+RENDERING_CURE = (
+    "install your GPU's Vulkan driver, or (software rendering) apt install chromium and set "
+    "VK_ICD_FILENAMES to /usr/lib/chromium/vk_swiftshader_icd.json"
+)
+"""How to get pictures and videos."""
+
 # Warnings of SAPIEN and escnn at import on a machine without Vulkan or Fortran.
 _NOISE = (
     "Failed to find system libvulkan.*",

@@ -15,7 +15,7 @@ import torch
 from mani_skill.utils import common
 
 from symsteer.bench.sim.contacts import Buffer
-from symsteer.bench.sim.headless import rendering_works
+from symsteer.bench.sim.headless import RENDERING_CURE, rendering_works
 from symsteer.bench.sim.physx import BatchedPhysx
 from symsteer.errors import UserError
 
@@ -32,9 +32,8 @@ def find_device(name: str | None = None) -> sapien.Device:
     """
     if not rendering_works():
         raise UserError(
-            "Rendering needs a Vulkan driver, and none was found: install your GPU's driver, or "
-            "Debian's chromium for software rendering, and set VK_ICD_FILENAMES to its "
-            "vk_swiftshader_icd.json; state-only runs need no driver."
+            f"Rendering needs a Vulkan driver, and none was found: {RENDERING_CURE}; state-only "
+            "runs need no driver."
         )
     if name in (None, "gpu", "cpu", "none"):
         return sapien.render.RenderSystem().device
