@@ -86,7 +86,8 @@ class ArmTurner:
         frame = world @ rotation
         if reflect:
             frame = frame * frame.new_tensor([1.0, -1.0, 1.0])
-        solution, reached = self.solve(target, frame, q, angle, reflect)
+        starts = self._starts(target, q, angle, reflect)
+        solution, reached = self._solve(target, frame, q, starts)
 
         twist = (self._jacobian(q) @ v[:, :, None])[:, :, 0]
         wanted = torch.cat(
@@ -94,40 +95,22 @@ class ArmTurner:
         )
         speed = torch.linalg.pinv(self._jacobian(solution), rtol=1e-3) @ wanted[:, :, None]
         fingers = [n + 1, n] if reflect else [n, n + 1]
-        turned = torch.cat(
-            [
-                state[:, :13].double(),
-                solution,
-                joints[:, fingers],
-                speed[:, :, 0],
-                rates[:, fingers],
-            ],
-            dim=1,
-        ).to(state.dtype)
+        new = [solution, joints[:, fingers], speed[:, :, 0], rates[:, fingers]]
+        turned = torch.cat([state[:, :13].double(), *new], dim=1).to(state.dtype)
         return torch.where(reached[:, None], turned, state), reached
 
-    def solve(
-        self,
-        target: torch.Tensor,
-        frame: torch.Tensor,
-        near: torch.Tensor,
-        angle: float,
-        reflect: bool,
+    def _solve(
+        self, target: torch.Tensor, frame: torch.Tensor, near: torch.Tensor, start: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Find joint angles that reach tool poses in the base's frame.
+        """Joint angles ``[S, 7]`` that reach tool poses in the base's frame, and whether they do.
 
         Args:
-            target: positions ``[S, 3]``.
-            frame: orientations ``[S, 3, 3]``.
+            target, frame: positions ``[S, 3]`` and orientations ``[S, 3, 3]``.
             near: the joint angles before the turn ``[S, 7]``.
-            angle, reflect: the turn.
-
-        Returns:
-            Angles ``[S, 7]`` and whether they reach ``[S]`` bool.
+            start: where the search begins, ``[starts, S, 7]``.
         """
-        starts = self._starts(target, near, angle, reflect)
-        count = len(starts)
-        q = starts.reshape(-1, self.joints)
+        count = len(start)
+        q = start.reshape(-1, self.joints)
         goal, pose = target.repeat(count, 1), frame.repeat(count, 1, 1)
         for _ in range(ITERATIONS):
             error = self._error(q, goal, pose)

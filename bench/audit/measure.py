@@ -187,8 +187,8 @@ class Experiment:
 
         poses = [self._poses()]
         place = {
-            body: self._split(position[:, :2] - self.centre)[:, : len(elements)]
-            for body, (position, _) in poses[0].items()
+            body: self._split(pose[:, :2] - self.centre)[:, : len(elements)]
+            for body, pose in poses[0].items()
         }
         outcome_cost, outcome_dense = self._rewards(plan)
         poses.append(self._poses())
@@ -239,33 +239,37 @@ class Experiment:
         bodies = {kind: {**whole[kind], **state[kind]} for kind in ("actors", "articulations")}
         self.env.set_state_dict({**whole, **state, **bodies})
 
-    def _poses(self) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-        """Positions and quaternions of tool and object in every scene."""
+    def _poses(self) -> Tensors:
+        """Position and quaternion of tool and object in every scene, ``[N, 7]`` each."""
         bodies = {"tool": self.env.agent.tcp_pose, "object": self.env.manipulated.pose}
-        return {name: (pose.p.cpu().clone(), pose.q.cpu().clone()) for name, pose in bodies.items()}
+        return {name: torch.cat([pose.p, pose.q], dim=1).cpu() for name, pose in bodies.items()}
 
     def _split(self, values: torch.Tensor) -> torch.Tensor:
         """Reshape ``[(G + 1) * S, ...]``, ordered by copy, to ``[S, G + 1, ...]``."""
         return values.unflatten(0, (-1, self.batch)).transpose(0, 1)
 
-    def _turned_back(
-        self, poses: list[dict[str, tuple[torch.Tensor, torch.Tensor]]]
-    ) -> tuple[Tensors, Tensors]:
+    def _turned_back(self, poses: list[Tensors]) -> tuple[Tensors, Tensors]:
         positions, quaternions = {}, {}
         mirrored = self.env.manipulated.name in self.env.mirrored_across_yz
         centre = torch.cat([self.centre.double(), torch.zeros(1, dtype=torch.float64)])
+        inverses = [*map(_inverse, self.elements), (0.0, False)]
         for body in ("tool", "object"):
-            p, q = (
-                self._split(torch.stack([pose[body][kind] for pose in poses], dim=1)).double()
-                for kind in (0, 1)
+            pose = self._split(torch.stack([pose[body] for pose in poses], dim=1)).double()
+            p, q = pose[..., :3], pose[..., 3:]
+            across_yz = body == "object" and mirrored
+            positions[body] = torch.stack(
+                [
+                    (p[:, g] - centre) @ planar_matrix(*inverse, p).T + centre
+                    for g, inverse in enumerate(inverses)
+                ],
+                dim=1,
             )
-            back = []
-            for g, inverse in enumerate([*map(_inverse, self.elements), (0.0, False)]):
-                matrix = planar_matrix(*inverse, p)
-                turned = transform_quaternion(q[:, g], *inverse, body == "object" and mirrored)
-                back.append(((p[:, g] - centre) @ matrix.T + centre, turned))
-            positions[body], quaternions[body] = (
-                torch.stack(column, dim=1) for column in zip(*back, strict=True)
+            quaternions[body] = torch.stack(
+                [
+                    transform_quaternion(q[:, g], *inverse, across_yz)
+                    for g, inverse in enumerate(inverses)
+                ],
+                dim=1,
             )
         return positions, quaternions
 

@@ -239,7 +239,7 @@ def _interval(
         return "at rest"
     if all(abs(v) < exact for v in interval):
         return "0"
-    value, low, high = (_two(scale * v) for v in interval)
+    value, low, high = (two_digits(scale * v) for v in interval)
     return f"{value}{unit and ' ' + unit} [{low}, {high}]"
 
 
@@ -248,18 +248,7 @@ def percent(interval: Sequence[float] | None) -> str:
     return _interval(interval, 100, "%")
 
 
-def percent_range(intervals: Sequence[list[float] | None], exact: float) -> str:
-    """Smallest to largest value in per cent; just 0 if all are below ``exact``."""
-    values = [i[0] for i in intervals if i is not None]
-    if not values:
-        return "at rest"
-    if max(values) < exact:
-        return "0"
-    low, high = _two(100 * min(values)), _two(100 * max(values))
-    return f"{low} %" if low == high else f"{low} to {high} %"
-
-
-def _two(value: float) -> str:
+def two_digits(value: float) -> str:
     """Two significant digits, without an exponent."""
     if value == 0:
         return "0"

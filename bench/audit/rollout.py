@@ -77,20 +77,15 @@ class RolloutError:
             median, high = np.quantile(1e3 * values.numpy(), [0.5, 0.95])
             return f"median {median:.4f}, 95th percentile {high:.4f}, max {1e3 * values.max():.4f}"
 
-        contact, success, agree, path, steps = (
-            float(values.double().mean())
-            for values in (
-                *(self.contact, self.success, self.same_outcome),
-                *(self.contact_free_path, self.steps),
-            )
-        )
+        mean = {name: float(values.double().mean()) for name, values in vars(self).items()}
         return (
-            f"{len(self.path)} episodes, {contact:.0%} with contact\n"
+            f"{len(self.path)} episodes, {mean['contact']:.0%} with contact\n"
             f"before contact: within 1 % of the path {self.share_within():.1%}; error mm "
-            f"{mm(self.contact_free_tcp)}; path mean {path:.3f} m over {steps:.1f} steps\n"
+            f"{mm(self.contact_free_tcp)}; path mean {mean['contact_free_path']:.3f} m over "
+            f"{mean['steps']:.1f} steps\n"
             f"whole episode:  within 1 % of the path {self.share_within(contacts=True):.1%}; "
-            f"error mm {mm(self.tcp)}; objects mm {mm(self.objects)}; success {success:.1%}, "
-            f"all copies agree {agree:.1%}"
+            f"error mm {mm(self.tcp)}; objects mm {mm(self.objects)}; "
+            f"success {mean['success']:.1%}, all copies agree {mean['same_outcome']:.1%}"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import re
@@ -95,18 +96,16 @@ def read_bundle(path: Path) -> tuple[BundleManifest, dict[str, bytes]]:
 
 
 def _manifest(path: Path, archive: zipfile.ZipFile) -> BundleManifest:
-    foreign = f"{path} is a zip file, but not a bundle of SymSteer"
-    if MANIFEST not in archive.namelist():
-        raise UserError(f"{foreign}: it has no {MANIFEST}; name one that `symsteer export` wrote")
-    _check_member(path, archive.getinfo(MANIFEST), LARGEST_MANIFEST)
-    text = archive.read(MANIFEST)
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is damaged: its {MANIFEST} is not JSON; copy it again") from error
+    data, text = None, b""
+    if MANIFEST in archive.namelist():
+        _check_member(path, archive.getinfo(MANIFEST), LARGEST_MANIFEST)
+        text = archive.read(MANIFEST)
+        with contextlib.suppress(ValueError, RecursionError):
+            data = json.loads(text)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise UserError(
-            f"{foreign}: its {MANIFEST} has another format; name one that `symsteer export` wrote"
+            f"{path} is a zip file, but its {MANIFEST} is missing or not that of a bundle of "
+            "SymSteer; name a file that `symsteer export` wrote"
         )
     if data.get("version") != VERSION:
         raise UserError(

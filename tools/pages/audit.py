@@ -19,9 +19,9 @@ from symsteer.bench.audit.report import (
     EXACT,
     SIGNIFICANT,
     percent,
-    percent_range,
     summary_json,
     to_markdown,
+    two_digits,
 )
 from symsteer.bench.audit.result import VERSION, old_version
 from symsteer.bench.variants.levels import table
@@ -72,6 +72,17 @@ def _overview(rows: Sequence[dict[str, Any]]) -> str:
         cells += [f"{differ} of {len(own)} differ" if differ else "alike"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def percent_range(intervals: Sequence[list[float] | None], exact: float) -> str:
+    """Smallest to largest value in per cent; just 0 if all are below ``exact``."""
+    values = [i[0] for i in intervals if i is not None]
+    if not values:
+        return "at rest"
+    if max(values) < exact:
+        return "0"
+    low, high = two_digits(100 * min(values)), two_digits(100 * max(values))
+    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def generate(page: str, rows: Sequence[dict[str, Any]]) -> str:

@@ -215,7 +215,7 @@ def larger(files):
         (larger, "more bytes than it has"),
         (edited(version=2), "version 2 of the format"),
         (edited(version="1"), "version 1 of the format"),
-        (edited(format="other"), "another format"),
+        (edited(format="other"), "not that of a bundle"),
         (edited(task="a task"), "wrong in task"),
         (edited(name=".."), "wrong in name"),
         (edited(name="a/b"), "wrong in name"),
@@ -276,7 +276,7 @@ def test_foreign_files_are_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "theirs.zip", "w") as archive:
         archive.writestr("readme.txt", "hello")
     for path, words in (
-        (tmp_path / "theirs.zip", "not a bundle of SymSteer"),
+        (tmp_path / "theirs.zip", "not that of a bundle"),
         (tmp_path / "nowhere.zip", "there is no file"),
         (tmp_path, "there is no file"),
         (Path("https://example.org/a.zip"), "download it"),
