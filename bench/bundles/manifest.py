@@ -60,8 +60,8 @@ class Code(_Strict):
     @functools.cache
     def here(cls) -> Code:
         """The one that runs."""
-        found = Provenance.collect("cpu", 1).model_dump()
-        return cls(**{key: found[key] for key in cls.model_fields})
+        provenance = Provenance.collect("cpu", 1).model_dump()
+        return cls(**{key: provenance[key] for key in cls.model_fields})
 
     def __str__(self) -> str:
         which = f"commit `{self.commit}`" if self.commit else f"code with SHA-256 `{self.sha256}`"

@@ -158,13 +158,13 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 def checksum(file: h5py.File, description: dict[str, Any]) -> str:
     """SHA-256 of every array of the .h5 file and of the content of its .json."""
-    found = hashlib.sha256(json.dumps(description, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(description, sort_keys=True).encode())
 
     def add(name: str, item: h5py.Group | h5py.Dataset) -> None:
         if isinstance(item, h5py.Dataset):
             array = np.asarray(item)
-            found.update(f"{name} {array.dtype} {array.shape}".encode())
-            found.update(array.tobytes())
+            digest.update(f"{name} {array.dtype} {array.shape}".encode())
+            digest.update(array.tobytes())
 
     file.visititems(add)
-    return found.hexdigest()
+    return digest.hexdigest()
