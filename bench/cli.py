@@ -455,12 +455,9 @@ def audit(
         embodiment: floating or panda.
         variant: none, name:strength, several of these joined with +, or all:strength.
         group: Symmetry group, e.g. C8, D4 (with reflections).
-        count: Number of states of the scripted expert and of the base policy with random noise,
-            each; every one is from a different episode.
-        base_policy: Saved base policy; default: the one that `symsteer run` would train and keep in
-            runs/base. none: only the states of the expert.
-        out: Folder for audit.json, map.csv and map.png; of several cells, each has its own folder
-            there, beside table.csv, table.md and summary.json.
+        count: Number of states of the expert and of the base policy with random noise, each.
+        base_policy: Saved base policy, or none: only the expert; default: that of `symsteer run`.
+        out: Folder for audit.json, map.csv and map.png, or for a folder of each cell and the table.
     """
     allow(*task, *variant, *trust)
     from symsteer.bench.audit.report import summary, text, to_markdown, write_table
@@ -506,10 +503,8 @@ def audit_episodes(
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none.
         group: Symmetry group, e.g. C8, D4 (with reflections).
         episodes: Number of episodes.
-        actions: Who acts: the expert or noise, whose actions are turned, or the base policy, whose
-            noise is turned.
-        base_policy: Saved base policy; default: the one that `symsteer run` would train and keep in
-            runs/base.
+        actions: Who acts: expert or random, whose actions are turned, or policy: its noise is.
+        base_policy: Saved base policy; default: that of `symsteer run`, kept in runs/base.
     """
     allow(task, variant, *trust)
     from symsteer.bench.audit.result import AuditSettings
