@@ -515,14 +515,9 @@ def audit_episodes(
     settings.check()
     if base_policy is not None and actions != "policy":
         raise UserError(f"--actions {actions} does not use --base-policy; leave one of them out")
-    policy = audited_policy(settings, base_policy) if actions == "policy" else None
+    actor = audited_policy(settings, base_policy) if actions == "policy" else actions
     error = rotated_rollout_error(
-        settings.task,
-        episodes=episodes,
-        actions=actions,
-        group=group,
-        variant=settings.variant,
-        policy=policy,
+        settings.task, episodes=episodes, actor=actor, group=group, variant=settings.variant
     )
     print(f"{settings.name}, {actions}")
     print(error.summary())

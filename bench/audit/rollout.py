@@ -25,7 +25,10 @@ from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
 from symsteer.policies.contract import ChunkPolicy
 
-Actions = Literal["random", "expert", "policy"]
+Actor = Literal["random", "expert"] | ChunkPolicy
+"""Who acts. Open loop: the actions of the original, which are correlated noise at a height without
+contacts or those of the scripted expert, are turned for the copies. Closed loop: every copy decodes
+its own observation with the original's latent noise, turned."""
 
 BATCH = 25
 """Largest number of episodes in parallel, with one environment per group element each."""
@@ -58,17 +61,16 @@ class RolloutError:
     success: torch.Tensor
     same_outcome: torch.Tensor
 
-    def share_within(self, limit: float = 0.01, contacts: bool = False) -> float:
-        """Share of episodes whose error is at most ``limit`` of the path.
+    def share_close(self, contacts: bool = False) -> float:
+        """Share of episodes whose error is at most 1 % of the path.
 
         Args:
-            limit: relative error.
             contacts: compare whole episodes, not only the part before contact.
         """
         error, path = (
             (self.tcp, self.path) if contacts else (self.contact_free_tcp, self.contact_free_path)
         )
-        return float((error / path.clamp(min=1e-9) <= limit).double().mean())
+        return float((error / path.clamp(min=1e-9) <= 0.01).double().mean())
 
     def summary(self) -> str:
         """Text of three lines."""
@@ -80,10 +82,10 @@ class RolloutError:
         mean = {name: float(values.double().mean()) for name, values in vars(self).items()}
         return (
             f"{len(self.path)} episodes, {mean['contact']:.0%} with contact\n"
-            f"before contact: within 1 % of the path {self.share_within():.1%}; error mm "
+            f"before contact: within 1 % of the path {self.share_close():.1%}; error mm "
             f"{mm(self.contact_free_tcp)}; path mean {mean['contact_free_path']:.3f} m over "
             f"{mean['steps']:.1f} steps\n"
-            f"whole episode:  within 1 % of the path {self.share_within(contacts=True):.1%}; "
+            f"whole episode:  within 1 % of the path {self.share_close(contacts=True):.1%}; "
             f"error mm {mm(self.tcp)}; objects mm {mm(self.objects)}; "
             f"success {mean['success']:.1%}, all copies agree {mean['same_outcome']:.1%}"
         )
@@ -93,34 +95,26 @@ def rotated_rollout_error(
     task: str,
     *,
     episodes: int,
-    actions: Actions = "random",
+    actor: Actor = "random",
     group: str = "C8",
     steps: int | None = None,
     seed: int = 0,
     variant: str = "none",
-    policy: ChunkPolicy | None = None,
 ) -> RolloutError:
     """Compare episodes of the floating gripper with their turned copies.
 
     Args:
         task: name of a task.
         episodes: number of episodes, with seeds ``seed``, ``seed + 1``, ...
-        actions: ``random`` (open loop: correlated noise, at a height without contacts), ``expert``
-            (open loop: the actions of the scripted expert in the original, turned for the copies)
-            or ``policy`` (closed loop: every copy decodes its own observation with the original's
-            latent noise, turned).
+        actor: who acts.
         group: a finite planar group, e.g. ``C8`` or ``D4``.
         steps: steps per episode; by default the task's limit.
         seed: of the first episode.
         variant: symmetry-breaking variant of all environments.
-        policy: the policy for ``actions="policy"``.
 
     Raises:
         UserError: unknown task, group or variant, or no episodes.
-        ValueError: ``actions`` and ``policy`` do not fit together.
     """
-    if (actions == "policy") != (policy is not None):
-        raise ValueError("a policy is needed for actions='policy', and only there")
     if episodes < 1:
         raise UserError(f"the number of episodes must be at least 1; it is {episodes}")
     elements = check_group(group).elements
@@ -128,7 +122,7 @@ def rotated_rollout_error(
     env = make(task, num_envs=batch * len(elements), variant=variant)
     steps = env.max_episode_steps if steps is None else steps
     played = [
-        _rollout(env, range(start, start + batch), elements, steps, actions, policy)
+        _rollout(env, range(start, start + batch), elements, steps, actor)
         for start in range(seed, seed + episodes, batch)
     ]
     env.close()
@@ -140,8 +134,7 @@ def _rollout(
     seeds: Sequence[int],
     elements: tuple[Element, ...],
     steps: int,
-    kind: Actions,
-    policy: ChunkPolicy | None,
+    actor: Actor,
 ) -> RolloutError:
     """An episode for each of the seeds; environment g * count + i is copy g of episode i."""
     count, order = len(seeds), len(elements)
@@ -159,7 +152,7 @@ def _rollout(
         objects.append(torch.stack([body.pose.p.clone() for body in env.moving_bodies], dim=1))
 
     look()
-    for action in _actions(env, seeds, elements, steps, kind, policy):
+    for action in _actions(env, seeds, elements, steps, actor):
         success.append(env.step(action)[-1]["success"].clone())
         look()
 
@@ -201,8 +194,7 @@ def _actions(
     seeds: Sequence[int],
     elements: tuple[Element, ...],
     steps: int,
-    kind: Actions,
-    policy: ChunkPolicy | None,
+    actor: Actor,
 ) -> Iterator[torch.Tensor]:
     """The actions of all copies, ``[order * count, 7]``, of one step after the other."""
     layout, count = env.action_layout, len(seeds)
@@ -210,15 +202,15 @@ def _actions(
     def turned(originals: torch.Tensor) -> torch.Tensor:
         return torch.cat([layout.transform(originals, *element) for element in elements])
 
-    if policy is not None:
+    if isinstance(actor, ChunkPolicy):
         streams = [np.random.default_rng([seed, 3]) for seed in seeds]
         for step in range(steps):
-            if step % policy.execute == 0:
-                draws = [stream.standard_normal((policy.horizon, layout.dim)) for stream in streams]
+            if step % actor.execute == 0:
+                draws = [stream.standard_normal((actor.horizon, layout.dim)) for stream in streams]
                 noise = torch.as_tensor(np.stack(draws), dtype=torch.float32)
-                chunk = policy.decode(env.get_obs(), turned(noise))
-            yield chunk[:, step % policy.execute]
-    elif kind == "expert":
+                chunk = actor.decode(env.get_obs(), turned(noise))
+            yield chunk[:, step % actor.execute]
+    elif actor == "expert":
         expert = Expert(env)
         for _ in range(steps):
             yield turned(expert.act()[:count])

@@ -17,8 +17,8 @@ TASK = "PickCube-v1"
     [("random", "C8", 20), ("expert", "C8", 20), ("expert", "D4", 16)],
 )
 def test_rotated_episodes_coincide(actions, group, steps):
-    result = rotated_rollout_error(TASK, episodes=6, actions=actions, group=group, steps=steps)
-    assert result.share_within(0.01) == 1.0
+    result = rotated_rollout_error(TASK, episodes=6, actor=actions, group=group, steps=steps)
+    assert result.share_close() == 1.0
     assert result.contact_free_path.min() > 0.05
     assert result.contact.any() == (actions == "expert")
     assert result.contact_free_tcp.max() < 1e-3
@@ -35,22 +35,20 @@ def fresh_policy(name: str) -> ChunkPolicy:
 
 
 def test_turned_noise_gives_the_turned_episode():
-    options = {"episodes": 8, "actions": "policy", "steps": 20}
-    result = rotated_rollout_error(TASK, policy=fresh_policy("edp"), **options)
-    assert result.share_within(0.01) == 1.0
+    options = {"episodes": 8, "steps": 20}
+    result = rotated_rollout_error(TASK, actor=fresh_policy("edp"), **options)
+    assert result.share_close() == 1.0
     assert result.contact_free_path.min() > 0.02
     # A policy without the symmetry takes the copies elsewhere.
-    plain = rotated_rollout_error(TASK, policy=fresh_policy("plain"), **options)
-    assert plain.share_within(0.01) == 0.0
-    with pytest.raises(ValueError, match="policy is needed"):
-        rotated_rollout_error(TASK, episodes=1, actions="policy")
+    plain = rotated_rollout_error(TASK, actor=fresh_policy("plain"), **options)
+    assert plain.share_close() == 0.0
 
 
 @pytest.mark.parametrize(("group", "share"), [("C8", 0.0), ("C2", 1.0)])
 def test_a_variant_breaks_what_is_not_a_symmetry_of_it(group, share):
     options = {"episodes": 4, "steps": 10, "variant": "action_gain:0.5"}
     result = rotated_rollout_error(TASK, group=group, **options)
-    assert result.share_within(0.01) == share
+    assert result.share_close() == share
 
 
 @pytest.mark.slow
@@ -61,13 +59,13 @@ def test_turned_noise_of_a_trained_policy_over_200(tmp_path):
     )
     kind, layouts = POLICIES.get("edp"), (demos.observation_layout, demos.action_layout)
     policy = kind.fit(kind.Options(), demos.episodes, *layouts)
-    result = rotated_rollout_error(TASK, episodes=200, actions="policy", policy=policy)
-    assert result.share_within(0.01) >= 0.95
+    result = rotated_rollout_error(TASK, episodes=200, actor=policy)
+    assert result.share_close() >= 0.95
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("actions", ["random", "expert"])
 @pytest.mark.parametrize("task", ["PushCube-v1", "PickCube-v1", "StackCube-v1"])
 def test_rotated_episodes_coincide_over_200(task, actions):
-    result = rotated_rollout_error(task, episodes=200, actions=actions)
-    assert result.share_within(0.01) >= 0.95
+    result = rotated_rollout_error(task, episodes=200, actor=actions)
+    assert result.share_close() >= 0.95
