@@ -89,8 +89,8 @@ class BestOfNAgent(EitherAgent):
         noise = self.gaussian_noise(size * len(obs))
         repeated = obs.repeat_interleave(size, 0)
         q = self.reduced(self.q_values(repeated, noise)).view(len(obs), size)
-        rows = torch.arange(len(obs), device=self.device)
-        return noise.unflatten(0, (len(obs), size))[rows, q.argmax(1)]
+        states = torch.arange(len(obs), device=self.device)
+        return noise.unflatten(0, (len(obs), size))[states, q.argmax(1)]
 
     def drawn(self, obs: torch.Tensor) -> Drawn:
         """Nothing is drawn: the candidates are in the batch."""

@@ -71,15 +71,15 @@ class ConstrainedAgent(AsymmetricAgent):
     def penalty(self, name: str, batch: Batch) -> torch.Tensor | None:
         """The part of the Lagrangian that depends on gamma."""
         terms = []
-        for _, own in self.networks[name].layers():
-            size = own["gamma"].abs() if self.options.elastic else own["gamma"]
-            terms.append((own["multiplier"].detach() * size).sum())
+        for _, layer in self.networks[name].layers():
+            size = layer["gamma"].abs() if self.options.elastic else layer["gamma"]
+            terms.append((layer["multiplier"].detach() * size).sum())
         return torch.stack(terms).sum()
 
     def settle(self, name: str) -> None:
         """One step of dual ascent."""
-        for _, own in self.networks[name].layers():
-            gamma, multiplier = own["gamma"], own["multiplier"]
+        for _, layer in self.networks[name].layers():
+            gamma, multiplier = layer["gamma"], layer["multiplier"]
             if self.options.elastic:
                 multiplier.add_(self.options.dual_lr * (gamma.abs() - multiplier)).clamp_(min=0)
             else:

@@ -55,8 +55,8 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
     if options.critic == "aliased":
         gap = (agent.noise_q_values(obs, noise) - q_here).abs().mean().item()
     # What the critics gain by the actor; if the returns do not, it exploits errors of theirs.
-    own, random = agent.act(obs, True), agent.gaussian_noise(len(obs), played.generator)
-    preference = (agent.q_values(obs, own) - agent.q_values(obs, random)).mean().item()
+    steered, random = agent.act(obs, True), agent.gaussian_noise(len(obs), played.generator)
+    preference = (agent.q_values(obs, steered) - agent.q_values(obs, random)).mean().item()
     return {
         "q_mean": smallest.mean().item(),
         "q_min": smallest.min().item(),

@@ -23,7 +23,6 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Layout
 
 SMALL = 1e-4
@@ -42,9 +41,6 @@ class SquashedGaussian(nn.Module):
     Args:
         layout: geometry of the flattened noise, ``dim`` numbers in ``blocks`` irrep blocks.
         bound: largest norm of a block, > 0.
-
-    Raises:
-        UserError: if the bound is not positive.
     """
 
     index: torch.Tensor
@@ -53,8 +49,6 @@ class SquashedGaussian(nn.Module):
 
     def __init__(self, layout: Layout, bound: float):
         super().__init__()
-        if not bound > 0:
-            raise UserError(f"the noise bound must be positive, not {bound}")
         self.bound = bound
         self.dim, self.blocks = layout.dim, len(layout.blocks)
         # The means, then one invariant number per irrep block.

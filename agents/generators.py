@@ -25,11 +25,11 @@ def continue_stream(generator: torch.Generator, state: torch.Tensor) -> None:
         raise ValueError(f"the state of a generator has the shape {list(state.shape)}")
 
 
-def tensor_like(stored: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
-    """A stored tensor as ``own`` is; a copy would repeat one of another shape, so it is refused."""
-    if stored.shape != own.shape:
-        raise ValueError(f"a tensor has the shape {list(stored.shape)}, not {list(own.shape)}")
-    return stored.to(own)
+def tensor_like(stored: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """A stored tensor as another is; a copy would repeat one of another shape, so it is refused."""
+    if stored.shape != like.shape:
+        raise ValueError(f"a tensor has the shape {list(stored.shape)}, not {list(like.shape)}")
+    return stored.to(like)
 
 
 def owned(tree: Any) -> Any:

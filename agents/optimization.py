@@ -25,14 +25,14 @@ class Adam(torch.optim.Adam):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with stored moments; torch does not check that they fit the parameters."""
-        own = self.state_dict()["param_groups"]
+        groups = self.state_dict()["param_groups"]
         parameters = dict(enumerate(p for group in self.param_groups for p in group["params"]))
         for index, moments in state["state"].items():
             for name in ("exp_avg", "exp_avg_sq"):
                 tensor_like(moments[name], parameters[index])
             if moments.keys() != {"step", "exp_avg", "exp_avg_sq"} or not moments["step"] >= 1:
                 raise ValueError("an optimiser has other moments")
-        super().load_state_dict({"state": state["state"], "param_groups": own})
+        super().load_state_dict({"state": state["state"], "param_groups": groups})
 
 
 class Multiplier:

@@ -111,7 +111,7 @@ class PartialAgent(StandardAgent):
             "gate": self.layers(self.action_inputs, VALUE),
             "state_gate": self.layers(self.obs_layout, VALUE),
         }
-        return networks | {name: self._network([own]) for name, own in layers.items()}
+        return networks | {name: self._network([each]) for name, each in layers.items()}
 
     # The mixtures.
 

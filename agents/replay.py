@@ -95,18 +95,9 @@ class ReplayBuffer:
         return self.size
 
     def add(self, transition: Transition | Mapping[str, torch.Tensor]) -> None:
-        """Append N transitions; other fields than those of the buffer are ignored.
-
-        Raises:
-            UserError: if N exceeds the capacity.
-        """
+        """Append N transitions, at most the capacity; fields that the buffer lacks are ignored."""
         new = transition if isinstance(transition, Mapping) else vars(transition)
         count = len(new["reward"])
-        if count > self.capacity:
-            raise UserError(
-                f"{count} transitions at once do not fit a replay buffer of {self.capacity}; "
-                "raise replay_capacity"
-            )
         self._grow(min(self.position + count, self.capacity))
         rows = (torch.arange(count, device=self.device) + self.position) % self.capacity
         for name, kept in self.storage.items():

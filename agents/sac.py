@@ -456,8 +456,8 @@ class SacAgent(Agent):
     def description(self) -> dict[str, Any]:
         """Agent, geometry and sizes; a checkpoint must have the same."""
         keys = ("critic", "group", "width", "depth", "critics", "layer_norm", "activation")
-        own = {key: getattr(self.options, key) for key in (*keys, "noise_bound")}
-        return {**super().description(), **own}
+        sizes = {key: getattr(self.options, key) for key in (*keys, "noise_bound")}
+        return {**super().description(), **sizes}
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimisers, multipliers, generators; loads with ``weights_only=True``."""
@@ -485,8 +485,8 @@ class SacAgent(Agent):
             for name, loadable in getattr(self, kind).items():
                 loadable.load_state_dict(state[kind][name])
         with torch.no_grad():
-            for own, stored in zip(_flat(self.target), state["target"], strict=True):
-                own.copy_(tensor_like(stored, own))
+            for tensor, stored in zip(_flat(self.target), state["target"], strict=True):
+                tensor.copy_(tensor_like(stored, tensor))
         for name, generator in self.generators.items():
             continue_stream(generator, state["generators"][name])
         for name in COUNTERS:

@@ -230,6 +230,6 @@ def _each(functions: Sequence[Callable[..., torch.Tensor]]) -> Callable[..., tor
 
     def call(*arguments: torch.Tensor) -> torch.Tensor:
         each = zip(functions, *arguments, strict=True)
-        return torch.stack([function(*parts) for function, *parts in each])
+        return torch.stack([function(*given) for function, *given in each])
 
     return call

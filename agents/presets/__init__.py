@@ -35,9 +35,9 @@ def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
     preset, path = read_model(name, "preset", FOLDER, RootModel[dict[str, dict[str, Any]]])
     tables = preset.root
     valid = [field.name for field in dataclasses.fields(options)]
-    special = tables.get(agent, {})
-    check(f"option of {agent}", special, valid, path.name)
-    return {key: value for key, value in tables.get("all", {}).items() if key in valid} | special
+    of_agent = tables.get(agent, {})
+    check(f"option of {agent}", of_agent, valid, path.name)
+    return {key: value for key, value in tables.get("all", {}).items() if key in valid} | of_agent
 
 
 def tuned(agent: type[T]) -> type[T]:

@@ -104,11 +104,13 @@ class Problem:
             return torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)
 
         ends = (torch.rand(size, generator=g) < 0.3).to(dtype)
-        found = {name: draw(size, *shape) for name, shape in self.shapes(rows).items()}
-        found["terminal"] = ends if terminal is None else torch.full((size,), terminal, dtype=dtype)
-        found["truncated"] = torch.zeros(size, dtype=dtype)
-        found["discount"] = torch.full((size,), 0.95, dtype=dtype)
-        return Batch(found)
+        fields = {name: draw(size, *shape) for name, shape in self.shapes(rows).items()}
+        fields["terminal"] = (
+            ends if terminal is None else torch.full((size,), terminal, dtype=dtype)
+        )
+        fields["truncated"] = torch.zeros(size, dtype=dtype)
+        fields["discount"] = torch.full((size,), 0.95, dtype=dtype)
+        return Batch(fields)
 
     def transition(self, size=32, seed=0, rows=None):
         batch = self.batch(size, seed, rows=rows)

@@ -20,8 +20,9 @@ def filled(problem, name="standard", **options):
 
 def gap(agent, obs, noise):
     """Spread of Q(s, decode(s, w)) - Q_W(s, w), over that of Q(s, decode(s, w))."""
-    wanted, found = agent.q_values(obs, noise), agent.noise_q_values(obs, noise)
-    return ((found - wanted).square().mean() / wanted.var()).sqrt().item()
+    wanted = agent.q_values(obs, noise)
+    apart = agent.noise_q_values(obs, noise) - wanted
+    return (apart.square().mean() / wanted.var()).sqrt().item()
 
 
 def where_it_distils(agent):

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from symsteer.agents.distributions import SMALL, SquashedGaussian
-from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Group, Layout
 
 LAYOUT = Layout([Field("xy", 1), Field("z", 0), Field("tilt", 1, odd=True), Field("rod", 2)])
@@ -120,8 +119,3 @@ def test_saturation():
     noise[LAYOUT.slice("tilt")] = torch.tensor([1.2, 0.9])  # norm 1.5
     noise[LAYOUT.slice("z")] = 1.3
     assert gaussian.saturated(noise).tolist() == [False, False, True, False]
-
-
-def test_bound_must_be_positive():
-    with pytest.raises(UserError, match="positive"):
-        SquashedGaussian(LAYOUT, 0.0)

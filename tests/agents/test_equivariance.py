@@ -103,14 +103,6 @@ def test_the_control_is_exact_under_its_mirrored_action(problem, critic):
     assert shapes[0] == shapes[1]
 
 
-def test_a_tanh_per_axis_is_seen(problem):
-    agent = problem.agent("equivariant", **DOUBLE)
-    agent.distribution.squash = lambda mean: 1.5 * mean.tanh()
-    worst = errors(agent, problem)
-    assert worst["mean"] < 1e-10
-    assert worst["deterministic"] > 1e-2
-
-
 def test_normalizers_must_commute_with_the_group(problem):
     block = problem.obs_layout.slice("tcp_xy")
     for scaled, broken in ((block.start, True), (block, False)):

@@ -100,9 +100,8 @@ EXECUTED = 4
         ),
     ],
 )
-@pytest.mark.parametrize("name", [name for name in TRAINED if (name, "dsrl") not in REFUSED])
-def test_presets_are_the_published_settings(name, preset, own):
-    options = AGENTS.get(name).Options(**preset_options(preset, name, AGENTS.get(name).Options))
+def test_presets_are_the_published_settings(preset, own):
+    options = StandardAgent.Options(**preset_options(preset, "standard", StandardAgent.Options))
     found = {key: getattr(options, key) for key in DSRL | own}
     assert found == DSRL | own
 

@@ -99,8 +99,6 @@ def test_sampling_is_seeded_and_continues_after_loading():
 def test_mistakes_are_named():
     with pytest.raises(UserError, match="empty"):
         ReplayBuffer(4, SHAPES).sample(1, GAMMA)
-    with pytest.raises(UserError, match="replay_capacity"):
-        ReplayBuffer(4, SHAPES).add(numbered(0, 5))
     with pytest.raises(UserError, match="capacity"):
         ReplayBuffer(0, SHAPES)
     other = ReplayBuffer(4, {**SHAPES, "obs": (3,)})
