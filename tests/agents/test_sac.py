@@ -9,17 +9,13 @@ import torch
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import Budget
-from symsteer.agents.diagnostics import actor_equivariance_error
 from symsteer.agents.networks import count
-from symsteer.agents.replay import Transition
 from symsteer.agents.sac import SacAgent
 from symsteer.agents.standard import StandardAgent
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Field, Group, Layout
-from tests.marks import slow_except
+from symsteer.policies.geometry import Field, Layout
 
 LEARNERS = ["standard", "standard-matched", "augmented", "equivariant", "residual-pathway"]
-SAC = ["standard", "augmented", "equivariant", "residual-pathway"]
 CRITICS = ["noise", "aliased", "sampler"]
 
 
@@ -341,74 +337,3 @@ def test_a_budget_within_the_warm_up_is_refused(problem):
     with pytest.raises(UserError, match="nothing would be learned"):
         SacAgent.check(options, Budget(160, 4, 4, 50))
     SacAgent.check(options, Budget(161, 4, 4, 50))
-
-
-# A bandit: the best noise is a known function of the observation, the reward is minus the squared
-# distance to it. Unbroken, it rotates with the scene. Broken, a part of it is fixed in the world.
-
-BANDIT_OBS = Layout([Field("xy", 1), Field("height", 0), Field("rod", 2)])
-BANDIT_ACT = Layout([Field("xy", 1), Field("z", 0)])
-
-
-def best_noise(obs, broken):
-    direction = obs[:, BANDIT_OBS.slice("xy")]
-    direction = direction / direction.norm(dim=1, keepdim=True)
-    left = 0.9 * torch.stack([-direction[:, 1], direction[:, 0]], dim=1)
-    if broken:
-        left = 0.5 * left + torch.tensor([0.7, 0.0])
-    z = 0.8 * obs[:, BANDIT_OBS.slice("height")].tanh()
-    return torch.cat([left, z], dim=1).unsqueeze(1).expand(-1, 2, -1)
-
-
-def bandit_reward(obs, noise, broken):
-    return -(noise - best_noise(obs, broken)).square().sum((1, 2))
-
-
-def solve(problem, name, broken, rounds=400, **options):
-    """Final reward of the deterministic actor and its equivariance error."""
-    bandit = dataclasses.replace(
-        problem,
-        obs_layout=BANDIT_OBS,
-        act_layout=BANDIT_ACT,
-        horizon=2,
-        options={**problem.options, "width": 128, "batch_size": 128},
-    )
-    agent, base = bandit.agent(name, **options), bandit.agent("base", seed=1)
-    g = torch.Generator().manual_seed(2)
-    for i in range(rounds):
-        obs = torch.randn(64 if i else 512, BANDIT_OBS.dim, generator=g)
-        noise = (agent if i else base).act(obs)
-        agent.observe(
-            Transition(
-                obs=obs,
-                noise=noise,
-                actions=agent.executed(obs, noise),
-                reward=bandit_reward(obs, noise, broken),
-                next_obs=obs,
-                terminal=torch.ones(len(obs)),
-                truncated=torch.zeros(len(obs)),
-            )
-        )
-        agent.update(agent.replay.sample(128, agent.options.gamma))
-    obs = torch.randn(512, BANDIT_OBS.dim, generator=g)
-    reward = bandit_reward(obs, agent.act(obs, deterministic=True), broken).mean().item()
-    error = actor_equivariance_error(agent, obs, Group.parse("C8"))
-    return reward, error
-
-
-@pytest.mark.parametrize("name", slow_except(SAC, "standard", "equivariant"))
-def test_learns_a_symmetric_problem(problem, name):
-    """Best is 0, standing still about -2.1, the base policy about -8."""
-    reward, error = solve(problem, name, broken=False)
-    assert reward > -0.6
-    if name == "equivariant":
-        assert error < 1e-5
-    if name == "residual-pathway":
-        assert error < 0.2
-
-
-def test_the_strict_agent_cannot_solve_a_broken_problem(problem):
-    """Others can (test_asymmetry.py)."""
-    reward, error = solve(problem, "equivariant", broken=True)
-    assert error < 1e-5
-    assert reward < -0.8
