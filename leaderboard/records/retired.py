@@ -19,6 +19,12 @@ RETIRED: dict[str, JsonValue] = {
     "learning_starts": None,
     "actor_delay": 0,
     "demonstration_share": 0.0,
+    "warmup_noise": "gaussian",
+    "initial_scale": 0.5,
+    "actor_penalty": None,
+    "critic_penalty": None,
+    "augmentation": "C8",
+    "slack_price": 1.0,
 }
 """Options of the SAC agents, and the one value that was ever used."""
 
