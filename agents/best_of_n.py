@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import nn
 
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.episodes import Played
-from symsteer.agents.networks import Ensemble
 from symsteer.agents.options import Critic, EitherOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
@@ -58,9 +58,9 @@ class BestOfNAgent(EitherAgent):
         super().__init__(context, options)
         self.multipliers = {}
 
-    def _networks(self) -> dict[str, Ensemble]:
-        """The critics."""
-        return {"critic": super()._networks()["critic"]}
+    def _members(self) -> dict[str, list[list[nn.Module]]]:
+        """Those of the critics."""
+        return {"critic": super()._members()["critic"]}
 
     @property
     def alpha(self) -> torch.Tensor:

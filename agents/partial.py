@@ -38,7 +38,7 @@ from symsteer.agents.agent import AgentContext
 from symsteer.agents.episodes import Played
 from symsteer.agents.equivariant import equivariant_layers
 from symsteer.agents.generators import tensor_like
-from symsteer.agents.networks import Ensemble, Weights
+from symsteer.agents.networks import Weights
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
@@ -101,17 +101,16 @@ class PartialAgent(StandardAgent):
         """What is predicted: the change of the observation, and the reward."""
         return Layout([*self.obs_layout.fields, Field("reward", 0)])
 
-    def _networks(self) -> dict[str, Ensemble]:
-        """Actor, critics, predictors and gates."""
-        networks, predicted = super()._networks(), (self.action_inputs, self.following)
+    def _members(self) -> dict[str, list[list[nn.Module]]]:
+        """Those of actor and critics, both kinds of layers, and of predictors and gates."""
+        members, predicted = super()._members(), (self.action_inputs, self.following)
         torch.manual_seed(self.context.seed + 1)
-        layers = {
-            "strict_predictor": equivariant_layers(*predicted, self.options),
-            "plain_predictor": self.layers(*predicted),
-            "gate": self.layers(self.action_inputs, VALUE),
-            "state_gate": self.layers(self.obs_layout, VALUE),
+        return members | {
+            "strict_predictor": [equivariant_layers(*predicted, self.options)],
+            "plain_predictor": [self.layers(*predicted)],
+            "gate": [self.layers(self.action_inputs, VALUE)],
+            "state_gate": [self.layers(self.obs_layout, VALUE)],
         }
-        return networks | {name: self._network([each]) for name, each in layers.items()}
 
     # The mixtures.
 
@@ -134,10 +133,10 @@ class PartialAgent(StandardAgent):
         how = (self.actor_inputs, self.actor_layout, self.options, self.options.initial_output)
         return [equivariant_layers(*how), self.actor_layers()]
 
-    def _critics(self, inputs: Layout) -> Ensemble:
+    def _critics(self, inputs: Layout) -> list[list[nn.Module]]:
         count = range(self.options.critics)
         strict = [equivariant_layers(inputs, VALUE, self.options) for _ in count]
-        return self._network([*strict, *(self.critic_layers(inputs) for _ in count)])
+        return strict + super()._critics(inputs)
 
     def _heads(self, policy: Weights, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         outputs = self.actor.apply_weights(policy, obs).unbind(-3)
@@ -197,7 +196,9 @@ class PartialAgent(StandardAgent):
     def _distance(self, one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
         """d ``[B]`` of two predictions ``[B, dim]``."""
         apart = (one - other).square() @ self.blocks
-        return (apart * block_weights(self.sizes)).mean(-1).clamp(min=1e-12)
+        # About 1 / c_k for a block that varies much, 0 for one that never does.
+        weights = self.sizes / (self.sizes + self.sizes.mean()).square()
+        return (apart * weights).mean(-1).clamp(min=1e-12)
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Also the mean of lambda(s) on the states that were visited."""
@@ -213,12 +214,3 @@ class PartialAgent(StandardAgent):
         """Continue exactly where :meth:`state_dict` was taken."""
         super().load_state_dict(state)
         self.sizes.copy_(tensor_like(state["sizes"], self.sizes))
-
-
-def block_weights(sizes: torch.Tensor) -> torch.Tensor:
-    """Weights of squared differences in blocks, from what blocks vary by, ``[blocks]``.
-
-    c_k / (c_k + c)^2 with the mean c: about 1 / c_k for a block that varies much, 0 for one that
-    never does.
-    """
-    return sizes / (sizes + sizes.mean()).square()

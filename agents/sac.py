@@ -106,7 +106,12 @@ class SacAgent(Agent):
         self.target_entropy = options.target_entropy * self.noise_layout.dim
         with torch.random.fork_rng(devices=[]):  # does not change the global generator
             torch.manual_seed(context.seed)
-            self.networks = self._networks()
+            self.networks = {
+                name: Ensemble(members, options.layer_norm, options.activation)
+                for name, members in self._members().items()
+            }
+        for network in self.networks.values():
+            network.to(self.device, self.dtype)
         self.distribution.to(self.device, self.dtype)
         self.target = [(w.clone(), b.clone()) for w, b in detached(self.critic.weights())]
         self.optimizers = {
@@ -496,22 +501,19 @@ class SacAgent(Agent):
 
     # Inner parts.
 
-    def _networks(self) -> dict[str, Ensemble]:
-        """New networks, untrained."""
-        aliased = self.options.critic == "aliased"
+    def _members(self) -> dict[str, list[list[nn.Module]]]:
+        """The layers of each member of each network, new ones."""
         judged = self.noise_inputs if self.options.critic == "noise" else self.action_inputs
-        networks = {"actor": self._network(self._actors()), "critic": self._critics(judged)}
-        return networks | ({"noise_critic": self._critics(self.noise_inputs)} if aliased else {})
-
-    def _network(self, members: list[list[nn.Module]]) -> Ensemble:
-        network = Ensemble(members, self.options.layer_norm, self.options.activation)
-        return network.to(self.device, self.dtype)
+        members = {"actor": self._actors(), "critic": self._critics(judged)}
+        if self.options.critic == "aliased":
+            members["noise_critic"] = self._critics(self.noise_inputs)
+        return members
 
     def _actors(self) -> list[list[nn.Module]]:
         return [self.actor_layers()]
 
-    def _critics(self, inputs: Layout) -> Ensemble:
-        return self._network([self.critic_layers(inputs) for _ in range(self.options.critics)])
+    def _critics(self, inputs: Layout) -> list[list[nn.Module]]:
+        return [self.critic_layers(inputs) for _ in range(self.options.critics)]
 
     def _descend(self, name: str, loss: torch.Tensor, batch: Batch) -> None:
         self.optimizers[name].descend(loss, self.penalty(name, batch))

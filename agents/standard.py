@@ -22,8 +22,8 @@ class StandardAgent(SacAgent):
     in_teams = True
 
     def layers(self, inputs: Layout, outputs: Layout, scale: float = 1.0) -> list[nn.Module]:
-        width = self.width_of(inputs, outputs)
-        layers = plain_layers(inputs.dim, width, self.options.depth, outputs.dim)
+        sizes = [inputs.dim, *[self.width_of(inputs, outputs)] * self.options.depth, outputs.dim]
+        layers: list[nn.Module] = [Dense(a, b) for a, b in itertools.pairwise(sizes)]
         shrink_(layers[-1], scale)
         return layers
 
@@ -69,9 +69,3 @@ class EitherAgent(StandardAgent):
         if self.options.layers == "equivariant":
             return equivariant_layers(inputs, outputs, self.options, scale)
         return super().layers(inputs, outputs, scale)
-
-
-def plain_layers(inputs: int, width: int, depth: int, outputs: int) -> list[nn.Module]:
-    """``depth`` hidden layers of ``width`` and an output layer."""
-    sizes = [inputs, *[width] * depth, outputs]
-    return [Dense(a, b) for a, b in itertools.pairwise(sizes)]

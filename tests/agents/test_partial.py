@@ -124,7 +124,8 @@ def test_in_a_symmetric_world_they_stay_closed():
     agent, seen, windy = learned("nothing")
     share = agent._share(agent._features(seen.obs), None)
     assert share.mean() < 0.35
-    assert auroc(agent.share(seen.obs, seen.actions), windy) < 0.75
+    of_actions = agent.share(seen.obs, seen.actions)
+    assert auroc(of_actions, windy) < 0.75
 
 
 def test_noise_and_actions_must_differ():
