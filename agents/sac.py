@@ -461,8 +461,8 @@ class SacAgent(Agent):
     def description(self) -> dict[str, Any]:
         """Agent, geometry and sizes; a checkpoint must have the same."""
         keys = ("critic", "group", "width", "depth", "critics", "layer_norm", "activation")
-        sizes = {key: getattr(self.options, key) for key in (*keys, "noise_bound")}
-        return {**super().description(), **sizes}
+        sizes = {key: getattr(self.options, key) for key in keys}
+        return {**super().description(), **sizes, "noise_bound": self.options.noise_bound}
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimisers, multipliers, generators; loads with ``weights_only=True``."""

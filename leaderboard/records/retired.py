@@ -21,12 +21,17 @@ RETIRED: dict[str, JsonValue] = {
     "demonstration_share": 0.0,
     "warmup_noise": "gaussian",
     "initial_scale": 0.5,
-    "actor_penalty": None,
-    "critic_penalty": None,
-    "augmentation": "C8",
-    "slack_price": 1.0,
 }
 """Options of the SAC agents, and the one value that was ever used."""
+
+RETIRED_BESIDE: dict[str, dict[str, JsonValue]] = {
+    "penalty": {"actor_penalty": None, "critic_penalty": None},
+    "dual_lr": {"slack_price": 1.0},
+}
+"""Options of those of them that have another option."""
+
+RETIRED_OF_AUGMENTED: dict[str, JsonValue] = {"augmentation": "C8"}
+"""Options of the agent `augmented`."""
 
 RETIRED_OF_RUNS: dict[str, JsonValue] = {"keep_replay": False}
 """Options of runs of any agent."""
@@ -43,8 +48,8 @@ def with_retired(config: Mapping[str, Any]) -> dict[str, Any]:
     policy, options = config.get("policy"), config.get("agent_options")
     is_old = not isinstance(policy, Mapping) or POLICY_OPTION not in policy
     whole = dict(config) if is_old else {**RETIRED_OF_RUNS, **config}
-    if isinstance(options, Mapping) and SAC_OPTION in options:
-        whole["agent_options"] = {**RETIRED, **options}
+    if isinstance(options, Mapping):
+        whole["agent_options"] = {**_retired_of(config), **options}
     return whole
 
 
@@ -57,9 +62,20 @@ def without_retired(config: Mapping[str, Any], known: Collection[str]) -> dict[s
     """
     kept = _without(config, RETIRED_OF_RUNS, ())
     options = kept.get("agent_options")
-    if isinstance(options, Mapping) and SAC_OPTION in options:
-        kept["agent_options"] = _without(options, RETIRED, known)
+    if isinstance(options, Mapping):
+        kept["agent_options"] = _without(options, _retired_of(config), known)
     return kept
+
+
+def _retired_of(config: Mapping[str, Any]) -> dict[str, JsonValue]:
+    """The options that the agent of a configuration once had."""
+    options = config["agent_options"]
+    if SAC_OPTION not in options:
+        return {}
+    retired = dict(RETIRED)
+    for option, beside in RETIRED_BESIDE.items():
+        retired |= beside if option in options else {}
+    return retired | (RETIRED_OF_AUGMENTED if config.get("agent") == "augmented" else {})
 
 
 def _without(
