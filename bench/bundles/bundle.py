@@ -38,13 +38,12 @@ from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import TASKS, make, task_class
 from symsteer.errors import UserError
 from symsteer.files import prepare_folder, write_atomically
-from symsteer.leaderboard.records import flat
+from symsteer.leaderboard.records import repeat_command
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path
 from symsteer.policies.geometry import Group
 from symsteer.policies.steerability import decode_error, evenly
 from symsteer.tables import markdown
-from symsteer.terminal import option_words, to_paste
 
 PARALLEL = 100
 """Parallel environments in which a policy is measured, at most."""
@@ -202,31 +201,22 @@ def _card(manifest: BundleManifest, config: RunConfig) -> str:
         f"The task: {TASKS.summary(config.task)}",
         _measured_table(manifest.measured or {}),
         "## How to use it\n\n```sh\n{}\n```".format("\n".join(use)),
-        f"## How it was made\n\n{how_made(config, manifest.origin)}",
+        f"## How it was made\n\n{_how_made(config, manifest.origin)}",
         f"## Files\n\n{markdown(['file', 'bytes', 'SHA-256'], table)}",
         f"## Licence\n\n{LICENCES}",
     ]
     return "\n\n".join(blocks) + "\n"
 
 
-def how_made(config: RunConfig, origin: Mapping[str, str]) -> str:
+def _how_made(config: RunConfig, origin: Mapping[str, str]) -> str:
     """The command that makes the same policy, or where it came from."""
     if origin:
         files = ", ".join(f"{kind} with SHA-256 `{key}`" for kind, key in origin.items())
         return f"The run that it was taken from began with files of its user: {files}."
-    wanted, defaults = config.demonstrations, flat(type(config.policy)().to_json())
-    options = [
-        word
-        for key, value in flat(config.policy.to_json()).items()
-        if value != defaults[key]
-        for word in option_words(f"policy.{key}", value)
-    ]
-    command = to_paste(
-        *("symsteer", "run", "--task", config.task, "--embodiment", config.embodiment),
-        *("--policy.name", config.policy_name, "--policy-seed", config.policy_seed),
-        *("--demonstrations.mode", wanted.mode, "--demonstrations.count", wanted.count),
-        *("--demonstrations.seed", wanted.seed, *options),
-    )
+    settings = config.to_json()
+    keys = ("task", "embodiment", "demonstrations", "policy", "policy_seed")
+    command = repeat_command({**{key: settings[key] for key in keys}, "agent_options": {}})
+    command = command or "symsteer run  # with the settings in manifest.json"
     return f"`symsteer run` trains this policy before it steers it:\n\n```sh\n{command}\n```"
 
 
