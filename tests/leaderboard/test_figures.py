@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from pathlib import Path
 
 import pytest
@@ -12,13 +13,13 @@ from matplotlib.collections import FillBetweenPolyCollection
 from matplotlib.figure import Figure
 
 from symsteer.agents import AGENTS
-from symsteer.leaderboard.figures import MANY, STYLES, learning_curves
+from symsteer.leaderboard.figures import MANY, STYLES, learning_curves, q_values
 from symsteer.leaderboard.plots import cut
 from symsteer.leaderboard.row_numbers import summarize
 from symsteer.leaderboard.rows import Table
 from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.svg import SHEETS, draw, plain
-from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
+from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record, summary_of
 
 LEARNERS = [name for name in AGENTS.names() if AGENTS.get(name).role != "reference"]
 
@@ -77,3 +78,14 @@ def test_names_of_any_kind_are_drawn_as_text() -> None:
     """matplotlib would read mathematics between dollars, and has no glyphs for everything."""
     assert cut("a\n\x00b" + "c" * 60) == "a b" + "c" * 34 + "..."
     assert plain("$x$ \u00a0\u202e") == "?x?  ?"
+
+
+def test_a_cross_marks_a_q_that_is_not_finite_and_no_missing_bias() -> None:
+    def crosses(**diagnostics: float) -> int:
+        curve = [make_evaluation([1, 0], 25_000, False, q_mean=-5.0, q_max=-4.0)]
+        curve.append(make_evaluation([1, 0], 50_000, q_mean=-5.0, **diagnostics))
+        (plot,) = q_values(summary_of([make_record(curve)]).tables).plots
+        return sum(trace.cross > 0 for trace in plot.traces)
+
+    assert crosses(q_max=math.inf) == 1
+    assert crosses(q_max=-4.0, q_bias=math.nan) == 0
