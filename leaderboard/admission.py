@@ -42,6 +42,7 @@ from symsteer.leaderboard.records import (
 )
 from symsteer.leaderboard.records.provenance import checkout, git
 from symsteer.leaderboard.records.repeat import KEYS
+from symsteer.leaderboard.records.retired import RETIRED_OF_RUNS
 from symsteer.leaderboard.records.schema import Q_VALUES
 from symsteer.leaderboard.records.values import Count, Sha256
 from symsteer.leaderboard.rows import MIN_SEEDS
@@ -108,7 +109,7 @@ class Judged:
         self.least = least
         # Version 0.1 called the agent's options `sac`.
         options = "agent_options" if "agent_options" in record.config else "sac"
-        if strange := record.config.keys() - KEYS - {*DERIVED, options}:
+        if strange := record.config.keys() - KEYS - {*DERIVED, *RETIRED_OF_RUNS, options}:
             raise UserError(f"it has a key {min(strange)!r}")
         values = {re.sub("^sac", "agent_options", k): v for k, v in flat(record.config).items()}
         self.config = c = Configuration.model_validate(values)
