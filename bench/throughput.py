@@ -14,6 +14,7 @@ import torch
 
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import Agent, AgentContext
+from symsteer.bench.sim.environment import MAX_SCENES
 from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
@@ -48,11 +49,16 @@ def measure(
     Raises:
         UserError: an unknown name, or a number out of range.
     """
-    if not 0 < seconds < math.inf or min(*num_envs, *workers, 1) < 1:
+    most = max(num_envs, default=0)
+    if not 0 < seconds < math.inf or min(*num_envs, *workers, most) < 1:
         raise UserError("--seconds, --num-envs and --workers must be positive")
     cores = len(os.sched_getaffinity(0))
     if max(workers, default=1) > cores:
         raise UserError(f"--workers is {max(workers)}; this machine has {cores} cores")
+    if any(most > MAX_SCENES * processes for processes in workers):
+        raise UserError(
+            f"one process simulates at most {MAX_SCENES} environments; --num-envs has {most}"
+        )
     rows = []
     for processes in workers:
         for count in (count for count in num_envs if count >= processes):
