@@ -12,10 +12,9 @@ from symsteer.bench.cli import Trust
 from symsteer.errors import UserError
 from symsteer.registry import allow
 from symsteer.tables import aligned
-from symsteer.terminal import printable
+from symsteer.terminal import printable, to_paste
 
 if TYPE_CHECKING:
-    from symsteer.bench.audit.result import AuditSettings
     from symsteer.leaderboard.defects import Audit
     from symsteer.leaderboard.sections.unknown_task import LeaveOut
     from symsteer.leaderboard.statistics import Interval
@@ -29,15 +28,12 @@ def advise(
     group: str = "C8",
     audit: Path | None = None,
     records: tuple[Path, ...] = (),
-    states: int = 32,
-    runs: Path = Path("runs"),
     json: Path | None = None,
     trust: Trust = (),
 ) -> int:
     """Say which agent to take in a world, and how sure that is (docs/advise.md).
 
-    The world is named by --task, or by a file of `symsteer audit`. What the committed audit does
-    not have is measured first.
+    The world is named by --task, if the committed audit has it, or by what `symsteer audit` wrote.
 
     Args:
         task: Task; `symsteer list` names them.
@@ -47,8 +43,6 @@ def advise(
         audit: What `symsteer audit --out` wrote, the folder or its audit.json or summary.json.
         records: Folders of runs or records, each a study of its own; default: the committed
             records.
-        states: States of the expert and of the base policy, each, of an audit that is measured.
-        runs: Folder of the runs; base policies of an audit that is measured are kept in RUNS/base.
         json: Write everything into this file, too.
     """
     allow(task, variant, *trust)
@@ -63,16 +57,17 @@ def advise(
     from symsteer.leaderboard.which_agent import advise
 
     folders = chosen_records(records, "advise", "--records RUNS")
-    # Mistakes first: to read the records takes seconds, to measure a world minutes.
-    settings = _named(task, embodiment, variant, group, states) if task is not None else None
-    worlds = [] if audit is None else [(world, f"measured, {audit}") for world in _audited(audit)]
+    defects = read_audit()
+    # Mistakes first: to read the records takes seconds.
+    if task is not None:
+        worlds = [(_committed(task, embodiment, variant, group, defects), "committed audit")]
+    else:
+        assert audit is not None
+        worlds = [(world, f"measured, {audit}") for world in _audited(audit)]
     # Of the committed records, submitted ones that nobody has made again give no advice.
     listed = None if records else read_list(FOLDER / f"{STUDY}.toml")
     marks = None if records else REPRODUCTIONS
     summaries = [summarize(load_runs([folder], marks, listed)) for folder in folders]
-    defects = read_audit()
-    if settings is not None:
-        worlds = [_world(settings, runs, defects)]
     embodiments = dict.fromkeys(world.embodiment for world, _ in worlds)
     tests = [leave_tasks_out(summaries, defects, name) for name in embodiments]
     advices = [(advise(summaries, defects, world), source) for world, source in worlds]
@@ -94,33 +89,27 @@ def advise(
     return 0
 
 
-def _named(task: str, embodiment: str, variant: str, group: str, states: int) -> AuditSettings:
-    """The settings of an audit of a world that is named."""
+def _committed(task: str, embodiment: str, variant: str, group: str, audit: Audit) -> AuditedWorld:
+    """A world of the committed audit."""
     from symsteer.bench.audit.result import AuditSettings
     from symsteer.bench.audit.study import cells
+    from symsteer.leaderboard.defects import in_order
+    from symsteer.leaderboard.which_agent import AuditedWorld
 
-    template = AuditSettings(embodiment=embodiment, group=group, count=states)
-    named = cells([task], [variant], template)
+    named = cells([task], [variant], AuditSettings(embodiment=embodiment, group=group))
     if len(named) != 1:
         raise UserError("name one task and one variant, not all")
     (settings,) = named
     settings.check()
-    return settings
-
-
-def _world(settings: AuditSettings, runs: Path, audit: Audit) -> tuple[AuditedWorld, str]:
-    """A world with its committed or measured defect, and where that is from."""
-    from symsteer.bench.audit.report import summary, summary_json
-    from symsteer.bench.audit.study import run_audits
-    from symsteer.leaderboard.defects import in_order
-    from symsteer.leaderboard.which_agent import AuditedWorld
-
     place = settings.task, settings.embodiment, in_order(settings.variant), settings.group
     if defect := audit.get(place):
-        return AuditedWorld(*place, defect), "committed audit"
-    (result,) = run_audits([settings], runs)
-    (world,) = _worlds(summary_json([summary(result)]).encode(), runs)
-    return world, f"measured now, {settings.count} states"
+        return AuditedWorld(*place, defect)
+    where = ("--task", task, "--embodiment", embodiment, "--variant", variant, "--group", group)
+    measure = to_paste("symsteer", "audit", *where, "--out", "found")
+    raise UserError(
+        f"the committed audit has no {variant} of {task}, {embodiment}, {group}; measure it with: "
+        f"{measure}; then: symsteer advise --audit found"
+    )
 
 
 def _audited(path: Path) -> list[AuditedWorld]:

@@ -51,7 +51,7 @@ advise
 advise --task Nothing
 advise --task PickCube-v1 --variant wnid:1
 advise --task PickCube-v1 --audit x.json
-advise --task PickCube-v1 --states few
+advise --task PickCube-v1 --group few
 advise --audit nowhere
 advise --audit x.json
 advise --task PickCube-v1 --records nowhere
