@@ -54,11 +54,16 @@ def measure(
         raise UserError("--seconds, --num-envs and --workers must be positive")
     cores = len(os.sched_getaffinity(0))
     if max(workers, default=1) > cores:
-        raise UserError(f"--workers is {max(workers)}; this machine has {cores} cores")
+        raise UserError(
+            f"--workers is {max(workers)}; this machine has {cores} cores, so name at most {cores}"
+        )
     if any(most > MAX_SCENES * processes for processes in workers):
         raise UserError(
-            f"one process simulates at most {MAX_SCENES} environments; --num-envs has {most}"
+            f"one process simulates at most {MAX_SCENES} environments, and --num-envs has {most}; "
+            "lower it"
         )
+    task_class(task)
+    AGENTS.get(agent)
     rows = []
     for processes in workers:
         for count in (count for count in num_envs if count >= processes):

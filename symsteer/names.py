@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from symsteer.errors import UserError
 
 LONGEST_NAME = 80
-"""Characters of a wrong name that are quoted."""
+"""Characters of a wrong name that are quoted: its end, which tells paths apart."""
 
 
 def check(kind: str, names: Iterable[str], valid: Iterable[str], where: str = "") -> None:
@@ -29,7 +29,7 @@ def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> User
         where: the file or command with the name; the message begins with it.
     """
     valid = list(valid)
-    name = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..."
+    name = name if len(name) <= LONGEST_NAME else f"...{name[-LONGEST_NAME:]}"
     close = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
     hint = f"did you mean {close[0]!r}? " if close else ""
     start = f"{where}: " if where else ""

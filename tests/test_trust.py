@@ -71,7 +71,7 @@ SECONDS = 6
 
 IMPORTERS = (
     *("run", "sweep", "tune", "report", "site", "compare", "film", "reproduce", "export", "audit"),
-    *("detect", "advise", "doctor"),
+    *("advise", "doctor"),
 )
 """Verbs that together import every module that a verb imports."""
 

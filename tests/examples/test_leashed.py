@@ -83,7 +83,8 @@ def test_the_suite_of_the_page_has_cells_of_the_leaderboard(tmp_path, monkeypatc
     (tmp_path / "mine.toml").write_text(text)
     assert number == 1
     runs = load_suite(str(tmp_path / "mine.toml")).runs
-    mine = {replace(run, agent="base", agent_options=None) for run in runs}
+    base = [run for run in load_suite("second").runs if run.agent == "base"]
+    mine = {replace(run, agent="base", agent_options=base[0].agent_options) for run in runs}
     assert len(mine) == 40
-    assert mine <= {run for run in load_suite("second").runs if run.agent == "base"}
+    assert mine <= set(base)
     assert {run.agent for run in runs} == {"leashed"}

@@ -90,7 +90,7 @@ def test_no_cell_of_a_plan_is_on_a_leaderboard():
         ("low = 1e-4, high = 1e-1", "low = 1e-1, high = 1e-4", "with low below high"),
         ("low = 1e-4", "low = 0.0", "above 0 with log"),
         ("low = 1e-4", "lowest = 1e-4", "space.lr must be a list of choices"),
-        ("low = 1e-4", "low = nan", "lr is nan; it must be finite"),
+        ("low = 1e-4", "low = nan", "agent option lr must be positive, not nan"),
         ("high = 1e-1", 'high = "1e-1"', "space.lr must be a list of choices"),
         ("lr = 6e-4", "lr = [1]", "space: agent_options.lr: Input should be a valid num"),
         ("[32, 64]", "[32, 64.5]", "tiny.toml: space: agent_options.batch_size: Input should be"),

@@ -16,7 +16,7 @@ from symsteer.bench.runs.config import build_config
 from symsteer.bench.runs.folder import RECORD, run_id
 from symsteer.bench.sweep.schedule import EndedRun
 from symsteer.bench.sweep.survey import look
-from symsteer.bench.tuning import command, plan_summaries
+from symsteer.bench.tuning import command
 from symsteer.bench.tuning.command import Tuner, preview
 from symsteer.bench.tuning.plan import read_plan
 from symsteer.bench.tuning.search import Search, open_storage
@@ -261,8 +261,9 @@ def test_what_is_written_can_be_read_again(whole):
     assert [line.split()[:2] for line in lines] == [["standard", "12"], ["equivariant", "12"]]
 
 
-@pytest.mark.parametrize("name", list(plan_summaries()))
-def test_the_committed_searches_can_be_gone_on_with(name, tmp_path):
+def test_a_committed_search_can_be_gone_on_with(tmp_path):
+    """That of the plan zoo has an agent that is no more."""
+    name = "core"
     for path in RESULTS.glob(f"tuning/{name}*"):
         (tmp_path / "tuning").mkdir(exist_ok=True)
         shutil.copy(path, tmp_path / "tuning")
