@@ -172,11 +172,6 @@ def variant_text(specs: Iterable[VariantSpec]) -> str:
     return "+".join(spec.text for spec in specs) or UNBROKEN
 
 
-def lacks_strength(text: str) -> bool:
-    """Whether a text is a single name without a strength, such as ``wind``."""
-    return text != UNBROKEN and "+" not in text and not _divide(text)[1]
-
-
 def with_strength(text: str, strength: float) -> str:
     """The text of names without strengths, each with this one; other texts stay as they are."""
     parts = text.split("+")
