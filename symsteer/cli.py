@@ -87,6 +87,12 @@ GROUPS = {
 
 VERBS = {name: verb for verbs in GROUPS.values() for name, verb in verbs.items()}
 
+REMOVED = {
+    "base": "`symsteer sweep policies` compares base policies",
+    "detect": "`symsteer audit` measures how broken a task is; no detector was reliable",
+}
+"""Verbs of earlier versions, and what there is in their place."""
+
 
 def main() -> int:
     """Run the verb that the command line names.
@@ -158,6 +164,8 @@ def _run(arguments: Sequence[str]) -> int:
 
         print(f"symsteer {__version__}")
         return 0
+    if name in REMOVED:
+        raise UserError(f"the verb {name!r} was removed in version 0.3.0; {REMOVED[name]}")
     if name not in VERBS:
         raise unknown("verb", name, VERBS)
     verb = VERBS[name]

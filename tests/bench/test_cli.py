@@ -24,7 +24,7 @@ from symsteer.bench import cli
 from symsteer.bench.demos import collect
 from symsteer.bench.sweep.survey import look
 from symsteer.bench.tasks import task_class
-from symsteer.cli import GROUPS, VERBS, _threads
+from symsteer.cli import GROUPS, VERBS, _threads, main
 from symsteer.leaderboard.records import Episodes, write_record
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
@@ -227,6 +227,15 @@ def test_no_command_has_words_that_are_not_quoted():
                 if COMMAND.search(str(text)) and isinstance(value, ast.FormattedValue):
                     found.append(f"{file}:{value.lineno}")
     assert (len(files) > 200, found) == (True, [])
+
+
+@pytest.mark.parametrize(("verb", "now"), [("base", "sweep policies"), ("detect", "audit")])
+def test_a_removed_verb_names_what_does_it_now(verb, now, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["symsteer", verb, "anything"])
+    assert main() == 2
+    assert f"the verb {verb!r} was removed in version 0.3.0; `symsteer {now}`" in (
+        capsys.readouterr().err
+    )
 
 
 def test_the_module_is_the_same_program():
