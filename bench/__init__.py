@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from symsteer.bench.sim.headless import rendering_works
     from symsteer.bench.steering.latent_env import LatentNoiseEnv
     from symsteer.bench.tasks import EMBODIMENTS, TASKS, SymmetricTask, make, task_class
+    from symsteer.bench.tasks.move_cube import PushCube
     from symsteer.bench.tasks.pick_cube import PickCube
     from symsteer.bench.variants import VARIANTS
     from symsteer.bench.variants.base import Variant
@@ -21,6 +22,7 @@ __all__ = [
     "VARIANTS",
     "LatentNoiseEnv",
     "PickCube",
+    "PushCube",
     "SymmetricTask",
     "Variant",
     "make",
@@ -37,6 +39,7 @@ __getattr__ = lazily(
         "VARIANTS": "variants",
         "LatentNoiseEnv": "steering.latent_env",
         "PickCube": "tasks.pick_cube",
+        "PushCube": "tasks.move_cube",
         "SymmetricTask": "tasks.base",
         "Variant": "variants.base",
         "make": "tasks",

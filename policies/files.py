@@ -161,6 +161,7 @@ def load_policy(
         raise UserError(
             f"{path} is damaged: its description does not match its checksum; copy it again"
         )
+    cure = "train it again"
     try:
         description = shallow(json.loads(metadata["policy"]))
         if "config" in description:
@@ -179,6 +180,8 @@ def load_policy(
         with _no_larger_than(10 * sum(tensor.numel() for tensor in tensors.values())):
             policy = kind(options, obs_layout, act_layout)
         policy.to(next(t.dtype for t in tensors.values() if t.is_floating_point()))
+        if description["extension"]:
+            cure += f", or let the constructor of {kind.__name__} build all tensors that fit fills"
         policy.load_state_dict(tensors)
         stored_hash = description["content_hash"]
         policy.training_record = description["training_record"]
@@ -187,9 +190,7 @@ def load_policy(
         raise
     except DAMAGE as error:
         reason = " ".join(first_problem(error).split())[:200]
-        raise UserError(
-            f"{path} is a damaged SymSteer policy ({reason}); train it again"
-        ) from error
+        raise UserError(f"{path} is a damaged SymSteer policy ({reason}); {cure}") from error
     for what, found, expected in (
         ("observation", obs_layout, expect_obs_layout),
         ("action", act_layout, expect_act_layout),

@@ -1,7 +1,9 @@
 """The sections of the leaderboard: each a file that computes, renders and explains one statistic.
 
-To add one, write a file here that ends with a `Section`, name it in `page.SECTIONS`, and test it in
-`tests/leaderboard/sections/`. The page, the site and the CSV files take it from that list.
+To add one, write a file here that ends with a `Section` (`spread_of_results` is a short one),
+import it in `page` and name it in `SECTIONS` there. The page, the site and the CSV files take it
+from that list. What is known of a run is in `runs.Run`. Tests are in `tests/leaderboard/sections/`:
+`make_cell`, `summary_of` and `view_of` of `record_factory` make records with known success.
 """
 
 from __future__ import annotations
