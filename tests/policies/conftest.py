@@ -1,12 +1,12 @@
 """A small symmetric world for the policies' tests: a point mass with an equivariant controller."""
 
-from types import SimpleNamespace
+import contextlib
 
 import pytest
 import torch
 
 from symsteer.policies import POLICIES
-from symsteer.policies.geometry import Field, Layout
+from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
 
 OBS = Layout(
     [
@@ -62,16 +62,26 @@ def controller(obs: torch.Tensor) -> torch.Tensor:
     )
 
 
-def sample_observations(count: int, generator: torch.Generator) -> torch.Tensor:
+def observations(count: int, seed: int = 0) -> torch.Tensor:
+    """Random states ``[count, OBS.dim]``."""
+    return _drawn(count, torch.Generator().manual_seed(seed))
+
+
+def _drawn(count: int, generator: torch.Generator) -> torch.Tensor:
     obs = torch.rand(count, OBS.dim, generator=generator) * 2 - 1
     rod = obs[:, OBS.slice("rod")]
     obs[:, OBS.slice("rod")] = rod / rod.norm(dim=-1, keepdim=True)
     return obs
 
 
+def noises(count: int, seed: int = 1) -> torch.Tensor:
+    """Noise chunks ``[count, 8, ACT.dim]``."""
+    return torch.randn(count, 8, ACT.dim, generator=torch.Generator().manual_seed(seed))
+
+
 def make_episodes(count: int, seed: int = 0, length: int = 8, noise: float = 0.0):
     generator = torch.Generator().manual_seed(seed)
-    obs = sample_observations(count, generator)
+    obs = _drawn(count, generator)
     states, actions = [obs], []
     for _ in range(length):
         action = controller(obs)
@@ -94,39 +104,21 @@ def small_options(name: str = "edp", **fields):
 
 def fit(name: str = "edp", seed: int = 0, progress=None, episodes=None, **fields):
     """A policy trained for a few steps."""
-    if hasattr(POLICIES.get(name).Options, "match_compute"):
-        fields.setdefault("match_compute", False)
+    kind = POLICIES.get(name)
+    few = {"steps": 30, "batch_size": 32, "match_compute": False}
+    few = {key: value for key, value in few.items() if hasattr(kind.Options, key)}
     episodes = make_episodes(6, noise=0.2) if episodes is None else episodes
-    options = small_options(name, **{"steps": 30, "batch_size": 32, **fields})
-    return POLICIES.get(name).fit(options, episodes, OBS, ACT, seed, progress)
+    return kind.fit(small_options(name, **{**few, **fields}), episodes, OBS, ACT, seed, progress)
 
 
-def untrained(name: str = "edp", **fields):
+def untrained(name: str = "edp", layouts=(OBS, ACT), **fields):
     """A policy with random weights."""
     torch.manual_seed(0)
-    return POLICIES.get(name)(small_options(name, **fields), OBS, ACT)
+    return POLICIES.get(name)(small_options(name, **fields), *layouts)
 
 
 @pytest.fixture(scope="session")
-def world() -> SimpleNamespace:
-    """Layouts, controller, episodes and a configuration small enough for tests."""
-    return SimpleNamespace(
-        obs_layout=OBS,
-        act_layout=ACT,
-        controller=controller,
-        observations=lambda count, seed=0: sample_observations(
-            count, torch.Generator().manual_seed(seed)
-        ),
-        episodes=make_episodes,
-        small=SMALL,
-        options=small_options,
-        fit=fit,
-        untrained=untrained,
-    )
-
-
-@pytest.fixture(scope="session")
-def trained(world):
+def trained():
     """Policies trained briefly, each once; ``trained(name, **options)``."""
     cache = {}
 
@@ -136,8 +128,49 @@ def trained(world):
             short = {"steps": 120, "batch_size": 64, "ema_decay": 0.9}
             if fields.get("network") == "unet":
                 short |= {"steps": 100, "batch_size": 32, "width": 16}
-            episodes = world.episodes(24, noise=0.2)
-            cache[key] = world.fit(name, episodes=episodes, **{**short, **fields})
+            cache[key] = fit(name, episodes=make_episodes(24, noise=0.2), **{**short, **fields})
         return cache[key]
 
     return get
+
+
+@contextlib.contextmanager
+def as_type(dtype, *policies):
+    """Policies in another precision for a while."""
+    for policy in policies:
+        policy.to(dtype)
+    try:
+        yield
+    finally:
+        for policy in policies:
+            policy.float()
+
+
+def decode_error(policy, group=None, obs=None, layouts=None, dtype=torch.float32):
+    """Relative equivariance error of decode; inputs are transformed in float64.
+
+    Args:
+        policy: of this precision.
+        group: by default the policy's own.
+        obs: by default states of the point mass, of which some are far out.
+        layouts: of observation and action, how the world turns; by default as the policy believes.
+        dtype: precision of the inputs.
+    """
+    obs_layout, act_layout = layouts or (policy.obs_layout, policy.act_layout)
+    obs = 1.5 * observations(16) if obs is None else obs
+    generator = torch.Generator().manual_seed(1)
+    noise = 1.5 * torch.randn(len(obs), policy.horizon, act_layout.dim, generator=generator)
+    return equivariance_error(
+        lambda *inputs: policy.decode(*(x.to(dtype) for x in inputs)),
+        (obs.double(), noise.double()),
+        (obs_layout, act_layout),
+        act_layout,
+        group or policy.group,
+    )
+
+
+def assert_exact(policy, group: Group | None = None, obs=None, tolerance=1e-5):
+    """It commutes with its group to rounding, in single and in double precision."""
+    for dtype, bound in ((torch.float32, tolerance), (torch.float64, 1e-10)):
+        with as_type(dtype, policy):
+            assert decode_error(policy, group, obs, dtype=dtype) <= bound

@@ -8,53 +8,51 @@ from symsteer.policies import steerability
 from symsteer.policies.normalizer import clip_blocks
 from symsteer.policies.steerability import STILL, action_spread, jumps
 from symsteer.policies.training.demonstrations import make_chunks
+from tests.policies.conftest import ACT, OBS, fit, make_episodes, observations
 
 
-def test_diverse_demonstrations_spread_more_than_clean_ones(world):
+def test_diverse_demonstrations_spread_more_than_clean_ones():
     clean, diverse = (
         action_spread(
-            world.fit(episodes=world.episodes(24, noise=noise), steps=200, batch_size=64),
-            world.observations(32),
+            fit(episodes=make_episodes(24, noise=noise), steps=200, batch_size=64),
+            observations(32),
         )
         for noise in (0.0, 0.6)
     )
     assert diverse > 1.5 * clean
 
 
-def test_the_definition(world):
-    episodes = [(o, a.clone()) for o, a in world.episodes(8, noise=0.2)]
+def test_the_definition():
+    episodes = make_episodes(8, noise=0.2)
     for _, actions in episodes:
-        actions[:, world.act_layout.slice("tilt")] = 0.0  # never moves, so it is left out
-    policy, obs = world.fit(episodes=episodes, steps=5), world.observations(3)
+        actions[:, ACT.slice("tilt")] = 0.0  # never moves, so it is left out
+    policy, obs = fit(episodes=episodes, steps=5), observations(3)
     noise = torch.randn(5, 3, 8, 7, generator=torch.Generator().manual_seed(7))
     actions = torch.stack([policy.decode(obs, w) for w in noise])[:, :, : policy.execute]
-    _, chunks = make_chunks(episodes, world.act_layout, policy.horizon, ("gripper",))
-    chunks = clip_blocks(chunks, world.act_layout, 1.0)
+    _, chunks = make_chunks(episodes, ACT, policy.horizon, ("gripper",))
+    chunks = clip_blocks(chunks, ACT, 1.0)
     ratios = []
-    for field in world.act_layout.fields:
-        part = world.act_layout.slice(field.name)
+    for field in ACT.fields:
+        part = ACT.slice(field.name)
         shown = chunks[..., part].flatten(0, 1)
         # Numbers that change sign under a reflection have no mean.
         centred = field.frequency == 0 and not field.odd
         deviation = (shown - shown.mean(0) * centred).square().mean().sqrt()
         if deviation > STILL:
             ratios.append(actions[..., part].var(dim=0).mean().sqrt() / deviation)
-    assert len(ratios) == len(world.act_layout.fields) - 1
+    assert len(ratios) == len(ACT.fields) - 1
     spread = action_spread(policy, obs, draws=5, seed=7)
     assert spread == pytest.approx(float(sum(ratios) / len(ratios)), rel=1e-5)
     assert spread != action_spread(policy, obs, draws=5, seed=8)
-
-
-def test_a_spread_needs_observations_and_draws(trained, world):
-    for obs, draws in ((world.observations(4), 1), (torch.zeros(0, world.obs_layout.dim), 2)):
+    for few, draws in ((obs, 1), (obs[:0], 2)):
         with pytest.raises(UserError, match="at least 1 observation and 2 draws"):
-            action_spread(trained(group="C8"), obs, draws)
+            action_spread(policy, few, draws)
 
 
-def test_jumps_are_where_the_frame_of_a_canonical_policy_jumps(trained, world, monkeypatch):
-    obs = world.observations(64)
+def test_jumps_are_where_the_frame_of_a_canonical_policy_jumps(trained, monkeypatch):
+    obs = observations(64)
     near = obs.clone()
-    near[:, world.obs_layout.slice("goal")] *= 1e-3
+    near[:, OBS.slice("goal")] *= 1e-3
     for name, options in (("canonical", {"anchor": "goal"}), ("edp", {"group": "C8"})):
         policy = trained(name, **options)
         far_away, at_the_jump = jumps(policy, obs), jumps(policy, near)

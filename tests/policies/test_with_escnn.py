@@ -6,8 +6,16 @@ import torch
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Group
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
-from tests.policies.conftest import small_options
-from tests.policies.test_equivariance import decode_error
+from tests.policies.conftest import (
+    ACT,
+    OBS,
+    decode_error,
+    make_episodes,
+    noises,
+    observations,
+    small_options,
+    untrained,
+)
 
 nn = pytest.importorskip("escnn.nn")
 
@@ -28,17 +36,17 @@ class Encoded(EscnnDiffusionPolicy):
 
 
 @pytest.mark.parametrize("name", ["C4", "C8", "D4"])
-def test_it_has_the_parameters_and_the_functions_of_edp(world, name):
+def test_it_has_the_parameters_and_the_functions_of_edp(name):
     """Every matrix of ours is one of escnn's."""
-    ours, theirs = (world.untrained(policy, group=name) for policy in ("edp", "escnn"))
+    ours, theirs = (untrained(policy, group=name) for policy in ("edp", "escnn"))
     group = Group.parse(name)
     # Ours also has biases of what turns, which have no effect.
-    turning = ~world.act_layout.repeat(8).invariant_mask(reflections=group.reflections)
+    turning = ~ACT.repeat(8).invariant_mask(reflections=group.reflections)
     assert theirs.parameter_count() == ours.parameter_count() - turning.sum()
     for layer in (
-        Lift(world.obs_layout, group, 2),
+        Lift(OBS, group, 2),
         RegularLinear(group, 2, 3),
-        Project(group, 2, world.act_layout),
+        Project(group, 2, ACT),
     ):
         other = EscnnLayer(layer)
         columns = []
@@ -46,24 +54,23 @@ def test_it_has_the_parameters_and_the_functions_of_edp(world, name):
             other.weight.data = torch.eye(other.weight.numel())[i].double()
             columns.append(other.double().dense()[0].flatten())
         basis, wanted = torch.stack(columns, 1), layer.double().dense()[0].flatten()
-        found = torch.linalg.lstsq(basis, wanted[:, None]).solution
-        assert torch.allclose((basis @ found).squeeze(1), wanted, atol=1e-5)
+        coefficients = torch.linalg.lstsq(basis, wanted[:, None]).solution
+        assert torch.allclose((basis @ coefficients).squeeze(1), wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["C1", "C8", "D4"])
-def test_it_starts_as_edp_of_the_same_seed(world, name):
-    ours, theirs = (world.untrained(policy, group=name) for policy in ("edp", "escnn"))
-    obs, noise = world.observations(5), torch.randn(5, ours.horizon, 7)
+def test_it_starts_as_edp_of_the_same_seed(name):
+    ours, theirs = (untrained(policy, group=name) for policy in ("edp", "escnn"))
+    obs, noise = observations(5), noises(5)
     assert ours.decode(obs, noise).abs().max() > 0.01
     assert torch.allclose(theirs.decode(obs, noise), ours.decode(obs, noise), atol=1e-5)
 
 
-def test_an_escnn_network_may_encode_the_observation(world, tmp_path):
+def test_an_escnn_network_may_encode_the_observation(tmp_path):
     options = small_options("escnn", steps=30, batch_size=32)
-    episodes = world.episodes(6, noise=0.2)
-    policy = Encoded.fit(options, episodes, world.obs_layout, world.act_layout)
-    assert decode_error(policy, world, policy.group, torch.float32) <= 1e-5
-    obs, noise = world.observations(4), torch.randn(4, policy.horizon, 7)
+    policy = Encoded.fit(options, make_episodes(6, noise=0.2), OBS, ACT)
+    assert decode_error(policy) <= 1e-5
+    obs, noise = observations(4), noises(4)
     far = policy.decode(obs.flip(0), noise)
     assert not torch.allclose(policy.decode(obs, noise), far, atol=1e-2)
     again = load_policy(save_policy(policy, tmp_path / "policy.safetensors"))
