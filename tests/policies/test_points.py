@@ -112,7 +112,7 @@ def test_a_point_that_occurs_twice_counts_once_and_is_met_with_the_rest() -> Non
 
 
 def test_the_place_of_the_points_is_learned() -> None:
-    policy = fit("edp", steps=150, count=60, batch_size=128)
+    policy = fit("edp", steps=120, count=60, batch_size=64)
     obs, place = observe(64, seed=2)
     chunk = policy.decode(obs, torch.zeros(64, 2, ACT.dim))
     moved = chunk[:, 0, ACT.slice("xy")]

@@ -31,7 +31,7 @@ ACTION = Layout(
 )
 
 
-SMALL = {"channels": 8, "width": 8, "depth": 1, "ema_decay": 0.9}
+SMALL = {"channels": 8, "width": 8, "depth": 1, "ema_decay": 0.9, "batch_size": 32}
 
 
 def rotations(count, seed=0):
@@ -87,9 +87,12 @@ def test_the_spherical_policy_commutes_with_every_rotation_of_space(spherical, d
             assert error / own.square().mean().sqrt() < bound
 
 
-def test_a_planar_policy_does_not(spherical):
-    options = small_options("so2", steps=20, **SMALL)
+def test_both_learn_and_a_planar_policy_does_not_commute(spherical):
+    options = small_options("so2", steps=60, **SMALL)
     planar = POLICIES.get("so2").fit(options, episodes(8), SCENE, ACTION)
+    for policy in (planar, spherical):
+        losses = [loss for _, loss in policy.training_record["losses"]]
+        assert losses[-1] < 0.6 * losses[0]
     obs, noise = episodes(1)[0][0], torch.randn(9, 8, ACTION.dim)
     matrix = rotations(1)[0]
     for policy, exact in ((planar, False), (spherical, True)):
@@ -113,15 +116,6 @@ def test_a_gripper_that_only_turns_about_the_normal_is_hardly_tilted():
     along = (turns * normals).sum(-1, keepdim=True)
     tilts = turns - along * normals
     assert tilts.square().mean().sqrt() < 0.1 * along.square().mean().sqrt()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["so2", "spherical"])
-def test_they_learn(name):
-    options = small_options(name, steps=120, **SMALL)
-    policy = POLICIES.get(name).fit(options, episodes(24), SCENE, ACTION)
-    losses = [loss for _, loss in policy.training_record["losses"]]
-    assert losses[-1] < 0.6 * losses[0]
 
 
 @pytest.mark.parametrize("irreps", [PlanarIrreps(4), SpatialIrreps()], ids=["planar", "spatial"])

@@ -12,6 +12,7 @@ tools.gradient_variance` prints.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import statistics
 import sys
@@ -96,13 +97,17 @@ def label(name: str, options: Mapping[str, Any]) -> str:
 
     The other tasks of a joint policy are left out: it is one policy for all of them.
     """
-    defaults = POLICIES.get(name).Options().to_json()
     own = [
         value if isinstance(value := options[key], str) else f"{key} {value}".removesuffix(" True")
-        for key, default in sorted(defaults.items())
+        for key, default in sorted(_defaults(name).items())
         if key != "tasks" and options.get(key, default) != default
     ]
     return " ".join([f"`{name}`", *own])
+
+
+@functools.cache
+def _defaults(name: str) -> dict[str, Any]:
+    return POLICIES.get(name).Options().to_json()
 
 
 def label_of(record: RunRecord) -> str:
