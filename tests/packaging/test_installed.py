@@ -11,32 +11,14 @@ from symsteer.registry import code_hash
 pytestmark = pytest.mark.long
 
 SUITE = """
-description = "one frozen policy"
-
 [grid]
 agent = ["base"]
 
 [run]
 task = "PickCube-v1"
-env_steps = 160
-num_envs = 4
-
-[run.demonstrations]
-count = 3
-
-[run.policy]
-channels = 8
-width = 16
-depth = 1
-steps = 20
-
-[run.evaluation]
-every = 160
-episodes = 2
-final_episodes = 3
-diagnostic_episodes = 2
-final_diagnostic_episodes = 2
-steerability_states = 2
+demonstrations = { count = 3 }
+policy = { channels = 8, width = 16, depth = 1, steps = 20 }
+evaluation = { final_episodes = 3, final_diagnostic_episodes = 2, steerability_states = 2 }
 """
 
 FOREIGN = 'raise ImportError("another project\'s package")\n'
@@ -51,7 +33,7 @@ def test_list_sweep_and_report_in_an_empty_folder(installed, tmp_path):
         assert re.search(rf"^  {name} ", names, re.MULTILINE), names
     assert not list(tmp_path.iterdir())
     (tmp_path / "tiny.toml").write_text(SUITE)
-    installed.run(tmp_path, "symsteer", "sweep", "tiny.toml", "--workers", "2")
+    installed.run(tmp_path, "symsteer", "sweep", "tiny.toml", "--workers", "1")
     installed.run(tmp_path, "symsteer", "report", "runs")
     page = tmp_path / "runs" / "leaderboard" / "LEADERBOARD.md"
     assert "PickCube-v1" in page.read_text()

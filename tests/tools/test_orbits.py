@@ -28,9 +28,8 @@ def test_unbroken_copies_are_a_star(unbroken: Orbit) -> None:
     assert (unbroken.origin == 0).all()
 
 
-@pytest.mark.parametrize("name", ["action_gain", "obstacle", "wind"])
-def test_broken_dynamics_bend_it(name: str, unbroken: Orbit) -> None:
-    broken = orbit(f"{name}:1")
+def test_broken_dynamics_bend_it(unbroken: Orbit) -> None:
+    broken = orbit("action_gain:1")
     np.testing.assert_allclose(broken.object[0], unbroken.object[0], atol=0.1)
     assert spread(broken.object) > 20
 
