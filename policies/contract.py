@@ -98,11 +98,10 @@ class ChunkPolicy(nn.Module, abc.ABC):
         options: of the class's own ``Options``.
         obs_layout: geometry of one observation.
         act_layout: geometry of one action.
-        obs_normalizer, act_normalizer: statistics of the demonstrations; by default identities,
-            to be overwritten by a saved state.
-        group: the finite group that the policy keeps exactly; C1 for none.
 
     Attributes:
+        group: the finite group that the policy keeps exactly; C1, unless a subclass sets another.
+        obs_normalizer, act_normalizer: statistics of the demonstrations; at first identities.
         training_record: what training reports (losses, seconds, ...), JSON-ready.
         report: what is measured later (steerability), JSON-ready; saved with the policy.
     """
@@ -112,21 +111,12 @@ class ChunkPolicy(nn.Module, abc.ABC):
     Options: ClassVar[type[PolicyOptions]] = PolicyOptions
     """The dataclass of the policy's options."""
 
-    def __init__(
-        self,
-        options: PolicyOptions,
-        obs_layout: Layout,
-        act_layout: Layout,
-        obs_normalizer: Normalizer | None = None,
-        act_normalizer: Normalizer | None = None,
-        group: Group | None = None,
-    ):
+    def __init__(self, options: PolicyOptions, obs_layout: Layout, act_layout: Layout):
         super().__init__()
         self.options = options
         self.obs_layout, self.act_layout = obs_layout, act_layout
-        self.group = group or Group.parse("C1")
-        self.obs_normalizer = obs_normalizer or Normalizer(obs_layout)
-        self.act_normalizer = act_normalizer or Normalizer(act_layout)
+        self.group = Group.parse("C1")
+        self.obs_normalizer, self.act_normalizer = Normalizer(obs_layout), Normalizer(act_layout)
         self.training_record: dict[str, Any] = {}
         self.report: dict[str, Any] = {}
 

@@ -176,12 +176,12 @@ def load_policy(
         for side, layout in (("obs", obs_layout), ("act", act_layout)):
             if layout.dim != len(tensors[f"{side}_normalizer.scale"]):
                 raise ValueError(f"{side}_layout does not fit the normaliser")
+        if description["extension"]:
+            cure += f", or let the constructor of {kind.__name__} build all tensors that fit fills"
         options = kind.Options.from_json(description["options"])
         with _no_larger_than(10 * sum(tensor.numel() for tensor in tensors.values())):
             policy = kind(options, obs_layout, act_layout)
         policy.to(next(t.dtype for t in tensors.values() if t.is_floating_point()))
-        if description["extension"]:
-            cure += f", or let the constructor of {kind.__name__} build all tensors that fit fills"
         policy.load_state_dict(tensors)
         stored_hash = description["content_hash"]
         policy.training_record = description["training_record"]

@@ -25,15 +25,27 @@ from symsteer.policies.geometry import Group, Layout
 
 
 class EquivariantLayer(nn.Module, abc.ABC):
-    """What the layers have in common."""
+    """What the layers have in common.
+
+    Attributes:
+        in_rank: number of the last axes that are its input: 1 for a vector, 2 for regular fields.
+        out_shape: of the last axes of its output.
+    """
 
     group: Group
     weight: torch.Tensor
     bias: torch.Tensor
+    in_rank: int
+    out_shape: tuple[int, ...]
 
     @abc.abstractmethod
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The map as (matrix, bias)."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Apply it to ``x [..., *in]``."""
+        out = nn.functional.linear(x.flatten(-self.in_rank), *self.dense())
+        return out.unflatten(-1, self.out_shape)
 
     @abc.abstractmethod
     def nearest(
@@ -64,6 +76,7 @@ class Lift(EquivariantLayer):
     def __init__(self, layout: Layout, group: Group, channels: int):
         super().__init__()
         self.layout, self.group, self.channels = layout, group, channels
+        self.in_rank, self.out_shape = 1, (group.order, channels)
         bound = 1 / math.sqrt(layout.dim)
         self.weight = nn.Parameter(torch.empty(channels, layout.dim).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(channels).uniform_(-bound, bound))
@@ -84,10 +97,6 @@ class Lift(EquivariantLayer):
         stacked = torch.einsum("...cd,ged->...gce", weight, rho).flatten(-3, -2)
         return stacked, _mean_over_group(bias, order)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        out = nn.functional.linear(x, *self.dense())
-        return out.unflatten(-1, (self.group.order, self.channels))
-
 
 class RegularLinear(EquivariantLayer):
     """Group convolution: f'(g) = sum_h W(g^-1 h) f(h) + b.
@@ -100,6 +109,7 @@ class RegularLinear(EquivariantLayer):
     def __init__(self, group: Group, in_channels: int, out_channels: int):
         super().__init__()
         self.group, self.in_channels, self.out_channels = group, in_channels, out_channels
+        self.in_rank, self.out_shape = 2, (group.order, out_channels)
         bound = 1 / math.sqrt(group.order * in_channels)
         self.weight = nn.Parameter(
             torch.empty(group.order, out_channels, in_channels).uniform_(-bound, bound)
@@ -130,10 +140,6 @@ class RegularLinear(EquivariantLayer):
         blocks = weight.index_select(-3, self.index.flatten()).unflatten(-3, (order, order))
         return blocks.transpose(-3, -2).flatten(-2).flatten(-3, -2), _mean_over_group(bias, order)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        out = nn.functional.linear(x.flatten(-2), *self.dense())
-        return out.unflatten(-1, (self.group.order, self.out_channels))
-
 
 class Project(EquivariantLayer):
     """Regular fields to a vector: y = mean_g rho(g) (V f(g) + b).
@@ -144,6 +150,7 @@ class Project(EquivariantLayer):
     def __init__(self, group: Group, channels: int, layout: Layout):
         super().__init__()
         self.layout, self.group = layout, group
+        self.in_rank, self.out_shape = 2, (layout.dim,)
         bound = 1 / math.sqrt(channels)
         self.weight = nn.Parameter(torch.empty(layout.dim, channels).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(layout.dim).uniform_(-bound, bound))
@@ -162,9 +169,6 @@ class Project(EquivariantLayer):
         weight = torch.einsum("gde,...dgc->...ec", rho, blocks) / self.group.order
         return torch.einsum("gde,...ec->...dgc", rho, weight).flatten(-2), bias @ rho.mean(0).mT
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return nn.functional.linear(x.flatten(-2), *self.dense())
-
 
 def _mean_over_group(bias: torch.Tensor, order: int) -> torch.Tensor:
     """``[..., order * channels]`` with the mean over the group in every place."""
@@ -173,7 +177,7 @@ def _mean_over_group(bias: torch.Tensor, order: int) -> torch.Tensor:
 
 
 class ExpandedLayer(nn.Module):
-    """A fixed equivariant layer as one matrix; the last ``in_rank`` axes are its input.
+    """A fixed equivariant layer as one matrix.
 
     The matrix is computed in float64 and rounded once, so that it is as equivariant as the layer.
     """
@@ -181,14 +185,15 @@ class ExpandedLayer(nn.Module):
     weight: torch.Tensor
     bias: torch.Tensor
 
-    def __init__(self, layer: EquivariantLayer, in_rank: int, out_shape: tuple[int, ...]):
+    def __init__(self, layer: EquivariantLayer):
         super().__init__()
-        self.in_rank, self.out_shape = in_rank, out_shape
+        self.in_rank, self.out_shape = layer.in_rank, layer.out_shape
         with torch.no_grad():
             weight, bias = copy.deepcopy(layer).double().dense()
         self.register_buffer("weight", weight.to(layer.weight.dtype).contiguous())
         self.register_buffer("bias", bias.to(layer.weight.dtype))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        out = nn.functional.linear(x.flatten(-self.in_rank), self.weight, self.bias)
-        return out.unflatten(-1, self.out_shape)
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.weight, self.bias
+
+    forward = EquivariantLayer.forward

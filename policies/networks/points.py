@@ -46,7 +46,6 @@ class PointEncoder(nn.Module):
     def expanded(self) -> Self:
         """A copy for inference whose layers hold their dense matrices ready."""
         fast = copy.deepcopy(self)
-        for name, inputs in (("lift", 1), ("known", 2), ("mix", 2), ("out", 2)):
-            layer = ExpandedLayer(getattr(self, name), inputs, (self.group.order, -1))
-            fast.register_module(name, layer)
+        for name in ("lift", "known", "mix", "out"):
+            fast.register_module(name, ExpandedLayer(getattr(self, name)))
         return fast

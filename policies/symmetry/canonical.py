@@ -15,15 +15,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import torch
 
-from symsteer.policies.contract import Episode, Progress
+from symsteer.policies.contract import Episode
 from symsteer.policies.geometry import Group, Layout
-from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.symmetry.unconstrained import PlainDiffusionPolicy, PlainOptions
-from symsteer.policies.training.demonstrations import check_episodes
 from symsteer.policies.training.frames import Frame, planar_vectors
 
 SHORT = 0.01
@@ -52,37 +50,20 @@ class CanonicalDiffusionPolicy(PlainDiffusionPolicy):
     Options = CanonicalOptions
     options: CanonicalOptions
 
-    def __init__(
-        self,
-        options: CanonicalOptions,
-        obs_layout: Layout,
-        act_layout: Layout,
-        obs_normalizer: Normalizer | None = None,
-        act_normalizer: Normalizer | None = None,
-    ):
+    def __init__(self, options: CanonicalOptions, obs_layout: Layout, act_layout: Layout):
         if not options.anchor:
             options = dataclasses.replace(options, anchor=planar_vectors(obs_layout)[0].name)
-        super().__init__(options, obs_layout, act_layout, obs_normalizer, act_normalizer)
+        super().__init__(options, obs_layout, act_layout)
         self.anchor = Frame(options.anchor, obs_layout, act_layout)
         self.group = Group.parse(options.symmetry)
 
     @classmethod
-    def fit(
-        cls,
-        options: Any,
-        episodes: Sequence[Episode],
-        obs_layout: Layout,
-        act_layout: Layout,
-        seed: int = 0,
-        progress: Progress | None = None,
-        device: torch.device | str = "cpu",
-    ) -> Self:
-        """Train in the frame of the anchor; see :meth:`ChunkPolicy.fit`."""
-        check_episodes(episodes, obs_layout, act_layout)
-        if not options.anchor:
-            seen = torch.cat([obs for obs, _ in episodes])
-            options = dataclasses.replace(options, anchor=steadiest_vector(seen, obs_layout))
-        return super().fit(options, episodes, obs_layout, act_layout, seed, progress, device)
+    def told_by_data(cls, options: Any, episodes: Sequence[Episode], obs_layout: Layout) -> Any:
+        """With the anchor."""
+        if options.anchor:
+            return options
+        seen = torch.cat([obs for obs, _ in episodes])
+        return dataclasses.replace(options, anchor=steadiest_vector(seen, obs_layout))
 
     def augment(
         self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator

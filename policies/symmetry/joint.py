@@ -26,7 +26,6 @@ from torch.nn import functional
 from symsteer.errors import UserError
 from symsteer.policies.contract import Episode, Progress
 from symsteer.policies.geometry import Field, Group, Layout
-from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.symmetry.lifted import (
     EquivariantDiffusionPolicy,
     EquivariantOptions,
@@ -213,12 +212,11 @@ class Joint(DiffusionPolicy):
             dataclasses.replace(options, steps=options.steps // len(options.tasks)),
             obs_layout,
             self.act_layout,
-            Normalizer(
-                obs_layout,
-                *(getattr(statistics, n)[columns] for n in ("scale", "offset", "deviation")),
-            ),
-            Normalizer(self.bounded_layout(self.act_layout), **self.act_normalizer.state_dict()),
         ).to(self.device)
+        policy.obs_normalizer.load_state_dict(
+            {name: value[columns] for name, value in statistics.state_dict().items()}
+        )
+        policy.act_normalizer.load_state_dict(self.act_normalizer.state_dict())
         assert isinstance(self.denoiser, TaskDenoiser)
         policy.denoiser.load_state_dict(
             self.denoiser.weights_of_task(columns, self.normalized_observation(blank))

@@ -101,13 +101,10 @@ class LiftedDenoiser(Denoiser):
     def expanded(self) -> LiftedDenoiser:
         """A copy for inference whose equivariant layers hold their dense matrices ready."""
         fast = super().expanded()
-        order = self.group.order
-        for name, inputs in (("obs_lift", 1), ("obs_mix", 2), ("chunk_lift", 1), ("project", 2)):
+        for name in ("obs_lift", "obs_mix", "chunk_lift", "project"):
             layer = getattr(self, name)
-            if not hasattr(layer, "dense"):
-                continue
-            outputs = (layer.layout.dim,) if name == "project" else (order, -1)
-            fast.register_module(name, ExpandedLayer(layer, inputs, outputs))
+            if hasattr(layer, "dense"):
+                fast.register_module(name, ExpandedLayer(layer))
         if self.points is not None:
             fast.points = self.points.expanded()
         if isinstance(self.slice_network, ResidualMLP):

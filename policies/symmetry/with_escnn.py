@@ -46,7 +46,8 @@ class EscnnLayer(nn.Module):
             assert isinstance(ours, RegularLinear)
             layout, ends = ANY, (ours.in_channels, ours.out_channels)
         self.geometry = ours.without_parameters()
-        self.layout, self.ends, self.order = layout, ends, ours.group.order
+        self.in_rank, self.out_shape = ours.in_rank, ours.out_shape
+        self.ends, self.order = ends, ours.group.order
         vector = layout.field_type(ours.group)
         linear = escnn_package().nn.Linear(
             *(regular_fields(vector, count) if count else vector for count in ends),
@@ -58,13 +59,6 @@ class EscnnLayer(nn.Module):
         self.bias = None if linear.bias is None else nn.Parameter(torch.ones_like(linear.bias))
         self._start_as(*ours.dense())
 
-    @property
-    def channels(self) -> int:
-        """Regular fields of the output."""
-        return self.ends[1]
-
-    out_channels = channels
-
     def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Matrix and bias in our order, equivariant to the precision of their type.
 
@@ -74,9 +68,8 @@ class EscnnLayer(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """As the layer in whose place it is."""
-        flat = x.flatten(-2) if self.ends[0] else x
-        out = functional.linear(flat, *self._expanded())
-        return out.unflatten(-1, (self.order, self.ends[1])) if self.ends[1] else out
+        out = functional.linear(x.flatten(-self.in_rank), *self._expanded())
+        return out.unflatten(-1, self.out_shape)
 
     @torch.enable_grad()
     def _start_as(self, matrix: torch.Tensor, bias: torch.Tensor) -> None:

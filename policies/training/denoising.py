@@ -23,7 +23,6 @@ from symsteer.errors import UserError
 from symsteer.names import check
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
-from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.training.diffusion import Diffusion, Prediction, Process
 from symsteer.policies.training.frames import Frame
 from symsteer.policies.training.gradient import GradientOptions, GradientPolicy
@@ -118,16 +117,9 @@ class DiffusionPolicy(GradientPolicy):
     Options = DenoisingOptions
     options: Any
 
-    def __init__(
-        self,
-        options: DenoisingOptions,
-        obs_layout: Layout,
-        act_layout: Layout,
-        obs_normalizer: Normalizer | None = None,
-        act_normalizer: Normalizer | None = None,
-    ):
+    def __init__(self, options: DenoisingOptions, obs_layout: Layout, act_layout: Layout):
         options = options.resolved(obs_layout, act_layout)
-        super().__init__(options, obs_layout, act_layout, obs_normalizer, act_normalizer)
+        super().__init__(options, obs_layout, act_layout)
         self.diffusion = options.diffusion
         self.frame = Frame(options.action_frame, obs_layout, act_layout)
         self.denoiser = self.make_denoiser()

@@ -54,10 +54,7 @@ class GradientOptions(PolicyOptions):
 
 
 class GradientPolicy(ChunkPolicy):
-    """A policy whose parameters minimise a loss on batches of observations and chunks.
-
-    The constructor must take exactly options, layouts and normalisers, in this order.
-    """
+    """A policy whose parameters minimise a loss on batches of observations and chunks."""
 
     Options = GradientOptions
     options: Any
@@ -74,6 +71,11 @@ class GradientPolicy(ChunkPolicy):
             generator: for all random draws. It is on the CPU, so that a seed means the same on
                 every device; move what is drawn to ``obs.device``.
         """
+
+    @classmethod
+    def told_by_data(cls, options: Any, episodes: Sequence[Episode], obs_layout: Layout) -> Any:
+        """Options in which everything that depends on the demonstrations is filled in."""
+        return options
 
     @classmethod
     def pairs(
@@ -98,17 +100,14 @@ class GradientPolicy(ChunkPolicy):
         """Train on batches drawn with replacement; see :meth:`ChunkPolicy.fit`."""
         check_episodes(episodes, obs_layout, act_layout)
         start = time.perf_counter()
+        options = cls.told_by_data(options, episodes, obs_layout)
         obs, chunks = cls.pairs(options, episodes, act_layout)
         generator = torch.Generator().manual_seed(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            policy = cls(
-                options,
-                obs_layout,
-                act_layout,
-                Normalizer.fit(cls.bounded_layout(obs_layout), obs),
-                Normalizer.fit(cls.bounded_layout(act_layout), chunks),
-            )
+            policy = cls(options, obs_layout, act_layout)
+        policy.obs_normalizer = Normalizer.fit(cls.bounded_layout(obs_layout), obs)
+        policy.act_normalizer = Normalizer.fit(cls.bounded_layout(act_layout), chunks)
         options = policy.options
         policy.to(device)
         obs, chunks = obs.to(device), policy.act_normalizer.normalize(chunks.to(device))

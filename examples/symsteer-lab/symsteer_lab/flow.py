@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from symsteer.policies import GradientOptions, GradientPolicy, Layout, Normalizer, clip_blocks
+from symsteer.policies import GradientOptions, GradientPolicy, Layout, clip_blocks
 
 
 @dataclass(frozen=True)
@@ -42,15 +42,8 @@ class FlowPolicy(GradientPolicy):
     Options = FlowOptions
     options: FlowOptions
 
-    def __init__(
-        self,
-        options: FlowOptions,
-        obs_layout: Layout,
-        act_layout: Layout,
-        obs_normalizer: Normalizer | None = None,
-        act_normalizer: Normalizer | None = None,
-    ):
-        super().__init__(options, obs_layout, act_layout, obs_normalizer, act_normalizer)
+    def __init__(self, options: FlowOptions, obs_layout: Layout, act_layout: Layout):
+        super().__init__(options, obs_layout, act_layout)
         chunk = options.horizon * act_layout.dim
         sizes = [chunk + obs_layout.dim + 1, *[options.width] * options.depth]
         layers: list[nn.Module] = []
