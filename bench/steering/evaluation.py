@@ -20,7 +20,7 @@ from symsteer.policies.steerability import (
     action_spread,
     decode_error,
     evenly,
-    jumps,
+    jump,
 )
 
 Act = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -258,7 +258,7 @@ def steerability(
         states that at least one draw solves; of visited states ``action_std``
         (:func:`symsteer.policies.steerability.action_spread`), ``equivariance_error`` of decoding
         under C8 (:func:`symsteer.policies.steerability.decode_error`) and ``jump``
-        (:func:`symsteer.policies.steerability.jumps`); ``warning``, why steering is unlikely to
+        (:func:`symsteer.policies.steerability.jump`); ``warning``, why steering is unlikely to
         work, or None.
     """
     seeds = [start for start in steerability_seeds(seed, states) for _ in range(draws)]
@@ -282,6 +282,6 @@ def steerability(
         "draws": draws,
         "action_std": action_std,
         "equivariance_error": decode_error(policy, some, Group.parse("C8"), seed),
-        "jump": jumps(policy, some, seed)["high"],
+        "jump": jump(policy, some, seed),
         "warning": f"little to steer: {' and '.join(reasons)}" if reasons else None,
     }
