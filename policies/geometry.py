@@ -153,20 +153,20 @@ class Layout:
         Raises:
             UserError: if these fields differ in their number of points, or there is nothing else.
         """
-        own = [field for field in self.fields if field.name.startswith(CLOUD)]
-        if not own:
+        seen = [field for field in self.fields if field.name.startswith(CLOUD)]
+        if not seen:
             return None
-        (count, *others) = dict.fromkeys(field.multiplicity for field in own)
-        if others or len(own) == len(self.fields):
+        (count, *others) = dict.fromkeys(field.multiplicity for field in seen)
+        if others or len(seen) == len(self.fields):
             raise UserError(
                 "the fields cloud_... of a layout need the same number of points, and other fields "
                 "beside them"
             )
-        rest = [field for field in self.fields if field not in own]
+        rest = [field for field in self.fields if field not in seen]
         index = torch.arange(self.dim)
         return Cloud(
-            Layout([replace(f, name=f.name.removeprefix(CLOUD), multiplicity=1) for f in own]),
-            torch.cat([index[self.slice(f.name)].view(count, -1) for f in own], dim=1),
+            Layout([replace(f, name=f.name.removeprefix(CLOUD), multiplicity=1) for f in seen]),
+            torch.cat([index[self.slice(f.name)].view(count, -1) for f in seen], dim=1),
             Layout(rest),
             torch.cat([index[self.slice(field.name)] for field in rest]),
         )
@@ -177,7 +177,7 @@ class Layout:
         They follow each other and are named ``NAME_xy`` and ``NAME_z`` (or ``xy`` and ``z``), or
         ``tilt`` and ``yaw``, the parts of a rotation.
         """
-        found = []
+        pairs = []
         for first, second in itertools.pairwise(self.fields):
             stem, _, end = first.name.rpartition("[")
             name, instant = (stem, f"[{end}") if stem else (first.name, "")
@@ -185,8 +185,8 @@ class Layout:
             named = name == "tilt" or name == "xy" or name.endswith(("_xy", ".xy"))
             kinds = (first.frequency, second.frequency, first.multiplicity, second.multiplicity)
             if named and second.name == other + instant and kinds == (1, 0, 1, 1):
-                found.append((first.name, second.name))
-        return found
+                pairs.append((first.name, second.name))
+        return pairs
 
     @property
     def spatial(self) -> Layout:

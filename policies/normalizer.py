@@ -114,8 +114,8 @@ class Normalizer(nn.Module):
     def _fit_cloud(cls, layout: Layout, cloud: Cloud, data: torch.Tensor) -> Normalizer:
         whole = cls(layout)
         for part, columns in ((cloud.rest, cloud.rest_columns), (cloud.point, cloud.columns)):
-            found = cls.fit(part, data[:, columns.to(data.device)])
-            for name, value in found.state_dict().items():
+            fitted = cls.fit(part, data[:, columns.to(data.device)])
+            for name, value in fitted.state_dict().items():
                 getattr(whole, name)[columns] = value.to(whole.scale)
         return whole.to(data.device)
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import abc
 import functools
 import math
+from collections.abc import Iterator
 
 import torch
 from torch import nn
@@ -70,7 +71,6 @@ class Irreps(abc.ABC):
     def _couple(self, left: int, right: int, out: int) -> list[torch.Tensor]:
         """Forms ``[dims[out], dims[left], dims[right]]`` that commute with rotations."""
 
-    @abc.abstractmethod
     def embedding(self, layout: Layout) -> dict[int, torch.Tensor]:
         """Where the irreps of a vector are in it: by degree, ``[count, dims[degree], layout.dim]``.
 
@@ -79,6 +79,14 @@ class Irreps(abc.ABC):
         Raises:
             UserError: if the vector has a higher degree.
         """
+        places: dict[int, list[torch.Tensor]] = {}
+        for degree, place in self._places(layout, torch.eye(layout.dim)):
+            places.setdefault(degree, []).append(place)
+        return {degree: torch.cat(same) for degree, same in places.items()}
+
+    @abc.abstractmethod
+    def _places(self, layout: Layout, unit: torch.Tensor) -> Iterator[tuple[int, torch.Tensor]]:
+        """Degree and place of the irreps of each field; ``unit`` has the unit vectors."""
 
 
 class PlanarIrreps(Irreps):
@@ -104,18 +112,15 @@ class PlanarIrreps(Irreps):
             forms.append(form[: self.dims[out], : self.dims[left], : self.dims[right]])
         return forms
 
-    def embedding(self, layout: Layout) -> dict[int, torch.Tensor]:
-        eye = torch.eye(layout.dim)
-        found: dict[int, list[torch.Tensor]] = {}
+    def _places(self, layout: Layout, unit: torch.Tensor) -> Iterator[tuple[int, torch.Tensor]]:
         for field in layout.fields:
             if field.frequency not in self.degrees:
                 raise UserError(
                     f"the field {field.name!r} has frequency {field.frequency}, but this policy "
                     f"has frequencies up to {self.degrees[-1]}; raise max_frequency"
                 )
-            rows = eye[layout.slice(field.name)].unflatten(0, (field.multiplicity, -1))
-            found.setdefault(field.frequency, []).append(rows)
-        return {degree: torch.cat(rows) for degree, rows in found.items()}
+            whole = unit[layout.slice(field.name)]
+            yield field.frequency, whole.unflatten(0, (field.multiplicity, -1))
 
 
 class SpatialIrreps(Irreps):
@@ -153,26 +158,19 @@ class SpatialIrreps(Irreps):
         product = torch.einsum("kab,iac,jcb->kij", w, u, v)
         return [product] if product.norm() > EPSILON else []
 
-    def embedding(self, layout: Layout) -> dict[int, torch.Tensor]:
-        eye = torch.eye(layout.dim)
-        found: dict[int, list[torch.Tensor]] = {}
+    def _places(self, layout: Layout, unit: torch.Tensor) -> Iterator[tuple[int, torch.Tensor]]:
         vectors = layout.spatial_vectors()
-        inside = {name for pair in vectors for name in pair}
-        for horizontal, vertical in vectors:
-            parts = eye[layout.slice(horizontal)], eye[layout.slice(vertical)]
-            found.setdefault(1, []).append(torch.cat(parts)[None])
+        for pair in vectors:
+            yield 1, torch.cat([unit[layout.slice(name)] for name in pair])[None]
         for field in layout.fields:
-            if field.name in inside:
+            degree = field.frequency
+            if degree not in self.degrees or any(field.name in pair for pair in vectors):
                 continue
-            rows = eye[layout.slice(field.name)].unflatten(0, (field.multiplicity, -1))
-            whole = rows.new_zeros(len(rows), (1, 3, 5, 0)[min(field.frequency, 3)], layout.dim)
-            if field.frequency < 2:
-                whole[:, : rows.shape[1]] = rows
-            elif field.frequency == 2:
-                whole[:, [3, 0]] = rows
-            if whole.numel():
-                found.setdefault(field.frequency, []).append(whole)
-        return {degree: torch.cat(rows) for degree, rows in found.items()}
+            planar = unit[layout.slice(field.name)].unflatten(0, (field.multiplicity, -1))
+            place = planar.new_zeros(len(planar), self.dims[degree], layout.dim)
+            # The parts of a planar irrep among those of the spatial one.
+            place[:, ([0], [0, 1], [3, 0])[degree]] = planar
+            yield degree, place
 
 
 class EquivariantMap(nn.Module):

@@ -61,10 +61,10 @@ def planar_vectors(layout: Layout) -> list[Field]:
     Raises:
         UserError: if there are none.
     """
-    found = [f for f in layout.fields if f.frequency == 1 and f.multiplicity == 1]
-    if not found:
+    vectors = [f for f in layout.fields if f.frequency == 1 and f.multiplicity == 1]
+    if not vectors:
         raise UserError("a frame needs a planar vector, and this observation has none")
-    return found
+    return vectors
 
 
 def _components(field: Field, odd_axis: bool) -> list[Field]:
