@@ -34,6 +34,7 @@ from symsteer.bench.sim.seeds import reset_order
 from symsteer.bench.sim.trees import map_trees, rows_of, write_rows
 from symsteer.bench.tasks.embodiments import BODIES, Embodiment
 from symsteer.bench.tasks.experts import Intent
+from symsteer.bench.tasks.features import Thing, told
 from symsteer.bench.tasks.floating import ACTION_LAYOUT
 from symsteer.bench.variants import parse
 from symsteer.bench.variants.base import Role, overriding
@@ -91,6 +92,8 @@ class SymmetricTask(BaseEnv):
     max_episode_steps: ClassVar[int]
     gripper_fields: ClassVar[tuple[Field, ...]] = GRIPPER_FIELDS
     task_fields: ClassVar[tuple[Field, ...]]
+    things: ClassVar[dict[str, Thing]]
+    """Bodies by the names that they have in ``task_fields``; the one to be grasped first."""
     action_layout: ClassVar[Layout] = ACTION_LAYOUT
     workspace_center: ClassVar[tuple[float, float]] = (0.0, 0.0)
     manipulated_name: ClassVar[str]
@@ -252,9 +255,8 @@ class SymmetricTask(BaseEnv):
         return pose
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
-        fields = self._observe_task()
-        expected = [field.name for field in self.task_fields]
-        assert list(fields) == expected, f"fields {list(fields)} are not the layout's {expected}"
+        observed = self._observe_task()
+        fields = {field.name: observed[field.name] for field in self.task_fields}
         return self._reported(fields, self._task_layout)
 
     def _reported(self, fields: dict[str, torch.Tensor], layout: Layout) -> dict[str, torch.Tensor]:
@@ -275,8 +277,14 @@ class SymmetricTask(BaseEnv):
         return sum((variant.origin() for variant in self.variants), origin)
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        """The task's own fields ``[N, dim]``, in the order of ``task_fields``."""
-        raise NotImplementedError
+        """The task's own fields ``[N, dim]``, in any order.
+
+        By default those that their names define (:func:`symsteer.bench.tasks.features.told`).
+        """
+        poses = {"tcp": self.seen(self.agent.tcp_pose, "tool")}
+        for name, thing in self.things.items():
+            poses[name] = self.seen(getattr(self, thing.actor).pose, thing.role)
+        return told(self.task_fields, poses, self.things)
 
     # ------------------------------------------------------------------- step
 

@@ -83,12 +83,11 @@ class Seen(SymmetricTask):
         return cameras
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        flat = super()._observe_task()
         true = self.manipulated.pose
         shift = (self.seen(true, "object").p - true.p)[:, None]
         cloud = self._seen_cloud() + shift
         points = {"cloud_xy": cloud[:, :, :2].flatten(1), "cloud_z": cloud[:, :, 2]}
-        return {field.name: (flat | points)[field.name] for field in self.task_fields}
+        return {**super()._observe_task(), **points}
 
     def _seen_cloud(self) -> torch.Tensor:
         """The present cloud; if nobody looks, the last one, but for episodes at their time limit.

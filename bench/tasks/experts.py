@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from symsteer.bench.sim.rotations import quaternion_to_matrix, wrap
-from symsteer.bench.tasks.features import fourfold_yaw
+from symsteer.bench.tasks.features import yaw_up_to
 
 if TYPE_CHECKING:
     from symsteer.bench.tasks.base import SymmetricTask
@@ -96,7 +96,7 @@ def finger_width(env: SymmetricTask) -> torch.Tensor:
 def yaw_to_grasp(env: SymmetricTask, cube_q: torch.Tensor) -> torch.Tensor:
     """Smallest turn ``[N]`` that aligns the fingers with two faces of the cube."""
     axis = quaternion_to_matrix(env.agent.tcp_pose.q)[:, :2, 0]
-    cube = fourfold_yaw(cube_q)
+    cube = yaw_up_to(4, cube_q)
     gripper = torch.atan2(axis[:, 1], axis[:, 0])
     return wrap(torch.atan2(cube[:, 1], cube[:, 0]) / 4 - gripper, math.pi / 2)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,10 +11,51 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
+from symsteer.bench.variants.base import Role
 from symsteer.policies.geometry import Field
 
 GRASP_YAW = (Field("grasp_yaw_cos", 0), Field("grasp_yaw_sin", 0, odd=True))
-"""Of :func:`grasp_yaw` and :func:`bar_grasp_yaw`."""
+"""Cosine and sine of the yaw from the fingers to the first thing of a task, times its ``turns``."""
+
+
+@dataclass(frozen=True)
+class Thing:
+    """A body that a task's observation tells of."""
+
+    actor: str
+    """Attribute of the task that holds it."""
+    role: Role = "object"
+    turns: int = 1
+    """In how many turns about the vertical it looks the same: 4 of a cube, 2 of a bar."""
+
+
+def told(
+    fields: Iterable[Field], poses: Mapping[str, Pose], things: Mapping[str, Thing]
+) -> dict[str, torch.Tensor]:
+    """Those fields ``[N, dim]`` whose names say what they are; all others are left out.
+
+    With names ``A`` and ``B`` of poses these are ``A_xy`` and ``A_z``, the position of A;
+    ``A_to_B_xy`` and ``A_to_B_z``, the vector from A to B; ``A_yaw``, up to A's turns; and those
+    of :data:`GRASP_YAW`.
+
+    Args:
+        fields: of a task.
+        poses: as the observation reports them; ``tcp`` is the tool.
+        things: whose poses these are.
+    """
+    values: dict[str, torch.Tensor] = {}
+    for field in fields:
+        name, _, part = field.name.rpartition("_")
+        start, _, end = name.rpartition("_to_")
+        if field == GRASP_YAW[0]:
+            first, thing = next(iter(things.items()))
+            values |= grasp_yaw(poses["tcp"].q, poses[first].q, thing.turns)
+        elif part == "yaw" and name in things:
+            values[field.name] = yaw_up_to(things[name].turns, poses[name].q)
+        elif part in ("xy", "z") and end in poses and (start in poses or not start):
+            vector = poses[end].p - poses[start].p if start else poses[end].p
+            values[field.name] = vector[:, :2] if part == "xy" else vector[:, 2:]
+    return values
 
 
 def vector_fields(*names: str) -> tuple[Field, ...]:
@@ -33,48 +76,34 @@ def is_direction(name: str) -> bool:
     return name.removesuffix("_xy").removesuffix("_z").endswith(("normal", "_axis"))
 
 
-def fourfold_yaw(q: torch.Tensor) -> torch.Tensor:
-    """Yaw of a cube up to its symmetry, ``[N, 2]``: a frequency-4 vector.
+def yaw_up_to(turns: int, q: torch.Tensor) -> torch.Tensor:
+    """Yaw of a body ``[N, 2]`` up to its symmetry: a vector of frequency ``turns``, 2 or 4.
 
-    Half the sum over the body's axes of (x + i y)^4 of their horizontal parts: (cos 4 yaw,
-    sin 4 yaw) for a cube that lies flat, and the same for all 24 ways to name a cube's axes.
+    (x + i y)^turns of the horizontal part of a bar's axis (body x), or half the sum over the axes
+    of a cube: (cos, sin) of ``turns`` yaw for a body that lies flat, the same for all ways to name
+    its axes. That of a bar is shorter if it stands up.
     """
     axes = quaternion_to_matrix(q)[:, :2]
-    return _fourth_power(axes[:, 0], axes[:, 1]).sum(dim=1) / 2
+    if turns == 2:
+        return _power(2, axes[:, 0, 0], axes[:, 1, 0])
+    return _power(4, axes[:, 0], axes[:, 1]).sum(dim=1) / 2
 
 
-def twofold_yaw(q: torch.Tensor) -> torch.Tensor:
-    """Direction of a bar's axis (body x) up to its sign, ``[N, 2]``: a frequency-2 vector.
-
-    (x + i y)^2 of the axis's horizontal part: (cos 2 yaw, sin 2 yaw) for a bar that lies flat,
-    shorter for one that stands up.
-    """
-    axis = quaternion_to_matrix(q)[:, :2, 0]
-    x, y = axis.unbind(dim=1)
-    return torch.stack([x * x - y * y, 2 * x * y], dim=1)
-
-
-def grasp_yaw(tcp_q: torch.Tensor, cube_q: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Cosine and sine ``[N, 1]`` of four times the yaw from the fingers to the cube's faces."""
+def grasp_yaw(tcp_q: torch.Tensor, q: torch.Tensor, turns: int) -> dict[str, torch.Tensor]:
+    """The fields ``[N, 1]`` of :data:`GRASP_YAW` for a body of ``turns``."""
     axis = quaternion_to_matrix(tcp_q)[:, :2, 0]
-    return _yaw_between(_fourth_power(axis[:, 0], axis[:, 1]), fourfold_yaw(cube_q))
-
-
-def bar_grasp_yaw(tcp_q: torch.Tensor, bar_q: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Cosine and sine ``[N, 1]`` of twice the yaw from the fingers to a bar (its body x axis)."""
-    return _yaw_between(twofold_yaw(tcp_q), twofold_yaw(bar_q))
-
-
-def _yaw_between(gripper: torch.Tensor, thing: torch.Tensor) -> dict[str, torch.Tensor]:
+    gripper, thing = _power(turns, axis[:, 0], axis[:, 1]), yaw_up_to(turns, q)
     cosine = (gripper * thing).sum(dim=1, keepdim=True)
     sine = gripper[:, :1] * thing[:, 1:] - gripper[:, 1:] * thing[:, :1]
     return {"grasp_yaw_cos": cosine, "grasp_yaw_sin": sine}
 
 
-def _fourth_power(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    """Real and imaginary part of (x + i y)^4 along a new last axis."""
+def _power(turns: int, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Real and imaginary part of (x + i y)^turns along a new last axis."""
     re, im = x * x - y * y, 2 * x * y
-    return torch.stack([re * re - im * im, 2 * re * im], dim=-1)
+    if turns == 4:
+        re, im = re * re - im * im, 2 * re * im
+    return torch.stack([re, im], dim=-1)
 
 
 def disc(u: np.ndarray, radius: float) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -23,12 +23,11 @@ from symsteer.bench.tasks.experts import (
 )
 from symsteer.bench.tasks.features import (
     GRASP_YAW,
-    bar_grasp_yaw,
+    Thing,
     disc,
     flat_pose,
-    in_parts,
-    twofold_yaw,
     vector_fields,
+    yaw_up_to,
 )
 from symsteer.policies.geometry import Field
 
@@ -52,6 +51,7 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         *vector_fields("tcp_to_peg"),
         *GRASP_YAW,
     )
+    things: ClassVar[dict[str, Thing]] = {"peg": Thing("peg", turns=2)}
     manipulated_name = "peg"
     spawn_radius = 0.1
     spawn_extent = 0.223
@@ -76,16 +76,13 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         return {"success": (tilt < self.upright_tolerance) & (height < self.height_tolerance)}
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp = self.seen(self.agent.tcp_pose, "tool")
-        peg = self.seen(self.peg.pose, "object")
-        axis = quaternion_to_matrix(peg.q)[:, :, 0]
+        peg = self.seen(self.peg.pose, "object").q
+        axis = quaternion_to_matrix(peg)[:, :, 0]
         return {
-            **in_parts(peg=peg.p),
-            "peg_line": twofold_yaw(peg.q),
+            **super()._observe_task(),
+            "peg_line": yaw_up_to(2, peg),
             "peg_lean": axis[:, 2:] * axis[:, :2],
             "peg_rise": axis[:, 2:] ** 2,
-            **in_parts(tcp_to_peg=peg.p - tcp.p),
-            **bar_grasp_yaw(tcp.q, peg.q),
         }
 
     def intent(self, offset: torch.Tensor) -> Intent:

@@ -14,12 +14,11 @@ from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, HOVER, Intent, funnel
 from symsteer.bench.tasks.features import (
+    Thing,
     ahead_of,
     disc,
     flat_pose,
-    fourfold_yaw,
     goal_disc_pose,
-    in_parts,
     left_of,
     vector_fields,
 )
@@ -44,6 +43,10 @@ class MoveCube(SymmetricTask):
         Field("tcp_to_goal_xy", 1),
     )
     max_episode_steps = 50
+    things: ClassVar[dict[str, Thing]] = {
+        "cube": Thing("obj", turns=4),
+        "goal": Thing("goal_region", "goal"),
+    }
     manipulated_name = "obj"
     spawn_radius = 0.1
     spawn_extent = 0.13
@@ -63,19 +66,6 @@ class MoveCube(SymmetricTask):
     def direction(self) -> torch.Tensor:
         """Unit vectors ``[N, 2]`` from the cube's spawn point to the goal."""
         return quaternion_to_matrix(self.goal_region.pose.q)[:, :2, 2]
-
-    def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp = self.seen(self.agent.tcp_pose, "tool").p
-        cube = self.seen(self.obj.pose, "object")
-        goal = self.seen(self.goal_region.pose, "goal").p[:, :2]
-        return {
-            **in_parts(cube=cube.p),
-            "cube_yaw": fourfold_yaw(cube.q),
-            **in_parts(tcp_to_cube=cube.p - tcp),
-            "goal_xy": goal,
-            "cube_to_goal_xy": goal - cube.p[:, :2],
-            "tcp_to_goal_xy": goal - tcp[:, :2],
-        }
 
     def _gap_behind(self, margin: float) -> torch.Tensor:
         """Distance ``[N]`` of the tool from the point ``margin`` (m) behind the cube's rear."""

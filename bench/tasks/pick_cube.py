@@ -11,15 +11,7 @@ from mani_skill.utils.structs import Pose
 
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, funnel, grasp
-from symsteer.bench.tasks.features import (
-    GRASP_YAW,
-    disc,
-    flat_pose,
-    fourfold_yaw,
-    grasp_yaw,
-    in_parts,
-    vector_fields,
-)
+from symsteer.bench.tasks.features import GRASP_YAW, Thing, disc, flat_pose, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -38,6 +30,10 @@ class PickCube(SymmetricTask, PickCubeEnv):
         *GRASP_YAW,
         *vector_fields("goal", "cube_to_goal"),
     )
+    things: ClassVar[dict[str, Thing]] = {
+        "cube": Thing("cube", turns=4),
+        "goal": Thing("goal_site", "goal"),
+    }
     manipulated_name = "cube"
     spawn_radius = 0.1
     spawn_extent: ClassVar[float] = 0.13
@@ -54,18 +50,6 @@ class PickCube(SymmetricTask, PickCubeEnv):
         self.goal_site.set_pose(
             Pose.create_from_pq(torch.as_tensor(goal, dtype=torch.float32, device=self.device))
         )
-
-    def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp = self.seen(self.agent.tcp_pose, "tool")
-        cube = self.seen(self.cube.pose, "object")
-        goal = self.seen(self.goal_site.pose, "goal").p
-        return {
-            **in_parts(cube=cube.p),
-            "cube_yaw": fourfold_yaw(cube.q),
-            **in_parts(tcp_to_cube=cube.p - tcp.p),
-            **grasp_yaw(tcp.q, cube.q),
-            **in_parts(goal=goal, cube_to_goal=goal - cube.p),
-        }
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """Grasp the cube, then carry it to the goal."""

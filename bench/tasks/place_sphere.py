@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from mani_skill.envs.tasks.tabletop.place_sphere import PlaceSphereEnv
 
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, finger_width, funnel, grasp_at
-from symsteer.bench.tasks.features import flat_pose, fourfold_yaw, in_parts, pair, vector_fields
+from symsteer.bench.tasks.features import Thing, flat_pose, pair, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -29,6 +29,10 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
         Field("bin_yaw", 4),
         *vector_fields("sphere_to_bin"),
     )
+    things: ClassVar[dict[str, Thing]] = {
+        "sphere": Thing("obj"),
+        "bin": Thing("bin", "goal", turns=4),
+    }
     manipulated_name = "obj"
     spawn_radius = 0.07
     distance_range = (0.11, 0.18)
@@ -41,17 +45,6 @@ class PlaceSphere(SymmetricTask, PlaceSphereEnv):
         still, yaw = np.zeros(count), 2 * np.pi * u[:, 4]
         self.obj.set_pose(flat_pose(at_sphere, self.radius, still, self.device))
         self.bin.set_pose(flat_pose(at_bin, self.block_half_size[0], yaw, self.device))
-
-    def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp = self.seen(self.agent.tcp_pose, "tool").p
-        sphere = self.seen(self.obj.pose, "object").p
-        bin_pose = self.seen(self.bin.pose, "goal")
-        return {
-            **in_parts(sphere=sphere, tcp_to_sphere=sphere - tcp),
-            "bin_xy": bin_pose.p[:, :2],
-            "bin_yaw": fourfold_yaw(bin_pose.q),
-            **in_parts(sphere_to_bin=bin_pose.p - sphere),
-        }
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """Grasp the sphere, carry it over the bin, lower it, let go, rise."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,15 +14,12 @@ from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, OPEN, Intent, choose, funnel, grasp_at, yaw_along
 from symsteer.bench.tasks.features import (
     GRASP_YAW,
+    Thing,
     ahead_of,
-    bar_grasp_yaw,
     disc,
     flat_pose,
-    fourfold_yaw,
     goal_disc_pose,
-    in_parts,
     left_of,
-    twofold_yaw,
     vector_fields,
 )
 from symsteer.policies.geometry import Field
@@ -50,6 +47,11 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         Field("goal_xy", 1),
         Field("cube_to_goal_xy", 1),
     )
+    things: ClassVar[dict[str, Thing]] = {
+        "peg": Thing("peg", turns=2),
+        "cube": Thing("cube", turns=4),
+        "goal": Thing("goal_region", "goal"),
+    }
     manipulated_name = "cube"
     spawn_radius = 0.05
     peg_behind = 0.07
@@ -88,22 +90,10 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         return info
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp = self.seen(self.agent.tcp_pose, "tool")
-        peg, cube = self.seen(self.peg.pose, "object"), self.seen(self.cube.pose, "object")
-        goal = self.seen(self.goal_region.pose, "goal").p
+        peg, cube = (self.seen(body.pose, "object") for body in (self.peg, self.cube))
         peg_to_cube = cube.p - peg.p
         end = self._half_peg(quaternion_to_matrix(peg.q)[:, :, 0], peg_to_cube)
-        return {
-            **in_parts(peg=peg.p),
-            "peg_yaw": twofold_yaw(peg.q),
-            **in_parts(tcp_to_peg=peg.p - tcp.p),
-            **bar_grasp_yaw(tcp.q, peg.q),
-            **in_parts(cube=cube.p),
-            "cube_yaw": fourfold_yaw(cube.q),
-            "peg_end_to_cube_xy": (peg_to_cube - end)[:, :2],
-            "goal_xy": goal[:, :2],
-            "cube_to_goal_xy": (goal - cube.p)[:, :2],
-        }
+        return {**super()._observe_task(), "peg_end_to_cube_xy": (peg_to_cube - end)[:, :2]}
 
     def _half_peg(self, axis: torch.Tensor, towards: torch.Tensor) -> torch.Tensor:
         """From the peg's middle to its end on the side of ``towards [N, 3]``, ``[N, 3]``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,11 +15,10 @@ from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, grasp_at, yaw_along
 from symsteer.bench.tasks.features import (
     GRASP_YAW,
-    bar_grasp_yaw,
+    Thing,
     disc,
     flat_pose,
     goal_disc_pose,
-    in_parts,
     vector_fields,
 )
 from symsteer.policies.geometry import Field, Layout
@@ -50,6 +49,10 @@ class PushT(SymmetricTask, PushTEnv):
         Field("turn_cos", 0),
         Field("turn_sin", 0, odd=True),
     )
+    things: ClassVar[dict[str, Thing]] = {
+        "tee": Thing("tee", turns=2),
+        "goal": Thing("goal_tee", "goal"),
+    }
     manipulated_name = "tee"
     spawn_radius = 0.1
     goal_spawn_radius = 0.05
@@ -116,18 +119,12 @@ class PushT(SymmetricTask, PushTEnv):
     # ---------------------------------------------------------------- observation
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp = self.seen(self.agent.tcp_pose, "tool")
-        tee = self.seen(self.tee.pose, "object")
-        goal = self.seen(self.goal_tee.pose, "goal")
-        stem, goal_stem = _stem(tee.q), _stem(goal.q)
+        stem = _stem(self.seen(self.tee.pose, "object").q)
+        goal_stem = _stem(self.seen(self.goal_tee.pose, "goal").q)
         return {
-            **in_parts(tee=tee.p),
+            **super()._observe_task(),
             "tee_stem": stem,
-            **in_parts(tcp_to_tee=tee.p - tcp.p),
-            **bar_grasp_yaw(tcp.q, tee.q),
-            "goal_xy": goal.p[:, :2],
             "goal_stem": goal_stem,
-            "tee_to_goal_xy": (goal.p - tee.p)[:, :2],
             "turn_cos": (stem * goal_stem).sum(dim=1, keepdim=True),
             "turn_sin": _cross(stem, goal_stem)[:, None],
         }

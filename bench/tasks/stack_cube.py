@@ -10,15 +10,7 @@ from mani_skill.envs.tasks.tabletop.stack_cube import StackCubeEnv
 
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.experts import CLOSED, Intent, choose, finger_width, funnel, grasp
-from symsteer.bench.tasks.features import (
-    GRASP_YAW,
-    flat_pose,
-    fourfold_yaw,
-    grasp_yaw,
-    in_parts,
-    pair,
-    vector_fields,
-)
+from symsteer.bench.tasks.features import GRASP_YAW, Thing, flat_pose, pair, vector_fields
 from symsteer.policies.geometry import Field
 
 
@@ -39,6 +31,10 @@ class StackCube(SymmetricTask, StackCubeEnv):
         *GRASP_YAW,
         *vector_fields("a_to_b"),
     )
+    things: ClassVar[dict[str, Thing]] = {
+        **dict.fromkeys(("cube_a", "a"), Thing("cubeA", turns=4)),
+        **dict.fromkeys(("cube_b", "b"), Thing("cubeB", turns=4)),
+    }
     manipulated_name = "cubeA"
     spawn_radius = 0.07
     spawn_extent: ClassVar[float] = 0.18
@@ -50,19 +46,6 @@ class StackCube(SymmetricTask, StackCubeEnv):
         height = float(self.cube_half_size[2])
         self.cubeA.set_pose(flat_pose(at_a, height, 2 * np.pi * u[:, 4], self.device))
         self.cubeB.set_pose(flat_pose(at_b, height, 2 * np.pi * u[:, 5], self.device))
-
-    def _observe_task(self) -> dict[str, torch.Tensor]:
-        tcp = self.seen(self.agent.tcp_pose, "tool")
-        a, b = self.seen(self.cubeA.pose, "object"), self.seen(self.cubeB.pose, "object")
-        return {
-            **in_parts(cube_a=a.p),
-            "cube_a_yaw": fourfold_yaw(a.q),
-            **in_parts(cube_b=b.p),
-            "cube_b_yaw": fourfold_yaw(b.q),
-            **in_parts(tcp_to_a=a.p - tcp.p),
-            **grasp_yaw(tcp.q, a.q),
-            **in_parts(a_to_b=b.p - a.p),
-        }
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """Grasp A, bring it above B, lower it, let go, rise."""

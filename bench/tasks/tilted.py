@@ -24,7 +24,7 @@ from symsteer.bench.sim.rotations import (
     yaw_quaternion,
 )
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.features import GRASP_YAW, grasp_yaw, in_parts, vector_fields
+from symsteer.bench.tasks.features import GRASP_YAW, in_parts, vector_fields
 from symsteer.bench.tasks.move_cube import PushCube
 from symsteer.bench.tasks.pick_cube import PickCube
 from symsteer.bench.variants.base import STREAM
@@ -105,10 +105,13 @@ class Tilted(SymmetricTask):
         return {**in_parts(normal=normal, tcp=position, **turned), "gripper_width": width}
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
-        flat = super()._observe_task()
-        # What lies along the table has no height.
+        flat = {field.name for field in super().task_fields}
+        # What lies along the table in the flat task has no height.
         level = torch.zeros(self.num_envs, 1, device=self.device)
-        return {field.name: flat.get(field.name, level) for field in self.task_fields}
+        return {
+            name: level if name.endswith("_z") and name not in flat else value
+            for name, value in super()._observe_task().items()
+        }
 
     def _reported(self, fields: dict[str, torch.Tensor], layout: Layout) -> dict[str, torch.Tensor]:
         seen = torch.cat(list(super()._reported(fields, layout).values()), dim=1)
@@ -181,7 +184,3 @@ class TiltedPushCube(Tilted, PushCube):
     task_id = "TiltedPushCube-v1"
     # In place of the cube's yaw.
     task_fields: ClassVar[tuple[Field, ...]] = (*in_space(PushCube.task_fields), *GRASP_YAW)
-
-    def _observe_task(self) -> dict[str, torch.Tensor]:
-        tool, cube = self.seen(self.agent.tcp_pose, "tool"), self.seen(self.obj.pose, "object")
-        return {**super()._observe_task(), **grasp_yaw(tool.q, cube.q)}
