@@ -121,3 +121,23 @@ def transform_angular(w: torch.Tensor, angle: float, reflect: bool) -> torch.Ten
     """Act with (angle, reflect) on axial vectors ``w [..., 3]`` such as angular velocities."""
     sign = -1.0 if reflect else 1.0
     return sign * (w @ planar_matrix(angle, reflect, w).T)
+
+
+def transform_body(
+    state: torch.Tensor, angle: float, reflect: bool, across_yz: bool = False
+) -> torch.Tensor:
+    """Act with (angle, reflect) on rigid-body states ``[N, 13]``.
+
+    Their columns are position, quaternion, velocity and angular velocity; ``across_yz`` is that of
+    :func:`transform_quaternion`.
+    """
+    world = planar_matrix(angle, reflect, state)
+    return torch.cat(
+        [
+            state[:, :3] @ world.T,
+            transform_quaternion(state[:, 3:7], angle, reflect, across_yz),
+            state[:, 7:10] @ world.T,
+            transform_angular(state[:, 10:13], angle, reflect),
+        ],
+        dim=1,
+    )

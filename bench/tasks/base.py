@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
-import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
@@ -24,12 +23,7 @@ from mani_skill.utils import common
 from mani_skill.utils.structs import Actor, Pose
 
 from symsteer.bench.sim.headless import rendering_works
-from symsteer.bench.sim.rotations import (
-    planar_matrix,
-    quaternion_to_matrix,
-    transform_angular,
-    transform_quaternion,
-)
+from symsteer.bench.sim.rotations import quaternion_to_matrix, transform_body
 from symsteer.bench.sim.seeds import reset_order
 from symsteer.bench.sim.trees import map_trees, rows_of, write_rows
 from symsteer.bench.tasks.embodiments import BODIES, Embodiment
@@ -37,8 +31,8 @@ from symsteer.bench.tasks.experts import Intent
 from symsteer.bench.tasks.features import Thing, told
 from symsteer.bench.tasks.floating import ACTION_LAYOUT
 from symsteer.bench.variants import parse
-from symsteer.bench.variants.base import Role, overriding
-from symsteer.bench.variants.bodies import Frictions
+from symsteer.bench.variants.base import Role
+from symsteer.bench.variants.breaks import Breaks
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Layout
 from symsteer.variant import UNBROKEN, VariantSpec
@@ -114,7 +108,6 @@ class SymmetricTask(BaseEnv):
     observation_layout: ClassVar[Layout]
     _gripper_layout: ClassVar[Layout]
     _task_layout: ClassVar[Layout]
-    _main_seed: Any
     _batched_branch = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -138,8 +131,7 @@ class SymmetricTask(BaseEnv):
         self.embodiment = embodiment
         self.body: Embodiment = BODIES[embodiment]
         self.variants = parse(variant, strength, (self.task_id, embodiment))
-        for acting in self.variants:
-            acting.env = self
+        self.breaks = Breaks(self, self.variants)
         self._reset_rows: torch.Tensor | None = None
         self._closed = False
         kwargs.setdefault("control_mode", self.body.control_mode)
@@ -173,11 +165,7 @@ class SymmetricTask(BaseEnv):
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
-        for variant in self.variants:
-            variant.load_scene()
-        self._forces_held = False
-        self._extra_cost = torch.zeros(self.num_envs, device=self.device)
-        self._frictions = Frictions(self, overriding(self.variants, "friction"))
+        self.breaks.load_scene()
 
     @property
     def moving_bodies(self) -> list[Actor]:
@@ -192,12 +180,7 @@ class SymmetricTask(BaseEnv):
             self.agent.reset(torch.as_tensor(qpos, device=self.device))
             self.agent.robot.set_pose(sapien.Pose(p=self.body.root_position))
             self._place_objects(rng, len(env_idx))
-            for variant in self.variants:
-                variant.draw(env_idx)
-                variant.reset(env_idx)
-            if any(variant.low is not None for variant in self.variants):
-                self._forces_held = False
-                self.__dict__.pop("policy_origin", None)
+            self.breaks.reset(env_idx)
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """The scripted expert's intent in the present state.
@@ -250,9 +233,7 @@ class SymmetricTask(BaseEnv):
             pose: of N bodies.
             role: what is looked at.
         """
-        for variant in self.variants:
-            pose = variant.perceive(pose, role)
-        return pose
+        return self.breaks.perceive(pose, role)
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         observed = self._observe_task()
@@ -261,20 +242,12 @@ class SymmetricTask(BaseEnv):
 
     def _reported(self, fields: dict[str, torch.Tensor], layout: Layout) -> dict[str, torch.Tensor]:
         """The fields as variants of observation report them."""
-        distorting = overriding(self.variants, "observation")
-        if not distorting:
-            return fields
-        values = torch.cat(list(fields.values()), dim=1)
-        for variant in distorting:
-            values = variant.observation(values, layout)
-        return {name: values[:, layout.slice(name)] for name in fields}
+        return self.breaks.observation(fields, layout)
 
-    @functools.cached_property
+    @property
     def policy_origin(self) -> torch.Tensor:
         """Where the policy takes the workspace's centre to be, ``[N, 2]`` metres in the world."""
-        center = torch.tensor(self.workspace_center, device=self.device)
-        origin = center.expand(self.num_envs, 2)
-        return sum((variant.origin() for variant in self.variants), origin)
+        return self.breaks.origin
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         """The task's own fields ``[N, dim]``, in any order.
@@ -325,32 +298,9 @@ class SymmetricTask(BaseEnv):
         if not self.variants:
             return super()._step_action(action)
         if isinstance(action, torch.Tensor):
-            commanded = action.reshape(self.num_envs, -1)
-            executed = self.body.bound(commanded)
-            for variant in self.variants:
-                executed = variant.action(executed)
-            # Where no variant acts, the action must stay the same to the bit.
-            action = torch.where(self._broken[:, None], executed, commanded)
-        self._hold_forces()
-        self._frictions.update()
-        costly = overriding(self.variants, "extra_cost")
-        before = self.agent.tcp_pose.p.clone() if costly else None
-        action = super()._step_action(action)
-        if before is not None:
-            moved = self.agent.tcp_pose.p - before
-            self._extra_cost = torch.stack([v.extra_cost(moved) for v in costly]).sum(dim=0)
-        return action
-
-    def _hold_forces(self) -> None:
-        """Apply the variants' forces, which depend on masses only, in all substeps."""
-        if self._forces_held:
-            return
-        self._forces_held = True
-        for body in self.moving_bodies:
-            forces = [v.force(body) for v in overriding(self.variants, "force")]
-            present = [force for force in forces if force is not None]
-            if present:
-                self.hold_force(body, torch.stack(present).sum(dim=0))
+            action = self.breaks.action(action.reshape(self.num_envs, -1))
+        with self.breaks.step():
+            return super()._step_action(action)
 
     @_in_batched_branch
     def get_info(self) -> dict:
@@ -360,12 +310,9 @@ class SymmetricTask(BaseEnv):
         it. It is 0 at success.
         """
         info = super().get_info()
-        if overriding(self.variants, "extra_cost"):
-            info["extra_cost"] = torch.where(
-                info["success"] | (self._elapsed_steps == 0),
-                torch.zeros_like(self._extra_cost),
-                self._extra_cost,
-            )
+        if (cost := self.breaks.cost) is not None:
+            free = info["success"] | (self._elapsed_steps == 0)
+            info["extra_cost"] = torch.where(free, torch.zeros_like(cost), cost)
         return info
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
@@ -374,11 +321,6 @@ class SymmetricTask(BaseEnv):
         if "extra_cost" in info and self.reward_mode != "none":
             reward = reward.float() - info["extra_cost"]
         return reward
-
-    @functools.cached_property
-    def _broken(self) -> torch.Tensor:
-        """Environments in which some variant has a strength above zero, ``[N]`` bool."""
-        return torch.stack([variant.active for variant in self.variants]).any(dim=0)
 
     # ------------------------------------------------------------------ resets
 
@@ -418,13 +360,9 @@ class SymmetricTask(BaseEnv):
         return obs, info
 
     def _set_main_rng(self, seed: list[int] | None) -> None:
-        if seed is None or self._reset_rows is None:
+        # It only draws the seeds of an unseeded reset that reconfigures all environments.
+        if self._reset_rows is None:
             super()._set_main_rng(seed)
-        else:
-            rows = self._reset_rows.numpy(force=True)
-            self._main_seed = np.array(self._main_seed)
-            self._main_seed[rows] = seed
-            self._batched_main_rng[rows] = BatchedRNG.from_seeds(seed)
 
     def _set_episode_rng(self, seed: list[int] | None, env_idx: torch.Tensor) -> None:
         if seed is None or self._reset_rows is None:
@@ -496,7 +434,7 @@ class SymmetricTask(BaseEnv):
             "actors": {
                 name: value
                 if name == table
-                else _transform_body(value, angle, reflect, name in self.mirrored_across_yz)
+                else transform_body(value, angle, reflect, name in self.mirrored_across_yz)
                 for name, value in state["actors"].items()
             },
             "articulations": {
@@ -544,22 +482,3 @@ class SymmetricTask(BaseEnv):
             return -step_cost * steps_per_decision / (1 - gamma), 0.0
         decisions = math.ceil(cls.max_episode_steps / steps_per_decision)
         return -step_cost * steps_per_decision * sum(gamma**i for i in range(decisions)), 0.0
-
-
-# ------------------------------------------------------------------------- helpers
-
-
-def _transform_body(
-    state: torch.Tensor, angle: float, reflect: bool, across_yz: bool = False
-) -> torch.Tensor:
-    """Act on rigid-body states ``[N, 13]``: position, quaternion, velocity, angular velocity."""
-    world = planar_matrix(angle, reflect, state)
-    return torch.cat(
-        [
-            state[:, :3] @ world.T,
-            transform_quaternion(state[:, 3:7], angle, reflect, across_yz),
-            state[:, 7:10] @ world.T,
-            transform_angular(state[:, 10:13], angle, reflect),
-        ],
-        dim=1,
-    )
