@@ -35,12 +35,10 @@ import sapien
 import sapien.physx as physx
 
 from symsteer.bench.sim.contacts import Buffer, ContactReader, ImpulseQuery
+from symsteer.bench.sim.packed import PackedScenes
 
 _POSE = slice(0, 7)
 _VELOCITY = slice(7, 13)
-
-# Where `pack` puts a body's 13 numbers: quaternion first, then position, then velocities.
-_PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
 
 _NOTHING = np.zeros(3, dtype=np.float32)
 
@@ -55,6 +53,11 @@ class Mirror(Buffer):
     def changed(self, rows: Any = slice(None), columns: slice = slice(None)) -> np.ndarray:
         """In which of these rows the buffer differs from the simulation, bool."""
         return (self.array[rows, columns] != self.state[rows, columns]).any(axis=1)
+
+
+def _of_all_scenes(name: str) -> property:
+    """SAPIEN's components of that name, scene by scene; dynamic ones include kinematic ones."""
+    return property(lambda self: [c for system in self.systems for c in getattr(system, name)])
 
 
 class BatchedPhysx:
@@ -90,20 +93,9 @@ class BatchedPhysx:
         for system in self.systems:
             system.timestep = value
 
-    @property
-    def rigid_dynamic_components(self) -> list[physx.PhysxRigidDynamicComponent]:
-        """Dynamic and kinematic bodies of all scenes."""
-        return [c for system in self.systems for c in system.rigid_dynamic_components]
-
-    @property
-    def rigid_static_components(self) -> list[physx.PhysxRigidStaticComponent]:
-        """Static bodies of all scenes."""
-        return [c for system in self.systems for c in system.rigid_static_components]
-
-    @property
-    def articulation_link_components(self) -> list[physx.PhysxArticulationLinkComponent]:
-        """Articulation links of all scenes."""
-        return [c for system in self.systems for c in system.articulation_link_components]
+    rigid_dynamic_components = _of_all_scenes("rigid_dynamic_components")
+    rigid_static_components = _of_all_scenes("rigid_static_components")
+    articulation_link_components = _of_all_scenes("articulation_link_components")
 
     def get_contacts(self) -> list[physx.PhysxContact]:
         """Contacts of the last substep in all scenes."""
@@ -118,6 +110,7 @@ class BatchedPhysx:
     def gpu_init(self) -> None:
         """Index every body and articulation, allocate the buffers and fill them."""
         self._index_scenes()
+        self._packed = PackedScenes(self.systems)
         self.cuda_rigid_body_data = Mirror(len(self._bodies), 13)
         self.cuda_rigid_body_force = Buffer(np.zeros((len(self._bodies), 4), dtype=np.float32))
         shape = len(self._articulations), max(self._dof, default=0)
@@ -136,38 +129,19 @@ class BatchedPhysx:
         self.fetch_all()
 
     def _index_scenes(self) -> None:
-        """Assign rows to bodies and articulations, and find their places in packed scenes."""
-        rigid: list[tuple[Any, int]] = []
-        links: list[tuple[Any, int]] = []
-        self._articulations: list[physx.PhysxArticulation] = []
-        self._articulation_scene: list[int] = []
-        # Offsets of each scene in the concatenation of all packed scenes.
-        self._pack_start = [0]
-        rigid_at: list[int] = []
-        root_at: list[int] = []
-        for i, system in enumerate(self.systems):
-            at = self._pack_start[-1]
-            for body in system.rigid_dynamic_components:
-                rigid.append((body, i))
-                rigid_at.append(at)
-                at += 13
-            for link in system.articulation_link_components:
-                links.append((link, i))
-                if link.is_root:
-                    self._articulations.append(link.articulation)
-                    self._articulation_scene.append(i)
-                    root_at.append(at)
-                    # Root pose and velocity; per joint: position, velocity, two drive targets.
-                    at += 13 + 4 * link.articulation.dof
-            self._pack_start.append(at)
-        self._pack_calls = [system.pack for system in self.systems]
-        self._step_calls = [system.step for system in self.systems]
+        """Assign rows to bodies and articulations."""
+        scenes = list(enumerate(self.systems))
+        rigid = [(body, i) for i, s in scenes for body in s.rigid_dynamic_components]
+        links = [(link, i) for i, s in scenes for link in s.articulation_link_components]
+        roots = [(link, i) for link, i in links if link.is_root]
         self._bodies = [body for body, _ in rigid + links]
         self._scene_of = [scene for _, scene in rigid + links]
         self._body_row = {body: row for row, body in enumerate(self._bodies)}
-        self._articulation_row = {a: row for row, a in enumerate(self._articulations)}
         self._rigid_rows = np.arange(len(rigid))
-        self._root_rows = np.array([self._body_row[a.root] for a in self._articulations], int)
+        self._articulations = [root.articulation for root, _ in roots]
+        self._articulation_scene = [scene for _, scene in roots]
+        self._articulation_row = {a: row for row, a in enumerate(self._articulations)}
+        self._root_rows = np.array([self._body_row[root] for root, _ in roots], int)
         self._roots = dict(zip(self._root_rows.tolist(), self._articulations, strict=True))
         self._kinematic = {row for row, (body, _) in enumerate(rigid) if body.kinematic}
         fixed = {row for row, a in self._roots.items() if a.root.joint.type == "fixed"}
@@ -181,21 +155,6 @@ class BatchedPhysx:
             "target_qpos": [[j.set_drive_target for j in js] for js in joints],
             "target_qvel": [[j.set_drive_velocity_target for j in js] for js in joints],
         }
-        self._rigid_at = np.array(rigid_at, int).reshape(-1, 1) + _PACKED_BODY
-        self._root_at = np.array(root_at, int).reshape(-1, 1) + _PACKED_BODY
-        # Padded joints point to the last number of the flat array, which is zero.
-        total = self._pack_start[-1]
-        self._packed = np.zeros(total + 1, dtype=np.float32)
-        shape = len(joints), max(self._dof, default=0)
-        self._joint_at = {
-            name: np.full(shape, total) for name in ("qpos", "qvel", "target_qpos", "target_qvel")
-        }
-        for row, (at, dof) in enumerate(zip(root_at, self._dof, strict=True)):
-            first, count = at + 13, np.arange(dof)
-            self._joint_at["qpos"][row, :dof] = first + count
-            self._joint_at["qvel"][row, :dof] = first + dof + count
-            self._joint_at["target_qpos"][row, :dof] = first + 2 * dof + 2 * count
-            self._joint_at["target_qvel"][row, :dof] = first + 2 * dof + 2 * count + 1
 
     def body_index(self, body: Any) -> int:
         """Row of a rigid body or link in the body buffer; from now on it is kept up to date."""
@@ -247,7 +206,7 @@ class BatchedPhysx:
         substeps = range(count)
         moving = np.flatnonzero(~self._paused)
         for i in moving.tolist():
-            step, held = self._step_calls[i], self._held[i]
+            step, held = self.systems[i].step, self._held[i]
             pushes = [(self._bodies[row].add_force_torque, force) for row, force in held.items()]
             for _ in substeps:
                 for push, force in pushes:
@@ -264,17 +223,13 @@ class BatchedPhysx:
         if not self._stale.any():
             return
         stale = np.flatnonzero(self._stale).tolist()
-        packed, start = self._packed, self._pack_start
-        if len(stale) == len(self.systems):
-            packed[:-1] = np.frombuffer(b"".join([pack() for pack in self._pack_calls]), "f4")
-        else:
-            for i in stale:
-                packed[start[i] : start[i + 1]] = np.frombuffer(self._pack_calls[i](), "f4")
+        packed = self._packed
+        packed.read(stale)
         state = self.cuda_rigid_body_data.state
-        state[: len(self._rigid_rows)] = packed[self._rigid_at]
-        state[self._root_rows] = packed[self._root_at]
-        for name, at in self._joint_at.items():
-            self.joints[name].state[:] = packed[at]
+        state[: len(self._rigid_rows)] = packed.numbers[packed.rigid]
+        state[self._root_rows] = packed.numbers[packed.roots]
+        for name, at in packed.joints.items():
+            self.joints[name].state[:] = packed.numbers[at]
         rows = [row for i in stale for row in self._live_links[i]]
         if rows:
             self._read_links(rows)
@@ -290,7 +245,7 @@ class BatchedPhysx:
         """Update every buffer."""
         self._refresh()
         self.cuda_rigid_body_data.array[:] = self.cuda_rigid_body_data.state
-        for name in self._joint_at:
+        for name in self._packed.joints:
             self.joints[name].array[:] = self.joints[name].state
 
     def gpu_fetch_rigid_dynamic_data(self) -> None:
@@ -364,8 +319,7 @@ class BatchedPhysx:
                 set_target(value)
         mirror.state[:] = mirror.array
         # The next refresh must find the new targets.
-        self._packed[self._joint_at[name]] = mirror.array
-        self._packed[-1] = 0
+        self._packed.write_targets(name, mirror.array)
 
     gpu_apply_articulation_target_position = partialmethod(_apply_targets, "target_qpos", True)
     gpu_apply_articulation_target_velocity = partialmethod(_apply_targets, "target_qvel", True)

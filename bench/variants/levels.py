@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from symsteer.errors import UserError
-from symsteer.tables import markdown
 from symsteer.variant import UNBROKEN, parts_of
 
 LEVELS = {"easy": 0.1, "medium": 0.25, "hard": 0.5}
@@ -96,28 +95,6 @@ def strength(
         pair for pair in itertools.pairwise(sorted(points.items())) if pair[1][1] >= wanted
     )
     return round(low + (high - low) * (wanted - below) / (above - below), 2)
-
-
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The strengths of all levels, in markdown: a row for each task, a column for each variant."""
-    audited = points_of(rows)
-
-    def cell(name: str, place: tuple[str, str]) -> str:
-        strengths = []
-        for level in LEVELS:
-            try:
-                strengths.append(f"{strength(name, level, *place, audited):g}")
-            except UserError:
-                strengths.append("-")
-        return " / ".join(strengths) if {*strengths} != {"-"} else "-"
-
-    names = sorted({name for place in audited for name in audited[place]})
-    cells = {name: [cell(name, place) for place in audited] for name in names}
-    shown = [name for name in names if {*cells[name]} != {"-"}]
-    lines = [
-        [", ".join(place), *(cells[name][i] for name in shown)] for i, place in enumerate(audited)
-    ]
-    return markdown(["task", *(f"`{name}`" for name in shown)], lines) + "\n"
 
 
 def points_of(rows: Sequence[Mapping[str, Any]]) -> Points:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,10 @@ from symsteer.bench.audit.report import (
     two_digits,
 )
 from symsteer.bench.audit.result import VERSION, old_version
-from symsteer.bench.variants.levels import table
+from symsteer.bench.variants.levels import LEVELS, points_of, strength
 from symsteer.errors import UserError
 from symsteer.files import write_together
+from symsteer.tables import markdown
 from symsteer.terminal import complain
 from tools.pages.marks import CHECKOUT, check_checkout, with_tables
 
@@ -72,6 +73,28 @@ def _overview(rows: Sequence[dict[str, Any]]) -> str:
         cells += [f"{differ} of {len(own)} differ" if differ else "alike"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def levels(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The strengths of all levels, in markdown: a row for each task, a column for each variant."""
+    audited = points_of(rows)
+
+    def cell(name: str, place: tuple[str, str]) -> str:
+        strengths = []
+        for level in LEVELS:
+            try:
+                strengths.append(f"{strength(name, level, *place, audited):g}")
+            except UserError:
+                strengths.append("-")
+        return " / ".join(strengths) if {*strengths} != {"-"} else "-"
+
+    names = sorted({name for place in audited for name in audited[place]})
+    cells = {name: [cell(name, place) for place in audited] for name in names}
+    shown = [name for name in names if {*cells[name]} != {"-"}]
+    lines = [
+        [", ".join(place), *(cells[name][i] for name in shown)] for i, place in enumerate(audited)
+    ]
+    return markdown(["task", *(f"`{name}`" for name in shown)], lines) + "\n"
 
 
 def percent_range(intervals: Sequence[list[float] | None], exact: float) -> str:
@@ -158,7 +181,7 @@ def main(arguments: Sequence[str]) -> int:
         rows = [row for path in arguments or [str(SUMMARY)] for row in read_summary(Path(path))]
         pages = {PAGE: generate(PAGE.read_text(), rows)}
         pages[VARIANTS_PAGE] = with_tables(
-            VARIANTS_PAGE.read_text(), table(rows), "docs/variants.md"
+            VARIANTS_PAGE.read_text(), levels(rows), "docs/variants.md"
         )
         for task in dict.fromkeys(row["task"] for row in rows):
             pages[task_page(task)] = generate_task(task_page(task).read_text(), task, rows)

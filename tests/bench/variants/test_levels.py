@@ -4,10 +4,10 @@ from symsteer.bench.audit.result import AuditSettings
 from symsteer.bench.audit.study import cells
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.tasks import make
-from symsteer.bench.variants.levels import LEVELS, points_of, strength, table, with_numbers
+from symsteer.bench.variants.levels import LEVELS, points_of, strength, with_numbers
 from symsteer.errors import UserError
 from symsteer.registry import allow
-from tools.pages.audit import SUMMARY, read_summary
+from tools.pages.audit import SUMMARY, levels, read_summary
 
 PLACE = ("PushCube-v1", "floating")
 
@@ -100,4 +100,4 @@ def test_levels_that_do_not_exist(task, embodiment, variant, words):
 
 def test_the_page_has_the_levels_of_the_committed_audit():
     page = (SUMMARY.parents[3] / "docs" / "variants.md").read_text()
-    assert table(read_summary(SUMMARY)).strip() in page
+    assert levels(read_summary(SUMMARY)).strip() in page
