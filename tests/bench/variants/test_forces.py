@@ -14,22 +14,7 @@ from tests.bench.variants.scenes import CONTROL_STEP, G, act, place, scene
 STRENGTHS = torch.tensor([0.0, 0.5, 1.0])
 
 
-def fall(env, steps=3):
-    """Velocity ``[N, 3]`` of the manipulated object after a free fall from rest."""
-    place(env, (0.25, 0.25, 0.5))
-    for _ in range(steps):
-        env.step(act(env))
-    return env.manipulated.linear_velocity
-
-
-def test_tilt_turns_gravity():
-    env = scene("gravity_tilt", STRENGTHS)
-    tilt = math.radians(30) * STRENGTHS
-    direction = torch.stack([tilt.sin(), torch.zeros(3), -tilt.cos()], dim=1)
-    assert torch.allclose(fall(env), 3 * CONTROL_STEP * G * direction, atol=2e-3)
-
-
-def test_tilt_pulls_on_all_objects_and_not_on_the_hand():
+def test_tilt_turns_the_gravity_of_all_objects_and_not_of_the_hand():
     env = scene("gravity_tilt", STRENGTHS, task="StackCube-v1")
     state = env.get_state_dict()
     for i, name in enumerate(("cubeA", "cubeB")):
@@ -38,9 +23,10 @@ def test_tilt_pulls_on_all_objects_and_not_on_the_hand():
     tool = env.agent.tcp_pose.p.clone()
     for _ in range(3):
         env.step(act(env))
+    tilt = math.radians(30) * STRENGTHS
+    direction = torch.stack([tilt.sin(), torch.zeros(3), -tilt.cos()], dim=1)
     for cube in (env.cubeA, env.cubeB):
-        expected = 3 * CONTROL_STEP * G * torch.sin(math.radians(30) * STRENGTHS)
-        assert torch.allclose(cube.linear_velocity[:, 0], expected, atol=2e-3)
+        assert torch.allclose(cube.linear_velocity, 3 * CONTROL_STEP * G * direction, atol=2e-3)
     assert torch.allclose(env.agent.tcp_pose.p, tool, atol=1e-4)
 
 
@@ -77,7 +63,7 @@ def test_tilt_drags_what_is_let_go():
         pytest.param("wind:1+gravity_tilt:1", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("task", STATE_TASKS)
+@pytest.mark.parametrize("task", [task for task in STATE_TASKS if not task.startswith("Tilted")])
 def test_untouched_objects_stay(task, variant):
     """Within 1 mm over a whole episode; also a sphere, which does not roll there."""
     env = make(task, num_envs=2, variant=variant)
@@ -103,11 +89,13 @@ def test_sphere_rolls_where_nothing_acts():
 def test_wind_blows_on_the_manipulated_object_alone():
     env = scene("wind", STRENGTHS, task="StackCube-v1")
     other = env.cubeB.pose.p.clone()
-    velocity = fall(env)
+    place(env, (0.25, 0.25, 0.5))
+    for _ in range(3):
+        env.step(act(env))
     expected = torch.zeros(3, 3)
     expected[:, 0] = 0.75 * 0.3 * STRENGTHS * G * 3 * CONTROL_STEP
     expected[:, 2] = -G * 3 * CONTROL_STEP
-    assert torch.allclose(velocity, expected, atol=2e-3)
+    assert torch.allclose(env.manipulated.linear_velocity, expected, atol=2e-3)
     assert torch.allclose(env.cubeB.pose.p, other, atol=1e-4)
 
 

@@ -26,21 +26,14 @@ def audit_of(task="Task-v1", group="C8", **defects):
     ]
 
 
-def test_a_level_is_where_the_audit_finds_its_defect():
-    audited = points_of(audit_of(s0=0.02, s25=0.12, s50=0.22, s100=0.5))
+def test_a_level_is_where_the_audit_first_finds_its_defect():
+    rows = audit_of(s0=0.02, s25=0.12, s50=0.22, s100=0.5) + audit_of(group="D4", s0=0.0, s100=0.9)
+    audited = points_of(rows)
     found = {level: strength("wind", level, "Task-v1", "floating", audited) for level in LEVELS}
     # 0.02 + 0.1 s / 0.25 = 0.1; 0.22 + 0.28 (s - 0.5) / 0.5 = 0.25; the last point is 0.5.
     assert found == {"easy": 0.2, "medium": 0.55, "hard": 1.0}
-
-
-def test_the_least_strength_counts():
     audited = points_of(audit_of(s0=0.0, s25=0.3, s50=0.1, s100=0.3))
     assert strength("wind", "medium", "Task-v1", "floating", audited) == 0.21
-
-
-def test_audits_of_other_groups_do_not_count():
-    rows = audit_of(s0=0.0, s100=0.5) + audit_of(group="D4", s0=0.0, s100=0.9)
-    assert points_of(rows) == {("Task-v1", "floating"): {"wind": {0.0: 0.0, 1.0: 0.5}}}
 
 
 def test_levels_become_numbers_wherever_a_strength_can_stand():
@@ -53,11 +46,6 @@ def test_levels_become_numbers_wherever_a_strength_can_stand():
         assert with_numbers(other, *PLACE) == other
 
 
-def test_the_audited_strength_rises_with_the_level():
-    strengths = [strength("action_gain", level, "PushT-v1", "floating") for level in LEVELS]
-    assert strengths == sorted(set(strengths))
-
-
 def test_runs_audits_and_environments_take_levels():
     config = RunConfig(task=PLACE[0], variant="perception_bias:medium")
     number = strength("perception_bias", "medium", *PLACE)
@@ -66,15 +54,8 @@ def test_runs_audits_and_environments_take_levels():
     env = make(PLACE[0], num_envs=1, variant="perception_bias:medium")
     assert [part.strength for part in env.variants] == pytest.approx([number])
     env.close()
-    tasks = ["PushCube-v1", "PickCube-v1"]
-    texts = {
-        settings.task: settings.variant
-        for settings in cells(tasks, ["perception_bias:hard"], AuditSettings())
-    }
-    assert texts == {
-        task: f"perception_bias:{strength('perception_bias', 'hard', task, 'floating'):g}"
-        for task in tasks
-    }
+    (settings,) = cells([PLACE[0]], ["perception_bias:medium"], AuditSettings())
+    assert settings.variant == config.variant
 
 
 @pytest.mark.parametrize(

@@ -22,23 +22,15 @@ NAMES = sorted(VARIANTS)
     [
         ("action_gian:0.5", "did you mean 'action_gain'"),
         ("", "valid: none, gravity_tilt"),
-        ("wined:0.5", "did you mean 'wind'"),
         ("earthquake:0.5", "valid: none, gravity_tilt, .*, spawn_sector"),
         ("action_gain", "needs a strength"),
         ("action_gain:", "no strength can be read"),
-        ("action_gain:much", "no strength can be read"),
         ("action_gain:nan", "no strength can be read"),
         ("action_gain:1.5", r"\[0, 1\]"),
-        ("action_gain:-0.1", r"\[0, 1\]"),
-        ("wind:0.1+gravity_tilt:7", r"'gravity_tilt' must lie in \[0, 1\]"),
+        ("wind:0.1+gravity_tilt:-7", r"'gravity_tilt' must lie in \[0, 1\]"),
         ("action_gain:0.1+action_gain:0.2", "named twice"),
         ("action_gain:0.1+", "there is no variant ''"),
-        (
-            "none+action_gain:0.1",
-            "none .* must stand alone.* leave it out of 'none\\+action_gain:0",
-        ),
-        ("wind:0.1+none", "must stand alone"),
-        ("none:0.5", "must stand alone"),
+        ("none+wind:0.1", r"none .* must stand alone.* leave it out of 'none\+wind:0"),
         ("none:hard", "must stand alone"),
         ("wind:0.5..0.2", r"must be a range such as 0.2..0.8 within \[0, 1\]; they are 0.5..0.2"),
         ("wind:0.5..", "no strength can be read"),
@@ -50,9 +42,9 @@ NAMES = sorted(VARIANTS)
     ],
 )
 def test_bad_text_is_explained(text, part):
-    for reader in (parse, read, functools.partial(read, place=("PickCube-v1", "floating"))):
+    for place in (None, ("PickCube-v1", "floating")):
         with pytest.raises(UserError, match=part) as error:
-            reader(text)
+            read(text, place=place)
         assert "\n" not in str(error.value)
 
 
@@ -79,17 +71,15 @@ def test_text_becomes_data_and_objects():
     assert own.name == "symsteer.bench.variants.wind:Wind"
     with pytest.raises(UserError, match="must be a class that inherits from"):
         parse("symsteer.bench.variants.base:overriding:0.5")
-    with pytest.raises(UserError, match="without a variant"):
-        parse("none", 0.5)
     assert parse("none", 0.0) == ()
-    with pytest.raises(UserError, match="given twice"):
-        parse("action_gain:0.5", 0.5)
-    with pytest.raises(UserError, match=r"\[0, 1\]"):
-        parse("action_gain", torch.tensor([0.5, 1.2]))
-    with pytest.raises(UserError, match=r"\[0, 1\]"):
-        parse("action_gain", "a lot")
-    with pytest.raises(UserError, match=r"2 strengths .* for 3 environments"):
-        make("PickCube-v1", num_envs=3, variant="action_gain", strength=[0.5, 0.2])
+    for text, strength, part in (
+        ("none", 0.5, "without a variant"),
+        ("action_gain:0.5", 0.5, "given twice"),
+        ("action_gain", torch.tensor([0.5, 1.2]), r"\[0, 1\]"),
+        ("action_gain", "a lot", r"\[0, 1\]"),
+    ):
+        with pytest.raises(UserError, match=part):
+            parse(text, strength)
 
 
 def test_the_strength_may_grow_during_a_run_or_be_drawn_for_each_episode():
@@ -118,7 +108,6 @@ def test_the_strength_may_grow_during_a_run_or_be_drawn_for_each_episode():
 
 def test_evaluation_leaves_out_what_is_for_training_alone():
     for text, kept in (
-        ("none", "none"),
         ("spawn_sector:1", "none"),
         ("wind:0.5+spawn_sector:1+action_gain:0.5", "wind:0.5+action_gain:0.5"),
     ):
@@ -126,7 +115,6 @@ def test_evaluation_leaves_out_what_is_for_training_alone():
 
 
 def test_highest_cost():
-    assert highest_cost(parse("wind:1")) == 1
     assert highest_cost(parse("directional_reward:0.5+wind:1")) == 1.5
     assert highest_cost(parse("directional_reward", torch.tensor([0.2, 0.75]))) == 1.75
 
@@ -178,18 +166,16 @@ def play(embodiment, **kwargs):
     return shown
 
 
-def one_of_three(name, embodiment):
-    """The variant acts in the second environment alone."""
-    return play(embodiment, variant=name, strength=(0.0, 1.0, 0.0))
-
-
 @pytest.mark.parametrize("embodiment", ["floating", pytest.param("panda", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NAMES)
 def test_strength_zero_is_the_unbroken_task_to_the_bit(name, embodiment):
-    """Also beside environments in which the variant acts."""
-    mixed = one_of_three(name, embodiment)
-    for plain, broken in zip(play(embodiment), mixed, strict=True):
+    """Also beside an environment in which the variant acts, as it shows there."""
+    unbroken, mixed = play(embodiment), play(embodiment, variant=name, strength=(0.0, 1.0, 0.0))
+    for plain, broken in zip(unbroken, mixed, strict=True):
         assert torch.equal(plain[[0, 2]], broken[[0, 2]])
+    if name not in ("obstacle", "friction_patch"):  # which have tests of their own where they act
+        pairs = zip(unbroken, mixed, strict=True)
+        assert not all(torch.equal(plain[1], broken[1]) for plain, broken in pairs)
 
 
 def test_strength_zero_of_all_is_the_unbroken_task_to_the_bit():
@@ -198,47 +184,37 @@ def test_strength_zero_of_all_is_the_unbroken_task_to_the_bit():
         assert torch.equal(plain, zero)
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("obstacle", "friction_patch")])
-def test_strength_one_shows(name):
-    """The two local ones have tests of their own where they act."""
-    pairs = zip(play("floating"), one_of_three(name, "floating"), strict=True)
-    assert not all(torch.equal(plain[1], broken[1]) for plain, broken in pairs)
-
-
 # ---------------------------------------------------------------- drawn strengths
 
 
 @pytest.mark.parametrize("embodiment", ["floating", pytest.param("panda", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "obstacle"])
 def test_an_episode_that_draws_a_strength_is_one_of_that_strength(name, embodiment):
-    actions = script(embodiment)[:8]
-
     def episodes(variant, strength=None):
         """Two episodes of three environments; of the last one the first episode goes on."""
         env = make(
             "PushCube-v1", num_envs=3, embodiment=embodiment, variant=variant, strength=strength
         )
-        shown, strengths = [], []
-        for seeds in ([1, 2, 3], [4, 5]):
+        shown, strengths = ([], []), []
+        for episode, seeds in zip(shown, ([1, 2, 3], [4, 5]), strict=True):
             rows = torch.arange(len(seeds))
-            shown.append(env.reset(seed=seeds, options={"env_idx": rows})[0].clone())
+            episode.append(env.reset(seed=seeds, options={"env_idx": rows})[0].clone())
             strengths.append(env.variants[0].amount.clone())
-            for action in actions:
+            for action in script(embodiment)[:8]:
                 obs, reward, *_ = env.step(action)
-                shown.extend([obs.clone(), reward.clone()])
+                episode.extend([obs.clone(), reward.clone()])
         env.close()
-        return shown, strengths
+        return *shown, strengths
 
-    drawn, (first, second) = episodes(f"{name}:0.2..0.9")
-    assert 0.2 < torch.cat([first, second]).min() < torch.cat([first, second]).max() < 0.9
-    assert len(torch.cat([first, second]).unique()) == 5
+    *drawn, (first, second) = episodes(f"{name}:0.2..0.9")
+    values = torch.cat([first, second])
+    assert 0.2 < values.min() < values.max() < 0.9
+    assert len(values.unique()) == 5
     assert first[2] == second[2]
-    half = len(drawn) // 2
-    for strengths, part in ((first, slice(0, half)), (second, slice(half, None))):
-        constant, _ = episodes(name, strengths)
-        same = slice(None) if part.start == 0 else slice(0, 2)
-        for one, other in zip(drawn[part], constant[part], strict=True):
-            assert torch.equal(one[same], other[same])
+    for number, rows in ((0, slice(3)), (1, slice(2))):
+        constant = episodes(name, (first, second)[number])[number]
+        for one, other in zip(drawn[number], constant, strict=True):
+            assert torch.equal(one[rows], other[rows])
 
 
 # -------------------------------------------------------------------- together
