@@ -88,25 +88,11 @@ def test_cameras_with_vulkan():
     assert (env.render()[0] != first).any()
 
 
-@pytest.mark.parametrize("package", ["mani-skill", "sapien"])
-def test_other_release_is_refused(monkeypatch, package):
+def test_other_release_is_refused(monkeypatch):
     """Another version of ManiSkill or SAPIEN gives one sentence with the cure."""
-    monkeypatch.setitem(versions.PINNED, package, "9.9.9")
-    with pytest.raises(UserError, match=rf"{package} 9\.9\.9.*pip install {package}==9\.9\.9"):
+    monkeypatch.setitem(versions.PINNED, "sapien", "9.9.9")
+    with pytest.raises(UserError, match=r"sapien 9\.9\.9.*pip install sapien==9\.9\.9"):
         create(PickCubeEnv, 1)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"sim": "gpu"}, 'Unknown simulator "gpu": choose "cpu" or "cuda"'),
-        ({"num_envs": 0}, "at least one environment"),
-    ],
-)
-def test_bad_settings(settings, message):
-    """Each wrong setting is answered by one sentence."""
-    with pytest.raises(UserError, match=message):
-        create(PickCubeEnv, **{"num_envs": 2, **settings})
 
 
 def test_more_scenes_than_a_process_can_hold(monkeypatch):
@@ -130,19 +116,19 @@ def test_more_scenes_than_a_process_can_hold(monkeypatch):
 
 
 def test_dropped_scenes_are_collected_before_they_are_many(monkeypatch):
-    monkeypatch.setattr("symsteer.bench.sim.environment.MAX_DROPPED", 9)
+    monkeypatch.setattr("symsteer.bench.sim.environment.MAX_DROPPED", 3)
     gc.collect()
     gc.disable()
     try:
-        env, dropped = create(PickCubeEnv, 4, obs_mode="state"), []
-        for _ in range(5):
+        env, dropped = create(PickCubeEnv, 2, obs_mode="state"), []
+        for _ in range(4):
             env.reset(seed=0, options={"reconfigure": True})
             dropped.append(batched._count(batched._DROPPED_SCENES))
         env.close()
     finally:
         gc.enable()
-    # The task still names actors of the last scene when the third one is dropped.
-    assert dropped == [4, 8, 4, 8, 4]
+    # The task still names actors of the last scene when the second one is dropped.
+    assert dropped == [2, 2, 2, 2]
 
 
 def test_physx_gpu_library_missing(monkeypatch):

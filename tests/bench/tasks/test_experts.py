@@ -25,7 +25,7 @@ def success_rate(task, embodiment, episodes, first_seed=0):
 
 @pytest.mark.parametrize("task", STATE_TASKS)
 def test_expert_solves_the_floating_task(task):
-    assert success_rate(task, "floating", 24) >= 0.9
+    assert success_rate(task, "floating", 16) >= 0.9
 
 
 @pytest.mark.slow
@@ -40,12 +40,13 @@ def test_expert_is_equivariant(task):
     env = shared(task, 8)
     env.reset(seed=list(range(8)))
     expert = Expert(env)
+    elements = Group.parse("D8").elements[::3]
     # Far enough for every expert to have its object in hand.
     for step in range(24):
         action = expert.act()
-        if step % 2 == 0:
+        if step % 3 == 0:
             state = env.get_state_dict()
-            for angle, reflect in Group.parse("D8").elements[:: 3 if step % 4 else 1]:
+            for angle, reflect in elements:
                 env.set_state_dict(env.transform_state(state, angle, reflect))
                 expected = env.action_layout.transform(action, angle, reflect)
                 # A float error may tip a threshold for one state in many, no more.

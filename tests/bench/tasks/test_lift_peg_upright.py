@@ -49,17 +49,6 @@ def near_upright():
     return quaternion_multiply(yaw_quaternion(uniform(-math.pi, math.pi, 2)), q)
 
 
-def test_success_is_stocks_where_that_is_well_conditioned(env):
-    """A peg that leans in the x-z plane about its body z axis: stock's Euler angle is its tilt."""
-    lean = quaternion_multiply(
-        about("y", -math.pi / 2 + uniform(-0.2, 0.2, 3)), about("x", torch.full((COUNT,), 1.5708))
-    )
-    place(env, lean, uniform(0.112, 0.128, 4))
-    ours, stock = env.evaluate()["success"], LiftPegUprightEnv.evaluate(env)["success"]
-    assert torch.equal(ours, stock)
-    assert 5 < ours.sum() < COUNT - 5
-
-
 def test_success_is_invariant_and_stocks_is_not(env):
     place(env, near_upright(), uniform(0.114, 0.126, 5))
     state = env.get_state_dict()
@@ -71,6 +60,11 @@ def test_success_is_invariant_and_stocks_is_not(env):
         assert torch.equal(env.evaluate()["success"], ours), (angle, reflect)
         stock_changed |= not torch.equal(LiftPegUprightEnv.evaluate(env)["success"], stock)
     assert stock_changed
+    # A peg that leans in the x-z plane about its body z axis: stock's Euler angle is its tilt.
+    lean = about("y", -math.pi / 2 + uniform(-0.2, 0.2, 3))
+    lean = quaternion_multiply(lean, about("x", torch.full((COUNT,), 1.5708)))
+    place(env, lean, uniform(0.112, 0.128, 4))
+    assert torch.equal(env.evaluate()["success"], LiftPegUprightEnv.evaluate(env)["success"])
 
 
 @pytest.mark.parametrize(
@@ -99,13 +93,6 @@ def test_all_ways_to_name_the_pegs_axes_are_observed_alike(env):
     for axis, turn in [("x", math.pi / 2), ("x", math.pi), ("y", math.pi), ("z", math.pi)]:
         place(env, quaternion_multiply(q, about(axis, torch.full((COUNT,), turn))), 0.13)
         assert torch.allclose(env.get_obs(), seen, atol=2e-6), axis
-
-
-def test_resets_lie_in_the_disc(env):
-    line = env.get_obs()[:, env.observation_layout.slice("peg_line")]
-    assert torch.allclose(line.norm(dim=1), torch.ones(COUNT), atol=1e-5)
-    assert env.peg.pose.p[:, :2].norm(dim=1).max() <= env.spawn_radius + 1e-6
-    assert not env.evaluate()["success"].any()
 
 
 def test_the_pandas_wrist_takes_the_turn_that_its_joint_allows():

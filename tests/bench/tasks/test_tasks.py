@@ -52,15 +52,15 @@ def test_tasks_are_maniskills(task):
     assert (ours.evaluate is stock.evaluate) == (task not in OWN_EVALUATE)
 
 
-@pytest.mark.parametrize("embodiment", ["floating", "panda"])
-@pytest.mark.parametrize("task", FLAT)
+@pytest.mark.parametrize(
+    ("task", "embodiment"), [*((task, "floating") for task in FLAT), ("PokeCube-v1", "panda")]
+)
 def test_observation_follows_the_layout(task, embodiment):
     env = shared(task, 4, embodiment=embodiment)
     obs, _ = env.reset(seed=[1, 2, 3, 4])
     layout = env.observation_layout
     assert obs.shape == (4, layout.dim)
     assert obs.dtype == torch.float32
-    assert env.action_layout.dim == 7
     assert env.single_observation_space.shape == (layout.dim,)
     assert torch.equal(obs[:, layout.slice("tcp_xy")], env.agent.tcp_pose.p[:, :2])
     assert torch.equal(obs[:, layout.slice("tcp_z")], env.agent.tcp_pose.p[:, 2:])
@@ -102,12 +102,6 @@ def test_unseeded_resets_continue_each_environments_own_stream():
         env.reset()
         states.append(rows_of(copied(env), [0, 2, 3]))
     assert_same(*states)
-
-
-def test_wrong_number_of_seeds_is_explained():
-    env = shared("PickCube-v1", 4)
-    with pytest.raises(UserError, match="2 seeds were given for 4 environments"):
-        env.reset(seed=[1, 2])
     with pytest.raises(UserError, match="3 seeds were given for 2 environments"):
         env.reset(seed=[1, 2, 3], options={"env_idx": [0, 1]})
 
@@ -117,9 +111,17 @@ def test_resets_have_no_preferred_direction_and_stay_inside_the_spawn_extent(tas
 
     A square spawn region, or a yaw that is not uniform, fails for some k up to 8.
     """
-    count = 400
-    env = make(task, num_envs=count)
-    obs, _ = env.reset(seed=list(range(count)))
+    env, batch, furthest = shared(task, 40), [], []
+    furniture = env.table_scene.table
+    for start in range(0, 400, 40):
+        batch.append(env.reset(seed=list(range(start, start + 40)))[0].clone())
+        furthest += [
+            reach(actor, actor._bodies[0].collision_shapes)
+            for actor in env.scene.actors.values()
+            if actor.px_body_type != "static" and actor is not furniture
+            if actor._bodies[0].collision_shapes
+        ]
+    obs, count = torch.cat(batch), 400
     for field in env.observation_layout.fields:
         value = obs[:, env.observation_layout.slice(field.name)].double()
         if field.frequency == 0:
@@ -132,16 +134,9 @@ def test_resets_have_no_preferred_direction_and_stay_inside_the_spawn_extent(tas
         for k in (1, 2, 3, 4, 8):
             size = (z.abs() ** (2 * k)).mean().sqrt()
             assert (z**k).mean().abs() < 5 * size / count**0.5, (field.name, k)
-    furthest = max(
-        reach(actor, actor._bodies[0].collision_shapes)
-        for actor in env.scene.actors.values()
-        if actor.px_body_type != "static" and actor is not env.table_scene.table
-        if actor._bodies[0].collision_shapes
-    )
-    env.close()
-    assert furthest <= env.spawn_extent < 0.3
+    assert max(furthest) <= env.spawn_extent < 0.3
     # and not half the table: an obstacle outside of it must matter
-    assert furthest >= 0.75 * env.spawn_extent
+    assert max(furthest) >= 0.75 * env.spawn_extent
 
 
 def reach(actor, shapes):
@@ -183,6 +178,10 @@ def test_restoring_a_state(floating):
     state = copied(floating)
     roam(floating, 6, seed=2)
     expected = copied(floating)
+    floating.set_state_dict(rows_of(state, [2, 3]), env_idx=torch.tensor([4, 1]))
+    now = floating.get_state_dict()
+    assert_same(rows_of(now, [0, 2, 3, 5]), rows_of(expected, [0, 2, 3, 5]))
+    assert_same(rows_of(now, [4, 1]), rows_of(state, [2, 3]))
     floating.set_state_dict(state)
     assert_same(copied(floating), state)
     roam(floating, 6, seed=2)
@@ -198,42 +197,29 @@ def test_restoring_a_state(floating):
             assert close.all(), name
 
 
-def test_restoring_some_environments_keeps_the_others(floating):
-    roam(floating, 3)
-    before = copied(floating)
-    roam(floating, 3)
-    after = copied(floating)
-    floating.set_state_dict(rows_of(before, [2, 3]), env_idx=torch.tensor([4, 1]))
-    now = floating.get_state_dict()
-    assert_same(rows_of(now, [0, 2, 3, 5]), rows_of(after, [0, 2, 3, 5]))
-    assert_same(rows_of(now, [4, 1]), rows_of(before, [2, 3]))
-
-
 def test_turning_a_state_turns_observation_and_keeps_the_reward(floating):
-    """The layout says how each observed number turns; the simulation state must agree."""
+    """The layout says how each observed number turns; the simulation state must agree.
+
+    Nothing in the observation depends on how the state came about (contacts, velocities).
+    """
     roam(floating, 8)
-    state = copied(floating)
+    seen, state = floating.get_obs().clone(), copied(floating)
     floating.set_state_dict(state)
     obs, zero = floating.get_obs().clone(), torch.zeros(6, 7)
+    assert torch.allclose(obs, seen, atol=1e-6)
     reward = floating.get_reward(obs, zero, floating.get_info()).clone()
     for angle, reflect in ELEMENTS:
-        floating.set_state_dict(floating.transform_state(state, angle, reflect))
+        there = floating.transform_state(state, angle, reflect)
+        floating.set_state_dict(there)
         expected = floating.observation_layout.transform(obs.double(), angle, reflect)
         assert torch.allclose(floating.get_obs().double(), expected, atol=2e-5), (angle, reflect)
         turned = floating.get_reward(obs, zero, floating.get_info())
         assert torch.allclose(turned, reward, atol=1e-5)
-
-
-def test_transformations_compose(floating):
-    roam(floating, 8)
-    state = floating.get_state_dict()
-    there = floating.transform_state(state, 1.1, True)
-    # A reflection followed by a rotation is its own inverse.
-    back = floating.transform_state(there, 1.1, True)
-    map_trees(lambda a, b: torch.testing.assert_close(a, b, atol=5e-6, rtol=1e-5), back, state)
-    robot = floating.agent.robot.name
-    moved = (there["articulations"][robot] - state["articulations"][robot])[:, 13:21]
-    assert moved.abs().max() > 0.1
+        if reflect:  # a reflection followed by a rotation is its own inverse
+            back = floating.transform_state(there, angle, reflect)
+            map_trees(
+                lambda a, b: torch.testing.assert_close(a, b, atol=5e-6, rtol=1e-5), back, state
+            )
 
 
 def test_panda_states_cannot_be_turned():
@@ -250,11 +236,9 @@ def test_reward_in_the_stock_direction_is_maniskills(task, angle):
     direction = env.direction()
     angles = angle - torch.atan2(direction[:, 1], direction[:, 0])
     # Turn every environment so that it moves along the stock direction.
+    now = env.get_state_dict()
     state = join_trees(
-        [
-            rows_of(env.transform_state(env.get_state_dict(), float(a)), [i])
-            for i, a in enumerate(angles)
-        ]
+        [rows_of(env.transform_state(now, float(a)), [i]) for i, a in enumerate(angles)]
     )
     env.set_state_dict(state)
     # Bring some cubes to where the tool is right behind them, one of them into the goal.
@@ -273,21 +257,17 @@ def test_reward_in_the_stock_direction_is_maniskills(task, angle):
     assert len(ours.round(decimals=3).unique()) >= 5
 
 
-def test_a_closed_environment_says_so():
-    env = make("PushCube-v1", num_envs=1)
+def test_truncation_at_the_limit_and_use_after_the_end():
+    env = make("PickCube-v1", num_envs=2)
+    env.reset(seed=[0, 1])
+    for step in range(env.max_episode_steps):
+        _, _, terminated, truncated, _ = env.step(torch.zeros(2, 7))
+        assert truncated.tolist() == [step + 1 == env.max_episode_steps] * 2
+        assert not terminated.any()
     env.close()
-    for use in (lambda: env.step(torch.zeros(1, 7)), lambda: env.reset(seed=[0])):
+    for use in (lambda: env.step(torch.zeros(2, 7)), lambda: env.reset(seed=[0])):
         with pytest.raises(UserError, match="was closed"):
             use()
-
-
-def test_truncation_at_the_limit():
-    env = shared("PickCube-v1", 4)
-    env.reset(seed=[0, 1, 2, 3])
-    for step in range(env.max_episode_steps):
-        _, _, terminated, truncated, _ = env.step(torch.zeros(4, 7))
-        assert truncated.tolist() == [step + 1 == env.max_episode_steps] * 4
-        assert not terminated.any()
 
 
 def test_feasible_return():
@@ -299,13 +279,3 @@ def test_feasible_return():
     for gamma in (1.0, -0.1):
         with pytest.raises(UserError, match="gamma"):
             task.feasible_return(gamma)
-
-
-def test_observation_is_a_function_of_the_state(floating):
-    """Nothing in the observation depends on how the state came about (contacts, velocities)."""
-    roam(floating, 10)
-    obs, state = floating.get_obs().clone(), copied(floating)
-    other = shared(floating.task_id, 6, 1, reward_mode="dense")
-    other.reset(seed=[9] * 6)
-    other.set_state_dict(state)
-    assert torch.allclose(other.get_obs(), obs, atol=1e-6)
