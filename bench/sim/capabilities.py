@@ -12,25 +12,18 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, metadata, requires, version
+from importlib.metadata import version
 from pathlib import Path
 
-from packaging.requirements import Requirement
-
 from symsteer.bench.sim.headless import RENDERING_CURE, silence_import_noise
-from symsteer.bench.sim.versions import PINNED
+from symsteer.bench.sim.versions import PINNED, check_versions
+from symsteer.errors import UserError
 
 _RENDER_PROBE = (
     "import warnings; warnings.simplefilter('ignore'); import sapien; "
     "print(sapien.render.RenderSystem().device.name)"
 )
 _PROBE_SECONDS = 60
-
-_ROOT = Path(__file__).resolve().parents[2]
-_IN_CHECKOUT = (_ROOT / "Makefile").is_file() and (_ROOT / "pyproject.toml").is_file()
-
-_DEVELOPMENT = "dev"
-"""The extra that only developers of SymSteer need."""
 
 
 @dataclass(frozen=True)
@@ -86,63 +79,11 @@ def _memory() -> str:
 
 
 def _versions() -> str:
-    requirements = _requirements("")
-    wrong = [r for r in requirements if not _satisfied(r)]
-    if wrong:
-        details = [f"{r.name}{r.specifier} (found: {_installed(r.name)})" for r in wrong]
-        packages = " ".join(f"'{r.name}{r.specifier}'" for r in wrong)
-        raise _AbsentError(f"wrong: {', '.join(details)}", _install(packages))
-    shown = [r.name for r in requirements if r.name in (*PINNED, "torch", "numpy")]
-    return ", ".join(f"{name} {_installed(name)}" for name in shown)
-
-
-def _extras() -> str:
     try:
-        names = metadata("symsteer").get_all("Provides-Extra") or []
-    except PackageNotFoundError:
-        names = []
-    extras = [name for name in names if name != _DEVELOPMENT]
-    absent = [name for name in extras if not all(map(_satisfied, _requirements(name)))]
-    present = (", ".join(name for name in extras if name not in absent) or "none") + " found"
-    if absent:
-        cure = _install(f"'symsteer[{','.join(absent)}]'")
-        raise _AbsentError(f"{present}; absent: {', '.join(absent)}", f"optional: {cure}")
-    return present
-
-
-def _install(packages: str) -> str:
-    return "make setup" if _IN_CHECKOUT else f"pip install {packages}"
-
-
-def _requirements(extra: str) -> list[Requirement]:
-    """Requirements of an extra; of SymSteer itself for ``""``.
-
-    Only the simulator's pinned versions if SymSteer is not installed.
-    """
-    try:
-        texts = requires("symsteer") or []
-    except PackageNotFoundError:
-        texts = [f"{package}=={wanted}" for package, wanted in PINNED.items()]
-
-    def needed(requirement: Requirement, extra: str) -> bool:
-        return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
-
-    requirements = [Requirement(text) for text in texts]
-    if not extra:
-        return [r for r in requirements if needed(r, "")]
-    return [r for r in requirements if needed(r, extra) and not needed(r, "")]
-
-
-def _installed(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "missing"
-
-
-def _satisfied(requirement: Requirement) -> bool:
-    installed = _installed(requirement.name)
-    return installed != "missing" and requirement.specifier.contains(installed)
+        check_versions()
+    except UserError as error:
+        raise _AbsentError(*str(error).split(": ", 1)) from error
+    return ", ".join(f"{name} {version(name)}" for name in (*PINNED, "torch", "numpy"))
 
 
 def _maniskill() -> str:
@@ -153,7 +94,7 @@ def _maniskill() -> str:
         # The usual reason is a missing shared library; the message begins with its name.
         library = str(error).split(":")[0]
         packages = {"libX11.so.6": "libx11-6", "libGL.so.1": "libgl1", "libEGL.so.1": "libegl1"}
-        cure = _install("--force-reinstall symsteer")
+        cure = "pip install --force-reinstall symsteer"
         if library in packages:
             cure = f"apt install {packages[library]}"
         raise _AbsentError(f"cannot be imported: {error}", cure) from error
@@ -211,7 +152,6 @@ def _rendering() -> str:
 _CHECKS: dict[str, tuple[bool, Callable[[], str]]] = {
     "memory": (False, _memory),
     "package versions": (True, _versions),
-    "optional packages": (False, _extras),
     "ManiSkill": (True, _maniskill),
     "CUDA": (False, _cuda),
     "PhysX on GPU": (False, _physx_gpu),

@@ -21,6 +21,7 @@ from symsteer.bench.sim.rotations import (
     planar_matrix,
     transform_angular,
 )
+from symsteer.bench.tasks.features import disc
 from symsteer.bench.tasks.floating import (
     ACTION_LAYOUT,
     TCP_OFFSET,
@@ -125,9 +126,8 @@ class Floating(Embodiment):
 
     def initial_qpos(self, rng: Any, count: int) -> np.ndarray:
         u = rng.uniform(size=4)
-        radius, bearing = 0.05 * np.sqrt(u[:, 0]), 2 * np.pi * u[:, 1]
         qpos = np.zeros((count, 8), dtype=np.float32)
-        qpos[:, 0], qpos[:, 1] = radius * np.cos(bearing), radius * np.sin(bearing)
+        qpos[:, :2] = disc(u[:, :2], 0.05)
         qpos[:, 2] = 0.14 + 0.06 * u[:, 2] + TCP_OFFSET - self.root_position[2]
         qpos[:, 4] = np.pi
         qpos[:, 5] = np.pi * (2 * u[:, 3] - 1)

@@ -51,6 +51,11 @@ class MoveCube(SymmetricTask):
     spawn_radius = 0.1
     spawn_extent = 0.13
 
+    gap: ClassVar[float]
+    """Where the dense reward wants the tool, metres behind the cube."""
+    flat_on_the_table: ClassVar[bool]
+    """Whether the dense reward has a term for the cube's height."""
+
     obj: Actor
     goal_region: Actor
     cube_half_size: float
@@ -67,15 +72,23 @@ class MoveCube(SymmetricTask):
         """Unit vectors ``[N, 2]`` from the cube's spawn point to the goal."""
         return quaternion_to_matrix(self.goal_region.pose.q)[:, :2, 2]
 
-    def _gap_behind(self, margin: float) -> torch.Tensor:
-        """Distance ``[N]`` of the tool from the point ``margin`` (m) behind the cube's rear."""
-        behind = self.obj.pose.p.clone()
-        behind[:, :2] -= (self.cube_half_size + margin) * self.direction()
-        return (behind - self.agent.tcp_pose.p).norm(dim=1)
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Reach a point behind the cube, then bring the cube to the goal.
 
-    def _goal_distance(self) -> torch.Tensor:
-        """Horizontal distance ``[N]`` of the cube from the goal, metres."""
-        return (self.obj.pose.p - self.goal_region.pose.p)[:, :2].norm(dim=1)
+        ManiSkill's terms with its +x replaced by the direction.
+        """
+        cube = self.obj.pose.p
+        behind = cube.clone()
+        behind[:, :2] -= (self.cube_half_size + self.gap) * self.direction()
+        gap = (behind - self.agent.tcp_pose.p).norm(dim=1)
+        distance = (cube - self.goal_region.pose.p)[:, :2].norm(dim=1)
+        placing = 1 - torch.tanh(5 * distance)
+        if self.flat_on_the_table:
+            level = 1 - torch.tanh(5 * (cube[:, 2] - self.cube_half_size).abs())
+            placing = placing + placing * level
+        reward = 1 - torch.tanh(5 * gap) + placing * (gap < 0.01)
+        highest = 4.0 if self.flat_on_the_table else 3.0
+        return torch.where(info["success"], torch.full_like(reward, highest), reward)
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """Close the fingers, come down behind the cube, push it towards the goal."""
@@ -102,18 +115,11 @@ class PushCube(MoveCube, PushCubeEnv):
     """Push a cube into a disc on the table, in any direction.
 
     ManiSkill's PushCube-v1 turned by a uniform angle in every episode (docs/tasks/push-cube.md).
-    The dense reward has ManiSkill's terms with its +x replaced by the direction.
     """
 
     task_id = "PushCube-v1"
-
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Reach a point behind the cube, then bring the cube to the goal flat on the table."""
-        placing = 1 - torch.tanh(5 * self._goal_distance())
-        level = 1 - torch.tanh(5 * (self.obj.pose.p[:, 2] - self.cube_half_size).abs())
-        gap = self._gap_behind(0.005)
-        reward = 1 - torch.tanh(5 * gap) + (placing + placing * level) * (gap < 0.01)
-        return torch.where(info["success"], torch.full_like(reward, 4.0), reward)
+    gap = 0.005
+    flat_on_the_table = True
 
 
 class PullCube(MoveCube, PullCubeEnv):
@@ -125,10 +131,5 @@ class PullCube(MoveCube, PullCubeEnv):
     """
 
     task_id = "PullCube-v1"
-
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Reach a point behind the cube, then bring the cube to the goal."""
-        placing = 1 - torch.tanh(5 * self._goal_distance())
-        gap = self._gap_behind(0.01)
-        reward = 1 - torch.tanh(5 * gap) + placing * (gap < 0.01)
-        return torch.where(info["success"], torch.full_like(reward, 3.0), reward)
+    gap = 0.01
+    flat_on_the_table = False
