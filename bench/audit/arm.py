@@ -50,7 +50,7 @@ class ArmTurner:
             chain = pk.build_serial_chain_from_urdf(urdf, end_link_name=env.agent.tcp.name)
             self.chain = chain.to(dtype=torch.float64)
             exact = pk.build_serial_chain_from_urdf(urdf, end_link_name=env.agent.tcp.name)
-        self.fast = SerialChain.replace(exact)
+        self.fast = SerialChain(exact)
         low, high = self.chain.get_joint_limits()
         self.low = torch.tensor(low, dtype=torch.float64)
         self.high = torch.tensor(high, dtype=torch.float64)

@@ -14,7 +14,6 @@ import sapien
 import sapien.physx as physx
 import torch
 from mani_skill.agents.base_agent import BaseAgent
-from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.utils.structs import Actor
@@ -181,15 +180,11 @@ class BatchedCpuMixin(Unique, BaseEnv):
 
     def _code_runs_between_substeps(self) -> bool:
         """Whether the task or the robot overrides a hook that may touch SAPIEN's objects."""
-        agent = type(self.agent)
+        task, agent = type(self), BaseAgent if self.agent is None else type(self.agent)
         return not (
-            type(self)._before_simulation_step is BaseEnv._before_simulation_step
-            and type(self)._after_simulation_step is BaseEnv._after_simulation_step
-            and (
-                self.agent is None
-                or agent.before_simulation_step
-                in (BaseAgent.before_simulation_step, MultiAgent.before_simulation_step)
-            )
+            task._before_simulation_step is BaseEnv._before_simulation_step
+            and task._after_simulation_step is BaseEnv._after_simulation_step
+            and agent.before_simulation_step is BaseAgent.before_simulation_step
         )
 
 

@@ -58,7 +58,7 @@ def install() -> None:
         # ManiSkill chooses the batched solver by device type, but it works on CPU tensors too.
         if is_batched(self.articulation.scene):
             self._setup_gpu()
-            self.pk_chain = SerialChain.replace(self.pk_chain)
+            self.pk_chain = SerialChain(self.pk_chain)
         else:
             stock_setup_cpu(self)
 

@@ -8,8 +8,6 @@ import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
-from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
-from mani_skill.envs.tasks.tabletop.two_robot_pick_cube import TwoRobotPickCube
 from mani_skill.utils.building.ground import build_ground
 from mani_skill.utils.structs.actor import Actor
 
@@ -191,33 +189,21 @@ def test_held_force_equals_one_set_between_substeps(playground):
     torch.testing.assert_close(box.linear_velocity[:, 0], speed, atol=0.1, rtol=0)
 
 
-def test_fetch_discards_what_was_not_applied(playground):
-    """As on CUDA, a fetch overwrites a buffer that was written but not applied."""
-    box = playground.boxes["dynamic"]
-    before = box.pose.raw_pose.clone()
-    box.set_pose(sapien.Pose([5, 5, 5]))
-    playground.scene._gpu_fetch_all()
-    assert torch.equal(box.pose.raw_pose, before)
-
-
 def test_hidden_object_returns(playground):
-    """Hiding moves an object away and showing brings it back, to the bit, without physics."""
+    """Hiding moves an object away and showing brings it back, to the bit, without physics.
+
+    A fetch overwrites a buffer that was written but not applied, as on CUDA.
+    """
     marker, box = playground.marker, playground.boxes["dynamic"]
-    before, packed = marker.pose.raw_pose.clone(), box.pose.raw_pose.clone()
+    before, still = marker.pose.raw_pose.clone(), box.pose.raw_pose.clone()
     marker.hide_visual()
     assert marker._objs[0].pose.p[0] > 1e4
     assert torch.equal(marker.pose.raw_pose, before)
     marker.show_visual()
     assert marker._objs[0].pose.p.tolist() == before[0, :3].tolist()
-    assert torch.equal(box.pose.raw_pose, packed)
-
-
-def test_merged_views(playground):
-    """Views made after loading find their rows."""
-    boxes = playground.boxes
-    both = Actor.merge([boxes["dynamic"], boxes["kinematic"]], name="both")
-    expected = torch.cat([boxes["dynamic"].pose.raw_pose, boxes["kinematic"].pose.raw_pose])
-    assert torch.equal(both.pose.raw_pose, expected)
+    box.set_pose(sapien.Pose([5, 5, 5]))
+    playground.scene._gpu_fetch_all()
+    assert torch.equal(box.pose.raw_pose, still)
 
 
 class Hooked(PickCubeEnv):
@@ -234,30 +220,20 @@ class Hooked(PickCubeEnv):
 def test_hooks_see_every_substep():
     """If code runs between substeps, they are not deferred; results are the same."""
     lifted = torch.tensor([[0.0, 0, 0.5, 1, 0, 0, 0]]).repeat(2, 1)
-    finals = []
+    finals, heights = [], []
     for cls in (Hooked, PickCubeEnv):
         env = create(cls, 2, control_mode="pd_joint_delta_pos")
         env.reset(seed=[1, 2])
         env.cube.set_pose(lifted)
         write(env)
-        if cls is Hooked:
-            env.heights.clear()
+        heights.append(len(getattr(env, "heights", [])))
         env.step(torch.zeros(2, 8))
         finals.append(env.get_state())
         if cls is Hooked:
-            assert len(env.heights) == 5
-            assert all(np.diff(env.heights) < 0)
+            fall = env.heights[heights[0] :]
+            assert len(fall) == 5
+            assert all(np.diff(fall) < 0)
     assert torch.equal(*finals)
-
-
-@pytest.mark.parametrize("env_cls", [PushTEnv, TwoRobotPickCube])
-def test_other_tasks(env_cls):
-    """A task that paints its table, and one with two robots."""
-    env = create(env_cls, 2, obs_mode="state")
-    env.reset(seed=[1, 2])
-    obs, reward, *_ = env.step(env.action_space.sample())
-    assert torch.isfinite(obs).all()
-    assert reward.shape == (2,)
 
 
 def test_jacobian_equals_pytorch_kinematics():
@@ -270,18 +246,3 @@ def test_jacobian_equals_pytorch_kinematics():
     torch.testing.assert_close(chain.jacobian(q), expected, atol=2e-6, rtol=0)
     single = torch.cat([chain.jacobian(q[i : i + 1]) for i in range(32)])
     assert torch.equal(single, chain.jacobian(q))
-
-
-def test_other_joints_keep_pytorch_kinematics():
-    import pytorch_kinematics as pk
-
-    joint = (
-        '<joint name="j{i}" type="{t}"><parent link="l{i}"/><child link="l{j}"/>'
-        '<origin xyz="0.1 0.2 0.3" rpy="0.4 -0.2 0.7"/><axis xyz="0 0 1"/>'
-        '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
-    )
-    links = "".join(f'<link name="l{i}"/>' for i in range(4))
-    for kinds in (("revolute", "fixed", "revolute"), ("revolute", "prismatic", "revolute")):
-        joints = "".join(joint.format(t=t, i=i, j=i + 1) for i, t in enumerate(kinds))
-        chain = pk.build_serial_chain_from_urdf(f'<robot name="r">{links}{joints}</robot>', "l3")
-        assert (SerialChain.replace(chain) is chain) == ("prismatic" in kinds)
