@@ -145,19 +145,6 @@ def test_all_variants_and_the_arm():
     two.close()
 
 
-def test_a_chunk_is_its_steps(pair):
-    one, two = pair
-    chunk = actions(4, 5, seed=2)
-    for env in pair:
-        env.reset(seed=[1, 2, 3, 4, 5])
-    steps = [one.step(action) for action in chunk]
-    obs, reward, terminated, truncated, info = two.step_chunk(chunk.transpose(0, 1))
-    for t, step in enumerate(steps):
-        info_t = {key: value[:, t] for key, value in info.items()}
-        assert_same(step, (obs[:, t], reward[:, t], terminated[:, t], truncated[:, t], info_t))
-    assert_same(one.elapsed_steps, two.elapsed_steps)
-
-
 def test_same_latent_noise_environment():
     """Successes within a chunk, in some and in all environments, and time limits."""
     one, two = both(4)

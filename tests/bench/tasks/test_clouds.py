@@ -18,9 +18,9 @@ needs_vulkan = pytest.mark.skipif(not rendering_works(), reason="needs a Vulkan 
 SEEN = ["SeenPushCube-v1", "SeenPickCube-v1"]
 
 
-def random_points(count=3, points=200, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(count, points, 3, generator=generator, dtype=torch.float64)
+POINTS_OF_THREE = torch.randn(
+    3, 200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+)
 
 
 def apart(a, b):
@@ -28,7 +28,7 @@ def apart(a, b):
 
 
 def test_thinned_points_are_valid_ones_far_from_each_other():
-    points = random_points()
+    points = POINTS_OF_THREE
     valid = torch.rand(3, 200, generator=torch.Generator().manual_seed(1)) < 0.5
     chosen = thinned(points, valid, 20)
     for row in range(3):
@@ -42,7 +42,7 @@ def test_thinned_points_are_valid_ones_far_from_each_other():
 
 
 def test_the_choice_turns_with_the_points():
-    points, valid = random_points(), torch.ones(3, 200, dtype=torch.bool)
+    points, valid = POINTS_OF_THREE, torch.ones(3, 200, dtype=torch.bool)
     c, s = math.cos(0.7), math.sin(0.7)
     turn = torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=torch.float64)
     order = torch.randperm(200, generator=torch.Generator().manual_seed(2))
@@ -52,7 +52,7 @@ def test_the_choice_turns_with_the_points():
 
 
 def test_few_points_occur_several_times_and_none_are_the_origin():
-    points, valid = random_points(), torch.zeros(3, 200, dtype=torch.bool)
+    points, valid = POINTS_OF_THREE, torch.zeros(3, 200, dtype=torch.bool)
     valid[1, 5] = valid[2, 7] = valid[2, 9] = True
     found = thinned(points, valid, 4)
     assert torch.equal(found[0], torch.zeros(4, 3, dtype=torch.float64))

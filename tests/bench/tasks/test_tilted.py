@@ -13,7 +13,6 @@ from symsteer.bench.demos import collect, load
 from symsteer.bench.sim.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
-    rotation_vector_to_matrix,
     wrap,
     yaw_quaternion,
 )
@@ -163,46 +162,6 @@ def test_all_but_three_numbers_are_vectors():
     inside = {name for pair in layout.spatial_vectors() for name in pair}
     outside = {field.name for field in layout.fields} - inside
     assert outside == {"gripper_width", "grasp_yaw_cos", "grasp_yaw_sin"}
-
-
-def test_actions_are_displacements_and_turns_in_the_laboratory():
-    env = shared("TiltedPickCube-v1", 4)
-    env.reset(seed=[1, 2, 3, 4])
-    obs = reframed(env, turns(4, seed=3))
-    move = torch.tensor([[0.3, -0.5, 0.2]]).expand(4, 3)
-    normal = vector(env, obs, "normal")
-    # Half a radian about the table's normal, in ten steps of a quarter of 0.2 rad.
-    action = torch.cat([move, 0.25 * normal, torch.ones(4, 1)], dim=1)
-    for _ in range(10):
-        later, *_ = env.step(action)
-        action[:, :3] = 0
-    # The hand comes to rest.
-    moved = vector(env, later, "tcp") - vector(env, obs, "tcp")
-    assert torch.allclose(moved, 0.03 * move, atol=5e-4)
-    turn = rotation_vector_to_matrix(0.5 * normal)
-    for axis in "xyz":
-        before, after = (vector(env, o, f"tcp_{axis}_axis") for o in (obs, later))
-        assert torch.allclose(after, (turn @ before[..., None])[..., 0], atol=0.02), axis
-        assert torch.allclose(after.norm(dim=1), torch.ones(4))
-
-
-def test_vectors_of_the_observation_fit_together():
-    env = shared("TiltedPickCube-v1", 4)
-    obs, _ = env.reset(seed=[1, 2, 3, 4])
-    tcp, cube, goal = (vector(env, obs, name) for name in ("tcp", "cube", "goal"))
-    assert torch.allclose(vector(env, obs, "tcp_to_cube"), cube - tcp, atol=1e-6)
-    assert torch.allclose(vector(env, obs, "cube_to_goal"), goal - cube, atol=1e-6)
-    x, y, z = (vector(env, obs, f"tcp_{name}_axis") for name in "xyz")
-    assert torch.allclose(torch.linalg.cross(x, y), z, atol=1e-6)
-    normal = vector(env, obs, "normal")
-    # The tool looks at the table; the cube lies on it, 2 cm above.
-    assert torch.allclose(z, -normal, atol=1e-5)
-    assert torch.allclose((cube * normal).sum(dim=1), torch.full((4,), 0.02), atol=1e-5)
-    push = shared("TiltedPushCube-v1", 4)
-    obs, _ = push.reset(seed=[1, 2, 3, 4])
-    ahead, normal = vector(push, obs, "cube_to_goal"), vector(push, obs, "normal")
-    assert torch.allclose(ahead.norm(dim=1), torch.full((4,), 0.2), atol=1e-5)
-    assert (ahead * normal).sum(dim=1).abs().max() < 1e-6
 
 
 def test_a_cubes_yaw_is_known_from_the_fingers():

@@ -43,17 +43,6 @@ def test_stacked_cubes_rest_on_a_slope():
     assert info["is_cubeA_on_cubeB"].tolist() == [True, True, False]
 
 
-def test_tilt_drags_what_is_let_go():
-    """A cube that slides down the slope: friction has risen, and slows it as it should."""
-    env = scene("gravity_tilt", STRENGTHS)
-    place(env, (0.0, 0.2, env.cube_half_size), (0.4, 0.0, 0.0))
-    env.step(act(env, z=1.0))
-    tilt = math.radians(30) * STRENGTHS
-    friction = 0.3 + 1.5 * tilt.tan()
-    speed = 0.4 + CONTROL_STEP * G * (tilt.sin() - friction * tilt.cos())
-    assert torch.allclose(env.manipulated.linear_velocity[:, 0], speed, atol=0.03)
-
-
 @pytest.mark.parametrize(
     "variant",
     [
