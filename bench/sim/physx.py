@@ -55,11 +55,6 @@ class Mirror(Buffer):
         return (self.array[rows, columns] != self.state[rows, columns]).any(axis=1)
 
 
-def _of_all_scenes(name: str) -> property:
-    """SAPIEN's components of that name, scene by scene; dynamic ones include kinematic ones."""
-    return property(lambda self: [c for system in self.systems for c in getattr(system, name)])
-
-
 class BatchedPhysx:
     """N ``PhysxCpuSystem`` scenes with the interface of one ``PhysxGpuSystem``.
 
@@ -92,15 +87,6 @@ class BatchedPhysx:
     def timestep(self, value: float) -> None:
         for system in self.systems:
             system.timestep = value
-
-    rigid_dynamic_components = _of_all_scenes("rigid_dynamic_components")
-    rigid_static_components = _of_all_scenes("rigid_static_components")
-    articulation_link_components = _of_all_scenes("articulation_link_components")
-
-    def get_contacts(self) -> list[physx.PhysxContact]:
-        """Contacts of the last substep in all scenes."""
-        self.finish_substeps()
-        return [contact for system in self.systems for contact in system.get_contacts()]
 
     def get_scene_offset(self, scene: sapien.Scene) -> np.ndarray:
         """Always zero: each scene has a space of its own."""

@@ -239,6 +239,17 @@ def test_errors_of_a_worker():
     env.close()
 
 
+def test_an_interrupted_request_ends_the_workers(monkeypatch):
+    """Its answers may still arrive, and would be taken for later ones."""
+    env = make(TASK, num_envs=2, workers=2)
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr("pickle.loads", lambda data: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            env.reset(seed=1)
+    with pytest.raises(UserError, match="because KeyboardInterrupt interrupted it"):
+        env.reset(seed=1)
+
+
 def test_local_classes_are_refused():
     with pytest.raises(UserError, match="import the task class"):
         create(type("Mine", (PickCubeEnv,), {"__module__": "__main__"}), 2, workers=2)
