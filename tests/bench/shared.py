@@ -7,7 +7,13 @@ from typing import Any
 
 import torch
 
-from symsteer.bench.tasks import SymmetricTask, make
+from symsteer.bench.tasks import TASKS, SymmetricTask, make, task_class
+
+STATE_TASKS = [name for name in TASKS.names() if not task_class(name).needs_cameras]
+"""The tasks that run without a Vulkan driver."""
+
+FLAT_TASKS = [name for name in STATE_TASKS if not name.startswith("Tilted")]
+"""Those of them on a level table."""
 
 
 @lru_cache(maxsize=12)

@@ -20,7 +20,7 @@ from symsteer.bench.audit.report import (
 from symsteer.bench.audit.result import VERSION, AuditResult, AuditSettings
 from symsteer.bench.sim.trees import map_trees
 from symsteer.bench.variants import VARIANTS
-from tests.bench.state_tasks import STATE_TASKS
+from tests.bench.shared import STATE_TASKS
 
 QUICK = AuditSettings(task="PickCube-v1", states="expert", count=16, resets=64)
 

@@ -11,14 +11,10 @@ from mani_skill.utils.structs.pose import Pose
 
 from symsteer.bench.sim.headless import prepare_headless
 from symsteer.bench.sim.parallel import create
-from tests.bench.state_tasks import STATE_TASKS
+from tests.bench.shared import FLAT_TASKS
 from tools.speed.simulation import stock_class
 
-TASKS = {
-    name.removesuffix("-v1"): stock_class(name)
-    for name in STATE_TASKS
-    if not name.startswith("Tilted")
-}
+TASKS = {name.removesuffix("-v1"): stock_class(name) for name in FLAT_TASKS}
 
 
 def _settings(task: str, settings: dict[str, Any]) -> dict[str, Any]:

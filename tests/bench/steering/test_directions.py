@@ -6,7 +6,7 @@ import torch
 from symsteer.bench.steering.directions import directions, positions
 from symsteer.bench.tasks import task_class
 from symsteer.policies.geometry import Field, Layout
-from tests.bench.state_tasks import STATE_TASKS
+from tests.bench.shared import STATE_TASKS
 
 LAYOUT = Layout(
     [

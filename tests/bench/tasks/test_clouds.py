@@ -54,10 +54,10 @@ def test_the_choice_turns_with_the_points():
 def test_few_points_occur_several_times_and_none_are_the_origin():
     points, valid = POINTS_OF_THREE, torch.zeros(3, 200, dtype=torch.bool)
     valid[1, 5] = valid[2, 7] = valid[2, 9] = True
-    found = thinned(points, valid, 4)
-    assert torch.equal(found[0], torch.zeros(4, 3, dtype=torch.float64))
-    assert torch.equal(found[1], points[1, [5, 5, 5, 5]])
-    assert {tuple(p.tolist()) for p in found[2]} == {tuple(p.tolist()) for p in points[2, [7, 9]]}
+    chosen = thinned(points, valid, 4)
+    assert torch.equal(chosen[0], torch.zeros(4, 3, dtype=torch.float64))
+    assert torch.equal(chosen[1], points[1, [5, 5, 5, 5]])
+    assert {tuple(p.tolist()) for p in chosen[2]} == {tuple(p.tolist()) for p in points[2, [7, 9]]}
 
 
 @pytest.mark.parametrize("task", SEEN)

@@ -6,8 +6,7 @@ import torch
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.experts import Expert
 from symsteer.policies.geometry import Group
-from tests.bench.shared import shared
-from tests.bench.state_tasks import STATE_TASKS
+from tests.bench.shared import STATE_TASKS, shared
 
 
 def success_rate(task, embodiment, episodes, first_seed=0):

@@ -124,8 +124,8 @@ def test_euler_rates_give_the_angular_velocity():
     step = euler_to_matrix(angles + 1e-6 * rates) @ euler_to_matrix(angles - 1e-6 * rates).mT
     skew = (step - step.mT) / 4e-6
     omega = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)
-    found = (euler_rates_matrix(angles) @ rates[:, :, None])[..., 0]
-    assert torch.allclose(found, omega, atol=1e-7)
+    computed = (euler_rates_matrix(angles) @ rates[:, :, None])[..., 0]
+    assert torch.allclose(computed, omega, atol=1e-7)
 
 
 @pytest.mark.parametrize("element", [(0.7, False), (0.7, True), (0.0, True)])
@@ -134,5 +134,5 @@ def test_mirrored_orientations_are_conjugated(element):
     turn = planar_matrix(element[0], False, q)
     mirror = planar_matrix(0.0, element[1], q)
     expected = turn @ mirror @ quaternion_to_matrix(q) @ mirror
-    found = quaternion_to_matrix(transform_quaternion(q, *element))
-    assert torch.allclose(found, expected, atol=1e-12)
+    computed = quaternion_to_matrix(transform_quaternion(q, *element))
+    assert torch.allclose(computed, expected, atol=1e-12)

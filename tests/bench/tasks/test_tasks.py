@@ -12,11 +12,8 @@ from symsteer.bench.sim.trees import join_trees, map_trees, rows_of
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
-from tests.bench.shared import assert_same, roam, shared
-from tests.bench.state_tasks import STATE_TASKS
+from tests.bench.shared import FLAT_TASKS, STATE_TASKS, assert_same, roam, shared
 
-# Their observations are those of the world (test_tilted.py has the others).
-FLAT = [name for name in STATE_TASKS if not name.startswith("Tilted")]
 # Stock evaluates these with Euler angles; their own tests compare.
 OWN_EVALUATE = {"LiftPegUpright-v1", "PokeCube-v1"}
 ELEMENTS = [*Group.parse("D4").elements, (0.3, False), (-2.0, True)]
@@ -44,7 +41,7 @@ def test_an_unknown_task_is_explained():
         make("PickCub-v1", num_envs=1)
 
 
-@pytest.mark.parametrize("task", [task for task in FLAT if task in REGISTERED_ENVS])
+@pytest.mark.parametrize("task", [task for task in FLAT_TASKS if task in REGISTERED_ENVS])
 def test_tasks_are_maniskills(task):
     ours, stock = task_class(task), REGISTERED_ENVS[task].cls
     assert stock.__module__.startswith("mani_skill.")
@@ -53,7 +50,7 @@ def test_tasks_are_maniskills(task):
 
 
 @pytest.mark.parametrize(
-    ("task", "embodiment"), [*((task, "floating") for task in FLAT), ("PokeCube-v1", "panda")]
+    ("task", "embodiment"), [*((task, "floating") for task in FLAT_TASKS), ("PokeCube-v1", "panda")]
 )
 def test_observation_follows_the_layout(task, embodiment):
     env = shared(task, 4, embodiment=embodiment)

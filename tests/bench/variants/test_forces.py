@@ -8,7 +8,7 @@ import torch
 from symsteer.bench.tasks import make
 from symsteer.bench.variants.friction_patch import CENTER
 from symsteer.bench.variants.obstacle import GAP, HALF_WIDTH
-from tests.bench.state_tasks import STATE_TASKS
+from tests.bench.shared import FLAT_TASKS
 from tests.bench.variants.scenes import CONTROL_STEP, G, act, place, scene
 
 STRENGTHS = torch.tensor([0.0, 0.5, 1.0])
@@ -52,7 +52,7 @@ def test_stacked_cubes_rest_on_a_slope():
         pytest.param("wind:1+gravity_tilt:1", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("task", [task for task in STATE_TASKS if not task.startswith("Tilted")])
+@pytest.mark.parametrize("task", FLAT_TASKS)
 def test_untouched_objects_stay(task, variant):
     """Within 1 mm over a whole episode; also a sphere, which does not roll there."""
     env = make(task, num_envs=2, variant=variant)

@@ -29,9 +29,9 @@ def audit_of(task="Task-v1", group="C8", **defects):
 def test_a_level_is_where_the_audit_first_finds_its_defect():
     rows = audit_of(s0=0.02, s25=0.12, s50=0.22, s100=0.5) + audit_of(group="D4", s0=0.0, s100=0.9)
     audited = points_of(rows)
-    found = {level: strength("wind", level, "Task-v1", "floating", audited) for level in LEVELS}
+    strengths = {level: strength("wind", level, "Task-v1", "floating", audited) for level in LEVELS}
     # 0.02 + 0.1 s / 0.25 = 0.1; 0.22 + 0.28 (s - 0.5) / 0.5 = 0.25; the last point is 0.5.
-    assert found == {"easy": 0.2, "medium": 0.55, "hard": 1.0}
+    assert strengths == {"easy": 0.2, "medium": 0.55, "hard": 1.0}
     audited = points_of(audit_of(s0=0.0, s25=0.3, s50=0.1, s100=0.3))
     assert strength("wind", "medium", "Task-v1", "floating", audited) == 0.21
 

@@ -11,7 +11,7 @@ from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.variants import VARIANTS, build, evaluation_variants, highest_cost, parse, read
 from symsteer.errors import UserError
 from symsteer.variant import VariantSpec, specs_at, variant_text
-from tests.bench.state_tasks import STATE_TASKS
+from tests.bench.shared import STATE_TASKS
 from tests.bench.variants.scenes import act, scene
 
 NAMES = sorted(VARIANTS)
