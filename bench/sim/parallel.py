@@ -195,15 +195,11 @@ class ShardedEnv(Unique, gym.Env):
         index, seeds = reset_order(seed, partial, self.num_envs)
         if seeds is not None:
             super().reset(seed=seeds[0])
-        count = self.num_envs if index is None else len(index)
-        states = options.pop("reset_to_env_states", None)
         requests: list[tuple | None] = []
         for places, local in self._places(index):
             shard = dict(options)
             if local is not None:
                 shard["env_idx"] = local
-            if states is not None:
-                shard["reset_to_env_states"] = select(states, count, places)
             requests.append((None if seeds is None else [seeds[i] for i in places], shard))
         obs, info = self._ask("reset", requests)
         return obs, {**info, "reconfigure": bool(options.get("reconfigure", False))}
@@ -247,10 +243,6 @@ class ShardedEnv(Unique, gym.Env):
         """Save the physics of environments ``[N]`` bool; see ``BatchedCpuMixin.pause``."""
         self._ask("pause", [(scenes[rows],) for rows in self._shards])
 
-    def transform_state(self, state: dict, angle: float, reflect: bool = False) -> dict:
-        """Turn a state about the workspace centre; see ``SymmetricTask.transform_state``."""
-        return self._ask("transform_state", [(state, angle, reflect)])
-
     def close(self) -> None:
         """End the workers. Tensors that were returned stay valid."""
         self._closed = self._closed or "because it was closed"
@@ -269,9 +261,6 @@ class ShardedEnv(Unique, gym.Env):
                 "workers=1 to use it"
             )
         return static
-
-    def __str__(self) -> str:
-        return f"<{self.workers} workers with {self.num_envs} environments of {self._env_cls}>"
 
     def _ask(self, name: str, requests: Sequence[tuple | None]) -> Any:
         """Ask the workers and join their answers, a row for each environment.

@@ -236,9 +236,10 @@ class SymmetricTask(BaseEnv):
         return self.breaks.perceive(pose, role)
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
-        observed = self._observe_task()
-        fields = {field.name: observed[field.name] for field in self.task_fields}
-        return self._reported(fields, self._task_layout)
+        observed, names = self._observe_task(), [field.name for field in self.task_fields]
+        unknown = [name for name in names if name not in observed]
+        assert not unknown, f"_observe_task does not tell {unknown}, and no name of `things` does"
+        return self._reported({name: observed[name] for name in names}, self._task_layout)
 
     def _reported(self, fields: dict[str, torch.Tensor], layout: Layout) -> dict[str, torch.Tensor]:
         """The fields as variants of observation report them."""

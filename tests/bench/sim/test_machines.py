@@ -40,22 +40,17 @@ def test_headless_without_vulkan():
     code = """
 import gc
 from symsteer.bench.sim import environment
-from symsteer.bench.sim.headless import prepare_headless, rendering_works
+from symsteer.bench.sim.headless import prepare_headless
 from symsteer.bench.sim.parallel import create
 from symsteer.errors import UserError
-from mani_skill.envs.tasks.tabletop.push_t import PushTEnv
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 create(PickCubeEnv, 3, obs_mode="state").close()
 gc.collect()
 assert environment._count(environment._LIVE_SCENES) == 0
-assert prepare_headless() is False and prepare_headless() is False
-assert not rendering_works()
-for cls in (PickCubeEnv, PushTEnv):
-    env = create(cls, 2, obs_mode="state")
-    env.reset(seed=[1, 2])
-    env.step(env.action_space.sample())
+assert prepare_headless() is False
 stock = PickCubeEnv(sim_backend="physx_cpu", render_backend="none", obs_mode="state")
-stock.step(stock.action_space.sample())
+for env in (create(PickCubeEnv, 2, obs_mode="state"), stock):
+    env.step(env.action_space.sample())
 for settings in (dict(render=True), dict(obs_mode="rgb")):
     try:
         create(PickCubeEnv, 1, **settings)
