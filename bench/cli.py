@@ -64,11 +64,11 @@ def resume(
     """
     allow(*trust)
     from symsteer.bench.runs.config import Execution
-    from symsteer.bench.runs.run import resume
+    from symsteer.bench.runs.run import execute
     from symsteer.bench.runs.tracking import check_tracking
 
     check_tracking(track)
-    _print_places(resume(folder, Execution(workers=workers, track=track, quiet=quiet)))
+    _print_places(execute(folder, Execution(workers=workers, track=track, quiet=quiet)))
     return 0
 
 

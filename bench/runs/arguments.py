@@ -6,6 +6,7 @@ its own dataclass of options. So these two names are read first. Then tyro parse
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -26,8 +27,6 @@ the policy that --policy.name names.
 NAMES = ("--agent", "--policy.name", "--task", "--policy.tasks", "--variant", "--trust")
 """Options that name classes."""
 
-DEFAULTS = {"--agent": RunConfig.agent, "--policy.name": RunConfig.policy_name}
-
 
 @dataclass(frozen=True)
 class _Arguments:
@@ -45,14 +44,16 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunConfig, Execution]:
         SystemExit: with code 0 after ``--help``; with code 2 for an unknown option or a value that
             cannot be read. tyro has printed the help or the error.
     """
-    given = _values(arguments)
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for option in (*NAMES, "--agent.preset"):
+        early.add_argument(option, action="extend", nargs="*", default=[])
+    given = vars(early.parse_known_args(arguments)[0])
+    preset = given.pop("agent.preset")
     # What a user types by these names may be executed; the name of a file is no consent.
-    allow(*(value for option in NAMES for value in given.get(option, ())))
-    agent, policy = (given.get(option, [name])[-1] for option, name in DEFAULTS.items())
-    options = {}
-    if preset := given.get("--agent.preset"):
-        options = preset_options(preset[-1], agent, AGENTS.get(agent).Options)
-    names = {"agent": agent, "policy": {"name": policy}}
+    allow(*(value for values in given.values() for value in values))
+    agent = [RunConfig.agent, *given["agent"]][-1]
+    names = {"agent": agent, "policy": {"name": [RunConfig.policy_name, *given["policy.name"]][-1]}}
+    options = preset_options(preset[-1], agent, AGENTS.get(agent).Options) if preset else {}
     defaults = build_config({**names, "agent_options": options}, "symsteer run")
     # A seed that is not given follows the run's seed, which is not known yet.
     vars(defaults).update(policy_seed=None, demonstrations=DemonstrationConfig())
@@ -64,16 +65,3 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunConfig, Execution]:
         default=_Arguments(Execution(), defaults),
     )
     return parsed.config, parsed.execution
-
-
-def _values(arguments: Sequence[str]) -> dict[str, list[str]]:
-    """The values of each option, written as ``--option VALUE`` or ``--option=VALUE``."""
-    values: dict[str, list[str]] = {}
-    option = ""
-    for word in arguments:
-        if word.startswith("--"):
-            option, equals, word = word.partition("=")
-            if not equals:
-                continue
-        values.setdefault(option, []).append(word)
-    return values

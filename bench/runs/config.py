@@ -136,7 +136,8 @@ class RunConfig(_Checked):
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
-        for task in self.policy_tasks:
+        tasks, complete = self.policy_tasks, vars(self)
+        for task in tasks:
             TASKS.check_allowed(task_name(task))
         for kind, name, options in (
             ("agent_options", self.agent, AGENTS.get(self.agent).Options),
@@ -144,20 +145,18 @@ class RunConfig(_Checked):
         ):
             given = getattr(self, kind)
             if given is None:
-                self._set(kind, options())
+                complete[kind] = options()
             elif type(given) is not options:
                 raise UserError(
                     f"{kind} are {type(given).__name__}, but {name!r} takes {options.__name__}"
                 )
-        if len(self.policy_tasks) > 1:
+        if len(tasks) > 1:
             # All of them, so that runs on each of these tasks ask for the same base policy.
-            policy = dataclasses.replace(self.policy, tasks=self.policy_tasks)  # type: ignore[call-arg]
-            self._set("policy", policy)
+            complete["policy"] = dataclasses.replace(self.policy, tasks=tasks)  # type: ignore[call-arg]
         if self.policy_seed is None:
-            self._set("policy_seed", self.seed)
+            complete["policy_seed"] = self.seed
         if self.demonstrations.seed is None:
-            drawn = dataclasses.replace(self.demonstrations, seed=self.seed)
-            self._set("demonstrations", drawn)
+            complete["demonstrations"] = dataclasses.replace(self.demonstrations, seed=self.seed)
         for key, value in [*vars(self.policy).items(), *vars(self.agent_options).items()]:
             if isinstance(value, float) and not math.isfinite(value):
                 raise UserError(f"{key} is {value}; it must be finite")
@@ -167,13 +166,10 @@ class RunConfig(_Checked):
                 f"not have more than {LONGEST_VARIANT}, so join fewer of them"
             )
         # The variant is a part of the run's identity: each strength in its shortest form.
-        specs = parse_variant(with_numbers(self.variant, *self.place))
-        self._set("variant", variant_text(specs))
+        specs = parse_variant(with_numbers(self.variant, self.task, self.embodiment))
+        complete["variant"] = variant_text(specs)
         for spec in specs:
             VARIANTS.check_allowed(spec.name)
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
 
     @property
     def place(self) -> tuple[str, str]:

@@ -30,17 +30,9 @@ class RunBusyError(UserError):
     """Another process is working on the run."""
 
 
-def run_id(
-    config: RunConfig, origin: Mapping[str, Any], stored: Mapping[str, Any] | None = None
-) -> str:
-    """A readable name that is unique for the configuration.
-
-    Args:
-        config: the run's configuration.
-        origin: content hashes of demonstrations or a policy that came from files.
-        stored: the configuration as plain data, of a run that may have options that are no more.
-    """
-    return run_id_of({**(stored or config.to_json()), "files": origin})
+def run_id(config: RunConfig, files: Mapping[str, str]) -> str:
+    """The name of a run; ``files``: hashes of those of the user that it starts from, by kind."""
+    return run_id_of({**config.to_json(), "files": files})
 
 
 def is_finished(folder: Path) -> bool:

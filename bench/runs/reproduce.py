@@ -14,9 +14,9 @@ import torch
 
 from symsteer.bench.runs.base_policy import take_base
 from symsteer.bench.runs.config import Execution, RunConfig
-from symsteer.bench.runs.folder import CONFIG, RECORD, is_finished
-from symsteer.bench.runs.run import check, check_all, execute
-from symsteer.bench.runs.stored import RunFolder, extensions_of, newer_options, read_back
+from symsteer.bench.runs.folder import CONFIG, RECORD, is_finished, run_id
+from symsteer.bench.runs.run import check, execute
+from symsteer.bench.runs.stored import extensions_of, newer_options, read_back
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.records import (
@@ -99,10 +99,12 @@ def reproduce(
     _check_files(record, files, how.files)
     # One with a base policy that was taken does not continue one that trains it.
     name = f"reproduction-{file_hash(path)[:DIGITS]}{'-taken' if base_from else ''}"
-    if out is None or not is_finished(RunFolder.new(config, out / name, files).folder):
-        check_all(config, how.workers)
+    run = run_id(config, files)
+    finished = out is not None and is_finished(out / name / run)
+    if not finished:
+        check(config, how.workers, begun=f"the run of {path}")
     place = out / name if out else Path(tempfile.mkdtemp(prefix="symsteer-reproduction-"))
-    folder = RunFolder.new(config, place, files).folder
+    folder = place / run
     report(f"repeating {record.run_id} in {place}")
     report(f"the recorded run took {record.wall_clock.total / 60:.1f} minutes")
     here = Provenance.collect(config.device, torch.get_num_threads(), extensions_of(config))
@@ -116,7 +118,7 @@ def reproduce(
         taken = [TAKEN]
     for line in [*taken, *conditions(record, config, here)]:
         report(f"note: {line}")
-    if is_finished(folder):
+    if finished:
         report("the run is there and finished: it is compared without making it again")
     else:
         execute(config, replace(how, out=place))
@@ -229,7 +231,6 @@ def _configuration(path: Path, record: RunRecord) -> tuple[RunConfig, dict[str, 
             f"this version of SymSteer cannot repeat {path} ({error}); the record is of "
             f"{_code(record.provenance)}: use that"
         ) from error
-    check(config, begun=f"the run of {path}")
     return config, files
 
 

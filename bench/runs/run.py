@@ -31,23 +31,27 @@ from symsteer.bench.runs.trainer import Trainer, budget_of
 from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import build, evaluation_variants, read
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import Episodes, Evaluation, read_record
+from symsteer.leaderboard.records import Episodes, Evaluation, read_record, run_id_of
 from symsteer.policies.files import save_policy
 from symsteer.terminal import to_paste
 from symsteer.variant import specs_at, variant_text
 
 
-def check(config: RunConfig, begun: str = "") -> None:
+def check(
+    config: RunConfig, workers: int | None = None, trains: bool = True, begun: str = ""
+) -> None:
     """Check that a configuration can be run, before anything is built.
 
     Args:
         config: what to run.
+        workers: processes that have to hold its environments; None: that is not checked.
+        trains: whether there are training environments among them.
         begun: the name of a run that was begun already, for the message.
 
     Raises:
         UserError: for an unknown task, embodiment or variant, tasks of a base policy that do not
-            fit together, a strength out of range, a budget in which nothing is learned, or a device
-            that this machine does not have.
+            fit together, a strength out of range, a budget in which nothing is learned, a device
+            that this machine does not have, or too few or too many processes.
     """
     actions = task_class(config.task).action_layout
     check_embodiment(config.embodiment)
@@ -74,11 +78,8 @@ def check(config: RunConfig, begun: str = "") -> None:
                 f"{what}, but torch finds no CUDA device here; {cure} (`symsteer doctor` says what "
                 "is missing)"
             )
-
-
-def check_all(config: RunConfig, workers: int, trains: bool = True, begun: str = "") -> None:
-    """:func:`check`, and whether these processes can hold the run's environments."""
-    check(config, begun)
+    if workers is None:
+        return
     if not 1 <= workers <= config.num_envs:
         raise UserError(
             f"--workers is {workers}; it must lie between 1 and the number of environments, "
@@ -89,60 +90,47 @@ def check_all(config: RunConfig, workers: int, trains: bool = True, begun: str =
     check_room([config], workers, trains)
 
 
-def execute(config: RunConfig, how: Execution) -> Path:
-    """Run one configuration from demonstrations to the final evaluation.
+def execute(run: RunConfig | Path, how: Execution) -> Path:
+    """Run a configuration, or what the folder of a run holds, to the final evaluation.
 
-    An unfinished run of the same configuration is continued from its last checkpoint.
+    An unfinished run is continued from its last checkpoint.
 
     Returns:
         The run's folder.
 
     Raises:
-        UserError: if the input is wrong, the run is finished already, or another process is
-            working on it (``RunBusyError``).
+        UserError: if the input is wrong, the folder is not a run's, its checkpoint is damaged, the
+            run is finished already, or another process is working on it (``RunBusyError``).
     """
-    with opened(new_run(config, how), how) as trainer:
+    with opened(run, how) as trainer:
         trainer.play()
     return trainer.folder
 
 
-def resume(folder: Path, how: Execution) -> Path:
-    """Continue an unfinished run from its last checkpoint.
-
-    Args:
-        folder: of the run.
-        how: it is executed; the folder of the runs is that of this one.
-
-    Raises:
-        UserError: if the folder is not a run's, the run is finished, its checkpoint is damaged, or
-            another process is working on it, or this machine lacks its device.
-    """
-    run = RunFolder.stored(folder)
-    check_all(run.config, how.workers, begun=f"the run {run.folder.name}")
-    with opened(run, replace(how, out=run.folder.parent)) as trainer:
-        trainer.play()
-    return run.folder
-
-
-def new_run(config: RunConfig, how: Execution) -> RunFolder:
-    """The run of a configuration, after all checks; nothing is built."""
-    if how.base_policy is not None:
-        if how.demos is not None:
-            raise UserError("a base policy of yours needs no demonstrations; leave one of them out")
-        config = with_policy_of(config, how.base_policy)
-    check_all(config, how.workers)
-    return RunFolder.new(config, how.out, how.files)
-
-
 @contextlib.contextmanager
-def opened(run: RunFolder, how: Execution, together: int = 1) -> Iterator[Trainer]:
+def opened(begun: RunConfig | Path, how: Execution, together: int = 1) -> Iterator[Trainer]:
     """The trainer of a run that this process alone works on; it is told of errors.
 
     Args:
-        run: what to execute.
+        begun: a configuration, or the folder of a run, which stays in its folder of runs.
         how: it is executed.
         together: number of runs in this process.
     """
+    if isinstance(begun, Path):
+        run = RunFolder.stored(begun)
+        how = replace(how, out=run.folder.parent)
+        check(run.config, how.workers, begun=f"the run {run.folder.name}")
+    else:
+        if how.base_policy is not None:
+            if how.demos is not None:
+                raise UserError(
+                    "a base policy of yours needs no demonstrations; leave one of them out"
+                )
+            begun = with_policy_of(begun, how.base_policy)
+        check(begun, how.workers)
+        variant = variant_text(evaluation_variants(begun.variants))
+        resolved = {**begun.to_json(), "evaluation_variant": variant, "files": how.files}
+        run = RunFolder(how.out / run_id_of(resolved), begun, resolved)
     config, folder = run.config, run.folder
     with claimed(folder):
         try:
@@ -209,7 +197,7 @@ def evaluate(
     """
     run = restored(folder)
     config, name = run.config, run.folder.name
-    check_all(config, workers, trains=False, begun=f"the run {name}")
+    check(config, workers, trains=False, begun=f"the run {name}")
     share = 1.0 if run.state["final"] else run.state["env_steps"] / config.env_steps
     trained = evaluation_variants(config.variants, share)
     variants = trained if variant is None else read(variant, place=config.place)

@@ -15,16 +15,15 @@ from symsteer.agents import AGENTS
 from symsteer.bench.runs.checkpoint import fitting, load_checkpoint
 from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.runs.evaluator import Steered, new_agent
-from symsteer.bench.runs.folder import CHECKPOINT, CONFIG, RECORD, read_config, run_id
+from symsteer.bench.runs.folder import CHECKPOINT, CONFIG, RECORD, read_config
 from symsteer.bench.tasks import TASKS, task_class
-from symsteer.bench.variants import VARIANTS, evaluation_variants
+from symsteer.bench.variants import VARIANTS
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import DERIVED, flat, read_record
+from symsteer.leaderboard.records import DERIVED, flat, read_record, run_id_of
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.files import load_policy, policy_path
 from symsteer.registry import Extension
-from symsteer.variant import variant_text
 
 REGISTRIES = {registry.kind: registry for registry in (AGENTS, POLICIES, TASKS, VARIANTS)}
 
@@ -44,19 +43,6 @@ class RunFolder:
     resolved: Mapping[str, Any]
 
     @classmethod
-    def new(cls, config: RunConfig, out: Path, files: Mapping[str, str]) -> Self:
-        """A run of a configuration.
-
-        Args:
-            config: what to run.
-            out: folder of the runs.
-            files: content hashes of the files that it starts from.
-        """
-        variant = variant_text(evaluation_variants(config.variants))
-        derived = {"evaluation_variant": variant, "files": dict(files)}
-        return cls(out / run_id(config, files), config, config.to_json() | derived)
-
-    @classmethod
     def stored(cls, folder: Path) -> Self:
         """The run of a folder, which may be given as ``.`` or as a link.
 
@@ -72,14 +58,13 @@ class RunFolder:
                 f"the run {folder.name} was begun by an older version, without {', '.join(newer)}; "
                 "use that version for it, or start it again with `symsteer run`"
             )
-        run = cls(folder, config, resolved)
-        named = isinstance(run.files, dict) and run_id(config, run.files, _settings(resolved))
-        if named != folder.name:
+        files = resolved.get("files", {})
+        if not isinstance(files, dict) or run_id_of({**resolved, "files": files}) != folder.name:
             raise UserError(
                 f"{folder / CONFIG} does not belong to a folder of this name: it was edited, or "
                 "the folder renamed; undo that"
             )
-        return run
+        return cls(folder, config, resolved)
 
     @property
     def files(self) -> dict[str, str]:
@@ -160,12 +145,8 @@ def read_back(data: Mapping[str, Any], path: Path, record: Path) -> RunConfig:
         extensions = []
     for one in extensions:
         REGISTRIES[one.kind].require(one.name, one.target, one.distribution, record)
-    return build_config(_settings(data), str(path))
-
-
-def _settings(resolved: Mapping[str, Any]) -> dict[str, Any]:
-    """What was asked for, without what the run has added."""
-    return {key: value for key, value in resolved.items() if key not in DERIVED}
+    asked = {key: value for key, value in data.items() if key not in DERIVED}
+    return build_config(asked, str(path))
 
 
 def newer_options(config: RunConfig, data: Mapping[str, Any]) -> list[str]:

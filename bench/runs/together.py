@@ -16,8 +16,8 @@ import torch
 from symsteer.agents.replay import Batch
 from symsteer.agents.team import Team, can_join
 from symsteer.bench.runs.config import Execution, RunConfig
-from symsteer.bench.runs.folder import is_finished
-from symsteer.bench.runs.run import new_run, opened
+from symsteer.bench.runs.folder import is_finished, run_id
+from symsteer.bench.runs.run import opened
 from symsteer.bench.runs.trainer import next_batch
 
 
@@ -35,10 +35,9 @@ class _Member(contextlib.ExitStack):
     def begin(self, config: RunConfig, how: Execution, together: int) -> None:
         """Open the run, unless it is finished, and let it go on."""
         try:
-            run = new_run(config, how)
-            if is_finished(run.folder):
+            if is_finished(how.out / run_id(config, {})):
                 return
-            self.trainer = self.enter_context(opened(run, how, together))
+            self.trainer = self.enter_context(opened(config, how, together))
         except Exception as error:
             self.error = error
             return

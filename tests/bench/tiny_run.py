@@ -59,7 +59,7 @@ def execute(config, out, **options):
 
 def resume(folder, **options):
     """Continue a run without progress bars."""
-    return run.resume(folder, quiet(**options))
+    return run.execute(folder, quiet(**options))
 
 
 def quiet(**options) -> Execution:

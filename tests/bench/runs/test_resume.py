@@ -24,12 +24,11 @@ from symsteer.bench.runs.folder import (
     claimed,
     is_finished,
     read_progress,
-    run_id,
     state_of,
 )
 from symsteer.bench.runs.run import evaluate
 from symsteer.errors import UserError
-from symsteer.leaderboard.records import DERIVED, read_record
+from symsteer.leaderboard.records import DERIVED, read_record, run_id_of
 from symsteer.leaderboard.records.retired import RETIRED
 from tests.bench.runs.conftest import ensure
 from tests.bench.tiny_run import resume, stop, tiny_config, without_clock
@@ -197,7 +196,7 @@ def test_a_run_with_an_option_that_is_no_more_goes_on(begun, monkeypatch):
     data["agent_options"]["momentum"] = 0.0
     data["keep_replay"] = False
     own = {key: value for key, value in data.items() if key not in DERIVED}
-    folder = begun.with_name(run_id(CONFIG, {}, own))
+    folder = begun.with_name(run_id_of({**own, "files": {}}))
     begun.rename(folder)
     (folder / "config.json").write_text(json.dumps(data))
     resume(folder)

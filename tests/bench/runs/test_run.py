@@ -14,7 +14,7 @@ from symsteer.agents.sac import SacAgent
 from symsteer.bench.runs import evaluator, trainer
 from symsteer.bench.runs.config import DemonstrationConfig, EvaluationConfig, RunConfig
 from symsteer.bench.runs.folder import is_finished, state_of
-from symsteer.bench.runs.run import check_all, evaluate
+from symsteer.bench.runs.run import check, evaluate
 from symsteer.bench.sim import environment
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.tasks import task_class
@@ -214,7 +214,7 @@ ROOMY = {"num_envs": 500, "env_steps": 10**6}
 def test_more_environments_than_processes_can_hold(change, workers, words, tmp_path):
     config = tiny_config(**change)
     if words is None:
-        return check_all(config, workers)
+        return check(config, workers)
     with pytest.raises(UserError, match=words):
         execute(config, tmp_path, workers=workers)
     assert not any(tmp_path.iterdir())
