@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from symsteer.bench.sweep.workforce import THIS_MACHINE, Workforce
 from symsteer.errors import UserError
 from symsteer.files import prepare_folder
 from symsteer.registry import allow
@@ -194,9 +195,7 @@ def sweep(
     suite: Annotated[str, tyro.conf.arg(metavar="SUITE")],
     /,
     out: Path = Path("runs"),
-    workers: int = 0,
-    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
-    together: int = 1,
+    workforce: Annotated[Workforce, tyro.conf.arg(name="")] = THIS_MACHINE,
     track: Literal["wandb"] | None = None,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
     trust: Trust = (),
@@ -209,10 +208,6 @@ def sweep(
     Args:
         suite: Name of a suite (see `symsteer list`) or path of a .toml file.
         out: Folder of the runs; a sweep on a cluster needs one that all its machines share.
-        workers: Number of runs at the same time; 0: one per core, or as many as fit on the cluster.
-        ray: Address of a Ray cluster to run on: auto, or host:port of its head.
-        together: Learners that share a process and are trained as one, which is faster, if they
-            differ in seeds and variants alone.
         track: Show the runs in Weights & Biases, too, in a group with the name of the suite.
         dry_run: Only show which runs are left and how long they may take.
     """
@@ -224,12 +219,12 @@ def sweep(
     from symsteer.bench.sweep.plan import make_plan, sweep_path
     from symsteer.bench.sweep.suite import load_suite
 
-    plan = make_plan(load_suite(suite), out, elsewhere=ray is not None)
+    plan = make_plan(load_suite(suite), out, elsewhere=workforce.ray is not None)
     if dry_run:
-        print(preview(plan, workers, ray))
+        print(preview(plan, workforce))
         return 0
     check_tracking(track)
-    ends = run_plan(replace(plan, track=track), workers, ray, together)
+    ends = run_plan(replace(plan, track=track), workforce)
     failed = [end for end in ends if end.status == "failed"]
     for end in failed:
         print(f"failed: {end.run.label}: {end.reason}", file=sys.stderr)
@@ -250,9 +245,7 @@ def tune(
     plan: Annotated[str, tyro.conf.arg(metavar="PLAN")],
     /,
     out: Path = Path("runs"),
-    workers: int = 0,
-    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None,
-    together: int = 1,
+    workforce: Annotated[Workforce, tyro.conf.arg(name="")] = THIS_MACHINE,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
     trust: Trust = (),
 ) -> int:
@@ -263,10 +256,6 @@ def tune(
     Args:
         plan: Name of a tuning plan (see `symsteer list`) or path of a .toml file.
         out: Folder of the runs; trials and chosen settings are written to OUT/tuning.
-        workers: Number of runs at the same time; 0: one per core, or as many as fit on the cluster.
-        ray: Address of a Ray cluster to run on: auto, or host:port of its head.
-        together: Runs of a trial that share a process and are trained as one, which is faster, if
-            they differ in seeds and variants alone.
         dry_run: Only show what would be tried.
     """
     allow(*trust)
@@ -280,7 +269,7 @@ def tune(
         return 0
     from symsteer.bench.tuning.trials import to_text
 
-    tuner = Tuner(found, out, workers, ray, together)
+    tuner = Tuner(found, out, workforce)
     trials, chosen = tuner.play()
     print(f"\n{to_text(trials, chosen)}\n")
     for kind, path in tuner.places.items():
@@ -530,7 +519,6 @@ def throughput(
     num_envs: tuple[int, ...] = (4, 16, 64),
     workers: tuple[int, ...] = (1,),
     seconds: float = 10.0,
-    json: bool = False,
 ) -> int:
     """Measure how fast this machine steers: steps per second of a run, and where its time goes.
 
@@ -542,15 +530,11 @@ def throughput(
         num_envs: Numbers of environments.
         workers: Numbers of processes that share the simulation.
         seconds: Length of each measurement.
-        json: Print only JSON.
     """
     allow(task, agent)
-    from json import dumps
-
     from symsteer.bench.throughput import measure, table
 
-    rows = measure(task, agent, num_envs, workers, seconds, _tell)
-    print(dumps({"rows": rows}, indent=2) if json else table(rows))
+    print(table(measure(task, agent, num_envs, workers, seconds, _tell)))
     return 0
 
 

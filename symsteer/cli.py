@@ -138,11 +138,11 @@ def demo(out: Path = Path("runs/demo")) -> int:
     Args:
         out: Folder of the runs and of their leaderboard.
     """
-    from symsteer.bench.cli import sweep
+    from symsteer.bench.cli import Workforce, sweep
     from symsteer.leaderboard.command import report
     from symsteer.leaderboard.curves import curves_as_text
 
-    exit_code = sweep("demo", out=out, together=2)
+    exit_code = sweep("demo", out=out, workforce=Workforce(together=2))
     report((out,), out=out / "leaderboard")
     print(f"\n{curves_as_text((out,))}")
     print(

@@ -16,8 +16,7 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from symsteer.bench.bundles.fetch import read_bundle
-from symsteer.bench.bundles.manifest import MANIFEST
+from symsteer.bench.bundles.fetch import MANIFEST, read_bundle
 from symsteer.leaderboard.records import config_hash, run_id_of
 
 EVIL = "evilmod:Evil"

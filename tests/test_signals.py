@@ -36,7 +36,7 @@ sys.addaudithook(look)
 
 WORDS = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
 
-CONFIG = tiny_config(agent="equivariant", checkpoint_every=20)
+CONFIG = tiny_config(agent="equivariant", env_steps=320, checkpoint_every=20)
 
 
 @pytest.fixture(scope="module", params=["run", "sweep"])

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from scipy.stats import binomtest
 
-from symsteer.bench.bundles.manifest import (
+from symsteer.bench.bundles.fetch import (
     CARD,
     FORMAT,
     MANIFEST,

@@ -17,8 +17,8 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from symsteer.bench.bundles.bundle import LICENCES
+from symsteer.bench.bundles.fetch import Code
 from symsteer.bench.bundles.film import CODEC, PIXELS, film_demonstrations
-from symsteer.bench.bundles.manifest import Code
 from symsteer.bench.demos import Demonstrations, load
 from symsteer.bench.runs.film import FRAMES_PER_SECOND
 from symsteer.bench.runs.folder import write_json

@@ -6,15 +6,15 @@ import logging
 import os
 import re
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 import grpc
 
-from symsteer.bench.runs.config import RunConfig
-from symsteer.bench.sweep.work import Result
+from symsteer.bench.runs.config import Execution, RunConfig
+from symsteer.bench.sweep.work import Kind, Result, work
 from symsteer.errors import UserError
 from symsteer.files import away
 from symsteer.registry import ALLOWED
@@ -51,12 +51,10 @@ class RayCluster:
             self.stop()
             raise
 
-    def submit(
-        self, function: Callable[..., list[Result]], configs: Sequence[RunConfig], *args: Any
-    ) -> Future:
+    def submit(self, kind: Kind, configs: Sequence[RunConfig], how: Execution) -> Future:
         cuda = any("cuda" in (config.sim, config.device) for config in configs)
-        remote = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)(function)
-        reference = remote.remote(configs, *args)
+        remote = self._ray.remote(num_cpus=1, num_gpus=int(cuda), max_retries=0)(work)
+        reference = remote.remote(kind, configs, how, self.patience)
         future = reference.future()
         self._references[future] = reference
         return future

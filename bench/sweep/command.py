@@ -6,12 +6,12 @@ import contextlib
 import os
 import sys
 
-from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.sweep.display import Display
 from symsteer.bench.sweep.plan import Plan, PlannedRun, sweep_path, title, write_sweep
 from symsteer.bench.sweep.pool import LocalPool, Workers
 from symsteer.bench.sweep.schedule import EndedRun, execute_plan, tasks_of, teams_of
 from symsteer.bench.sweep.survey import Sighting, duration, look, time_left
+from symsteer.bench.sweep.workforce import Workforce
 from symsteer.errors import UserError
 from symsteer.files import open_log
 from symsteer.tables import aligned
@@ -19,47 +19,36 @@ from symsteer.tables import aligned
 COLUMNS = ("runs", "finished", "running", "unfinished", "missing")
 
 
-def number_of_workers(asked: int, configs: list[RunConfig]) -> int:
-    """How many runs to execute at the same time on this machine.
+def _workers(workforce: Workforce, plan: Plan) -> int | None:
+    """How many runs are executed at the same time; None if the cluster decides.
 
-    Args:
-        asked: the number that the user gave. 0 means one per core, or only one on CUDA, because
-            the runs would share a device.
-        configs: of the runs.
-
-    Raises:
-        UserError: if it is negative.
+    On this machine that is one per core, if the user says nothing, or only one on CUDA, because the
+    runs would share a device.
     """
-    if asked < 0:
-        raise UserError(f"--workers is {asked}; it must be at least 1, or 0 for one per core")
-    if asked:
-        return asked
-    if any("cuda" in (config.sim, config.device) for config in configs):
+    if workforce.workers < 0:
+        raise UserError(
+            f"--workers is {workforce.workers}; it must be at least 1, or 0 for one per core"
+        )
+    if workforce.together < 1:
+        raise UserError(f"--together is {workforce.together}; it must be at least 1")
+    if workforce.workers or workforce.ray is not None:
+        return workforce.workers or None
+    if any("cuda" in (config.sim, config.device) for config in plan.configs.values()):
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_plan(
-    plan: Plan, workers: int = 0, ray: str | None = None, together: int = 1
-) -> list[EndedRun]:
+def run_plan(plan: Plan, workforce: Workforce) -> list[EndedRun]:
     """Execute every run of a plan that is not finished, and report on stdout.
-
-    Args:
-        plan: the runs.
-        workers: number of runs at the same time; 0: one per core, or as many as fit on the cluster.
-        ray: address of a Ray cluster to use instead of this machine.
-        together: learners that share a process, if they differ in seeds and variants alone.
 
     Returns:
         How each run has ended, in the order in which they ended; skipped ones first.
 
     Raises:
-        UserError: if ``workers``, ``ray`` or ``together`` is wrong.
+        UserError: if a number or an address of the workforce is wrong.
         OSError: if the folder of the runs cannot be created.
     """
-    if together < 1:
-        raise UserError(f"--together is {together}; it must be at least 1")
-    number = number_of_workers(workers, list(plan.configs.values()))
+    workers = _workers(workforce, plan)
     seen = look_at(plan)
     todo = [run for run, sighting in seen.items() if sighting.state != "finished"]
     ends = [
@@ -67,22 +56,22 @@ def run_plan(
         for run, sighting in seen.items()
         if sighting.state == "finished"
     ]
-    teams_of(plan, todo, together)  # before anything is written: they may be too large
-    limit = workers if ray is not None else number
+    # Before anything is written: they may be too large.
+    teams_of(plan, todo, workforce.together)
     log = sweep_path(plan.out, plan.name).with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     output = sys.stdout
     with contextlib.ExitStack() as stack:
         pool: Workers | None = None
-        if todo and ray is not None:
+        if todo and workforce.ray is not None:
             from symsteer.bench.sweep.cluster import RayCluster
 
             # Ray prints messages about its machines.
             stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open_log(log))))
-            pool = RayCluster(ray, plan.out, limit or None)
+            pool = RayCluster(workforce.ray, plan.out, workers)
         elif todo:
-            pool = LocalPool(min(number, len(todo)), log)
-        write_sweep(plan, limit, {})
+            pool = LocalPool(min(workers or 1, len(todo)), log)
+        write_sweep(plan, workers or 0, {})
         if ends:
             words = f"{len(ends)} of {len(plan.configs)} runs are finished already"
             print(f"{'skipped':9s} {words}", file=output, flush=True)
@@ -92,12 +81,12 @@ def run_plan(
         display = stack.enter_context(Display(plan, seen, pool.capacity, output))
         failures = {}
         try:
-            for end in execute_plan(plan, todo, pool, display, together):
+            for end in execute_plan(plan, todo, pool, display, workforce.together):
                 ends.append(end)
                 display.ended(end)
                 if end.status == "failed":
                     failures[end.run.run_id] = end.reason
-                    write_sweep(plan, limit, failures)
+                    write_sweep(plan, workers or 0, failures)
                 if end.trace:
                     with open_log(log) as file:
                         file.write(f"{end.run.label}\n{end.trace}\n")
@@ -112,25 +101,24 @@ def look_at(plan: Plan) -> dict[PlannedRun, Sighting]:
     return {run: look(plan.out / run.run_id) for run in plan.configs}
 
 
-def preview(plan: Plan, workers: int = 0, ray: str | None = None) -> str:
+def preview(plan: Plan, workforce: Workforce) -> str:
     """A text that shows what a sweep would do. It runs and writes nothing, and does not connect.
 
     Raises:
-        UserError: if ``workers`` is negative, or ``ray`` is not an address.
+        UserError: if a number or an address of the workforce is wrong.
     """
-    number: int | None = number_of_workers(workers, list(plan.configs.values()))
-    if ray is not None:
+    workers = _workers(workforce, plan)
+    if workforce.ray is not None:
         from symsteer.bench.sweep.cluster import check_address
 
-        check_address(ray)
-        number = workers or None
+        check_address(workforce.ray)
     seen = look_at(plan)
     todo = [run for run in seen if seen[run].state != "finished"]
     bases = [task.label for task in tasks_of(plan, todo) if task.kind == "base policy"]
     lines = [title(plan.name, plan.description), "", _counts(seen), ""]
     lines.append(f"base policies to build: {len(bases) or 'none'}")
     lines += [f"  {label}" for label in bases]
-    lines.append(f"time: {_time(seen, len(todo), number, bool(bases))}")
+    lines.append(f"time: {_time(seen, len(todo), workers, bool(bases))}")
     return "\n".join(lines)
 
 

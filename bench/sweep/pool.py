@@ -7,18 +7,18 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
-from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.sim.shards.processes import signals_wait
-from symsteer.bench.sweep.work import Result, one_thread
+from symsteer.bench.sweep.work import Kind, Result, one_thread, work
 from symsteer.files import open_log
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -32,9 +32,7 @@ class Workers(Protocol):
     patience: float
     """Seconds to wait for a run that another process seems to hold."""
 
-    def submit(
-        self, function: Callable[..., list[Result]], configs: Sequence[RunConfig], *args: Any
-    ) -> Future:
+    def submit(self, kind: Kind, configs: Sequence[RunConfig], how: Execution) -> Future:
         """Start a task; fewer than ``capacity`` may be running."""
 
     def result(self, future: Future) -> list[Result]:
@@ -65,14 +63,12 @@ class LocalPool:
         self._idle: list[ProcessPool] = [self._start() for _ in range(workers)]
         self._busy: dict[Future, ProcessPool] = {}
 
-    def submit(
-        self, function: Callable[..., list[Result]], configs: Sequence[RunConfig], *args: Any
-    ) -> Future:
+    def submit(self, kind: Kind, configs: Sequence[RunConfig], how: Execution) -> Future:
         pool = self._idle.pop()
         # Ctrl-C is for the sweep, which ends its processes itself. A process that is ended while it
         # starts complains, but not on the terminal.
         with signals_wait(signal.SIGINT, signal.SIGTERM), self._complaints_in_log():
-            future = pool.schedule(function, (configs, *args))
+            future = pool.schedule(work, (kind, configs, how, self.patience))
             self._busy[future] = pool
         return future
 

@@ -5,10 +5,10 @@ The workers are processes of this machine (``pool``) or of a cluster (``cluster`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 from symsteer.agents import AGENTS
 from symsteer.agents.team import can_join
@@ -17,7 +17,7 @@ from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.evaluator import check_room
 from symsteer.bench.sweep.plan import Plan, PlannedRun
 from symsteer.bench.sweep.pool import Workers
-from symsteer.bench.sweep.work import Result, build_base, build_demonstrations, play
+from symsteer.bench.sweep.work import Kind, Result
 
 TRIES = 2
 """A task that failed is tried once more; a run then continues from its checkpoint."""
@@ -43,7 +43,7 @@ class EndedRun:
 class Task:
     """Something to do: collect demonstrations, train a base policy, or execute runs."""
 
-    kind: Literal["demonstrations", "base policy", "run"]
+    kind: Kind
     label: str
     runs: list[PlannedRun]
     """The runs that it executes, trained together if they are several; of a task that executes
@@ -131,6 +131,7 @@ def execute_plan(
     in the order of the suite, then tasks that failed before; these are executed one by one.
     """
     queue = tasks_of(plan, todo, together)
+    how = Execution(plan.out, track=plan.track, quiet=True, group=plan.name)
     running: dict[Future, Task] = {}
     ended: set[Task] = set()
     lost: set[PlannedRun] = set()
@@ -155,7 +156,9 @@ def execute_plan(
                 queue.remove(task)
                 task.runs = [run for run in task.runs if run not in lost]
                 if task.runs:
-                    running[workers.submit(*_call(task, plan, workers.patience))] = task
+                    configs = [plan.configs[run] for run in task.runs]
+                    several = None if task.kind == "run" else 1
+                    running[workers.submit(task.kind, configs[:several], how)] = task
                 else:
                     ended.add(task)
         watcher.refresh(list(running.values()))
@@ -170,17 +173,6 @@ def execute_plan(
             for run, result in zip(task.runs, each, strict=True):
                 yield from settle(Task("run", run.label, [run]), result)
     watcher.refresh([])
-
-
-def _call(task: Task, plan: Plan, patience: float) -> tuple[Any, ...]:
-    """The function that executes a task, and its arguments."""
-    configs = [plan.configs[run] for run in task.runs]
-    if task.kind == "run":
-        how = Execution(plan.out, track=plan.track, quiet=True, group=plan.name)
-        return play, configs, how, patience
-    build: Callable[..., list[Result]]
-    build = build_base if task.kind == "base policy" else build_demonstrations
-    return build, configs[:1], plan.out
 
 
 def _again(task: Task, result: Result) -> bool:

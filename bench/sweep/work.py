@@ -11,7 +11,6 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -26,6 +25,9 @@ from symsteer.errors import UserError
 POLL_SECONDS = 0.5
 
 LONGEST_REASON = 500
+
+Kind = Literal["demonstrations", "base policy", "run"]
+"""What a task does."""
 
 
 @dataclass(frozen=True)
@@ -50,25 +52,21 @@ def one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def build_demonstrations(configs: Sequence[RunConfig], out: Path) -> list[Result]:
-    """Collect the demonstrations that runs share, if they do not exist."""
-    return [_guarded(lambda: demonstration_file(configs[0], out, quiet=True))]
-
-
-def build_base(configs: Sequence[RunConfig], out: Path) -> list[Result]:
-    """Train the base policy that runs share, if it does not exist."""
-    return [_guarded(lambda: prepare_base(configs[0], Execution(out, quiet=True)))]
-
-
-def play(configs: Sequence[RunConfig], how: Execution, patience: float = 0.0) -> list[Result]:
-    """Execute runs, or continue them; several are trained together.
+def work(kind: Kind, configs: Sequence[RunConfig], how: Execution, patience: float) -> list[Result]:
+    """Execute one task; unlike the others, the task ``run`` has a result for each configuration.
 
     Args:
+        kind: collect the demonstrations, or train the base policy, that runs share, unless they
+            exist; or execute runs, or continue them: several are trained together.
         configs: of the runs.
         how: they are executed.
         patience: seconds to wait until files of another machine are visible here: the base policies
             that it has trained, or the released lock of a run.
     """
+    if kind == "demonstrations":
+        return [_guarded(lambda: demonstration_file(configs[0], how.out, quiet=True))]
+    if kind == "base policy":
+        return [_guarded(lambda: prepare_base(configs[0], how))]
     deadline = time.monotonic() + patience
     while any(find_base(c, how.out) is None for c in configs) and time.monotonic() < deadline:
         time.sleep(POLL_SECONDS)

@@ -15,6 +15,7 @@ from symsteer.bench.runs.folder import run_id, write_json
 from symsteer.bench.sweep.command import run_plan
 from symsteer.bench.sweep.plan import make_plan
 from symsteer.bench.sweep.suite import Suite
+from symsteer.bench.sweep.workforce import THIS_MACHINE, Workforce
 from symsteer.bench.tuning.plan import TuningPlan
 from symsteer.bench.tuning.search import Search, open_storage
 from symsteer.bench.tuning.trials import (
@@ -42,24 +43,14 @@ class Tuner:
     Args:
         plan: what to tune.
         out: folder of the runs; the trials are in ``out/tuning``.
-        workers: number of runs at the same time; 0: one per core, or as many as fit on the cluster.
-        ray: address of a Ray cluster to use instead of this machine.
-        together: learners that share a process, if they differ in seeds and variants alone.
+        workforce: who executes the runs.
 
     Raises:
         UserError: if ``out`` holds trials of a plan that differs.
     """
 
-    def __init__(
-        self,
-        plan: TuningPlan,
-        out: Path,
-        workers: int = 0,
-        ray: str | None = None,
-        together: int = 1,
-    ):
-        self.plan, self.out = plan, out
-        self.workers, self.ray, self.together = workers, ray, together
+    def __init__(self, plan: TuningPlan, out: Path, workforce: Workforce = THIS_MACHINE):
+        self.plan, self.out, self.workforce = plan, out, workforce
         storage = open_storage(self.places["journal"])
         self.searches = {agent: Search(plan, agent, storage) for agent in plan.agents}
         # The folders of finished runs may be deleted.
@@ -144,8 +135,8 @@ class Tuner:
         runs = tuple(config for config in configs if not self._score(config))
         if runs:
             suite = Suite(f"tune-{self.plan.name}", self.plan.description, runs)
-            plan = make_plan(suite, self.out, self.ray is not None)
-            for end in run_plan(plan, self.workers, self.ray, self.together):
+            plan = make_plan(suite, self.out, self.workforce.ray is not None)
+            for end in run_plan(plan, self.workforce):
                 if end.status == "elsewhere":
                     raise UserError(
                         f"another process works on {end.run.label}; start the search again when it "

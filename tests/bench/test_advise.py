@@ -6,7 +6,6 @@ import json
 
 import pytest
 
-from symsteer.cli import main
 from symsteer.leaderboard import paths
 from symsteer.leaderboard.records import write_record
 from tests.leaderboard.record_factory import steered
@@ -28,14 +27,8 @@ def records(tmp_path_factory):
 
 
 @pytest.fixture
-def advise(records, monkeypatch, capsys):
-    def call(*arguments):
-        words = ["symsteer", "advise", *map(str, arguments), "--records", str(records)]
-        monkeypatch.setattr("sys.argv", words)
-        code = main()
-        return code, capsys.readouterr()
-
-    return call
+def advise(records, command):
+    return lambda *arguments: command("advise", *arguments, "--records", records)
 
 
 def test_a_world_by_name(advise, tmp_path):
@@ -74,11 +67,10 @@ def test_worlds_of_an_audit(advise, tmp_path):
 
 
 @pytest.mark.long
-def test_the_file_of_one_audit(advise, tmp_path, monkeypatch, capsys):
-    small = ("--base-policy", "none", "--count", "8", "--out", str(tmp_path))
-    words = ["symsteer", "audit", "--task", "PushCube-v1", "--variant", "wind:0.3", *small]
-    monkeypatch.setattr("sys.argv", words)
-    assert main() == 0
+def test_the_file_of_one_audit(advise, tmp_path, command):
+    small = ("--base-policy", "none", "--count", 8, "--out", tmp_path)
+    code, _ = command("audit", "--task", "PushCube-v1", "--variant", "wind:0.3", *small)
+    assert code == 0
     for path in (tmp_path, tmp_path / "audit.json"):
         code, shown = advise("--audit", path)
         assert code == 0
@@ -108,8 +100,8 @@ def test_mistakes(advise, tmp_path, monkeypatch, arguments, words):
     assert shown.err.count("\n") == 1
 
 
-def test_an_installed_package_has_no_committed_records(tmp_path, monkeypatch, capsys):
+def test_an_installed_package_has_no_committed_records(tmp_path, monkeypatch, command):
     monkeypatch.setattr(paths, "RECORDS", tmp_path / "nothing")
-    monkeypatch.setattr("sys.argv", ["symsteer", "advise", "--task", "PushT-v1"])
-    assert main() == 2
-    assert "name run folders: symsteer advise --records RUNS" in capsys.readouterr().err
+    code, shown = command("advise", "--task", "PushT-v1")
+    assert code == 2
+    assert "name run folders: symsteer advise --records RUNS" in shown.err

@@ -35,7 +35,8 @@ def tiny_config(agent="equivariant", policy_name="edp", options=None, **changes)
     values = {
         "agent": agent,
         "agent_options": kind(**{**shared, **(options or {})}),
-        "env_steps": 320,
+        # Its search plays whole episodes.
+        "env_steps": 240 if agent == "golden-ticket" else 160,
         "num_envs": 4,
         "demonstrations": DemonstrationConfig(count=3),
         "policy_name": policy_name,
@@ -43,9 +44,9 @@ def tiny_config(agent="equivariant", policy_name="edp", options=None, **changes)
         "evaluation": EvaluationConfig(
             every=160,
             episodes=3,
-            final_episodes=5,
+            final_episodes=3,
             diagnostic_episodes=2,
-            final_diagnostic_episodes=4,
+            final_diagnostic_episodes=2,
             steerability_states=2,
         ),
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
 from unittest.mock import patch
 
 import pytest
@@ -21,8 +20,8 @@ from tests.leaderboard.record_factory import make_record
 
 CHECKPOINT_EVERY = 20
 
-CONFIG = replace(tiny_config(agent="standard"), checkpoint_every=CHECKPOINT_EVERY)
-OTHER = tiny_config(agent="zero", checkpoint_every=CHECKPOINT_EVERY)
+CONFIG = tiny_config(agent="standard", env_steps=320, checkpoint_every=CHECKPOINT_EVERY)
+OTHER = tiny_config(agent="zero", env_steps=320, checkpoint_every=CHECKPOINT_EVERY)
 
 
 def stop_after(config, out, checkpoints):

@@ -20,7 +20,6 @@ from symsteer.bench.demos import load
 from symsteer.bench.demos.files import checksum
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import make, task_class
-from symsteer.cli import main
 from symsteer.errors import UserError
 
 ROOT = Path(__file__).parents[3]
@@ -194,22 +193,18 @@ def test_a_video_where_nothing_renders_leaves_nothing_behind(path, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def command(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["symsteer", "export-lerobot", *map(str, arguments)])
-    return main()
-
-
-def test_without_pyarrow_the_command_says_what_to_install(path, tmp_path, monkeypatch, capsys):
+def test_without_pyarrow_the_command_says_what_to_install(path, tmp_path, monkeypatch, command):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.delitem(sys.modules, "symsteer.bench.bundles.lerobot")
-    assert command(monkeypatch, path, "--out", tmp_path / "new") == 2
-    assert 'pip install "symsteer[lerobot]"' in capsys.readouterr().err
+    code, shown = command("export-lerobot", path, "--out", tmp_path / "new")
+    assert code == 2
+    assert 'pip install "symsteer[lerobot]"' in shown.err
 
 
-def test_the_command_line_writes_a_dataset(path, demos, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "new"
-    assert command(monkeypatch, path, "--videos", "off", "--out", out) == 0
-    assert f"{len(demos)} episodes" in capsys.readouterr().out
+def test_the_command_line_writes_a_dataset(path, demos, tmp_path, command):
+    code, shown = command("export-lerobot", path, "--videos", "off", "--out", tmp_path / "new")
+    assert code == 0
+    assert f"{len(demos)} episodes" in shown.out
     assert [found.name for found in tmp_path.iterdir()] == ["new"]
 
 
@@ -238,10 +233,9 @@ def hub():
     return module
 
 
-@pytest.mark.parametrize("use_async_envs", [False, True])
-def test_the_environment_plays_the_demonstrations(hub, path, demos, use_async_envs):
+def test_the_environment_plays_the_demonstrations(hub, path, demos):
     """Observations, actions and success are those of the dataset."""
-    ((task, numbered),) = hub.make_env(n_envs=2, use_async_envs=use_async_envs).items()
+    ((task, numbered),) = hub.make_env(n_envs=2, use_async_envs=True).items()
     envs = numbered[0]
     assert task == "PickCube-v1"
     assert envs.call("_max_episode_steps") == (50, 50)

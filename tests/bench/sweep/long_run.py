@@ -8,9 +8,9 @@ from tests.bench.tiny_run import tiny_config
 _TINY = tiny_config()
 LONG = dataclasses.replace(
     _TINY,
-    env_steps=480,
-    checkpoint_every=60,
-    evaluation=dataclasses.replace(_TINY.evaluation, every=240),
+    env_steps=320,
+    checkpoint_every=30,
+    evaluation=dataclasses.replace(_TINY.evaluation, every=320),
 )
 """Long enough to be killed after its first checkpoint."""
 

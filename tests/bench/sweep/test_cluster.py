@@ -16,6 +16,7 @@ from symsteer.bench.sweep.cluster import RayCluster
 from symsteer.bench.sweep.command import run_plan
 from symsteer.bench.sweep.plan import make_plan
 from symsteer.bench.sweep.suite import Suite
+from symsteer.bench.sweep.workforce import Workforce
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG, wait_for
@@ -120,7 +121,7 @@ def test_a_machine_dies_and_nothing_is_lost(cluster, undisturbed, tmp_path, caps
 
     killer = threading.Thread(target=kill)
     killer.start()
-    ends = run_plan(plan, ray=cluster.address)
+    ends = run_plan(plan, Workforce(ray=cluster.address))
     killer.join()
     assert len(cluster.worker_nodes) == 1
     assert [end.status for end in ends] == ["finished", "finished"]

@@ -20,7 +20,6 @@ from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite
 from symsteer.bench.sweep.survey import Sighting, duration, time_left
 from symsteer.bench.sweep.work import Result
-from symsteer.cli import main
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from symsteer.policies import POLICIES
@@ -87,22 +86,19 @@ def sweep(undisturbed, tmp_path):
     progress = {
         "phase": "training",
         "env_steps": 120,
-        "budget": 480,
+        "budget": 320,
         "success": 0.25,
         "steps_per_second": 12.0,
         "seconds_left": 30.0,
         "updated": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     (folders[1] / PROGRESS).write_text(json.dumps(progress))
-    # What an earlier process left is not what the present one does.
-    old = {**progress, "updated": "2026-01-01T00:00:00+00:00"}
-    (folders[2] / PROGRESS).write_text(json.dumps(old))
     write_sweep(plan, 2, {plan.runs[3].run_id: "its process was killed by SIGKILL"})
     with FileLock(folders[1] / LOCK):
         yield plan
 
 
-def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
+def test_status_tells_states_reasons_and_time_left(sweep, command):
     [status] = read_status(sweep.out).sweeps
     assert [status.state(one) for one in sweep.runs] == [
         "finished",
@@ -113,13 +109,12 @@ def test_status_tells_states_reasons_and_time_left(sweep, capsys, monkeypatch):
     ]
     text = to_text([status], sweep.out)
     assert text.startswith("tiny: five (5 runs)\n  finished         1\n")
-    assert "standard seed 0: 120 of 480 steps, success 25%, 12 steps/s, about 30 s left" in text
+    assert "standard seed 0: 120 of 320 steps, success 25%, 12 steps/s, about 30 s left" in text
     assert "standard-matched seed 0: its process was killed by SIGKILL" in text
     # zero does not learn: nothing is known of it.
     assert text.endswith("time left: unknown, no similar run is finished yet")
-    monkeypatch.setattr("sys.argv", ["symsteer", "status", str(sweep.out), "--suite", "tiny"])
-    assert main() == 0
-    assert capsys.readouterr().out == text + "\n"
+    code, shown = command("status", sweep.out, "--suite", "tiny")
+    assert (code, shown.out) == (0, text + "\n")
 
 
 def test_runs_and_sweeps_are_found_at_any_depth(sweep, undisturbed, tmp_path_factory):
@@ -133,6 +128,7 @@ def test_runs_and_sweeps_are_found_at_any_depth(sweep, undisturbed, tmp_path_fac
     assert [len(listed.in_state(state)) for state in ("finished", "missing")] == [1, 1]
     assert others.title == "runs of no sweep"
     assert [run.run_id for run in others.runs] == [name]
+    assert "run (1 runs)\n  finished         1" in to_text(read_status(undisturbed).sweeps, top)
     [only] = read_status(top, "tiny").sweeps
     assert only.title == listed.title
     # Without their list, the two that never began have left nothing.
@@ -142,7 +138,7 @@ def test_runs_and_sweeps_are_found_at_any_depth(sweep, undisturbed, tmp_path_fac
     (top / "deep" / "demo").rename(sweep.out)
 
 
-def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, capsys, monkeypatch):
+def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, command):
     other = tmp_path / "PickCube-v1-floating-none-equivariant-s7-0"
     shutil.copytree(undisturbed, other)
     (other / CONFIG).write_text("{")
@@ -152,22 +148,15 @@ def test_what_is_damaged_does_not_hide_the_rest(sweep, undisturbed, tmp_path, ca
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / CONFIG).write_text('{"task": ["PickCube-v1"]}')
     sweep_path(tmp_path, "older").write_text("[]")
-    monkeypatch.setattr("sys.argv", ["symsteer", "status", str(tmp_path)])
-    assert main() == 2
-    out, errors = capsys.readouterr()
-    assert out.startswith("tiny: five (5 runs)\n  finished         1\n")
-    one, two, three = sorted(errors.splitlines())
+    code, shown = command("status", tmp_path)
+    assert code == 2
+    assert shown.out.startswith("tiny: five (5 runs)\n  finished         1\n")
+    one, two, three = sorted(shown.err.splitlines())
     assert re.match(r"error: \S+7-0/config.json cannot be read .*; restore it", one)
     assert re.match(r"error: \S+a/config.json is not the configuration of a run", two)
     assert re.match(r"error: \S+older.json is not the list of a sweep; run the sweep again", three)
     with pytest.raises(UserError, match=CONFIG):
         read_status(other)
-
-
-def test_the_status_of_a_run_by_its_own_folder(undisturbed):
-    text = to_text(read_status(undisturbed).sweeps, undisturbed)
-    assert text.startswith("run (1 runs)")
-    assert "finished         1" in text
 
 
 def test_mistakes_with_status(sweep, tmp_path):
@@ -193,57 +182,26 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture
-def display(sweep, monkeypatch):
-    """Opens the display of the sweep, on a terminal or in a pipe."""
-
-    def opened(terminal):
-        bars, lines = Terminal() if terminal else io.StringIO(), io.StringIO()
-        monkeypatch.setattr("sys.stderr", bars)
-        return Display(sweep, look_at(sweep), 3, lines), bars, lines
-
-    return opened
-
-
-def test_a_terminal_has_a_bar_for_each_running_run_and_one_for_all(sweep, display, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "120")
-    # A run stops after the first decision that reaches its budget, some steps beyond it.
-    path = sweep.out / sweep.runs[1].run_id / PROGRESS
-    path.write_text(json.dumps({**json.loads(path.read_text()), "env_steps": 488}))
+@pytest.mark.parametrize("terminal", [False, True])
+def test_each_run_that_ended_has_a_line_and_a_terminal_a_bar_for_all(sweep, terminal, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    bar, lines = Terminal() if terminal else io.StringIO(), io.StringIO()
+    monkeypatch.setattr("sys.stderr", bar)
     team = Task("run", "a team", list(sweep.runs[1:3]))
     base = Task("base policy", "edp for PickCube-v1", list(sweep.runs[3:]))
-    shown, terminal, lines = display(terminal=True)
-    with shown:
+    with Display(sweep, look_at(sweep), 3, lines) as shown:
         for _ in range(2):
             shown.refresh([team, base])
-        written = terminal.getvalue()
         shown.retried(team, Result("failed", "why"))
-        shown.ended(EndedRun(sweep.runs[1], "failed", "why"))
-        shown.refresh([])
-        assert not shown.bars
-    assert "standard s0: 480 of 480 steps, success 25%, 12 steps/s, about 30 s left" in written
-    # What an earlier process left is not what the present one does.
-    assert "augmented s0: starting" in written
-    assert "base policy edp for PickCube-v1: for 0 s" in written
-    assert "1 of 5 runs finished, time left unknown" in written
-    assert "1 of 5 runs finished, 1 failed" in terminal.getvalue()
-    again, failed = lines.getvalue().splitlines()
-    assert again == "again     run a team: why"
-    assert re.fullmatch(r"failed    \[2/5\] standard s0 +why", failed)
-
-
-def test_a_pipe_gets_one_plain_line_a_run_that_ended(sweep, display):
-    shown, bars, lines = display(terminal=False)
-    one = Task("run", "c", list(sweep.runs[1:2]))
-    with shown:
-        shown.refresh([one])
-        shown.retried(one, Result("failed", "why"))
-        assert lines.getvalue() == ""
         shown.ended(EndedRun(sweep.runs[1], "failed", "why " * 30))
-    assert bars.getvalue() == ""
-    assert lines.getvalue() == (
-        "failed    [2/5] PickCube-v1 floating none standard seed 0          " + "why " * 30 + "\n"
-    )
+        shown.refresh([])
+    *again, failed = lines.getvalue().splitlines()
+    assert again == ["again     run a team: why"] * terminal
+    label = "PickCube-v1 floating none standard seed 0"
+    assert re.fullmatch(rf"failed    \[2/5\] {label} +{'why ' * 30}", failed)
+    words = "1 of 5 runs finished, 2 running, base policy edp for PickCube-v1, time left unknown"
+    assert (words in bar.getvalue()) == ("1 of 5 runs finished, 1 failed" in bar.getvalue())
+    assert (words in bar.getvalue()) == terminal == bool(bar.getvalue())
 
 
 def test_a_sweep_goes_on_when_nobody_reads_its_lines_any_more(sweep):

@@ -15,6 +15,7 @@ from symsteer.bench.sweep.grid import SUITES, read_suite, suite_names
 from symsteer.bench.sweep.plan import BASIC, make_plan
 from symsteer.bench.sweep.schedule import tasks_of
 from symsteer.bench.sweep.suite import load_suite
+from symsteer.bench.sweep.workforce import THIS_MACHINE
 from symsteer.bench.tasks import task_class
 from symsteer.bench.tuning.plan import read_plan
 from symsteer.errors import UserError
@@ -238,7 +239,7 @@ def test_options_in_which_runs_differ_are_shown(tmp_path):
         {"agent.penalty": 0.4},
     ]
     assert "residual-pathway penalty 0.2 seed 0" in plan.runs[1].label
-    assert re.search(r"agent.penalty +0.2 +1 +0", preview(plan))
+    assert re.search(r"agent.penalty +0.2 +1 +0", preview(plan, THIS_MACHINE))
 
 
 @pytest.mark.parametrize(

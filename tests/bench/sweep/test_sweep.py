@@ -22,7 +22,6 @@ from symsteer.bench.sweep.schedule import EndedRun, Task, Watcher, execute_plan
 from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite, load_suite
 from symsteer.bench.sweep.work import Result
-from symsteer.cli import main
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import tiny_config, without_clock, write_suite
@@ -62,30 +61,19 @@ def workers() -> list[int]:
 
 
 @pytest.mark.slow
-def test_of_a_team_only_the_run_that_fails_is_tried_again(tmp_path):
-    configs = tuple(tiny_config("standard", seed=seed) for seed in (0, 1))
+def test_a_team_goes_on_without_what_fails(tmp_path):
+    """Only the run that fails is tried again, and those whose base policy failed are left out."""
+    configs = tuple(tiny_config("standard", seed=seed) for seed in range(4))
     plan = make_plan(Suite("team", "", configs), tmp_path / "runs")
     (plan.out / plan.runs[1].run_id / CHECKPOINT).mkdir(parents=True)
-    ends, witness = work(plan, tmp_path, together=2)
-    assert [(end.run.seed, end.status) for end in ends] == [(0, "finished"), (1, "failed")]
-    assert witness.tasks[-2:] == [("run", "standard standard"), ("run", "standard")]
-    assert CHECKPOINT in ends[1].reason
+    demonstration_path(configs[3], plan.out).mkdir(parents=True)
+    ends, witness = work(plan, tmp_path, together=4)
+    states = {end.run.seed: end.status for end in ends}
+    assert states == {0: "finished", 1: "failed", 2: "finished", 3: "failed"}
+    assert witness.tasks[-2:] == [("run", "standard standard standard"), ("run", "standard")]
+    assert any(CHECKPOINT in end.reason for end in ends)
     record = read_record(plan.out / plan.runs[0].run_id / "record.json")
-    assert (record.status, record.provenance.together) == ("finished", 2)
-
-
-@pytest.mark.slow
-def test_a_team_goes_on_without_the_runs_whose_base_policy_failed(tmp_path):
-    configs = tuple(tiny_config("standard", seed=seed) for seed in range(3))
-    plan = make_plan(Suite("baseless", "", configs), tmp_path / "runs")
-    for config in configs[:2]:
-        demonstration_path(config, plan.out).mkdir(parents=True)
-    ends, _ = work(plan, tmp_path, together=3)
-    assert sorted((end.run.seed, end.status) for end in ends) == [
-        (0, "failed"),
-        (1, "failed"),
-        (2, "finished"),
-    ]
+    assert (record.status, record.provenance.together) == ("finished", 3)
 
 
 @pytest.mark.long
@@ -145,16 +133,11 @@ def test_failures_are_isolated_and_a_killed_worker_loses_nothing(undisturbed, tm
     assert workers() == []
 
 
-def symsteer(monkeypatch, *arguments) -> int:
-    monkeypatch.setattr(sys, "argv", ["symsteer", *map(str, arguments)])
-    return main()
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
 )
-def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_path, capsys):
+def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_path):
     """Ctrl-C reaches all processes of the terminal's group, a kill only the sweep itself."""
     path = write_suite(tmp_path, LONG, 'agent = ["equivariant"]\nseed = [0, 1]')
     out = tmp_path / "runs"
@@ -209,39 +192,36 @@ def group(leader: int) -> list[int]:
     return found
 
 
-def test_the_command_line(undisturbed, monkeypatch, capsys, tmp_path):
+def test_the_command_line(undisturbed, command, tmp_path):
     """Finished runs are skipped, failed ones are named with their reason, and counted."""
-    path = write_suite(tmp_path, LONG, 'agent = ["equivariant"]\nenv_steps = [480, 481]')
+    path = write_suite(tmp_path, LONG, 'agent = ["equivariant"]\nenv_steps = [320, 321]')
     out = tmp_path / "runs"
     shutil.copytree(undisturbed, out / undisturbed.name)
     other = make_plan(load_suite(path), out).runs[1]
     # Whoever comes to this folder cannot make a run of it.
     (out / other.run_id).write_text("in the way")
     before = sorted(out.rglob("*"))
-    assert symsteer(monkeypatch, "sweep", path, "--out", out, "--dry-run") == 0
-    text = capsys.readouterr().out
-    assert re.search(r"env_steps +480 +1 +1 +0 +0 +0\n +481 +1 +0 +0 +0 +1\n", text)
-    assert "base policies to build: 1\n  edp for PickCube-v1 floating, 3 diverse" in text
-    assert "estimated from 1 finished run" in text
-    cluster = ("sweep", path, "--out", out, "--dry-run", "--ray", "no-such-head:6379")
-    assert symsteer(monkeypatch, *cluster) == 0
-    assert "time: depends on the size of the cluster" in capsys.readouterr().out
-    assert symsteer(monkeypatch, *cluster, "--workers", 7) == 0
-    assert "with 7 workers, estimated from 1 finished run" in capsys.readouterr().out
+    trial = ("sweep", path, "--out", out, "--dry-run")
+    code, shown = command(*trial)
+    assert code == 0
+    assert re.search(r"env_steps +320 +1 +1 +0 +0 +0\n +321 +1 +0 +0 +0 +1\n", shown.out)
+    assert "base policies to build: 1\n  edp for PickCube-v1 floating, 3 diverse" in shown.out
+    assert "estimated from 1 finished run" in shown.out
+    cluster = (*trial, "--ray", "no-such-head:6379")
+    assert "time: depends on the size of the cluster" in command(*cluster)[1].out
+    assert "with 7 workers, estimated from" in command(*cluster, "--workers", 7)[1].out
     assert sorted(out.rglob("*")) == before
     record = (out / undisturbed.name / "record.json").stat().st_mtime_ns
     shutil.copytree(undisturbed.parent / "base", out / "base")
-    assert symsteer(monkeypatch, "sweep", path, "--out", out, "--workers", 1) == 1
-    output, errors = capsys.readouterr()
-    lines = output.splitlines()
-    assert lines[0] == "skipped   1 of 2 runs are finished already"
-    assert lines[1].startswith(f"failed    [2/2] {other.label}  cannot write")
-    reason = lines[1].partition(f"{other.label}  ")[2]
-    assert errors.splitlines() == [f"failed: {other.label}: {reason}"]
+    code, shown = command("sweep", path, "--out", out, "--workers", 1)
+    assert code == 1
+    skipped, failed = shown.out.splitlines()
+    assert skipped == "skipped   1 of 2 runs are finished already"
+    assert failed.startswith(f"failed    [2/2] {other.label}  cannot write")
+    reason = failed.partition(f"{other.label}  ")[2]
+    assert shown.err.splitlines() == [f"failed: {other.label}: {reason}"]
     assert (out / undisturbed.name / "record.json").stat().st_mtime_ns == record
-    assert symsteer(monkeypatch, "status", out) == 0
-    text = capsys.readouterr().out
-    assert f"failed:\n  {other.label}: cannot write" in text
+    assert f"failed:\n  {other.label}: cannot write" in command("status", out)[1].out
     assert workers() == []
 
 
@@ -259,13 +239,10 @@ def test_the_command_line(undisturbed, monkeypatch, capsys, tmp_path):
         ("", ["--ray", "here", "--dry-run"], "--ray here is not an address"),
     ],
 )
-def test_what_cannot_run_is_refused_before_anything_happens(
-    run, options, words, monkeypatch, capsys, tmp_path
-):
+def test_what_cannot_run_is_refused_before_anything_happens(run, options, words, command, tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text(f"[grid]\nseed = [0, 1]\n[run]\n{run}")
-    assert symsteer(monkeypatch, "sweep", path, "--out", tmp_path / "runs", *options) == 2
-    output, errors = capsys.readouterr()
-    assert output == ""
-    assert re.search(words, errors)
-    assert errors.count("\n") == 1
+    code, shown = command("sweep", path, "--out", tmp_path / "runs", *options)
+    assert (code, shown.out) == (2, "")
+    assert re.search(words, shown.err)
+    assert shown.err.count("\n") == 1

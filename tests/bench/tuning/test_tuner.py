@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 
-import numpy as np
 import pytest
 
 from symsteer.agents.equivariant import EquivariantAgent
@@ -16,8 +15,8 @@ from symsteer.bench.runs.config import build_config
 from symsteer.bench.runs.folder import RECORD, run_id
 from symsteer.bench.sweep.schedule import EndedRun
 from symsteer.bench.sweep.survey import look
-from symsteer.bench.tuning import command
-from symsteer.bench.tuning.command import Tuner, preview
+from symsteer.bench.tuning import command as tuning
+from symsteer.bench.tuning.command import Tuner
 from symsteer.bench.tuning.plan import read_plan
 from symsteer.bench.tuning.search import Search, open_storage
 from symsteer.bench.tuning.trials import (
@@ -31,12 +30,11 @@ from symsteer.bench.tuning.trials import (
     score_of,
     to_text,
 )
-from symsteer.cli import main
 from symsteer.errors import UserError
 from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.records import write_record
 from tests.bench.tuning.conftest import play_plan
-from tests.bench.tuning.tiny_plan import BEST, TEXT, write_plan
+from tests.bench.tuning.tiny_plan import BEST, TEXT, KnownRuns, write_plan
 from tests.leaderboard.record_factory import make_evaluation, make_record
 
 
@@ -96,43 +94,27 @@ def test_a_score_says_whether_q_stayed_finite(tmp_path):
         assert look(folder).success == f"success   0% of 2{'' if finite else ', Q not finite'}"
 
 
-def test_ranks_are_means_over_cells_and_ties_share_them():
+def test_the_best_mean_rank_is_chosen():
+    """Not the best mean: one cell in which areas vary much does not decide alone."""
     assert mean_ranks([scores_of(0.5, 0.9), scores_of(0.7, 0.9), scores_of(0.1, 0.2)]) == [
         pytest.approx(x) for x in ((2 + 1.5) / 2, (1 + 1.5) / 2, 3.0)
     ]
-
-
-def test_the_best_mean_rank_is_chosen_not_the_best_mean():
-    """One cell in which areas vary much does not decide alone."""
-    trials = [trial(0, 0.1, 0.50, 0.50), trial(1, 0.9, 0.48, 0.48), trial(2, 0.2, 0.51, 0.51)]
-    choice = choose(trials)
-    assert np.argmax([t.auc for t in trials]) == 1
+    choice = choose(
+        [trial(0, 0.1, 0.50, 0.50), trial(1, 0.9, 0.48, 0.48), trial(2, 0.2, 0.51, 0.51)]
+    )
     assert (choice.trial, choice.rank) == (2, pytest.approx(4 / 3))
     assert choice.start_rank == pytest.approx((3 + 2 + 2) / 3)
-
-
-def test_every_task_has_a_best_trial_of_its_own():
-    trials = [
-        trial(0, 0.5, 0.9, 0.5, 0.9),
-        trial(1, 0.7, 0.1, 0.4, 0.2),
-        trial(2, 0.6, 0.8, 0.8, 0.8),
-    ]
-    assert choose(trials).by_task == {"task-0": 2, "task-1": 0}
-
-
-def test_the_best_single_option_may_be_none():
-    choice = dataclasses.replace(
-        choose([trial(0, 0.5, 0.5)]),
-        singles={"lr": scores_of(0.6, 0.4), "tau": scores_of(0.7, 0.6)},
-    )
+    # Every task has a best trial of its own, and trials that were given up are not chosen.
+    areas = ((0.5, 0.9, 0.5, 0.9), (0.7, 0.1, 0.4, 0.2), (0.6, 0.8, 0.8, 0.8))
+    assert choose([trial(i, *x) for i, x in enumerate(areas)]).by_task == {"task-0": 2, "task-1": 0}
+    pruned = trial(1, 0.9, state="pruned")
+    assert choose([trial(0, 0.5, 0.5), pruned, trial(2, 0.4, 0.4)]).trial == 0
+    assert choose([trial(0, 0.5, state="failed"), trial(1, 0.4, 0.4)]) is None
+    # The best single option may be none.
+    singles = {"lr": scores_of(0.6, 0.4), "tau": scores_of(0.7, 0.6)}
+    choice = dataclasses.replace(choose([trial(0, 0.5, 0.5)]), singles=singles)
     assert best_single(choice, scores_of(0.5, 0.5)) == "tau"
     assert best_single(choice, scores_of(0.8, 0.8)) is None
-
-
-def test_trials_that_were_given_up_are_not_chosen():
-    trials = [trial(0, 0.5, 0.5), trial(1, 0.9, state="pruned"), trial(2, 0.4, 0.4)]
-    assert choose(trials).trial == 0
-    assert choose([trial(0, 0.5, state="failed"), trial(1, 0.4, 0.4)]) is None
 
 
 def test_agents_have_the_same_number_of_trials_and_bad_ones_are_given_up(whole):
@@ -170,7 +152,7 @@ def test_options_are_tried_by_themselves_where_the_plan_says_so(again):
     assert set(equivariant.fresh) == {"start", "chosen", "by_task"}
 
 
-@pytest.mark.parametrize("stop", [1, pytest.param(25, marks=pytest.mark.long), -1])
+@pytest.mark.parametrize("stop", [1, -1])
 def test_a_search_that_was_killed_continues_with_the_same_trials(stop, whole, tmp_path):
     stop %= len(whole.runs.played)
     with pytest.raises(KeyboardInterrupt):
@@ -237,10 +219,10 @@ def test_options_with_which_runs_fail_cost_their_trial(tmp_path, capsys):
 
 
 def test_a_run_of_another_process_costs_no_trial(tmp_path, monkeypatch):
-    def busy(plan, workers, ray, together):
+    def busy(plan, workforce):
         return [EndedRun(run, "elsewhere", "busy") for run in plan.runs]
 
-    monkeypatch.setattr(command, "run_plan", busy)
+    monkeypatch.setattr(tuning, "run_plan", busy)
     tuner = Tuner(read_plan(write_plan(tmp_path)), tmp_path / "runs")
     with pytest.raises(UserError, match=r"another process works on PickCube"):
         tuner.play()
@@ -273,53 +255,16 @@ def test_a_committed_search_can_be_gone_on_with(tmp_path):
     assert [tuner.searches[c.agent].best.trial for c in chosen] == [c.trial for c in chosen]
 
 
-def test_the_preview_counts_the_runs(tmp_path):
-    text = preview(read_plan(write_plan(tmp_path)))
-    assert "standard: 12 trials of 2 options: lr, batch_size" in text
-    assert "at most 60 runs" in text
-
-
-REAL = """
-description = "one agent, one cell"
-agents = ["standard"]
-trials = 2
-batch = 2
-probe = 1
-[grid]
-seed = [1]
-[confirm]
-seed = [1]
-task = ["PushCube-v1"]
-[run]
-task = "PushCube-v1"
-env_steps = 160
-num_envs = 4
-demonstrations.count = 3
-agent = { width = 16, warmup = 16, gamma = 0.5 }
-policy = { channels = 8, width = 16, depth = 1, steps = 20, batch_size = 32 }
-[run.evaluation]
-every = 80
-episodes = 2
-final_episodes = 2
-diagnostic_episodes = 2
-final_diagnostic_episodes = 2
-steerability_states = 2
-[space]
-lr = { low = 1e-4, high = 1e-2, log = true }
-"""
-
-
-@pytest.mark.slow
-def test_the_command_tunes_with_real_runs(tmp_path, monkeypatch, capsys):
-    path, out = write_plan(tmp_path, REAL), str(tmp_path / "runs")
-    arguments = ["symsteer", "tune", path, "--out", out, "--workers", "1"]
-    monkeypatch.setattr("sys.argv", arguments)
-    assert main() == 0
-    first = capsys.readouterr().out
-    assert "trial     standard 2 of 2: complete" in first
-    assert "standard-preset" not in first
-    assert str(tmp_path / "runs" / "tuning" / "tiny-preset.toml") in first
+def test_the_command_says_what_it_does_and_where_the_results_are(tmp_path, monkeypatch, command):
+    monkeypatch.setattr(tuning, "run_plan", KnownRuns())
+    words = ("tune", write_plan(tmp_path), "--out", tmp_path / "runs")
+    code, shown = command(*words, "--dry-run")
+    assert code == 0
+    assert "standard: 12 trials of 2 options: lr, batch_size" in shown.out
+    assert "at most 60 runs" in shown.out
+    code, first = command(*words)
+    assert code == 0
+    assert "trial     standard 12 of 12: " in first.out
+    assert str(tmp_path / "runs" / "tuning" / "tiny-preset.toml") in first.out
     # Again: all is done, and the same table is printed.
-    assert main() == 0
-    again = capsys.readouterr().out
-    assert again.splitlines()[-7:] == first.splitlines()[-7:]
+    assert command(*words)[1].out.splitlines()[-8:] == first.out.splitlines()[-8:]

@@ -10,6 +10,7 @@ import numpy as np
 from symsteer.bench.runs.folder import RECORD, run_id
 from symsteer.bench.sweep.plan import Plan
 from symsteer.bench.sweep.schedule import EndedRun
+from symsteer.bench.sweep.workforce import Workforce
 from symsteer.leaderboard.records import write_record
 from tests.leaderboard.record_factory import make_evaluation, make_record
 
@@ -66,7 +67,7 @@ class KnownRuns:
         self.left, self.failing = stop_after, failing
         self.played: list[str] = []
 
-    def __call__(self, plan: Plan, workers: int, ray: str | None, together: int) -> list[EndedRun]:
+    def __call__(self, plan: Plan, workforce: Workforce) -> list[EndedRun]:
         ends = []
         for run, config in plan.configs.items():
             folder = plan.out / run_id(config, {})
