@@ -18,11 +18,10 @@ import pytest
 from symsteer.agents import AGENTS
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, task_class
 from symsteer.bench.variants import VARIANTS
-from symsteer.errors import UserError
 from symsteer.leaderboard import catalogue, command
 from symsteer.leaderboard.admission import EVALUATION_RULES, RULES, Admission, check
 from symsteer.leaderboard.paths import RECORDS, RESULTS
-from symsteer.leaderboard.records import config_hash, read_record
+from symsteer.leaderboard.records import config_hash, run_id_of
 from symsteer.policies import POLICIES
 from symsteer.variant import VariantSpec
 from tests.leaderboard.command_line import main
@@ -48,14 +47,9 @@ def forge(path: Path, change: Change | Data, folder: Path) -> Path:
     data = json.loads(path.read_text())
     old = data["run_id"]
     (put(change) if isinstance(change, dict) else change)(data)
-    config = data["config"]
-    data["config_hash"] = config_hash(config)
+    data["config_hash"] = config_hash(data["config"])
     if data["run_id"] == old:
-        own = {k: v for k, v in config.items() if k not in ("evaluation_variant", "files")}
-        text = json.dumps([own, config.get("files")], sort_keys=True, separators=(",", ":"))
-        keys = config["task"], config["embodiment"], config["variant"], config["agent"]
-        key = hashlib.sha256(text.encode()).hexdigest()[:12]
-        data["run_id"] = "-".join([*keys, f"s{config['seed']}", key]).replace(":", "=")
+        data["run_id"] = run_id_of(data["config"])
     target = folder / f"{data['run_id']}.json"
     folder.mkdir(exist_ok=True)
     target.write_text(json.dumps(data))
@@ -68,11 +62,6 @@ def judge(*paths: Path, among: Path = Path("/nowhere")) -> list[Admission]:
 
 def five(folder: Path) -> list[Path]:
     return [forge(committed(seed=seed), {}, folder) for seed in range(25, 30)]
-
-
-def test_five_seeds_are_admitted_without_a_word(tmp_path: Path) -> None:
-    verdicts = judge(*five(tmp_path), committed("base"))
-    assert all(verdict.is_admissible and not verdict.notes for verdict in verdicts)
 
 
 # Forgeries: what a hostile author changes, with all that follows from it.
@@ -96,23 +85,23 @@ def put(values: Data) -> Change:
     return change
 
 
-def both(*changes: Change) -> Change:
-    return lambda data: [change(data) for change in changes]
-
-
-def config(**values: Any) -> Change:
-    """Keys of the configuration; a double underscore leads into a table."""
-    return put({f"config/{name.replace('__', '/')}": value for name, value in values.items()})
+def both(*changes: Change | Data) -> Change:
+    return lambda data: [
+        put(change)(data) if isinstance(change, dict) else change(data) for change in changes
+    ]
 
 
 def everywhere(change: Change) -> Change:
     return lambda data: [change(evaluation) for evaluation in data["evaluations"]]
 
 
-def solved(data: Data) -> None:
-    """Every episode of the final evaluation is a success, but nobody corrects the returns."""
-    columns = data["evaluations"][-1]["episodes"]
-    columns["success_once"] = columns["success_at_end"] = [1] * len(columns["seed"])
+def config(key: str, value: Any) -> Data:
+    """A key of the configuration; a slash leads into a table."""
+    return {f"config/{key}": value}
+
+
+def world(variant: str) -> Data:
+    return {**config("variant", variant), **config("evaluation_variant", variant)}
 
 
 def extension(kind: str, name: str, **more: Any) -> Data:
@@ -121,40 +110,23 @@ def extension(kind: str, name: str, **more: Any) -> Data:
     return target | {"distribution": "mine", "version": "1.0"} | more
 
 
-def extended(*extensions: Data, **values: Any) -> Change:
-    return both(config(**values), put({"provenance/extensions": list(extensions)}))
+def extended(*extensions: Data) -> Data:
+    return {"provenance/extensions": list(extensions)}
+
+
+def updates(data: Data, decisions: int) -> int:
+    return max(0, int((decisions - 1280) * data["config"]["agent_options"]["utd"]))
 
 
 def all_at(end: int) -> Change:
     """The run ends at another step."""
 
     def change(data: Data) -> None:
-        last = data["evaluations"][-1]
-        last["env_steps"] = data["budget"]["env_steps"] = end
-        last["decisions"] = data["budget"]["decisions"] = end // 4
-        updates = max(0, int((end // 4 - 1280) * data["config"]["agent_options"]["utd"]))
-        last["updates"] = data["budget"]["updates"] = updates
+        used = {"decisions": end // 4, "updates": updates(data, end // 4), "env_steps": end}
+        data["evaluations"][-1].update(used)
+        data["budget"].update(used)
 
     return change
-
-
-def extra_evaluation(data: Data) -> None:
-    early = copy.deepcopy(data["evaluations"][0]) | {"env_steps": 256, "decisions": 64}
-    data["evaluations"].insert(1, early)
-
-
-def few_episodes(data: Data) -> None:
-    config(evaluation__final_episodes=99)(data)
-    columns = data["evaluations"][-1]["episodes"]
-    for name, values in columns.items():
-        columns[name] = values[:99] if isinstance(values, list) else values
-
-
-def short(data: Data) -> None:
-    """One decision of all environments is more than a tenth of the budget."""
-    config(env_steps=2_000)(data)
-    data["evaluations"] = [data["evaluations"][0], data["evaluations"][-1]]
-    all_at(2_048)(data)
 
 
 def decide(factor: float) -> Change:
@@ -163,18 +135,51 @@ def decide(factor: float) -> Change:
     def change(data: Data) -> None:
         for place in [*data["evaluations"], data["budget"]]:
             place["decisions"] = int(place["decisions"] * factor)
-            utd = data["config"]["agent_options"]["utd"]
-            place["updates"] = max(0, int((place["decisions"] - 1280) * utd))
+            place["updates"] = updates(data, place["decisions"])
 
     return change
 
 
-def endless(data: Data) -> None:
-    for evaluation in data["evaluations"]:
+def short(data: Data) -> None:
+    """One decision of all environments is more than a tenth of the budget."""
+    data["config"]["env_steps"] = 2_000
+    data["evaluations"] = [data["evaluations"][0], data["evaluations"][-1]]
+    all_at(2_048)(data)
+
+
+def extra_evaluation(data: Data) -> None:
+    early = copy.deepcopy(data["evaluations"][0]) | {"env_steps": 256, "decisions": 64}
+    data["evaluations"].insert(1, early)
+
+
+def first_episodes(number: int, evaluation: Data) -> None:
+    """Only the first episodes of an evaluation."""
+    columns = evaluation["episodes"]
+    for name, values in columns.items():
+        columns[name] = values[:number] if isinstance(values, list) else values
+
+
+def few_episodes(data: Data) -> None:
+    data["config"]["evaluation"]["final_episodes"] = 99
+    first_episodes(99, data["evaluations"][-1])
+
+
+def outcome(once: int, value: float | None = None, **more: int) -> Change:
+    """Every episode of an evaluation has the same outcome; without a value the returns stay."""
+
+    def change(evaluation: Data) -> None:
         columns = evaluation["episodes"]
-        columns["episode_len"] = [9_999] * len(columns["seed"])
-        pairs = zip(columns["success_once"], columns["return"], strict=True)
-        columns["return"] = [value if once else -9_999.0 for once, value in pairs]
+        number = len(columns["seed"])
+        same = {"success_once": once, "success_at_end": once, **more}
+        if value is not None:
+            same["return"] = value
+        columns.update({name: [one] * number for name, one in same.items()})
+
+    return change
+
+
+def final(change: Change) -> Change:
+    return lambda data: change(data["evaluations"][-1])
 
 
 def late_failure(data: Data) -> None:
@@ -187,11 +192,7 @@ def continued(data: Data) -> None:
     data["continued"] = [copy.deepcopy(data["provenance"]) | {"dirty": True}]
 
 
-def hidden(*names: str) -> Change:
-    return everywhere(put({f"diagnostics/{name}": GONE for name in names}))
-
-
-FIRST = LAST + "episodes/{}/0"
+FIRST, END = LAST + "episodes/{}/0", ("success_at_end", 0)
 NO_CODE = {"provenance/commit": None, "provenance/dirty": None}
 UNVERSIONED = {
     "provenance/version": "0.2.dev3+g0123456",
@@ -202,67 +203,57 @@ FORGERIES: dict[str, list[Change | Data]] = {
     "its code can be looked up": [
         {"provenance/dirty": True},
         NO_CODE,
-        {**NO_CODE, **UNVERSIONED},
+        NO_CODE | UNVERSIONED,
         continued,
-        extended(
-            extension("agent", "mine:Mine", distribution=None, version=None), agent="mine:Mine"
-        ),
+        config("agent", "mine:Mine")
+        | extended(extension("agent", "mine:Mine", distribution=None, version=None)),
     ],
     "names are SymSteer's, or extensions'": [
-        {"config/task": "FetchCube-v1"},
-        {"config/embodiment": "hand"},
-        {"config/agent": "wonder"},
-        config(variant="earthquake:1", evaluation_variant="earthquake:1"),
-        {"config/policy/name": "oracle", "base_policy/name": "oracle"},
+        config("task", "FetchCube-v1"),
+        config("embodiment", "hand"),
+        config("agent", "wonder"),
+        world("earthquake:1"),
+        config("policy/name", "oracle") | {"base_policy/name": "oracle"},
         extended(extension("agent", "standard")),
         extended(extension("task", "PickCube-v1")),
         extended(extension("agent", "unused")),
     ],
-    "its name is its configuration's": [
-        {"run_id": "PickCube-v1-floating-none-standard-s25-0123456789ab"},
-        {"run_id": "PickCube-v1-floating-none-equivariant-s25-4fbbd8847ddd"},
-    ],
-    "seeds are the configuration's": [
-        {"seeds/run": 77},
-        {"seeds/policy": 7},
-        {"seeds/first_held_out": 7},
-        {"seeds/demonstrations": GONE},
-    ],
+    "its name is its configuration's": [{"run_id": "PickCube-v1-floating-none-standard-s25-012"}],
+    "seeds are the configuration's": [{"seeds/run": 7}, {"seeds/demonstrations": GONE}],
     "role and variant are its agent's and its evaluations'": [
         {"role": "control"},
-        config(evaluation_variant="wind:1"),
-        config(variant="action_gain:0.50", evaluation_variant="action_gain:0.5"),
+        config("evaluation_variant", "wind:1"),
+        config("variant", "action_gain:0.50") | config("evaluation_variant", "action_gain:0.5"),
     ],
     "hashes have many different digits": [
         {"base_policy/content_hash": "0" * 64},
         {"provenance/commit": "ab" * 20},
-        config(files={"demonstrations": "0" * 64}),
-        extended(extension("agent", "mine", sha256="01" * 32), agent="mine"),
+        config("files", {"demonstrations": "0" * 64}),
+        config("agent", "mine") | extended(extension("agent", "mine", sha256="01" * 32)),
     ],
     "the device is the configuration's, runs in a process at most 100": [
         {"provenance/together": 5_000},
         {"provenance/device": "NVIDIA H100"},
     ],
     "the whole budget is used, and not exceeded": [all_at(23_808), all_at(48_128)],
-    "a decision takes at most a tenth of the budget": [config(policy__horizon=3), short],
+    "a decision takes at most a tenth of the budget": [config("policy/horizon", 3), short],
     "evaluations are the configuration's": [
         lambda data: data.update(evaluations=data["evaluations"][-1:]),
         {"evaluations/0": GONE},
         {"evaluations/3": GONE},
         extra_evaluation,
-        config(evaluation__every=2_000),
+        config("evaluation/every", 2_000),
     ],
     "feasible Q-values are the reward's": [
-        config(agent_options__timeouts_terminal=True),
-        config(agent_options__gamma=0.9),
+        config("agent_options/timeouts_terminal", True),
+        config("agent_options/gamma", 0.9),
     ],
     "the base policy's shares are its draws'": [
-        {"base_policy/base_success": 0.0005},
-        {"base_policy/solvable": 0.99},
-        {"base_policy/solvable": 0.0},
-        {"base_policy/episodes": 1000},
-        {"base_policy/base_success": None},
-        {"base_policy/name": "plain"},
+        {f"base_policy/{name}": value}
+        for name, value in (
+            *(("base_success", 0.0005), ("solvable", 0.99), ("solvable", 0.0), ("episodes", 1000)),
+            *(("base_success", None), ("name", "plain")),
+        )
     ],
     "numbers of parameters add up": [{"parameters/total": 1}],
     "times are in order and within the run": [
@@ -277,36 +268,31 @@ FORGERIES: dict[str, list[Change | Data]] = {
         {"base_policy/warning": "trained in /home/somebody/runs/base"},
         {"provenance/platform": "C:\\Users\\somebody\\gpu"},
     ],
-    "seeds are the held-out ones in order": [
-        {FIRST.format("seed"): 17},
-        {"evaluations/1/episodes/seed/0": 17},
-    ],
+    "seeds are the held-out ones in order": [{"evaluations/1/episodes/seed/0": 17}],
     "episodes are as many as configured, 100 at the end": [
         few_episodes,
-        config(evaluation__episodes=31),
-        config(evaluation__final_episodes=200),
+        config("evaluation/episodes", 31),
+        config("evaluation/final_episodes", 200),
     ],
     "the final one counts what the run used": [{"budget/updates": 1}, {"budget/decisions": 1}],
-    "so many decisions take so many steps": [config(num_envs=60), decide(2), decide(0.5)],
+    "so many decisions take so many steps": [config("num_envs", 60), decide(2), decide(0.5)],
     "so many decisions lead to so many updates": [
-        config(agent_options__utd=5.0),
-        config(agent_options__warmup=0),
+        config("agent_options/utd", 5.0),
+        config("agent_options/warmup", 0),
         {"evaluations/2/updates": 3},
     ],
-    "episodes last to the time limit": [endless, {LAST + "episodes/episode_len/1": 49}],
+    "episodes last to the time limit": [
+        everywhere(outcome(0, -9_999.0, episode_len=9_999)),
+        {LAST + "episodes/episode_len/1": 49},
+    ],
     "returns are the reward's": [
-        solved,
+        final(outcome(1)),
         *({FIRST.format("return"): value} for value in (1e30, 1.0, -12.5, -51.0, None)),
         late_failure,
-        {
-            FIRST.format("return"): -49.0,
-            FIRST.format("success_once"): 1,
-            FIRST.format("success_at_end"): 0,
-        },
+        {FIRST.format(k): v for k, v in (("return", -49.0), ("success_once", 1), END)},
     ],
     "no diagnostic is left out": [
-        hidden("q_mean"),
-        hidden("q_magnitude", "q_overshoot"),
+        everywhere(put({"diagnostics/q_mean": GONE})),
         {LAST + "diagnostics/td_error": GONE},
         {LAST + "diagnostics/q_magnitude": None},
     ],
@@ -315,8 +301,7 @@ FORGERIES: dict[str, list[Change | Data]] = {
         for name, value in (
             *(("q_magnitude", 0.1), ("q_mean", 50.0), ("q_abs_max", 0.0), ("q_overshoot", -1.0)),
             *(("q_overshoot", 1e30), ("q_bias", 1e30), ("return_mean", -500.0)),
-            *(("q_violation", 2.0), ("q_correlation", 7.0), ("q_overestimated", 1.5)),
-            ("td_error", -3.0),
+            *(("q_violation", 2.0), ("q_correlation", 7.0), ("td_error", -3.0)),
         )
     ],
 }
@@ -346,12 +331,7 @@ def searched(data: Data) -> None:
 
 def evaluated_twice(data: Data) -> None:
     data["evaluations"].insert(0, copy.deepcopy(data["evaluations"][0]) | {"final": False})
-    few = data["config"]["evaluation"]["episodes"]
-    columns = data["evaluations"][0]["episodes"]
-    data["evaluations"][0]["episodes"] = {
-        name: values[:few] if isinstance(values, list) else values
-        for name, values in columns.items()
-    }
+    first_episodes(data["config"]["evaluation"]["episodes"], data["evaluations"][0])
 
 
 @pytest.mark.parametrize(
@@ -361,7 +341,6 @@ def evaluated_twice(data: Data) -> None:
         ("base", evaluated_twice, "the run (a reference has one) breaks the rule"),
         ("base", {"parameters": {"actor": 1, "critic": 0, "total": 1}}, "parameters add up"),
         ("zero", {"feasible_q": {"low": -80.0, "high": 0.0}}, "feasible Q-values are"),
-        ("base", {"budget/updates": 3}, "counts what the run used"),
     ],
 )
 def test_references_are_judged_as_well(
@@ -369,15 +348,6 @@ def test_references_are_judged_as_well(
 ) -> None:
     (problem,) = judge(forge(committed(agent), change, tmp_path))[0].problems
     assert sentence in problem
-
-
-@pytest.mark.parametrize("steps", [9, 10**9])
-def test_long_decisions_hide_no_steps(steps: int, tmp_path: Path) -> None:
-    path = forge(committed(), config(policy__execute=steps, policy__horizon=steps), tmp_path)
-    found = [
-        text for text in judge(path)[0].problems if "a decision takes at most a tenth of" in text
-    ]
-    assert len(found) == (steps > 50)
 
 
 def edit(path: Path, **changes: Any) -> None:
@@ -406,23 +376,17 @@ def test_the_form_of_a_record(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (config(variant="action_gain:77"), r"strength of variant 'action_gain' must lie in [0, 1]"),
-        (config(variant="action_gain"), "needs a strength"),
-        (config(evaluation__every=0), "evaluation.every"),
-        (config(policy__execute="4"), "policy.execute"),
-        (config(num_envs=10**6), "num_envs"),
-        (config(sim="tpu"), "sim"),
-        (config(policy_seed=2**32), "policy_seed"),
-        (config(demonstrations={"mode": "best", "count": 50, "seed": 25}), "demonstrations.mode"),
-        (config(secret=1), "a key 'secret'"),
-        (config(sac={"utd": 9.0}), "a key 'sac'"),
-        ({"config/evaluation": GONE}, "evaluation.every"),
-        (config(files={"policy": "zero"}), "files.policy"),
+        (config("variant", "action_gain:77"), "of variant 'action_gain' must lie in [0, 1]"),
+        (config("evaluation/every", 0), "evaluation.every"),
+        (config("policy/execute", "4"), "policy.execute"),
+        (config("demonstrations/mode", "best"), "demonstrations.mode"),
+        (config("secret", 1), "a key 'secret'"),
+        (config("sac", {"utd": 9.0}), "a key 'sac'"),
+        (config("evaluation", GONE), "evaluation.every"),
+        (config("files", {"policy": "zero"}), "files.policy"),
     ],
 )
-def test_a_configuration_that_nothing_runs(
-    change: Change | Data, words: str, tmp_path: Path
-) -> None:
+def test_a_configuration_that_nothing_runs(change: Data, words: str, tmp_path: Path) -> None:
     (problem,) = judge(forge(committed(), change, tmp_path))[0].problems
     assert problem.startswith("its configuration is none of `symsteer run` (")
     assert words in problem
@@ -443,90 +407,57 @@ def test_names_and_limits_are_those_of_the_registries() -> None:
 
 def test_what_others_can_install_is_admitted_with_a_note(tmp_path: Path) -> None:
     version = metadata.version("numpy")
-    path = forge(
-        committed(),
-        extended(
-            extension("agent", "mine", distribution="my-agents", version="1.2"),
-            extension("variant", "fog", distribution="numpy", version=version),
-            agent="mine",
-            variant="fog:1",
-            evaluation_variant="fog:1",
-        ),
-        tmp_path,
-    )
-    data = json.loads(path.read_text())
-    code = hashlib.sha256(b"symsteer").hexdigest()
-    data["provenance"].update(commit=None, dirty=None, sha256=code)
-    path.write_text(json.dumps(data))
-    verdict = judge(path)[0]
+    sha256, code = (hashlib.sha256(text).hexdigest() for text in (b"code", b"symsteer"))
+    installed = {**NO_CODE, "provenance/sha256": code}
+    mine = extension("agent", "mine", distribution="my-agents", version="1.2")
+    fog = extension("variant", "fog", distribution="numpy", version=version)
+    change = config("agent", "mine") | world("fog:1") | extended(mine, fog) | installed
+    (verdict,) = judge(forge(committed(), change, tmp_path))
     assert verdict.problems == []
-    sha256 = extension("", "")["sha256"][:12]
     assert verdict.notes[1:] == [
         f"it ran symsteer 0.2.0 as installed, not a checkout; sha256 {code[:12]}",
-        f"it uses the agent mine of my-agents 1.2; sha256 {sha256}, unresolved: not installed here",
-        f"it uses the variant fog of numpy {version}; sha256 {sha256}",
+        f"it uses the agent mine of my-agents 1.2; sha256 {sha256[:12]}, unresolved: not "
+        "installed here",
+        f"it uses the variant fog of numpy {version}; sha256 {sha256[:12]}",
     ]
 
 
-def moved(seed: int) -> Change:
+def moved(seed: int) -> Data:
     """The run of another seed, as a forger claims."""
-    return put({"config/seed": seed, "seeds/run": seed})
-
-
-def unmeasured(data: Data) -> None:
-    """Without diagnostics nobody looks for a copy."""
-    everywhere(put({"diagnostics": {}}))(data)
-    data["feasible_q"] = None
+    return {"config/seed": seed, "seeds/run": seed}
 
 
 def nudged(data: Data) -> None:
     """A few successes of the final evaluation come a step later."""
-    moved(7)(data)
     columns = data["evaluations"][-1]["episodes"]
-    later = [n for n, value in enumerate(columns["return"]) if -40 < value < 0][:4]
-    for number in later:
+    for number in [n for n, value in enumerate(columns["return"]) if -40 < value < 0][:4]:
         columns["return"][number] -= 1
 
 
 def test_copies_are_found_whatever_else_the_record_says(tmp_path: Path) -> None:
     old, new = five(tmp_path / "old"), tmp_path / "new"
-    same = forge(old[1], {}, new)
-    slower = forge(old[2], {"wall_clock/diagnose": 0.0}, new)
-    renamed = forge(old[3], moved(8), new)
-    silent = forge(old[4], both(moved(9), unmeasured, config(agent="mine")), new)
-    changed = forge(old[0], nudged, new)
-    verdicts = judge(same, slower, renamed, silent, changed, among=tmp_path / "old")
-    sentences = [
-        f"it is a copy of {old[1]}: remove one of the two",
-        f"{old[2]} holds the same configuration, seeds and base policy already: remove one",
-        *(f"its final episodes are nearly all those of {old[n]}, more than" for n in (3, 4, 0)),
+    # Without diagnostics nobody looks for a copy.
+    unmeasured = both(everywhere(put({"diagnostics": {}})), {"feasible_q": None})
+    cases: list[tuple[Change | Data, str]] = [
+        ({}, f"it is a copy of {old[0]}: remove one of the two"),
+        (
+            {"wall_clock/diagnose": 0.0},
+            f"{old[1]} holds the same configuration, seeds and base policy already: remove one",
+        ),
+        (moved(8), f"its final episodes are nearly all those of {old[2]}, more than"),
+        (
+            both(moved(9), unmeasured, config("agent", "mine")),
+            f"its final episodes are nearly all those of {old[3]}, more than",
+        ),
+        (both(moved(7), nudged), f"its final episodes are nearly all those of {old[4]}, more than"),
     ]
-    for verdict, sentence in zip(verdicts, sentences, strict=True):
+    copies = [forge(path, change, new) for path, (change, _) in zip(old, cases, strict=True)]
+    verdicts = judge(*copies, among=tmp_path / "old")
+    for verdict, (_, sentence) in zip(verdicts, cases, strict=True):
         assert any(problem.startswith(sentence) for problem in verdict.problems)
     note = "its seed 7 is none of those of the committed runs of its table (25, 26"
     assert any(text.startswith(note) for text in verdicts[4].notes)
-    assert all(verdict.is_admissible for verdict in judge(*old, among=tmp_path / "old"))
-
-
-def invented(data: Data) -> None:
-    """Every other failure of the final evaluation becomes a success like the one before it."""
-    columns = data["evaluations"][-1]["episodes"]
-    failures = [n for n, once in enumerate(columns["success_once"]) if not once]
-    for n in failures[::2]:
-        columns["success_once"][n] = columns["success_at_end"][n] = 1
-        columns["return"][n] = -20.0 - n % 7
-    for n, value in enumerate(columns["return"]):
-        columns["return"][n] = value - n % 2 if value > -40 else value
-
-
-def test_invented_numbers_that_agree_with_each_other_pass(tmp_path: Path) -> None:
-    """The limit of arithmetic: only a run that is made again shows them (docs/submit.md)."""
-    old = five(tmp_path / "old")
-    path = forge(old[0], both(moved(7), invented), tmp_path / "new")
-    (verdict,) = judge(path, among=tmp_path / "old")
-    assert verdict.is_admissible
-    better, worse = (sum(read_record(p).final.episodes.success_once) for p in (path, old[0]))
-    assert better > worse
+    assert all(v.is_admissible and not v.notes for v in judge(*old, among=tmp_path / "old"))
 
 
 @pytest.mark.parametrize(
@@ -538,25 +469,18 @@ def test_invented_numbers_that_agree_with_each_other_pass(tmp_path: Path) -> Non
         ({LAST + "episodes/direction/3": 0.5}, "initial states"),
     ],
 )
-def test_what_other_records_say_differently(
-    change: Change | Data, fact: str, tmp_path: Path
-) -> None:
+def test_what_other_records_say_differently(change: Data, fact: str, tmp_path: Path) -> None:
     """The same agent, base policy and cell; a new seed of the run alone."""
     old = committed(variant="action_gain=1")
-    five_copies = forge(old, {}, tmp_path / "old")
-    path = forge(old, both(moved(7), put(change)), tmp_path / "new")
-    problems = judge(path, among=five_copies.parent)[0].problems
+    other = forge(old, {}, tmp_path / "old")
+    path = forge(old, moved(7) | change, tmp_path / "new")
+    problems = judge(path, among=other.parent)[0].problems
     (problem,) = [p for p in problems if "a copy" not in p and "breaks" not in p]
-    assert problem.startswith(f"its {fact} are not those of {five_copies}")
+    assert problem.startswith(f"its {fact} are not those of {other}")
 
 
 def test_two_learners_that_always_fail_are_no_copies(tmp_path: Path) -> None:
-    def fail(data: Data) -> None:
-        for evaluation in data["evaluations"]:
-            columns = evaluation["episodes"]
-            columns["success_once"] = columns["success_at_end"] = [0] * len(columns["seed"])
-            columns["return"] = [-50.0] * len(columns["seed"])
-
+    fail = everywhere(outcome(0, -50.0))
     paths = [forge(committed(seed=seed), fail, tmp_path) for seed in (25, 26)]
     assert all(verdict.is_admissible for verdict in judge(*paths))
 
@@ -597,45 +521,27 @@ def test_a_commit_that_nobody_has_is_said(tmp_path: Path) -> None:
     ]
 
 
-def test_a_damaged_committed_record_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "bad.json").write_text("{")
-    with pytest.raises(UserError, match=r"bad\.json is not strict JSON"):
-        judge(committed(), among=tmp_path / "old")
-
-
-# Command line
-
-
-@pytest.fixture
-def alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Nothing is committed yet."""
-    (tmp_path / "nothing").mkdir()
+def test_the_command_says_what_to_mend(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of many records it names those that it complains about; none is committed yet."""
     monkeypatch.setattr(command, "RECORDS", tmp_path / "nothing")
-
-
-@pytest.mark.usefixtures("alone")
-def test_the_command_says_what_to_mend(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of many records it names those that it complains about."""
     new = tmp_path / "new"
     paths = five(new)
     assert main(["--check", *map(str, paths)]) == 0
     admitted = [f"{path}: admissible" for path in paths]
     assert capsys.readouterr().out.splitlines() == [*admitted, "5 of 5 records are admissible"]
-    for variant in ("action_gain=1", "perception_bias=1"):
-        for seed in range(25, 30):
-            forge(committed(seed=seed, variant=variant), {}, new)
-    assert main(["--check", str(new)]) == 0
-    assert capsys.readouterr().out == "15 of 15 records are admissible\n"
-    edit(paths[4], status="running", ended=None)
+    for seed in range(25, 30):
+        forge(committed(seed=seed, variant="action_gain=1"), {}, new)
+    running = forge(paths[4], moved(30) | {"status": "running", "ended": None}, new)
     (new / "hostile.json").write_text(
         '{"schema_version": 5, "config_hash": "", "\\u001b[2J\\nadmissible": 1}'
     )
     assert main(["--check", str(new)]) == 2
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == "14 of 16 records are admissible"
-    assert f"{paths[4]}: NOT ADMISSIBLE" in lines
-    assert sum(line.startswith("  problem: ") for line in lines) == 2
+    assert lines[-1] == "10 of 12 records are admissible"
+    assert f"{running}: NOT ADMISSIBLE" in lines
+    assert f"{paths[0]}: admissible" not in lines
     assert all(line.isprintable() for line in lines)
     assert any("the run is running, not finished" in line for line in lines)
 
@@ -643,6 +549,7 @@ def test_the_command_says_what_to_mend(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.mark.long
 @pytest.mark.parametrize("folder", ["records", "zoo", "learners", "first", "stress", "policies"])
 def test_what_is_committed_keeps_every_rule(folder: str) -> None:
-    """Runs of `stress` have 64 final episodes, as their study declares."""
-    verdicts = check([RESULTS / folder], RESULTS / folder)
+    """A tenth of it. Runs of `stress` have 64 final episodes, as their study declares."""
+    files = sorted((RESULTS / folder).rglob("*.json"))[::10]
+    verdicts = check(files, Path("/nowhere"))
     assert [problem for verdict in verdicts for problem in verdict.problems] == []
