@@ -1,11 +1,14 @@
-"""The generated files: determinism, escaping, figures, and the command line."""
+"""The generated files: determinism, escaping, figures; `--verify`; the command line."""
 
 from __future__ import annotations
 
 import csv
 import math
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,12 +20,12 @@ from symsteer.leaderboard import command, paths
 from symsteer.leaderboard.defects import AuditedDefect
 from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.page import other_files, render_page
-from symsteer.leaderboard.paths import RECORDS
-from symsteer.leaderboard.records import read_record, write_record
+from symsteer.leaderboard.records import write_record
 from symsteer.leaderboard.report import generate, render, slug
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.study import PAPER, read_study
 from symsteer.leaderboard.text import code, compact, count, number, relative_link
+from symsteer.leaderboard.verification import differences, other_versions
 from tests.leaderboard.command_line import main
 from tests.leaderboard.record_factory import (
     LEARNING,
@@ -31,9 +34,12 @@ from tests.leaderboard.record_factory import (
     make_curve,
     make_evaluation,
     make_record,
+    snapshot,
     summary_of,
     view_of,
 )
+
+REPOSITORY = Path(__file__).parents[2]
 
 
 def write_runs(folder: Path, seeds: int = 2) -> None:
@@ -55,16 +61,9 @@ def write_runs(folder: Path, seeds: int = 2) -> None:
                 write_record(record, folder / name / "record.json")
 
 
-def snapshot(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of `runs` and of their `board`."""
     folder = tmp_path_factory.mktemp("page")
     write_runs(folder / "runs")
     generate([folder / "runs"], folder / "board")
@@ -111,42 +110,26 @@ def test_figures_are_shown_and_are_svg_without_dates_and_texts(page: Path) -> No
         assert b"Matplotlib v" not in data
 
 
-def test_the_same_records_give_the_same_bytes_and_others_do_not(page: Path, tmp_path: Path) -> None:
-    """In another order, and over an older output; test_verify.py has another process."""
-    folders = sorted((page / "runs").iterdir(), reverse=True)
-    again = page / "again"
-    again.mkdir()
-    (again / "LEADERBOARD.md").write_text("older")
-    assert main([*map(str, folders), "--out", str(again)]) == 0
-    old = snapshot(page / "board")
-    assert snapshot(again) == old
-    write_runs(tmp_path / "runs", seeds=1)
-    generate([tmp_path / "runs"], tmp_path / "board")
-    new = snapshot(tmp_path / "board")
-    assert new.keys() == old.keys()
-    assert all(new[name] != old[name] for name in new)
-
-
 def test_the_audit_changes_the_page() -> None:
     records = make_cell({"standard": 0.5, "equivariant": 0.7})
     audits = ({}, audit_of({"none": 0.1}), audit_of({"none": 0.2}))
     assert len({render_page(view_of(records, audit=audit)) for audit in audits}) == 3
 
 
-def test_stale_figures_go_and_foreign_files_stay(page: Path, tmp_path: Path) -> None:
+def test_stale_files_go_and_foreign_ones_stay(tmp_path: Path) -> None:
+    """A study without statements has no PAPER.md; another file of this name is not ours."""
+    write_record(make_record(agent="base"), tmp_path / "record.json")
     out = tmp_path / "board"
-    shutil.copytree(page / "board", out)
+    generate([tmp_path / "record.json"], out)
     stale = out / "figures" / f"q-{slug('OldTask-v1', 'floating')}.svg"
-    foreign = out / "figures" / "mine.svg"
-    stale.write_text("")
-    foreign.write_text("")
-    paper = out / "PAPER.md"
+    foreign, paper = out / "figures" / "mine.svg", out / "PAPER.md"
+    for file in (stale, foreign):
+        file.write_text("")
     assert paper.exists()
-    # A study without statements has no such page; another file of this name is not ours.
-    generate([page / "runs"], out, study="first")
+    generate([tmp_path / "record.json"], out, study="first")
     assert (stale.exists(), foreign.exists(), paper.exists()) == (False, True, False)
     paper.write_text("# The paper")
-    generate([page / "runs"], out, study="first")
+    generate([tmp_path / "record.json"], out, study="first")
     assert paper.read_text() == "# The paper"
 
 
@@ -188,7 +171,7 @@ def test_hostile_text_stays_text_in_every_section(tmp_path: Path) -> None:
     }
     for text in HOSTILE:
         demonstrations = {"mode": text, "count": 3, "seed": 0}
-        names = dict.fromkeys(("task", "embodiment", "variant", "agent"), text)
+        names = place | dict.fromkeys(("variant", "agent"), text)
         curve = [make_evaluation([1, 0], q_mean=-1.0)]
         record = make_record(curve, **names, demonstrations=demonstrations)
         data = record.model_dump(by_alias=True)
@@ -254,6 +237,85 @@ def test_numbers_are_readable() -> None:
     assert {value: count(value) for value in counts} == counts
 
 
+# What is on the disk is what the records give
+
+
+def test_each_file_that_differs_has_its_line(
+    page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(page, tmp_path / "copy")
+    board = tmp_path / "copy" / "board"
+    text, table = board / "LEADERBOARD.md", board / "leaderboard.csv"
+    text.write_text(text.read_text().replace("## Details", "## Detail", 1))
+    # The line ends that a careless checkout makes.
+    table.write_bytes(table.read_bytes().replace(b"\n", b"\r\n"))
+    first, second, *_ = sorted((board / "figures").iterdir())
+    first.unlink()
+    second.write_bytes(second.read_bytes() + b"\n")
+    stale = board / "figures" / f"q-{slug('OldTask-v1', 'floating')}.svg"
+    for file in (stale, board / "figures" / "mine.svg", board / "NOTES.md"):
+        file.write_text("")
+    before = snapshot(board.parent)
+    assert main(["--verify", str(board.parent / "runs"), "--out", str(board)]) == 1
+    assert snapshot(board.parent) == before
+    shown = capsys.readouterr()
+    assert shown.err.startswith("error: 5 files")
+    assert shown.err.count("\n") == 1
+    lines = dict(line.split(": ", 1) for line in shown.out.splitlines())
+    number = text.read_text().splitlines().index("## Detail") + 1
+    assert lines.pop(str(second)).startswith("differs from line ")
+    assert lines == {
+        str(text): f"differs from line {number} on",
+        str(table): "differs from line 1 on",
+        str(first): "missing",
+        str(stale): "no record gives this file",
+    }
+
+
+def test_another_kind_of_machine_gives_the_same_bytes(page: Path, tmp_path: Path) -> None:
+    """Another order, folder, home, style, time zone, hash seed, processor, number of threads."""
+    (tmp_path / "matplotlibrc").write_text("font.size: 20\nlines.linewidth: 5\npath.sketch: 1,2,3")
+    environment = os.environ | {
+        "PYTHONHASHSEED": "7",
+        "HOME": str(tmp_path),
+        "MPLCONFIGDIR": str(tmp_path),
+        "LC_ALL": "C",
+        "TZ": "Asia/Tokyo",
+        "OMP_NUM_THREADS": "2",
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "NPY_DISABLE_CPU_FEATURES": "AVX2 FMA3",
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA",
+        "PYTHONPATH": str(REPOSITORY),
+    }
+    runs = map(str, sorted((page / "runs").iterdir(), reverse=True))
+    result = subprocess.run(
+        [sys.executable, "-m", "symsteer", "report", *runs, "--verify", "--out", page / "board"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    files = sum(path.is_file() for path in (page / "board").rglob("*"))
+    assert result.stdout == f"20 records and {files} files of the leaderboard agree\n", result
+
+
+def test_pinned_versions_are_those_that_run() -> None:
+    """In the environment of `make setup`; elsewhere `--verify` names what differs."""
+    assert other_versions() == []
+
+
+def test_differences_are_short_and_printable(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"\x1b[2J" + b"x" * 10**6)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "c").symlink_to(tmp_path / "c")
+    lines = differences({"a": b"y", "b": b"", "c": b"", "d/e": b""}, [], tmp_path)
+    assert [line.split(": ")[0] for line in lines] == [
+        str(tmp_path / name) for name in ("a", "b", "c", "d/e")
+    ]
+    assert all(line.isprintable() and len(line) < len(str(tmp_path)) + 140 for line in lines)
+    assert "Is a directory" in lines[1]
+
+
 # Command line
 
 
@@ -285,53 +347,6 @@ def test_the_page_goes_beside_the_runs_unless_another_folder_is_named(
     shutil.copytree(tmp_path / "runs", committed / "results" / "records")
     assert main([]) == 0
     assert main(["--verify"]) == 0
-
-
-def test_bad_records_leave_the_output_as_it_was(
-    page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    runs, out = tmp_path / "runs", tmp_path / "board"
-    shutil.copytree(page / "runs", runs)
-    shutil.copytree(page / "board", out)
-    before = snapshot(out)
-    victim = next(iter(sorted(runs.rglob("record.json"))))
-    victim.write_bytes(victim.read_bytes()[:-200])
-    fresh = tmp_path / "fresh"
-    for folder in (out, fresh):
-        assert main([str(runs), "--out", str(folder)]) == 2
-        shown = capsys.readouterr()
-        assert not shown.out
-        assert shown.err.count("\n") == 1
-        assert str(victim) in shown.err
-        assert "run the cell again" in shown.err
-    assert snapshot(out) == before
-    assert not fresh.exists()
-
-
-def test_bad_arguments_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "file").write_text("x")
-    write_record(make_record(), tmp_path / "good" / "record.json")
-    for arguments in (
-        [tmp_path / "nowhere"],
-        [tmp_path / "empty"],
-        [tmp_path / "file"],
-        [tmp_path / "good", "--out", tmp_path / "file"],
-        [tmp_path / "good", "--out", tmp_path / "file" / "below"],
-    ):
-        assert main([str(argument) for argument in arguments]) == 2
-        message = capsys.readouterr().err
-        assert message.startswith("error: ")
-        assert message.count("\n") == 1
-
-
-def test_committed_records_are_valid_and_name_no_machine() -> None:
-    paths = sorted(RECORDS.rglob("*.json"))
-    assert paths
-    for path in paths:
-        read_record(path)
-        found = re.search(r"/(home|root|tmp|work|Users|mnt)/", path.read_text())
-        assert found is None, f"{path.name} names a folder of a machine"
 
 
 # Extremes
