@@ -23,7 +23,7 @@ from symsteer.leaderboard.records import (
     read_record,
     read_reproductions,
 )
-from symsteer.leaderboard.records.curves import area_under_curve
+from symsteer.leaderboard.records.measures import area_under_curve
 from symsteer.leaderboard.statistics import Sample, paired_differences
 from symsteer.leaderboard.study import all_listed
 

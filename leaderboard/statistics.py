@@ -18,8 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from symsteer.leaderboard.records.curves import area_under_curve
-from symsteer.leaderboard.records.shares import CONFIDENCE, newcombe, normal_quantile, wilson
+from symsteer.leaderboard.records.measures import (
+    CONFIDENCE,
+    area_under_curve,
+    newcombe,
+    normal_quantile,
+    wilson,
+)
 
 RESAMPLES = 5000
 _EPISODES, _UNITS = 1, 2

@@ -17,7 +17,7 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import RECORD, run_id
 from symsteer.errors import UserError, first_problem
 from symsteer.leaderboard.records import read_record
-from symsteer.leaderboard.records.curves import area_under_curve
+from symsteer.leaderboard.records.measures import area_under_curve
 from symsteer.tables import aligned
 
 START = 0

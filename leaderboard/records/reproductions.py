@@ -17,12 +17,11 @@ from typing import Any, Literal, Self, get_args
 from pydantic import ValidationError, model_validator
 
 from symsteer.errors import UserError, first_problem
-from symsteer.leaderboard.records.curves import area_under_curve
 from symsteer.leaderboard.records.files import read_record
+from symsteer.leaderboard.records.measures import area_under_curve, newcombe
 from symsteer.leaderboard.records.provenance import Provenance
 from symsteer.leaderboard.records.retired import with_retired
 from symsteer.leaderboard.records.schema import RunRecord
-from symsteer.leaderboard.records.shares import newcombe
 from symsteer.leaderboard.records.values import (
     Count,
     Finite,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from pydantic import ValidationError
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import (
+    Episodes,
     Evaluation,
     RunRecord,
     config_hash,
@@ -28,8 +27,6 @@ from symsteer.leaderboard.records import (
 )
 from symsteer.leaderboard.records.retired import RETIRED
 from tests.leaderboard.record_factory import START, make_config, make_evaluation, make_record
-
-REPOSITORY = Path(__file__).parents[2]
 
 
 def refuse_constant(name: str) -> Any:
@@ -72,10 +69,12 @@ def older(tmp_path: Path, version: int) -> tuple[RunRecord, Path, dict[str, Any]
     return record, path, data
 
 
-@pytest.mark.parametrize("version", [1, 2, 3])
-def test_records_without_a_role_are_read_as_new_ones(tmp_path: Path, version: int) -> None:
+@pytest.mark.parametrize("version", range(1, 6))
+def test_older_records_are_read_as_new_ones(tmp_path: Path, version: int) -> None:
     record, path, data = older(tmp_path, version)
     assert read_record(path) == record
+    if version > 3:
+        return
     if version == 3:
         data["continued"] = [data["provenance"] | {"device": "another"}]
     for agent, role in (("zero", "reference"), ("golden-ticket", "reference"), ("my", "learner")):
@@ -115,11 +114,6 @@ def test_conditional_biases_of_version_4_are_never_read_as_those_of_version_5(
     assert json.loads(dump_record(record))["schema_version"] == 6
 
 
-def test_records_of_version_5_lack_the_symmetry_of_the_base_policy(tmp_path: Path) -> None:
-    record, path, _ = older(tmp_path, 5)
-    assert read_record(path) == record
-
-
 @pytest.mark.parametrize("value", [None, "5", 10**400])
 def test_what_is_no_number_of_a_measurement_is_not_divided(tmp_path: Path, value: Any) -> None:
     _, path, data = older(tmp_path, 4)
@@ -133,34 +127,9 @@ def test_what_is_no_number_of_a_measurement_is_not_divided(tmp_path: Path, value
         read_record(path)
 
 
-@pytest.mark.parametrize(
-    ("version", "where", "value", "words"),
-    [
-        (1, "continued", [], "continued does not belong"),
-        (2, "training", {"env_steps": [], "columns": {}}, "training must be null"),
-        (2, "feasible_q/entropy_allowance", 1.0, "entropy_allowance must be 0"),
-        (3, "role", "learner", "role does not belong"),
-        (3, "provenance/extensions", [], "extensions does not belong"),
-        (4, "wall_clock/diagnose", 0.0, "diagnose does not belong"),
-        (5, "base_policy/jump", 0.5, "jump does not belong"),
-        (4, "evaluations/0/diagnostics/q_magnitude", 0.5, "q_magnitude does not belong"),
-        (4, "evaluations/0/diagnostics/q_bias_successful", 0.5, "does not belong"),
-    ],
-)
-def test_what_an_older_version_did_not_have_is_refused(
-    tmp_path: Path, version: int, where: str, value: Any, words: str
-) -> None:
-    _, path, data = older(tmp_path, version)
-    change(data, where, value)
-    path.write_text(json.dumps(data))
-    with pytest.raises(UserError, match=words):
-        read_record(path)
-
-
-def test_arrays_and_tensors_are_stored_as_numbers(tmp_path: Path) -> None:
+def test_arrays_and_tensors_are_stored_as_numbers() -> None:
     torch = pytest.importorskip("torch")
     evaluation = make_evaluation([1, 0], q_mean=np.float32(0.5), alpha=torch.tensor(0.25))
-    evaluation = evaluation.model_copy()
     assert evaluation.diagnostics == {"q_mean": 0.5, "alpha": 0.25}
     columns = {
         "seed": torch.arange(3),
@@ -168,19 +137,13 @@ def test_arrays_and_tensors_are_stored_as_numbers(tmp_path: Path) -> None:
         "success_at_end": [torch.tensor(True), False, np.bool_(False)],
         "return": torch.tensor([0.0, -1.0, -2.0]),
         "episode_len": np.array([5, 6, 7]),
+        "direction": torch.tensor([0.5, -3.0, math.nan]),
     }
-    data = evaluation.model_dump(by_alias=True) | {"episodes": columns}
-    episodes = Evaluation.model_validate(data).episodes
+    episodes = Episodes.model_validate(columns)
     assert episodes.success_once == [True, False, True]
     assert episodes.success_at_end == [True, False, False]
     assert episodes.return_ == [0.0, -1.0, -2.0]
-    assert episodes.direction is None
-    columns["direction"] = torch.tensor([0.5, -3.0, math.nan])
-    episodes = Evaluation.model_validate(data).episodes
     assert episodes.direction == [0.5, -3.0, None]
-    columns["direction"] = [0.5, 1.0]
-    with pytest.raises(ValueError, match="equally long"):
-        Evaluation.model_validate(data)
 
 
 def test_numbers_that_are_not_finite_become_flagged_nulls(tmp_path: Path) -> None:
@@ -310,43 +273,28 @@ def test_growth_is_from_the_middle_of_the_run_to_its_end() -> None:
     record.evaluations[-1].diagnostics["td_error"] = 0.5
     assert record.divergence.td_error == 0.5
     assert make_record(q_curve((0, 0), (0, 0), (1, 0))).divergence.growth is None
-
-
-def test_untrained_critics_have_not_diverged() -> None:
+    # Untrained critics have not diverged.
     evaluations = q_curve((90, 4.0), (30, 0.5), (10, 0.0))
     evaluations[1].updates = 0
     assert make_record(evaluations).diverged is False
-    evaluations[1].updates = 1
-    assert make_record(evaluations).diverged is True
 
 
-def test_q_values_that_are_not_finite_are_divergence_and_a_missing_bias_is_not() -> None:
-    assert make_record([make_evaluation([1], q_mean=math.nan)]).diverged is True
-    assert make_record([make_evaluation([1], q_mean=-1.0, q_abs_max=math.inf)]).diverged is True
-    assert make_record([make_evaluation([1], q_mean=-1.0, q_bias=math.nan)]).diverged is False
-    reference = make_record([make_evaluation([1])], agent="base")
-    assert reference.divergence is None
-    assert reference.diverged is None
-
-
-def test_importing_the_leaderboard_does_not_import_torch() -> None:
-    code = (
-        "import sys, symsteer.leaderboard.command\n"
-        "heavy = {'torch', 'mani_skill', 'sapien', 'symsteer.policies', 'symsteer.agents', "
-        "'symsteer.bench'}\n"
-        "sys.exit(' '.join(heavy & set(sys.modules)) or 0)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True)
-    assert result.returncode == 0, result.stderr
+@pytest.mark.parametrize(
+    ("diagnostics", "diverged"),
+    [
+        ({"q_mean": math.nan}, True),
+        ({"q_mean": -1.0, "q_abs_max": math.inf}, True),
+        ({"q_mean": -1.0, "q_bias": math.nan}, False),
+        ({}, None),
+    ],
+)
+def test_q_values_that_are_not_finite_are_divergence_and_a_missing_bias_is_not(
+    diagnostics: dict[str, float], diverged: bool | None
+) -> None:
+    assert make_record([make_evaluation([1], **diagnostics)]).diverged is diverged
 
 
 # Damage
-
-
-def stored(tmp_path: Path) -> tuple[Path, dict[str, Any]]:
-    path = tmp_path / "record.json"
-    write_record(make_record([make_evaluation([1, 0, 1], q_mean=-2.0)]), path)
-    return path, json.loads(path.read_text())
 
 
 def change(data: dict[str, Any], where: str, value: Any) -> None:
@@ -359,31 +307,20 @@ def change(data: dict[str, Any], where: str, value: Any) -> None:
 
 EDITS: list[tuple[str, Any, str]] = [
     ("schema_version", 7, "schema_version"),
-    ("schema_version", 0, "schema_version"),
     ("schema_version", True, "schema_version"),
     ("run_id", "../../etc/passwd", "run_id"),
     ("extra", 1, "extra"),
     ("config/env_steps", 60_000, "config_hash"),
     ("config_hash", "0" * 64, "config_hash"),
-    ("status", "done", "status"),
-    ("role", "champion", "role"),
-    ("provenance/extensions", [{"kind": "agent"}], "extensions"),
     ("status", "running", "ended"),
     ("started", "yesterday", "started"),
     ("started", "2026-01-31T12:00:00", "zone"),
     ("ended", "2020-01-01T00:00:00+00:00", "before"),
-    ("provenance/commit", "<script>", "commit"),
-    ("parameters/actor", "many", "actor"),
     ("budget/env_steps", 2**53 + 1, "env_steps"),
-    ("seeds/run", -1, "seeds"),
     ("wall_clock/total", 1e300, "total"),
-    ("feasible_q/high", 1e300, "high"),
-    ("base_policy/base_success", 1.5, "base_success"),
     ("base_policy/content_hash", "abc", "content_hash"),
-    ("feasible_q/low", None, "low"),
     ("feasible_q/low", 1.0, "low"),
     ("evaluations", [], "final evaluation"),
-    ("evaluations/0/env_steps", -5, "env_steps"),
     ("evaluations/0/episodes/success_once", [1, 0, 2], "0 and 1"),
     ("evaluations/0/episodes/success_once", [1, 0], "equally long"),
     ("evaluations/0/episodes/success_once", [0, 0, 1], "without having had success"),
@@ -396,7 +333,9 @@ EDITS: list[tuple[str, Any, str]] = [
 
 @pytest.mark.parametrize(("where", "value", "word"), EDITS)
 def test_edited_records_are_refused(tmp_path: Path, where: str, value: Any, word: str) -> None:
-    path, data = stored(tmp_path)
+    path = tmp_path / "record.json"
+    record = make_record([make_evaluation([1, 0, 1], q_mean=-2.0)])
+    data = json.loads(dump_record(record))
     change(data, where, value)
     path.write_text(json.dumps(data))
     with pytest.raises(UserError) as caught:

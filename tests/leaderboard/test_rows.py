@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from symsteer.errors import UserError
 from symsteer.leaderboard.keys import recipe_of
 from symsteer.leaderboard.pairs import area_pairs, reference_success, success_pairs
-from symsteer.leaderboard.records import Evaluation, RunRecord, config_hash, write_record
+from symsteer.leaderboard.records import Evaluation, RunRecord, config_hash
 from symsteer.leaderboard.row_numbers import summarize
 from symsteer.leaderboard.rows import AgentRow, Summary
-from symsteer.leaderboard.runs import Pair, Run, load_runs
+from symsteer.leaderboard.runs import Pair, Run
 from symsteer.leaderboard.sections.cells import render_csv
 from symsteer.leaderboard.statistics import Sample
 from tests.leaderboard.record_factory import (
@@ -69,44 +68,26 @@ def test_what_cannot_be_compared_is_in_different_tables() -> None:
         t.key for t in summarize([of(0.5, **p) for p in (*places, {"demonstrations": few})]).tables
     ]
     assert len(keys) == 7
-    assert [
-        key.broken_by for key in keys if key.env_steps == 50_000 and key.demonstrations == 50
-    ] == [
-        (),
-        ("action_gain:0.5",),
-        ("arm kinematics",),
-        ("arm kinematics", "action_gain:0.5"),
-        (),
-    ]
+    broken_by = [k.broken_by for k in keys if k.env_steps == 50_000 and k.demonstrations == 50]
+    arm, gain = "arm kinematics", "action_gain:0.5"
+    assert broken_by == [(), (gain,), (arm,), (arm, gain), ()]
 
 
 def test_seeds_and_machine_settings_do_not_split_a_row_but_hyperparameters_do() -> None:
     config = make_record().config
-    assert recipe_of(config) == recipe_of(config | {"seed": 5, "device": "cuda", "policy_seed": 2})
-    nested = config | {"demonstrations": {"mode": "diverse", "count": 50, "seed": 9}}
-    assert recipe_of(config) == recipe_of(nested)
+    nested = {"demonstrations": {"mode": "diverse", "count": 50, "seed": 9}}
+    for same in ({"seed": 5, "device": "cuda", "policy_seed": 2}, nested):
+        assert recipe_of(config) == recipe_of(config | same)
     assert recipe_of(config) != config_hash(config)
-    runs = [of(0.5, seed=0), of(0.5, seed=1), of(0.6, seed=0, learning_rate=1e-3)]
-    rows = summarize(runs).tables[0].rows
-    assert [len(r.runs) for r in rows] in ([1, 2], [2, 1])
-    assert {r.label for r in rows} == {
-        "standard",  # most runs have its settings
-        "standard (learning_rate 0.001)",
-    }
-
-
-def test_of_several_rows_of_an_agent_only_unusual_settings_are_named() -> None:
     usual = {"lr": 3e-4, "critic": "aliased", "batch_size": 64, "utd": 1, "tau": 0.01}
     changes = [{}, {"critic": "noise"}, {"lr": 1e-3, "utd": 2}, dict.fromkeys(usual, 0)]
     runs = [of(0.5, agent_options=usual | change) for change in changes]
-    labels = {r.label for r in summarize(runs).tables[0].rows}
+    labels = {
+        r.label for r in summarize([*runs, of(0.5, seed=1, agent_options=usual)]).tables[0].rows
+    }
     many = next(label for label in labels if "other" in label)
     assert re.fullmatch(r"standard \(5 other settings, [0-9a-f]{6}\)", many)
-    assert labels - {many} == {
-        "standard",
-        "standard (critic noise)",
-        "standard (lr 0.001, utd 2)",
-    }
+    assert labels - {many} == {"standard", "standard (critic noise)", "standard (lr 0.001, utd 2)"}
 
 
 def test_the_settings_of_most_runs_in_all_tables_stand_for_the_agent() -> None:
@@ -118,12 +99,10 @@ def test_the_settings_of_most_runs_in_all_tables_stand_for_the_agent() -> None:
         *(of(0.9, seed=seed, agent_options=usual, variant="wind:1") for seed in range(2)),
     ]
     first, second = sorted(summarize(runs).tables, key=lambda table: table.key.variant)
-    assert [(r.label, r.usual) for r in first.rows] == [
-        ("standard", True),
-        ("standard (critic noise)", False),
-    ]
+    labels = [(r.label, r.usual) for r in first.rows]
+    assert labels == [("standard", True), ("standard (critic noise)", False)]
     assert first.row_of("standard").label == "standard"
-    assert [(r.label, r.usual) for r in second.rows] == [("standard", True)]
+    assert [(r.label, r.usual) for r in second.rows] == labels[:1]
 
 
 def test_the_difference_to_base_is_paired_by_policy_seed_and_episode() -> None:
@@ -206,17 +185,9 @@ def points(*points: tuple[int, list[int]]) -> list[Evaluation]:
 def test_the_final_window_pools_the_last_fifth_of_the_budget() -> None:
     curve = points((0, [0, 0]), (39_999, [0, 0]), (40_000, [1, 0]), (50_000, [1, 1, 0, 1]))
     learner = run(make_record(curve))
-    assert learner.window == {
-        (40_000, 100): 1.0,
-        (40_000, 101): 0.0,
-        (50_000, 100): 1.0,
-        (50_000, 101): 1.0,
-        (50_000, 102): 0.0,
-        (50_000, 103): 1.0,
-    }
+    last = {(50_000, 100 + i): float(success) for i, success in enumerate([1, 1, 0, 1])}
+    assert learner.window == {(40_000, 100): 1.0, (40_000, 101): 0.0} | last
     standard = row(summarize([learner]), "standard")
-    assert standard.success is not None
-    assert standard.last is not None
     assert standard.success.value == learner.success == pytest.approx(4 / 6)
     assert standard.last.value == pytest.approx(3 / 4)
     assert standard.episodes == [6]
@@ -319,16 +290,8 @@ def five(agent: str, rate: float, seeds: int = 5) -> list[Run]:
 def test_ranks_have_ties_and_need_five_seeds() -> None:
     runs = five("standard", 0.5) + five("equivariant", 0.52) + five("approximate", 0.9)
     summary = summarize(runs + five("standard-matched", 0.95, seeds=4) + five("base", 0.99))
-    ranks = {r.agent: r.rank for r in summary.tables[0].rows}
-    assert ranks == {
-        "approximate": 1,
-        "standard": 2,
-        "equivariant": 2,
-        "standard-matched": None,
-        "base": None,
-    }
-    few = summarize(five("standard", 0.5, 4) + five("approximate", 0.9, 4))
-    assert not few.tables[0].is_ranked
+    ranks = {r.agent: r.rank for r in summary.tables[0].rows if r.rank}
+    assert ranks == {"approximate": 1, "standard": 2, "equivariant": 2}
     # Five seeds each, of which they share four.
     apart = five("standard", 0.5) + [of(0.9, agent="approximate", seed=s) for s in range(1, 6)]
     assert not summarize(apart).tables[0].is_ranked
@@ -354,16 +317,16 @@ def test_learners_on_different_base_policies_are_not_compared() -> None:
 
 
 def test_a_second_attempt_replaces_the_first_in_plain_sight() -> None:
-    failed = run(make_record(status="failed"), "a.json")
-    old = of(0.5)
-    new = make_record([make_evaluation([1] * 10)])
-    new.started = START + timedelta(hours=1)
-    new.ended = START + timedelta(hours=2)
+    def later(record: RunRecord, hours: int) -> RunRecord:
+        record.started = START + timedelta(hours=hours)
+        record.ended = START + timedelta(hours=hours + 1)
+        return record
+
+    new = later(make_record([make_evaluation([1] * 10)]), 1)
     new.run_id = "again"
-    newest_failed = make_record(status="failed")
-    newest_failed.started = START + timedelta(hours=5)
-    newest_failed.ended = START + timedelta(hours=6)
-    copies = [failed, old, run(new, "n.json"), run(newest_failed, "f.json"), run(new, "copy.json")]
+    failed = [run(make_record(status="failed"), "a.json")]
+    failed.append(run(later(make_record(status="failed"), 5), "f.json"))
+    copies = [*failed, of(0.5), run(new, "n.json"), run(new, "copy.json")]
     for seed in range(3):
         random.Random(seed).shuffle(copies)
         summary = summarize(copies)
@@ -382,26 +345,6 @@ def test_runs_on_several_base_policies_are_runs_of_one_row() -> None:
     found = [(c["seed"], c.get("policy_seed")) for c in configs]
     assert sorted(found, key=str) == [(0, 0), (0, 1), (0, None), (2, 0)]
     assert summary.set_aside == []
-
-
-def test_folders_are_searched_for_records(tmp_path: Path) -> None:
-    runs = tmp_path / "runs"
-    write_record(make_record(), runs / "a" / "record.json")
-    write_record(make_record(seed=1), runs / "deep" / "b" / "record.json")
-    (runs / "a" / "config.json").write_text("{}")
-    assert len(load_runs([runs])) == 2
-    assert len(load_runs([runs, runs / "a", runs / "a" / "record.json"])) == 2
-    results = tmp_path / "results"
-    write_record(make_record(seed=2), results / "first.json")
-    write_record(make_record(seed=3), results / "suite" / "second.json")
-    assert len(load_runs([results])) == 2
-    (results / "notes.json").write_text("{}")
-    with pytest.raises(UserError, match=r"notes\.json"):
-        load_runs([results])
-    for path, words in ((tmp_path / "nowhere", "does not exist"), (tmp_path / "a", "no record")):
-        (tmp_path / "a").mkdir(exist_ok=True)
-        with pytest.raises(UserError, match=words):
-            load_runs([path])
 
 
 def test_each_setting_of_a_grid_that_learners_share_is_a_table() -> None:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from symsteer.leaderboard.records.curves import area_under_curve
-from symsteer.leaderboard.records.shares import wilson
+from symsteer.leaderboard.records.measures import area_under_curve, wilson
 from symsteer.leaderboard.statistics import (
     Array,
     Effect,

@@ -1,10 +1,13 @@
-"""Intervals of shares of successes."""
+"""Intervals of shares of successes, and the area under a learning curve."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 from scipy import special
+from scipy.integrate import trapezoid
 
 CONFIDENCE = 0.95
 
@@ -36,3 +39,15 @@ def newcombe(
     p_low, p_high = wilson(*first, confidence)
     q_low, q_high = wilson(*second, confidence)
     return p - q - math.hypot(p - p_low, q_high - q), p - q + math.hypot(p_high - p, q - q_low)
+
+
+def area_under_curve(steps: Sequence[int], values: Sequence[float], budget: int) -> float:
+    """Area under a learning curve by the trapezoidal rule, as a share of `budget` x 1.
+
+    The first value is held back to step 0 and the last one on to the budget; what lies beyond the
+    budget is left out. One evaluation gives its own value.
+    """
+    knots = np.array([0, *steps, max(budget, steps[-1])], dtype=np.float64)
+    heights = np.array([values[0], *values, values[-1]], dtype=np.float64)
+    inside = np.unique(np.concatenate([knots[knots <= budget], [float(budget)]]))
+    return float(trapezoid(np.interp(inside, knots, heights), inside) / budget)
