@@ -69,20 +69,15 @@ def test_a_name_that_means_nothing(place, name, words):
     assert all(word in str(error.value) for word in words), error.value
 
 
-def test_a_path_comes_before_an_agent(place):
+def test_a_path_comes_before_an_agent_and_a_run_belongs_to_one_side(place):
     shutil.copytree(place / "runs/more", place / "standard")
     a, b = read_sides("standard", "runs/some", Path("runs"))
     assert (a.kind, agents(a)) == ("folder", ["equivariant"] * 2)
     assert (b.kind, agents(b)) == ("folder", ["standard"] * 2)
     a, _ = read_sides("runs/more/run-1/record.json", "runs/some", Path("runs"))
     assert (a.kind, [run.seed for run in a.runs]) == ("file", [1])
-
-
-def test_a_run_belongs_to_one_side(place):
     with pytest.raises(UserError, match="2 of the runs belong to A"):
         read_sides("runs", "runs/more", Path("runs"))
-    with pytest.raises(UserError, match="belong to A"):
-        read_sides("standard", "aaaa1", Path("runs"))
 
 
 def test_unfinished_and_older_runs_are_left_over(place):
@@ -119,13 +114,6 @@ def test_all_settings_of_a_grid_stand_for_an_agent(tmp_path: Path):
     assert (len(a.rows), len(a.runs), a.leftovers) == (4, 8, ())
 
 
-@pytest.mark.parametrize("text", ["{}", "{"])
-def test_foreign_and_damaged_records_are_named(place, text):
-    (place / "runs/more/run-0/record.json").write_text(text)
-    with pytest.raises(UserError, match=r"more/run-0/record\.json"):
-        read_sides("runs/some", "runs/more", Path("runs"))
-
-
 # Pairs
 
 
@@ -150,25 +138,15 @@ def test_the_same_runs_of_other_code_are_paired_by_seed(tmp_path: Path):
     ("change", "words"),
     [
         ({"task": "PushCube-v1"}, "task (PickCube-v1, PushCube-v1)"),
-        ({"embodiment": "panda"}, "embodiment (floating, panda)"),
         ({"variant": "wind:1", "evaluation_variant": "wind:1"}, "variant (none, wind:1);"),
         ({"first_seed": 1}, "seed (0, 1)"),
-        ({"env_steps": 60_000}, "env_steps (50000, 60000)"),
-        (
-            {"demonstrations": {"mode": "diverse", "count": 10, "seed": 0}},
-            "demonstrations.count (50, 10)",
-        ),
-        (
-            {"demonstrations": {"mode": "diverse", "count": 50, "seed": 9}},
-            "demonstrations.seed (0, 9)",
-        ),
+        ({"demonstrations": {"mode": "diverse", "count": 10, "seed": 0}}, "demonstrations.count"),
         ({"evaluation": {"episodes": 20}}, "evaluation.episodes (10, 20)"),
-        ({"num_envs": 32}, "num_envs (64, 32)"),
         ({"policies": True}, "base policy"),
     ],
 )
 def test_all_but_the_agent_must_agree(tmp_path: Path, change, words):
-    usual = {"evaluation": {"episodes": 10}, "num_envs": 64}
+    usual = {"evaluation": {"episodes": 10}}
     a = save(tmp_path / "a", runs_of(CURVES[0], agent="standard", **usual))
     b = save(tmp_path / "b", runs_of(CURVES[0], agent="equivariant", **(usual | change)))
     with pytest.raises(UserError) as error:
@@ -205,22 +183,17 @@ def test_one_set_of_options_against_another(tmp_path: Path):
     assert found.changed == ("lr 0.1 -> 0.2", "new unset -> true")
 
 
-def test_of_several_agents_the_options_must_agree(tmp_path: Path):
-    zero = runs_of(*CURVES, agent="zero")
-    a = save(tmp_path / "a", runs_of(*CURVES, agent_options=NESTED) + zero)
-    b = save(tmp_path / "b", runs_of(*CURVES, agent_options=NESTED | {"lr": 0.2}) + zero)
-    found = changed(a, b)
-    assert {pair.a.agent for pair in found.pairs} == {"zero"}
-    for letter, alone in zip("BA", found.alone, strict=True):
-        assert [left.reason for left in alone] == [f"the nearest run of {letter} differs in lr"] * 3
-
-
-def test_agents_of_several_are_not_paired_with_each_other(tmp_path: Path):
+def test_of_several_agents_the_agent_and_its_options_must_agree(tmp_path: Path):
     zero, base, standard = (runs_of(*CURVES, agent=name) for name in ("zero", "base", "standard"))
-    a, b = save(tmp_path / "a", zero + base), save(tmp_path / "b", zero + standard)
-    found = changed(a, b)
-    assert {(pair.a.agent, pair.b.agent) for pair in found.pairs} == {("zero", "zero")}
-    assert {left.reason for left in found.alone[0]} == {"the nearest run of B differs in agent"}
+    options = [runs_of(*CURVES, agent_options=NESTED | {"lr": lr}) for lr in (0.1, 0.2)]
+    for word, first, second in (("agent", base, standard), ("lr", *options)):
+        a = save(tmp_path / word / "a", zero + first)
+        b = save(tmp_path / word / "b", zero + second)
+        found = changed(a, b)
+        assert {(pair.a.agent, pair.b.agent) for pair in found.pairs} == {("zero", "zero")}
+        for letter, alone in zip("BA", found.alone, strict=True):
+            reason = f"the nearest run of {letter} differs in {word}"
+            assert [left.reason for left in alone] == [reason] * 3
 
 
 def test_a_setting_that_one_side_does_not_know_does_not_count(tmp_path: Path):
