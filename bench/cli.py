@@ -446,7 +446,7 @@ def audit(
         group: Symmetry group, e.g. C8, D4 (with reflections).
         count: Number of states of the expert and of the base policy with random noise, each.
         base_policy: Saved base policy, or none: only the expert; default: that of `symsteer run`.
-        out: Folder for audit.json, map.csv and map.png, or for a folder of each cell and the table.
+        out: Folder for audit.json and map.png, or for a folder of each cell and the table.
     """
     allow(*task, *variant, *trust)
     from symsteer.bench.audit.report import summary, text, to_markdown, write_table

@@ -14,7 +14,6 @@ import tyro
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.paths import PAGE_FOLDER, RECORDS, STUDY, chosen_records
-from symsteer.leaderboard.verification import Verification, other_versions
 
 FEW = 10
 """`--check` lists up to this many records; of more, only those with problems or notes."""
@@ -62,7 +61,20 @@ def report(
     out = out or _folder_for(records)
     study = study or (PAPER if records else STUDY)
     if verify:
-        return _show_differences(report.verify(paths, out, audit, study, reproductions))
+        lines, number, files = report.verify(paths, out, audit, study, reproductions)
+        if not lines:
+            _say(f"{number} records and {files} files of the leaderboard agree")
+            return 0
+        for line in lines:
+            _say(line)
+        for package in report.other_versions():
+            _say(f"note: bytes are equal only with the pinned versions; here is {package}")
+        _say(
+            f"error: {len(lines)} file{'s'[: len(lines) != 1]} of the leaderboard did not come "
+            f"from these {number} records; run `symsteer report` with the same arguments",
+            sys.stderr,
+        )
+        return 1
     files = report.generate(paths, out, audit, study, reproductions)
     page = next(file for file in files if file.name == "LEADERBOARD.md")
     _say(f"wrote {page} and {len(files) - 1} files beside it")
@@ -134,23 +146,6 @@ def _folder_for(records: Sequence[Path]) -> Path:
             f"{out} holds the committed leaderboard; name another folder, or this one, with --out"
         )
     return out
-
-
-def _show_differences(result: Verification) -> int:
-    if not result.differences:
-        _say(f"{result.records} records and {result.files} files of the leaderboard agree")
-        return 0
-    for line in result.differences:
-        _say(line)
-    for package in other_versions():
-        _say(f"note: bytes are equal only with the pinned versions; here is {package}")
-    number = len(result.differences)
-    _say(
-        f"error: {number} file{'s'[: number != 1]} of the leaderboard did not come from these "
-        f"{result.records} records; run `symsteer report` with the same arguments",
-        sys.stderr,
-    )
-    return 1
 
 
 def _show_admissions(paths: Sequence[Path]) -> int:

@@ -1,4 +1,4 @@
-"""From record files to the leaderboard's files: load, summarise, render, then write."""
+"""From record files to the leaderboard's files: load, summarise, render, then write or compare."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import os
 import re
 import stat
 from collections.abc import Mapping, Sequence
+from importlib import metadata
+from itertools import takewhile
 from pathlib import Path
 
 from symsteer.errors import UserError
@@ -22,7 +24,11 @@ from symsteer.leaderboard.sections.verdicts import PAPER_TITLE
 from symsteer.leaderboard.study import PAPER, Study, read_study
 from symsteer.leaderboard.svg import to_image
 from symsteer.leaderboard.text import relative_link
-from symsteer.leaderboard.verification import Verification, differences
+
+DRAWN_WITH = ("matplotlib", "numpy", "pandas", "scipy")
+"""Packages whose version may change a file's bytes."""
+
+REQUIREMENTS = Path(__file__).resolve().parents[1] / "requirements.txt"
 
 FIGURE_NAME = re.compile(
     r"(map|answer|profiles|improvement|(map|success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg"
@@ -69,13 +75,50 @@ def verify(
     audit: Path | None = None,
     study: str = PAPER,
     reproductions: Path | None = None,
-) -> Verification:
+) -> tuple[list[str], int, int]:
     """Compare the files in `out` with what `generate` would write; changes nothing.
 
     Arguments and errors are those of `generate`.
+
+    Returns:
+        A line for each file that differs in any byte, and how many records and files there are.
     """
     out, files, number = _files(records, out, audit, study, reproductions)
-    return Verification(number, len(files), differences(files, _stale(out, files), out))
+    return differences(files, _stale(out, files), out), number, len(files)
+
+
+def differences(files: Mapping[str, bytes], stale: Sequence[str], out: Path) -> list[str]:
+    """A line for every file of the folder `out` that is not of `files`, as `render` gives them."""
+    lines = []
+    for name, wanted in sorted(files.items()):
+        try:
+            with open(out / name, "rb") as file:
+                # One byte more than wanted tells a longer file, however large it is.
+                written = file.read(len(wanted) + 1)
+        except FileNotFoundError:
+            lines.append(f"{out / name}: missing")
+        except OSError as error:
+            lines.append(f"{out / name}: cannot be read ({error.strerror})")
+        else:
+            if written != wanted:
+                pairs = zip(written, wanted, strict=False)
+                same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+                line = wanted[:same].count(b"\n") + 1
+                lines.append(f"{out / name}: differs from line {line} on")
+    return lines + [f"{out / name}: no record gives this file" for name in stale]
+
+
+def other_versions() -> list[str]:
+    """Packages that are not of the pinned version, as "name version, pinned: version"."""
+    try:
+        pins = dict(re.findall(r"^([a-z0-9.-]+)==(\S+)$", REQUIREMENTS.read_text(), re.M))
+    except OSError:  # an installed package has no list of pinned versions
+        return []
+    return [
+        f"{name} {version}, pinned: {pins[name]}"
+        for name in DRAWN_WITH
+        if name in pins and (version := metadata.version(name)) != pins[name]
+    ]
 
 
 def _files(

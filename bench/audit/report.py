@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from symsteer.bench.audit.estimates import Measurement
 from symsteer.bench.audit.result import BIN, BODIES, AuditResult, Body, Square, Subset
 from symsteer.errors import UserError
-from symsteer.files import csv_text, write_together
+from symsteer.files import write_together
 from symsteer.tables import aligned, markdown
 from symsteer.variant import UNBROKEN
 
@@ -198,17 +198,6 @@ def summary(result: AuditResult) -> dict[str, Any]:
     return row
 
 
-def to_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows of :func:`summary` as CSV: three columns for each interval."""
-    names = [number.key for number in LISTED]
-    head = [*FACTS, *(f"{name}{end}" for name in names for end in ("", "_low", "_high"))]
-    table = [
-        [row[fact] for fact in FACTS] + [v for name in names for v in row[name] or [None] * 3]
-        for row in rows
-    ]
-    return csv_text([head, *table])
-
-
 def to_markdown(rows: Sequence[dict[str, Any]]) -> str:
     """Rows of :func:`summary` as a markdown table."""
     several = len({(row["task"], row["embodiment"], row["group"]) for row in rows}) > 1
@@ -263,18 +252,15 @@ def two_digits(value: float) -> str:
 
 @mpl_style.context("default")  # no settings of a file in the current folder
 def write_result(result: AuditResult, folder: Path) -> None:
-    """Write ``audit.json``, ``map.csv`` and ``map.png``.
+    """Write ``audit.json`` and ``map.png``.
 
     Raises:
         UserError: the folder cannot be written.
     """
-    head = ["body", "x_mm", "y_mm", "copies", "mm"]
-    rows = [[s.body, s.x_mm, s.y_mm, s.copies, float(f"{s.mm:.4g}")] for s in result.map]
     picture = io.BytesIO()
     map_figure(result).savefig(picture, format="png", dpi=110, metadata={"Software": None})
     write_together(
         {
-            folder / "map.csv": csv_text([head, *rows]).encode(),
             folder / "map.png": picture.getvalue(),
             # Last: a folder with this file is complete, and is not measured again.
             folder / "audit.json": (json.dumps(result.to_json(), indent=1) + "\n").encode(),
@@ -301,17 +287,13 @@ def read_result(path: Path) -> AuditResult:
 
 
 def write_table(results: Sequence[AuditResult], folder: Path) -> None:
-    """Write ``table.csv``, ``table.md`` and ``summary.json`` of many results.
+    """Write ``table.md`` and ``summary.json`` of many results.
 
     Raises:
         UserError: the folder cannot be written.
     """
     rows = [summary(result) for result in results]
-    files = {
-        "table.csv": to_csv(rows),
-        "table.md": to_markdown(rows),
-        "summary.json": summary_json(rows),
-    }
+    files = {"table.md": to_markdown(rows), "summary.json": summary_json(rows)}
     write_together({folder / name: content.encode() for name, content in files.items()})
 
 

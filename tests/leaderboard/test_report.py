@@ -21,11 +21,10 @@ from symsteer.leaderboard.defects import AuditedDefect
 from symsteer.leaderboard.figures import render_figures
 from symsteer.leaderboard.page import other_files, render_page
 from symsteer.leaderboard.records import write_record
-from symsteer.leaderboard.report import generate, render, slug
+from symsteer.leaderboard.report import differences, generate, other_versions, render, slug
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.study import PAPER, read_study
 from symsteer.leaderboard.text import code, compact, count, number, relative_link
-from symsteer.leaderboard.verification import differences, other_versions
 from tests.leaderboard.command_line import main
 from tests.leaderboard.record_factory import (
     LEARNING,
