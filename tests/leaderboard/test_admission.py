@@ -7,7 +7,6 @@ import functools
 import hashlib
 import json
 import operator
-import subprocess
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -22,6 +21,7 @@ from symsteer.leaderboard import catalogue, command
 from symsteer.leaderboard.admission import EVALUATION_RULES, RULES, Admission, check
 from symsteer.leaderboard.paths import RECORDS, RESULTS
 from symsteer.leaderboard.records import config_hash, run_id_of
+from symsteer.leaderboard.records.provenance import git
 from symsteer.policies import POLICIES
 from symsteer.variant import VariantSpec
 from tests.leaderboard.command_line import main
@@ -210,12 +210,10 @@ FORGERIES: dict[str, list[Change | Data]] = {
     ],
     "names are SymSteer's, or extensions'": [
         config("task", "FetchCube-v1"),
-        config("embodiment", "hand"),
         config("agent", "wonder"),
         world("earthquake:1"),
         config("policy/name", "oracle") | {"base_policy/name": "oracle"},
         extended(extension("agent", "standard")),
-        extended(extension("task", "PickCube-v1")),
         extended(extension("agent", "unused")),
     ],
     "its name is its configuration's": [{"run_id": "PickCube-v1-floating-none-standard-s25-012"}],
@@ -272,13 +270,11 @@ FORGERIES: dict[str, list[Change | Data]] = {
     "episodes are as many as configured, 100 at the end": [
         few_episodes,
         config("evaluation/episodes", 31),
-        config("evaluation/final_episodes", 200),
     ],
     "the final one counts what the run used": [{"budget/updates": 1}, {"budget/decisions": 1}],
     "so many decisions take so many steps": [config("num_envs", 60), decide(2), decide(0.5)],
     "so many decisions lead to so many updates": [
         config("agent_options/utd", 5.0),
-        config("agent_options/warmup", 0),
         {"evaluations/2/updates": 3},
     ],
     "episodes last to the time limit": [
@@ -293,7 +289,6 @@ FORGERIES: dict[str, list[Change | Data]] = {
     ],
     "no diagnostic is left out": [
         everywhere(put({"diagnostics/q_mean": GONE})),
-        {LAST + "diagnostics/td_error": GONE},
         {LAST + "diagnostics/q_magnitude": None},
     ],
     "diagnostics agree with each other": [
@@ -378,8 +373,6 @@ def test_the_form_of_a_record(tmp_path: Path) -> None:
     [
         (config("variant", "action_gain:77"), "of variant 'action_gain' must lie in [0, 1]"),
         (config("evaluation/every", 0), "evaluation.every"),
-        (config("policy/execute", "4"), "policy.execute"),
-        (config("demonstrations/mode", "best"), "demonstrations.mode"),
         (config("secret", 1), "a key 'secret'"),
         (config("sac", {"utd": 9.0}), "a key 'sac'"),
         (config("evaluation", GONE), "evaluation.every"),
@@ -505,20 +498,13 @@ def test_another_base_policy_is_said(tmp_path: Path) -> None:
 
 
 def test_a_commit_that_nobody_has_is_said(tmp_path: Path) -> None:
-    shallow = subprocess.run(
-        ["git", "-C", str(REPOSITORY), "rev-parse", "--is-shallow-repository"],
-        capture_output=True,
-        text=True,
-    )
-    if shallow.stdout.strip() != "false":
+    if git(REPOSITORY, "rev-parse", "--is-shallow-repository") != "false":
         pytest.skip("needs a whole clone of the repository")
     path = forge(committed("base"), {"provenance/commit": "0123456789" * 4}, tmp_path)
-    verdict = judge(path)[0]
+    (verdict,) = judge(path)
     assert verdict.is_admissible
-    assert verdict.notes == [
-        "its commit 012345678901 is not in this clone: push it with the pull request, so that "
-        "others can run the same code"
-    ]
+    (note,) = verdict.notes
+    assert note.startswith("its commit 012345678901 is not in this clone: push it with the pull")
 
 
 def test_the_command_says_what_to_mend(

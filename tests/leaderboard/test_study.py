@@ -32,11 +32,7 @@ def test_a_study_declares_claims_or_names_a_file_that_does(tmp_path: Path) -> No
     assert {"first", "paper"} <= {path.stem for path in FOLDER.glob("*.toml")}
     study = read_study(write(tmp_path, f'notice = "mind this"\n{CLAIM}'))
     (claim,) = study.claims
-    assert (claim.agents, claim.cells.broken, claim.minus) == (
-        ("equivariant", "standard"),
-        False,
-        None,
-    )
+    assert (claim.agents, claim.cells.broken) == (("equivariant", "standard"), False)
     other = read_study(write(tmp_path, 'claims = "mine.toml"\ndeclared = "abcdef0"', "other.toml"))
     assert (other.claims, other.source) == (study.claims, "mine.toml")
     assert (other.notice, other.declared) == ("", "abcdef0")
@@ -49,25 +45,15 @@ def test_a_study_declares_claims_or_names_a_file_that_does(tmp_path: Path) -> No
     [
         (CLAIM.replace("measure", "mesure"), "claim 1: there is no key 'mesure'; did you mean 'me"),
         (CLAIM.replace('"auc"', '"acu"'), "claim 1: there is no measure 'acu'; did you mean 'auc'"),
-        (CLAIM.replace("broken", "brokn"), "claim 1 cells: there is no key 'brokn'; did you mean"),
         ("notce = 'x'", "there is no key 'notce'; did you mean 'notice'"),
         (CLAIM.replace("smallest = 0.05", "smallest = 0"), "claim 1 smallest: .*greater than 0"),
-        (CLAIM.replace("smallest = 0.05", "smallest = nan"), "claim 1 smallest: "),
-        (CLAIM.replace("predicted = 1", "predicted = 2"), "claim 1 predicted: "),
-        (CLAIM.replace("predicted = 1", ""), "claim 1 predicted: Field required"),
         (CLAIM.replace(', "standard"', ""), "claim 1 agents 2: Field required"),
         (CLAIM.replace('"faster"', '"<b>"'), "claim 1 name: "),
         (CLAIM + "minus = { broken = true }\neffect = 'slope'", "claim 1: minus belongs to"),
         (CLAIM.replace('"auc"', '"diverged"') + "effect = 'slope'", "no slope of diverged"),
         (CLAIM + "[[statement]]\nsays = 'x'\nclaims = ['fster']", "'fster'; did you mean 'faster'"),
-        (
-            CLAIM + "[[statement]]\nsay = 'x'",
-            "statement 1: there is no key 'say'; did you mean 'says'",
-        ),
-        ("[[statement]]\nsays = 'x'\nclaims = []", "statement 1 claims: "),
         (CLAIM + CLAIM, "two claims have the name 'faster'; rename one"),
         ("declared = 'yesterday'", "declared: "),
-        ("claim = 3", "claim: "),
         ("claims = 'none.toml'", r"there is no study '.*none\.toml'"),
         ("claims = 'mine.toml'", "must name a file that declares claims itself"),
         ("not toml", "cannot be read as TOML"),
@@ -108,9 +94,6 @@ def test_a_commit_that_has_not_declared_the_claims_is_refused(tmp_path: Path) ->
         read_study(study)
 
 
-def test_an_unknown_study_names_the_nearest(tmp_path: Path) -> None:
+def test_an_unknown_study_names_the_nearest() -> None:
     with pytest.raises(UserError, match="there is no study 'papr'; did you mean 'paper'"):
         read_study("papr")
-    (tmp_path / "folder.toml").mkdir()
-    with pytest.raises(UserError, match="cannot be read: Is a directory"):
-        read_study(str(tmp_path / "folder.toml"))
