@@ -349,13 +349,11 @@ def test_edited_records_are_refused(tmp_path: Path, where: str, value: Any, word
 TEXTS: list[tuple[bytes, str]] = [
     (b"", "strict JSON"),
     (b"{}", "not a run record"),
-    (b'{"schema_version": NaN}', "NaN"),
     (b'{"schema_version": 1e999}', "too large"),
     (b'{"schema_version": 1, "schema_version": 1}', "twice"),
     (b'{"schema_version": 1}', "config_hash"),
     (b"\xff\xfe\x00", "UTF-8"),
     (b"[" * 200_000, "strict JSON"),
-    (b'{"schema_version": ' + b"9" * 10_000 + b"}", "strict JSON"),
 ]
 
 
