@@ -61,9 +61,10 @@ def report(
     out = out or _folder_for(records)
     study = study or (PAPER if records else STUDY)
     if verify:
-        lines, number, files = report.verify(paths, out, audit, study, reproductions)
+        folder, wanted, number = report.contents(paths, out, audit, study, reproductions)
+        lines = report.differences(folder, wanted)
         if not lines:
-            _say(f"{number} records and {files} files of the leaderboard agree")
+            _say(f"{number} records and {len(wanted)} files of the leaderboard agree")
             return 0
         for line in lines:
             _say(line)

@@ -61,7 +61,7 @@ def generate(
         UserError: for bad records, a full disk or a folder that cannot be written; `out` is then
             as it was (`write_together`).
     """
-    out, files, _ = _files(records, out, audit, study, reproductions)
+    out, files, _ = contents(records, out, audit, study, reproductions)
     if (out / "figures").is_symlink():
         raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it")
     stale = [out / name for name in _stale(out, files)]
@@ -69,26 +69,8 @@ def generate(
     return [out / name for name in files]
 
 
-def verify(
-    records: Sequence[Path],
-    out: Path,
-    audit: Path | None = None,
-    study: str = PAPER,
-    reproductions: Path | None = None,
-) -> tuple[list[str], int, int]:
-    """Compare the files in `out` with what `generate` would write; changes nothing.
-
-    Arguments and errors are those of `generate`.
-
-    Returns:
-        A line for each file that differs in any byte, and how many records and files there are.
-    """
-    out, files, number = _files(records, out, audit, study, reproductions)
-    return differences(files, _stale(out, files), out), number, len(files)
-
-
-def differences(files: Mapping[str, bytes], stale: Sequence[str], out: Path) -> list[str]:
-    """A line for every file of the folder `out` that is not of `files`, as `render` gives them."""
+def differences(out: Path, files: Mapping[str, bytes]) -> list[str]:
+    """A line for every file of the leaderboard in the folder `out` that is not as in `files`."""
     lines = []
     for name, wanted in sorted(files.items()):
         try:
@@ -105,7 +87,7 @@ def differences(files: Mapping[str, bytes], stale: Sequence[str], out: Path) -> 
                 same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
                 line = wanted[:same].count(b"\n") + 1
                 lines.append(f"{out / name}: differs from line {line} on")
-    return lines + [f"{out / name}: no record gives this file" for name in stale]
+    return lines + [f"{out / name}: no record gives this file" for name in _stale(out, files)]
 
 
 def other_versions() -> list[str]:
@@ -121,10 +103,18 @@ def other_versions() -> list[str]:
     ]
 
 
-def _files(
-    records: Sequence[Path], out: Path, audit: Path | None, study: str, reproductions: Path | None
+def contents(
+    records: Sequence[Path],
+    out: Path,
+    audit: Path | None = None,
+    study: str = PAPER,
+    reproductions: Path | None = None,
 ) -> tuple[Path, dict[str, bytes], int]:
-    """The folder, what belongs into it, and the number of records."""
+    """What `generate` writes, with the same arguments and errors: nothing is written.
+
+    Returns:
+        The folder, the files by their path in it, and the number of records.
+    """
     claims = read_study(study)
     runs = load_runs(records, reproductions_for(records, reproductions), claims.listed)
     out = _folder(out)

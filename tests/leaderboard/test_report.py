@@ -307,7 +307,7 @@ def test_differences_are_short_and_printable(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\x1b[2J" + b"x" * 10**6)
     (tmp_path / "b").mkdir()
     (tmp_path / "c").symlink_to(tmp_path / "c")
-    lines = differences({"a": b"y", "b": b"", "c": b"", "d/e": b""}, [], tmp_path)
+    lines = differences(tmp_path, {"a": b"y", "b": b"", "c": b"", "d/e": b""})
     assert [line.split(": ")[0] for line in lines] == [
         str(tmp_path / name) for name in ("a", "b", "c", "d/e")
     ]
