@@ -13,20 +13,28 @@ def broken_by(key: Key) -> str:
     return " and ".join(part if part == ARM else code(part) for part in key.broken_by)
 
 
+def told_apart(key: Key, keys: Sequence[Key]) -> dict[str, str]:
+    """Base policy, demonstrations and steps, where they tell a key from others."""
+
+    def texts(key: Key) -> dict[str, str]:
+        return {
+            "base policy": f"{key.base} {key.group}".strip(),
+            "demonstrations": f"{key.demonstrations} {key.mode}",
+            "steps": count(key.env_steps),
+        }
+
+    others = [texts(other) for other in keys]
+    own = texts(key).items()
+    return {name: text for name, text in own if any(other[name] != text for other in others)}
+
+
 def cell_name(table: Table, summary: Summary) -> str:
     """Task, embodiment and variant, and of the rest of the key what tells the tables apart."""
     key = table.key
-    name = f"{code(key.task)} {code(key.embodiment)} {broken_by(key) or 'unbroken'}"
-    keys = [other.key for other in summary.tables]
-    if len({other.base + other.group for other in keys}) > 1:
-        name += f" {code((key.base + ' ' + key.group).strip())}"
-    if len({(other.mode, other.demonstrations) for other in keys}) > 1:
-        name += f" {code(f'{key.demonstrations} {key.mode}')}"
-    if len({other.env_steps for other in keys}) > 1:
-        name += f" {count(key.env_steps)}"
-    if key.settings:
-        name += f" {code(key.settings)}"
-    return name
+    words = [code(key.task), code(key.embodiment), broken_by(key) or "unbroken"]
+    apart = told_apart(key, [other.key for other in summary.tables])
+    words += [text if name == "steps" else code(text) for name, text in apart.items()]
+    return " ".join([*words, *([code(key.settings)] if key.settings else [])])
 
 
 def beside_variant(key: Key, others: Sequence[Key]) -> list[str]:

@@ -30,8 +30,7 @@ def picture(a: Side, b: Side, changes: Changes, path: Path) -> bytes:
 
 def described(a: Side, b: Side, changes: Changes) -> Figure:
     """Plots for success and AUC: cells from top to bottom, the mean over them below a line."""
-    names = cell_names(changes.cells)
-    labels = [cut(" ".join(name), 60) for name in names]
+    labels = [cut(name, 60) for name in cell_names(changes.cells)]
     rows = [changed.measures for changed in changes.cells]
     rules = [Rule(-changes.margin, is_vertical=True, dash=":")] if changes.margin else []
     if len(rows) > 1:

@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from symsteer.leaderboard.cell_names import told_apart
 from symsteer.leaderboard.compare.changes import (
     DECISIVE,
     Change,
@@ -113,26 +114,14 @@ def to_data(a: Side, b: Side, changes: Changes) -> dict[str, Any]:
     }
 
 
-def cell_names(cells: Sequence[PairedCell]) -> list[tuple[str, str]]:
-    """Task and embodiment of each cell, and what else tells it from the other cells."""
-    keys = [cell.key for cell in cells]
-    several = {
-        name: len({getattr(key, name) for key in keys}) > 1
-        for name in ("base", "group", "mode", "demonstrations", "env_steps")
-    }
+def cell_names(cells: Sequence[PairedCell]) -> list[str]:
+    """Task, embodiment and variant of each cell, and what else tells it from the other cells."""
     names = []
-    for cell in cells:
-        key = cell.key
-        texts = [
-            key.variant,
-            cell.label,
-            f"{key.base} {key.group}".strip() * (several["base"] or several["group"]),
-            f"{key.demonstrations} {key.mode} demonstrations"
-            * (several["mode"] or several["demonstrations"]),
-            f"{key.env_steps:,} steps" * several["env_steps"],
-            key.settings,
-        ]
-        names.append((f"{key.task} {key.embodiment}", " ".join(filter(None, texts))))
+    for key, label in ((cell.key, cell.label) for cell in cells):
+        apart = told_apart(key, [cell.key for cell in cells])
+        words = [f"{text} {name}" for name, text in apart.items()]
+        words = [key.task, key.embodiment, key.variant, label, *words, key.settings]
+        names.append(" ".join(filter(None, words)).replace(SPACE, " "))
     return names
 
 
@@ -226,7 +215,7 @@ def _alone(changes: Changes) -> list[str]:
 
 def _table(changes: Changes) -> str:
     """By measure a row for the mean over cells, and one for each cell that is not identical."""
-    names = [shown(" ".join(name), NAME_WIDTH) for name in cell_names(changes.cells)]
+    names = [shown(name, NAME_WIDTH) for name in cell_names(changes.cells)]
     listed = [
         (name, cell.measures, cell.seconds, len(cell.pairs))
         for name, cell in zip(names, changes.cells, strict=True)
