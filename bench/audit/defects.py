@@ -57,7 +57,7 @@ LENGTHS = ("_xy", "_z", "_width", "_height")
 def reference_task(settings: AuditSettings) -> SymmetricTask:
     """Make the unbroken task, with one environment for each state of a visitor, at most 64."""
     count = min(settings.count, 64)
-    return make(settings.task, num_envs=count, embodiment=settings.embodiment, sim=settings.sim)
+    return make(settings.task, num_envs=count, embodiment=settings.embodiment)
 
 
 def visit_all(
@@ -93,7 +93,7 @@ def audit(
     settings.check()
     begin, seed = time.perf_counter(), settings.seed
     group = check_group(settings.group)
-    with Experiment(reference, settings.variant, group, visited, seed, settings.sim) as experiment:
+    with Experiment(reference, settings.variant, group, visited, seed) as experiment:
         copies, resets = experiment.copies(), experiment.resets(settings.resets)
         centre, corners = experiment.centre, experiment.corners
     lengths = {body: copies.lengths(body, corners) for body in BODIES}
@@ -132,13 +132,12 @@ def _dynamics(
         "moving": moving,
     }
     for body in BODIES:
-        start, end = copies.positions[body].unbind(dim=2)
-        turned = copies.quaternions[body][:, :, 1]
-        distance = (end - end[:, :1]).norm(dim=-1)
-        angles = _angle(turned, turned[:, :1])
+        start, end = copies.poses[body].unbind(dim=2)
+        distance = (end - end[:, :1])[..., :3].norm(dim=-1)
+        angles = _angle(end[..., 3:], end[:, :1, 3:])
         millimetres = 1e3 * copies.mean(distance)
         degrees = np.degrees(copies.mean(angles))
-        travelled = copies.mean((end - start).norm(dim=-1), first=0)
+        travelled = copies.mean((end - start)[..., :3].norm(dim=-1), first=0)
         for subset, chosen in subsets.items():
             keep = chosen & copies.compared
             if keep.sum() < LEAST_STATES or (subset != "all" and chosen.all()):
@@ -237,7 +236,7 @@ def _departures(copies: Copies, body: str) -> torch.Tensor:
 
     The medoid is the copy that is closest to all others, so it belongs to the majority.
     """
-    end = copies.positions[body][:, :-1, 1]
+    end = copies.poses[body][:, :-1, 1, :3]
     apart = (end[:, :, None] - end[:, None]).norm(dim=-1)
     cost = (apart * copies.reached.double()[:, None]).sum(dim=-1)
     medoid = torch.where(copies.reached, cost, torch.inf).argmin(dim=1)

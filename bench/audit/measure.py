@@ -17,7 +17,6 @@ import numpy as np
 import torch
 
 from symsteer.bench.audit.states import Element, Turner, Visited, seen_from, task_state
-from symsteer.bench.sim.environment import Simulator
 from symsteer.bench.sim.rotations import planar_matrix, quaternion_to_matrix, transform_quaternion
 from symsteer.bench.sim.trees import join_trees, map_trees, rows_of
 from symsteer.bench.tasks import make
@@ -48,9 +47,9 @@ class Copies:
         reached: which copies exist, ``[S, G]`` bool (an arm cannot reach every turned state).
         place: initial position of each copy's tool and object, relative to the policy's origin,
             ``[S, G, 2]`` each.
-        positions, quaternions: turned-back positions ``[S, G + 1, 2, 3]`` and quaternions
-            ``[S, G + 1, 2, 4]`` of tool and object at the start and the end of the decision; the
-            last of the G + 1 is the copy that differs by rounding.
+        poses: turned-back positions and quaternions of tool and object at the start and the end of
+            the decision, ``[S, G + 1, 2, 7]`` each; the last of the G + 1 is the copy that differs
+            by rounding.
         rewards: mean over the decision's steps, ``[S, G]`` each: ``cost`` of a step (1 plus the
             extra cost of the variants until success, then 0) and ``dense`` (ManiSkill's normalised
             dense reward minus the extra cost) where every step starts and ends in the turned states
@@ -64,8 +63,7 @@ class Copies:
     policy: torch.Tensor
     reached: torch.Tensor
     place: Tensors
-    positions: Tensors
-    quaternions: Tensors
+    poses: Tensors
     rewards: Tensors
     observations: torch.Tensor
     observations_again: torch.Tensor
@@ -89,9 +87,9 @@ class Copies:
         Horizontally and vertically: of the tool's centre point, or of the object's corners (mean
         over these).
         """
-        points = self.positions[body][..., None, :]
+        points = self.poses[body][..., None, :3]
         if body == "object":
-            points = points + corners @ quaternion_to_matrix(self.quaternions[body]).mT
+            points = points + corners @ quaternion_to_matrix(self.poses[body][..., 3:]).mT
         start, end = points.unbind(dim=2)
         apart, moved = end - end[:, :1], end - start
         return {
@@ -115,7 +113,6 @@ class Experiment:
         group: a finite group.
         visited: the states; their number determines the number of scenes.
         seed: of resets and draws.
-        sim: ``cpu`` or ``cuda``.
     """
 
     def __init__(
@@ -125,7 +122,6 @@ class Experiment:
         group: Group,
         visited: Visited,
         seed: int,
-        sim: Simulator = "cpu",
     ) -> None:
         self.reference, self.visited, self.seed = reference, visited, seed
         self.elements: tuple[Element, ...] = group.elements
@@ -138,7 +134,6 @@ class Experiment:
             num_envs=self.batch * (group.order + 1),
             embodiment=reference.embodiment,
             variant=variant,
-            sim=sim,
             reward_mode="normalized_dense",
         )
         self.fresh = True
@@ -185,35 +180,29 @@ class Experiment:
             env.reset(seed=[self.seed] * env.num_envs)
             self._put(scenes)
 
-        poses = [self._poses()]
+        before = self._poses()
         place = {
             body: self._split(pose[:, :2] - self.centre)[:, : len(elements)]
-            for body, pose in poses[0].items()
+            for body, pose in before.items()
         }
-        outcome_cost, outcome_dense = self._rewards(plan)
-        poses.append(self._poses())
-        positions, quaternions = self._turned_back(poses)
+        simulated = self._rewards(plan)
+        after = self._poses()
+        poses = {body: self._turned_back(body, before[body], after[body]) for body in before}
         outcomes = []
         for step in range(plan.shape[1]):
-            after = map_trees(lambda later, k=step: later[:, k], visited.path)
-            copies, possible = self._turned(after)
-            outcomes.append(join_trees([*copies, after]))
+            later = map_trees(lambda states, k=step: states[:, k], visited.path)
+            copies, possible = self._turned(later)
+            outcomes.append(join_trees([*copies, later]))
             reached &= possible
         self._put(scenes)
-        cost, dense = self._rewards(plan, outcomes)
         return Copies(
             moving=visited.moving,
             policy=visited.policy,
             reached=reached,
             place=place,
-            positions=positions,
-            quaternions=quaternions,
-            rewards={
-                "cost": cost,
-                "dense": dense,
-                "outcome_cost": outcome_cost,
-                "outcome_dense": outcome_dense,
-            },
+            poses=poses,
+            rewards=self._rewards(plan, outcomes)
+            | {f"outcome_{name}": value for name, value in simulated.items()},
             observations=observations,
             observations_again=again,
         )
@@ -248,37 +237,25 @@ class Experiment:
         """Reshape ``[(G + 1) * S, ...]``, ordered by copy, to ``[S, G + 1, ...]``."""
         return values.unflatten(0, (-1, self.batch)).transpose(0, 1)
 
-    def _turned_back(self, poses: list[Tensors]) -> tuple[Tensors, Tensors]:
-        positions, quaternions = {}, {}
-        mirrored = self.env.manipulated.name in self.env.mirrored_across_yz
+    def _turned_back(self, body: str, *poses: torch.Tensor) -> torch.Tensor:
+        """Poses of a body at several times, each copy turned back, ``[S, G + 1, times, 7]``."""
+        name = self.env.manipulated.name
+        across_yz = body == "object" and name in self.env.mirrored_across_yz
         centre = torch.cat([self.centre.double(), torch.zeros(1, dtype=torch.float64)])
-        inverses = [*map(_inverse, self.elements), (0.0, False)]
-        for body in ("tool", "object"):
-            pose = self._split(torch.stack([pose[body] for pose in poses], dim=1)).double()
-            p, q = pose[..., :3], pose[..., 3:]
-            across_yz = body == "object" and mirrored
-            positions[body] = torch.stack(
-                [
-                    (p[:, g] - centre) @ planar_matrix(*inverse, p).T + centre
-                    for g, inverse in enumerate(inverses)
-                ],
-                dim=1,
+        copies = self._split(torch.stack(poses, dim=1)).double()
+        turned = []
+        for g, element in enumerate([*self.elements, (0.0, False)]):
+            p, q = copies[:, g, :, :3], copies[:, g, :, 3:]
+            p = (p - centre) @ planar_matrix(*_inverse(element), p).T + centre
+            turned.append(
+                torch.cat([p, transform_quaternion(q, *_inverse(element), across_yz)], dim=-1)
             )
-            quaternions[body] = torch.stack(
-                [
-                    transform_quaternion(q[:, g], *inverse, across_yz)
-                    for g, inverse in enumerate(inverses)
-                ],
-                dim=1,
-            )
-        return positions, quaternions
+        return torch.stack(turned, dim=1)
 
     # ------------------------------------------------------------------ reward
 
-    def _rewards(
-        self, plan: torch.Tensor, outcomes: list[dict[str, Any]] | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Cost and dense reward of a step, mean over the decision, ``[S, G]`` each.
+    def _rewards(self, plan: torch.Tensor, outcomes: list[dict[str, Any]] | None = None) -> Tensors:
+        """`cost` and `dense` reward of a step, mean over the decision, ``[S, G]`` each.
 
         Args:
             plan: the actions of all scenes, ``[(G + 1) * S, T, 7]``.
@@ -302,8 +279,8 @@ class Experiment:
             alive = alive * (~info["success"].cpu()).float()
             cost = cost + alive * (1 + extra).cpu() / steps
             dense = dense + reward.cpu() / steps
-        order = len(self.elements)
-        return self._split(cost)[:, :order], self._split(dense)[:, :order]
+        means = {"cost": cost, "dense": dense}
+        return {name: self._split(mean)[:, : len(self.elements)] for name, mean in means.items()}
 
     def _extra_cost(self, before: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
         """Extra cost of the variants for a step whose tool started at ``before``, ``[N]``."""

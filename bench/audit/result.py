@@ -9,7 +9,6 @@ from typing import Any, Literal, get_args
 from pydantic import TypeAdapter, ValidationError
 
 from symsteer.bench.audit.estimates import Measurement
-from symsteer.bench.sim.environment import Simulator
 from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import read
 from symsteer.errors import UserError, first_problem
@@ -75,7 +74,6 @@ class AuditSettings:
     resets: int = 256
     """Resets that are compared with as many turned ones."""
     seed: int = 0
-    sim: Simulator = "cpu"
 
     def check(self) -> None:
         """Check everything before anything is built.
