@@ -20,7 +20,8 @@ from symsteer.policies.files import load_policy
 from symsteer.variant import variant_text
 
 RUNS = Path("runs")
-"""The folder where runs are by default; its subfolder ``base`` keeps base policies."""
+"""The folder where runs are by default; its subfolder ``base`` keeps demonstrations and base
+policies."""
 
 ALL = "all"
 """Stands for every task, and with a strength for every variant."""
@@ -62,7 +63,6 @@ def cells(
 
 def run_audits(
     wanted: Sequence[AuditSettings],
-    runs: Path = RUNS,
     base_policy: Path | None = None,
     out: Path | None = None,
     done: Callable[[AuditResult], None] = lambda result: None,
@@ -71,7 +71,6 @@ def run_audits(
 
     Args:
         wanted: what to measure.
-        runs: folder of the runs; its subfolder ``base`` keeps demonstrations and base policies.
         base_policy: a saved policy to use instead of training one.
         out: folder of the results; several results get a subfolder each. What it has with the same
             settings and base policy is not measured again.
@@ -100,7 +99,7 @@ def run_audits(
         first = same_place[0]
         policy = None
         if "policy" in first.visitors:
-            policy = given or audited_policy(first, None, runs)
+            policy = given or audited_policy(first, None)
         reference = visited = None
         for settings in same_place:
             folder = out and (out / settings.name if len(wanted) > 1 else out)
@@ -123,10 +122,10 @@ def run_audits(
     return [results[settings] for settings in wanted]
 
 
-def audited_policy(settings: AuditSettings, path: Path | None, runs: Path = RUNS) -> ChunkPolicy:
+def audited_policy(settings: AuditSettings, path: Path | None) -> ChunkPolicy:
     """The base policy that visits states: a saved one, or that of a run with default settings."""
     task = task_class(settings.task)
     if path is not None:
         return load_policy(path, task.observation_layout, task.action_layout)
     config = RunConfig(task=settings.task, embodiment=settings.embodiment)
-    return prepare_base(config, Execution(runs))
+    return prepare_base(config, Execution(RUNS))

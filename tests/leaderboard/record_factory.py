@@ -138,53 +138,24 @@ def make_record(
 
 
 def make_curve(
-    generator: np.random.Generator,
-    rates: Sequence[float],
-    budget: int = 50_000,
-    episodes: int = 100,
-    critic: bool = True,
-    q_shift: float = 0.0,
+    generator: np.random.Generator, rates: Sequence[float], q_shift: float = 0.0
 ) -> list[Evaluation]:
-    """Evaluations at equal distances from 0 to `budget` with the given success rates."""
-    points = np.linspace(0, budget, len(rates)).astype(int)
+    """Evaluations at equal distances over the budget with the given success rates."""
+    known = {"q_violation": 0.01, "td_error": 1.5, "return_std": 5.0, "alpha": 0.01}
+    known |= {"orbit_variance": 0.04, "equivariance_actor": 0.31, "equivariance_critic": 0.12}
+    for prefix in ("q_", "q_off_"):
+        known |= {f"{prefix}bias": 0.6 + q_shift, f"{prefix}bias_std": 2.5}
+        known |= {f"{prefix}correlation": 0.9, f"{prefix}rank_correlation": 0.8}
+        known |= {f"{prefix}overestimated": 0.55}
     curve = []
-    for index, (step, rate) in enumerate(zip(points, rates, strict=True)):
+    steps = np.linspace(0, 50_000, len(rates)).astype(int).tolist()
+    for index, (step, rate) in enumerate(zip(steps, rates, strict=True)):
         q = -16 + 10 * rate + q_shift * index
-        diagnostics = {
-            "q_mean": q,
-            "q_min": q - 3,
-            "q_max": q + 2,
-            "q_abs_max": abs(q) + 4,
-            "q_magnitude": (abs(q) + 4) / 20,
-            "q_overshoot": max(0.0, q + 2, -20 - (q - 3)) / 20,
-            "q_violation": 0.2 if q > 0 else 0.01,
-            "td_error": 1.5,
-            **{
-                f"q_{kind}{name}": value
-                for kind in ("", "off_")
-                for name, value in (
-                    ("bias", 0.6 + q_shift),
-                    ("bias_std", 2.5),
-                    ("correlation", 0.9),
-                    ("rank_correlation", 0.8),
-                    ("overestimated", 0.55),
-                )
-            },
-            "return_mean": -16 + 10 * rate,
-            "return_std": 5.0,
-            "alpha": 0.01,
-            "orbit_variance": 0.04,
-            "equivariance_actor": 0.31,
-            "equivariance_critic": 0.12,
-        }
-        curve.append(
-            make_evaluation(
-                generator.random(episodes) < rate,
-                int(step),
-                index == len(rates) - 1,
-                **(diagnostics if critic else {}),
-            )
-        )
+        measured = {"q_mean": q, "q_min": q - 3, "q_max": q + 2, "q_abs_max": abs(q) + 4}
+        measured |= {"q_magnitude": (abs(q) + 4) / 20, "return_mean": -16 + 10 * rate}
+        measured["q_overshoot"] = max(0.0, q + 2, -20 - (q - 3)) / 20
+        outcomes, final = generator.random(100) < rate, index == len(rates) - 1
+        curve.append(make_evaluation(outcomes, step, final, **(known | measured)))
     return curve
 
 
@@ -201,21 +172,15 @@ def make_cell(
         curve = [rate] * 3 if isinstance(rate, float | int) else list(rate)
         for seed in range(seeds):
             generator = np.random.default_rng((index, seed))
-
-            def outcomes(share: float, generator: np.random.Generator = generator) -> list[int]:
-                order = generator.permutation(episodes)
-                return (order < round(share * episodes)).astype(int).tolist()
-
-            steps = np.linspace(0, config.get("env_steps", 50_000), len(curve)).astype(int)
-            if agent not in REFERENCES:
-                evaluations = [
-                    make_evaluation(
-                        outcomes(share), int(step), step == steps[-1], q_mean=-5.0, q_magnitude=0.5
-                    )
-                    for share, step in zip(curve, steps, strict=True)
-                ]
-            else:
-                evaluations = [make_evaluation(outcomes(curve[-1]), 0)]
+            steps = np.linspace(0, config.get("env_steps", 50_000), len(curve)).astype(int).tolist()
+            points, q = list(zip(curve, steps, strict=True)), {"q_mean": -5.0, "q_magnitude": 0.5}
+            if agent in REFERENCES:
+                points, q = [(curve[-1], 0)], {}
+            evaluations = []
+            for share, step in points:
+                outcomes = (generator.permutation(episodes) < round(share * episodes)).astype(int)
+                final = step == points[-1][1]
+                evaluations.append(make_evaluation(outcomes.tolist(), step, final, **q))
             records.append(make_record(evaluations, agent=agent, seed=seed, **config))
     return records
 
