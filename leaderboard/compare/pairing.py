@@ -23,7 +23,8 @@ TELLING = ("task", "embodiment", "variant", "agent", "seed", "env_steps")
 
 MOST_NAMED = 3
 
-Facts = Mapping[str, str]
+Facts = frozenset[tuple[str, str]]
+"""What tells a run from others: settings, base policy, held-out episodes, with their texts."""
 
 
 def pair_runs(a: Side, b: Side, margin: float = 0.0) -> Changes:
@@ -33,47 +34,42 @@ def pair_runs(a: Side, b: Side, margin: float = 0.0) -> Changes:
         UserError: if no run of A has a partner in B.
     """
     agents_differ = _has_one_agent(a) and _has_one_agent(b)
-    facts = {
-        run.path: {
-            key: text
-            for key, text in _facts_of(run).items()
-            if not (agents_differ and _is_of_agent(key))
-        }
-        for run in (*a.runs, *b.runs)
-    }
+
+    def counted(run: Run) -> dict[str, str]:
+        facts = _facts_of(run).items()
+        return {key: text for key, text in facts if not (agents_differ and _is_of_agent(key))}
 
     # Settings count that records of both sides have, for each agent.
-    known: list[dict[str, set[str]]] = [{}, {}]
+    known: list[dict[str, set[str]]] = [defaultdict(set), defaultdict(set)]
     for side, keys in zip((a, b), known, strict=True):
         for run in side.runs:
-            keys.setdefault("" if agents_differ else run.agent, set()).update(facts[run.path])
+            keys["" if agents_differ else run.agent] |= counted(run).keys()
     both = known[0].keys() & known[1].keys()
     shared = {agent: known[0][agent] & known[1][agent] for agent in both}
 
-    def identity(run: Run) -> dict[str, str]:
+    facts: dict[Path, Facts] = {}
+    for run in (*a.runs, *b.runs):
         keys = {*shared.get("" if agents_differ else run.agent, ()), "agent"}
-        return {key: text for key, text in facts[run.path].items() if key in keys}
-
-    identities = {run.path: identity(run) for run in (*a.runs, *b.runs)}
-    partners: dict[frozenset[tuple[str, str]], list[Run]] = defaultdict(list)
+        facts[run.path] = frozenset(item for item in counted(run).items() if item[0] in keys)
+    partners: dict[Facts, list[Run]] = defaultdict(list)
     for run in sorted(b.runs, key=lambda run: (run.record.started, run.record.run_id)):
-        partners[frozenset(identities[run.path].items())].append(run)
+        partners[facts[run.path]].append(run)
     cells, paired = [], set()
     for key, row in a.rows:
         pairs = []
         for run in row.finished:
-            if others := partners[frozenset(identities[run.path].items())]:
+            if others := partners[facts[run.path]]:
                 pairs.append(RunPair(run, others.pop()))
                 paired |= {pairs[-1].a.path, pairs[-1].b.path}
         if pairs:
             usual = agents_differ and row.label == row.agent
             cells.append(PairedCell(key, "" if usual else row.label, tuple(pairs)))
     if not cells:
-        raise _without_pairs(a, b, identities)
+        raise _without_pairs(a, b, facts)
 
     def alone(side: Side, other: Side, name: str) -> tuple[Leftover, ...]:
         rest = [run for run in side.runs if run.path not in paired]
-        reasons = (_why(run, other, identities, name) for run in rest)
+        reasons = (_why(run, other, facts, name) for run in rest)
         return *map(Leftover, rest, reasons), *side.leftovers
 
     def only(mine: dict[str, set[str]]) -> tuple[str, ...]:
@@ -89,7 +85,6 @@ def pair_runs(a: Side, b: Side, margin: float = 0.0) -> Changes:
 
 
 def _facts_of(run: Run) -> dict[str, str]:
-    """What tells a run from others: settings, base policy, held-out episodes."""
     more = {"base policy": run.policy, "held-out episodes": str(list(run.final_success))}
     return setting_texts(run.record.config) | more
 
@@ -115,48 +110,46 @@ def _changes(pair: RunPair) -> list[str]:
         return []
     return [
         f"{key.removeprefix(OPTIONS)} {mine.get(key, 'unset')} -> {theirs.get(key, 'unset')}"
-        for key in _differing(mine, theirs)
+        for key in sorted({key for key, _ in mine.items() ^ theirs.items()})
     ]
 
 
-def _differing(mine: Facts, theirs: Facts) -> list[str]:
-    """The facts in which two runs differ."""
-    return sorted(key for key in mine.keys() | theirs.keys() if mine.get(key) != theirs.get(key))
+def _named(mine: Facts, theirs: Facts) -> tuple[list[str], list[str]]:
+    """The facts that are named where two runs differ: the telling ones alone if there are any.
 
-
-def _named(mine: Facts, theirs: Facts, values: bool) -> list[str]:
-    """The facts that are named where two runs differ: the telling ones alone if there are any."""
-    keys = _differing(mine, theirs)
+    Returns:
+        Their names, and the same with both values.
+    """
+    keys = sorted({key for key, _ in mine ^ theirs})
     keys = [key for key in TELLING if key in keys] or keys
-    more = len(keys) - MOST_NAMED
-    texts = [
-        key.removeprefix(OPTIONS)
-        + f" ({mine.get(key, 'unset')[:40]}, {theirs.get(key, 'unset')[:40]})" * values
-        for key in keys[:MOST_NAMED]
+    more = [f"{len(keys) - MOST_NAMED} more"] * (len(keys) > MOST_NAMED)
+    names = [key.removeprefix(OPTIONS) for key in keys[:MOST_NAMED]]
+    values = [
+        ", ".join(dict(facts).get(key, "unset")[:40] for facts in (mine, theirs)) for key in keys
     ]
-    return texts + [f"{more} more"] * (more > 0)
+    both = [f"{name} ({texts})" for name, texts in zip(names, values, strict=False)]
+    return names + more, both + more
 
 
-def _nearest(run: Run, side: Side, identities: Mapping[Path, Facts]) -> tuple[int, Run]:
-    """The run of the other side that differs in the fewest facts, and in how many."""
-    own = identities[run.path]
-    counts = [len(own.items() ^ identities[other.path].items()) for other in side.runs]
+def _nearest(run: Run, side: Side, facts: Mapping[Path, Facts]) -> tuple[int, Run]:
+    """In how many facts the nearest run of the other side differs, and that run."""
+    counts = [len(facts[run.path] ^ facts[other.path]) for other in side.runs]
     return min(counts), side.runs[counts.index(min(counts))]
 
 
-def _why(run: Run, other: Side, identities: Mapping[Path, Facts], name: str) -> str:
+def _why(run: Run, other: Side, facts: Mapping[Path, Facts], name: str) -> str:
     """Why a run has no partner."""
-    _, near = _nearest(run, other, identities)
-    texts = _named(identities[run.path], identities[near.path], values=False)
-    if not texts:
+    _, near = _nearest(run, other, facts)
+    names, _ = _named(facts[run.path], facts[near.path])
+    if not names:
         return f"its run of {name} has another partner"
-    return f"the nearest run of {name} differs in {', '.join(texts)}"
+    return f"the nearest run of {name} differs in {', '.join(names)}"
 
 
-def _without_pairs(a: Side, b: Side, identities: Mapping[Path, Facts]) -> UserError:
-    mine = min(a.runs, key=lambda run: _nearest(run, b, identities)[0])
-    _, theirs = _nearest(mine, b, identities)
-    texts = _named(identities[mine.path], identities[theirs.path], values=True)
+def _without_pairs(a: Side, b: Side, facts: Mapping[Path, Facts]) -> UserError:
+    mine = min(a.runs, key=lambda run: _nearest(run, b, facts)[0])
+    _, theirs = _nearest(mine, b, facts)
+    _, texts = _named(facts[mine.path], facts[theirs.path])
     return UserError(
         f"no run of A ({a.name}, {len(a.runs)} finished) has a partner in B ({b.name}, "
         f"{len(b.runs)} finished): the nearest, {mine.record.run_id} and {theirs.record.run_id}, "
