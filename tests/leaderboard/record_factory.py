@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import itertools
 import re
@@ -34,6 +35,37 @@ from symsteer.leaderboard.study import PAPER, read_study
 START = datetime(2026, 1, 31, 12, 0, tzinfo=UTC)
 LEARNING = ("standard", "standard-matched", "equivariant", "residual-pathway", "approximate")
 REFERENCES = ("base", "zero", "golden-ticket")
+
+
+GONE = object()
+
+
+def put(data: Any, values: Mapping[str, Any]) -> Any:
+    """Give what is at the places of plain data other values.
+
+    Args:
+        data: lists and dictionaries, which are changed.
+        values: by place, such as ``evaluations/-1/final``, where ``*`` stands for every item;
+            `GONE` removes what is there.
+    """
+    for place, value in values.items():
+        *keys, last = (int(k) if k.lstrip("-").isdigit() else k for k in place.split("/"))
+        inner = [data]
+        for key in keys:
+            inner = [each for one in inner for each in (one if key == "*" else [one[key]])]
+        for one in inner:
+            if value is GONE:
+                del one[last]
+                continue
+            for key in range(len(one)) if last == "*" else [last]:
+                one[key] = copy.deepcopy(value)
+    return data
+
+
+def edited(record: RunRecord, values: Mapping[str, Any] | None = None) -> RunRecord:
+    """A copy of a record with other values at some places (`put`)."""
+    data = record.model_dump(by_alias=True, exclude={"config_hash"})
+    return RunRecord.model_validate(put(data, values or {}))
 
 
 def make_config(**changes: Any) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import copy
 import functools
 import hashlib
 import json
-import operator
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -25,11 +24,12 @@ from symsteer.leaderboard.records.provenance import git
 from symsteer.policies import POLICIES
 from symsteer.variant import VariantSpec
 from tests.leaderboard.command_line import main
+from tests.leaderboard.record_factory import GONE, put
 
 REPOSITORY = Path(__file__).parents[2]
 
 Data = dict[str, Any]
-Change = Callable[[Data], Any]
+Change = Data | Callable[[Data], Any]
 
 
 @functools.cache
@@ -42,11 +42,11 @@ def committed(agent: str = "standard", seed: int = 25, variant: str = "none") ->
     raise AssertionError("there is no such record")
 
 
-def forge(path: Path, change: Change | Data, folder: Path) -> Path:
+def forge(path: Path, change: Change, folder: Path) -> Path:
     """A changed copy as a careful forger makes it: hash, run id and name of the file are right."""
     data = json.loads(path.read_text())
     old = data["run_id"]
-    (put(change) if isinstance(change, dict) else change)(data)
+    put(data, change) if isinstance(change, dict) else change(data)
     data["config_hash"] = config_hash(data["config"])
     if data["run_id"] == old:
         data["run_id"] = run_id_of(data["config"])
@@ -66,33 +66,11 @@ def five(folder: Path) -> list[Path]:
 
 # Forgeries: what a hostile author changes, with all that follows from it.
 
-GONE = object()
 LAST = "evaluations/-1/"
 
 
-def put(values: Data) -> Change:
-    """Give what is at the places of a record other values; `GONE` removes it."""
-
-    def change(data: Any) -> None:
-        for place, value in values.items():
-            *keys, last = (int(k) if k.lstrip("-").isdigit() else k for k in place.split("/"))
-            inner = functools.reduce(operator.getitem, keys, data)
-            if value is GONE:
-                del inner[last]
-            else:
-                inner[last] = value
-
-    return change
-
-
-def both(*changes: Change | Data) -> Change:
-    return lambda data: [
-        put(change)(data) if isinstance(change, dict) else change(data) for change in changes
-    ]
-
-
-def everywhere(change: Change) -> Change:
-    return lambda data: [change(evaluation) for evaluation in data["evaluations"]]
+def both(first: Data, then: Callable[[Data], Any]) -> Change:
+    return lambda data: then(put(data, first))
 
 
 def config(key: str, value: Any) -> Data:
@@ -118,7 +96,7 @@ def updates(data: Data, decisions: int) -> int:
     return max(0, int((decisions - 1280) * data["config"]["agent_options"]["utd"]))
 
 
-def all_at(end: int) -> Change:
+def all_at(end: int) -> Callable[[Data], None]:
     """The run ends at another step."""
 
     def change(data: Data) -> None:
@@ -143,7 +121,7 @@ def decide(factor: float) -> Change:
 def short(data: Data) -> None:
     """One decision of all environments is more than a tenth of the budget."""
     data["config"]["env_steps"] = 2_000
-    data["evaluations"] = [data["evaluations"][0], data["evaluations"][-1]]
+    data["evaluations"][1:-1] = []
     all_at(2_048)(data)
 
 
@@ -164,22 +142,10 @@ def few_episodes(data: Data) -> None:
     first_episodes(99, data["evaluations"][-1])
 
 
-def outcome(once: int, value: float | None = None, **more: int) -> Change:
-    """Every episode of an evaluation has the same outcome; without a value the returns stay."""
-
-    def change(evaluation: Data) -> None:
-        columns = evaluation["episodes"]
-        number = len(columns["seed"])
-        same = {"success_once": once, "success_at_end": once, **more}
-        if value is not None:
-            same["return"] = value
-        columns.update({name: [one] * number for name, one in same.items()})
-
-    return change
-
-
-def final(change: Change) -> Change:
-    return lambda data: change(data["evaluations"][-1])
+def outcome(once: int, which: str = "*", **columns: float) -> Data:
+    """Every episode of an evaluation, or of all, has the same outcome; the other columns stay."""
+    same = {"success_once": once, "success_at_end": once, **columns}
+    return {f"evaluations/{which}/episodes/{name}/*": value for name, value in same.items()}
 
 
 def late_failure(data: Data) -> None:
@@ -199,7 +165,7 @@ UNVERSIONED = {
     "provenance/sha256": "0123456789abcdef" * 4,
 }
 
-FORGERIES: dict[str, list[Change | Data]] = {
+FORGERIES: dict[str, list[Change]] = {
     "its code can be looked up": [
         {"provenance/dirty": True},
         NO_CODE,
@@ -278,17 +244,17 @@ FORGERIES: dict[str, list[Change | Data]] = {
         {"evaluations/2/updates": 3},
     ],
     "episodes last to the time limit": [
-        everywhere(outcome(0, -9_999.0, episode_len=9_999)),
+        outcome(0, episode_len=9_999, **{"return": -9_999.0}),
         {LAST + "episodes/episode_len/1": 49},
     ],
     "returns are the reward's": [
-        final(outcome(1)),
+        outcome(1, "-1"),
         *({FIRST.format("return"): value} for value in (1e30, 1.0, -12.5, -51.0, None)),
         late_failure,
         {FIRST.format(k): v for k, v in (("return", -49.0), ("success_once", 1), END)},
     ],
     "no diagnostic is left out": [
-        everywhere(put({"diagnostics/q_mean": GONE})),
+        {"evaluations/*/diagnostics/q_mean": GONE},
         {LAST + "diagnostics/q_magnitude": None},
     ],
     "diagnostics agree with each other": [
@@ -339,7 +305,7 @@ def evaluated_twice(data: Data) -> None:
     ],
 )
 def test_references_are_judged_as_well(
-    agent: str, change: Change | Data, sentence: str, tmp_path: Path
+    agent: str, change: Change, sentence: str, tmp_path: Path
 ) -> None:
     (problem,) = judge(forge(committed(agent), change, tmp_path))[0].problems
     assert sentence in problem
@@ -430,8 +396,8 @@ def nudged(data: Data) -> None:
 def test_copies_are_found_whatever_else_the_record_says(tmp_path: Path) -> None:
     old, new = five(tmp_path / "old"), tmp_path / "new"
     # Without diagnostics nobody looks for a copy.
-    unmeasured = both(everywhere(put({"diagnostics": {}})), {"feasible_q": None})
-    cases: list[tuple[Change | Data, str]] = [
+    unmeasured = {"evaluations/*/diagnostics": {}, "feasible_q": None}
+    cases: list[tuple[Change, str]] = [
         ({}, f"it is a copy of {old[0]}: remove one of the two"),
         (
             {"wall_clock/diagnose": 0.0},
@@ -439,7 +405,7 @@ def test_copies_are_found_whatever_else_the_record_says(tmp_path: Path) -> None:
         ),
         (moved(8), f"its final episodes are nearly all those of {old[2]}, more than"),
         (
-            both(moved(9), unmeasured, config("agent", "mine")),
+            moved(9) | unmeasured | config("agent", "mine"),
             f"its final episodes are nearly all those of {old[3]}, more than",
         ),
         (both(moved(7), nudged), f"its final episodes are nearly all those of {old[4]}, more than"),
@@ -473,7 +439,7 @@ def test_what_other_records_say_differently(change: Data, fact: str, tmp_path: P
 
 
 def test_two_learners_that_always_fail_are_no_copies(tmp_path: Path) -> None:
-    fail = everywhere(outcome(0, -50.0))
+    fail = outcome(0, **{"return": -50.0})
     paths = [forge(committed(seed=seed), fail, tmp_path) for seed in (25, 26)]
     assert all(verdict.is_admissible for verdict in judge(*paths))
 

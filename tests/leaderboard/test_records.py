@@ -26,7 +26,13 @@ from symsteer.leaderboard.records import (
     write_record,
 )
 from symsteer.leaderboard.records.retired import RETIRED
-from tests.leaderboard.record_factory import START, make_config, make_evaluation, make_record
+from tests.leaderboard.record_factory import (
+    START,
+    make_config,
+    make_evaluation,
+    make_record,
+    put,
+)
 
 
 def refuse_constant(name: str) -> Any:
@@ -297,14 +303,6 @@ def test_q_values_that_are_not_finite_are_divergence_and_a_missing_bias_is_not(
 # Damage
 
 
-def change(data: dict[str, Any], where: str, value: Any) -> None:
-    *parents, last = where.split("/")
-    target: Any = data
-    for key in parents:
-        target = target[int(key)] if isinstance(target, list) else target[key]
-    target[last] = value
-
-
 EDITS: list[tuple[str, Any, str]] = [
     ("schema_version", 7, "schema_version"),
     ("schema_version", True, "schema_version"),
@@ -336,8 +334,7 @@ def test_edited_records_are_refused(tmp_path: Path, where: str, value: Any, word
     path = tmp_path / "record.json"
     record = make_record([make_evaluation([1, 0, 1], q_mean=-2.0)])
     data = json.loads(dump_record(record))
-    change(data, where, value)
-    path.write_text(json.dumps(data))
+    path.write_text(json.dumps(put(data, {where: value})))
     with pytest.raises(UserError) as caught:
         read_record(path)
     message = str(caught.value)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,14 @@ from symsteer.leaderboard.site.build import generate as generate_site
 from symsteer.leaderboard.statistics import ShareDifference
 from symsteer.leaderboard.study import read_study
 from tests.leaderboard.command_line import main
-from tests.leaderboard.record_factory import make_cell, make_evaluation, make_record
+from tests.leaderboard.record_factory import (
+    GONE,
+    edited,
+    make_cell,
+    make_evaluation,
+    make_record,
+    put,
+)
 
 STEPS = (0, 25_000, 50_000)
 
@@ -50,17 +58,11 @@ def record_of(**diagnostics: float | None) -> RunRecord:
     )
 
 
-def copy_of(record: RunRecord) -> RunRecord:
-    return RunRecord.model_validate(record.model_dump(by_alias=True))
-
-
 def test_equal_runs_agree_whatever_the_clock_and_the_machine() -> None:
-    record, again = record_of(q_mean=-3.0), record_of(q_mean=-3.0)
-    again.wall_clock.total *= 2
-    again.evaluations[1].wall_clock += 5
-    again.base_policy.training_seconds = 1.0
-    again.provenance.platform = "elsewhere"
-    differences, success, area = compare_records(record, again)
+    record = record_of(q_mean=-3.0)
+    other = {"wall_clock/total": 500, "evaluations/1/wall_clock": 500}
+    other |= {"base_policy/training_seconds": 1.0, "provenance/platform": "elsewhere"}
+    differences, success, area = compare_records(record, edited(record, other))
     assert differences == []
     assert (success.recorded, success.repeated) == (0.5, 0.5)
     assert success.low == pytest.approx(-0.495, abs=1e-3)
@@ -83,72 +85,47 @@ def test_both_runs_are_samples(count: int, verdict: str, tmp_path: Path) -> None
     assert found.success.high == pytest.approx(wanted.high)
 
 
-def diverge(record: RunRecord) -> None:
-    evaluation = record.evaluations[1]
-    evaluation.diagnostics["td_error"] = None
-    evaluation.nonfinite["diagnostics/td_error"] = "nan"
-
-
-def play_more(record: RunRecord) -> None:
-    record.evaluations[1].episodes = make_evaluation([1, 0, 1, 0, 1]).episodes
-
-
-def put(name: str, value: Any, *place: Any) -> Callable[[RunRecord], None]:
-    """Give what is at a place in the record another value."""
-
-    def change(record: Any) -> None:
-        for key in place:
-            record = record[key] if isinstance(key, int) else getattr(record, key)
-        record.__setitem__(name, value) if isinstance(record, dict) else setattr(
-            record, name, value
-        )
-
-    return change
-
-
-FLIPPED = [True, True, True, False]
-DIAGNOSTICS = ("evaluations", 2, "diagnostics")
+MORE = make_evaluation([1, 0, 1, 0, 1]).episodes.model_dump(by_alias=True)
 
 
 @pytest.mark.parametrize(
-    ("change", "part", "first", "differ"),
+    ("place", "value", "part", "first", "differ"),
     [
-        (put("success_once", FLIPPED, "evaluations", 1, "episodes"), "episodes", 25_000, 1),
-        (put("q_mean", -2.5, *DIAGNOSTICS), "diagnostics", 50_000, 1),
-        (lambda record: record.evaluations[0].diagnostics.pop("q_mean"), "diagnostics", 0, 1),
-        (diverge, "diagnostics", 25_000, 1),
+        ("evaluations/1/episodes/success_once", [True] * 3 + [False], "episodes", 25_000, 1),
+        ("evaluations/2/diagnostics/q_mean", -2.5, "diagnostics", 50_000, 1),
+        ("evaluations/0/diagnostics/q_mean", GONE, "diagnostics", 0, 1),
+        ("evaluations/1/diagnostics/td_error", math.nan, "diagnostics", 25_000, 1),
         # What the record has as not measured.
-        (put("q_correlation", 0.5, *DIAGNOSTICS), "diagnostics", 50_000, 1),
-        (
-            lambda record: record.evaluations.append(make_evaluation([1, 0], 60_000)),
-            *("episodes", 60_000, None),
-        ),
-        (play_more, "episodes", 25_000, None),
-        (lambda record: record.evaluations.pop(1), "episodes", 25_000, None),
-        (put("actor", 1, "parameters"), "parameters", None, 1),
-        (put("content_hash", "f" * 64, "base_policy"), "base policy", None, 1),
-        (put("updates", 1, "budget"), "budget", None, 1),
+        ("evaluations/2/diagnostics/q_correlation", 0.5, "diagnostics", 50_000, 1),
+        ("evaluations/1/episodes", MORE, "episodes", 25_000, None),
+        ("evaluations/1", GONE, "episodes", 25_000, None),
+        ("parameters/actor", 1, "parameters", None, 1),
+        ("base_policy/content_hash", "f" * 64, "base policy", None, 1),
+        ("budget/updates", 1, "budget", None, 1),
     ],
 )
 def test_every_difference_is_found(
-    change: Callable[[RunRecord], None], part: str, first: int | None, differ: int | None
+    place: str, value: Any, part: str, first: int | None, differ: int | None
 ) -> None:
     record = record_of(q_mean=-3.0, q_correlation=None)
-    change(again := copy_of(record))
-    parts = {one.part: one for one in compare_records(record, again)[0]}
+    parts = {one.part: one for one in compare_records(record, edited(record, {place: value}))[0]}
     assert parts[part].first == first
     assert differ is None or parts[part].differ == differ
     assert parts[part].example
 
 
 def test_what_the_record_lacks_is_not_compared() -> None:
-    """Directions, and diagnostics that are newer than the record."""
-    record, again = record_of(q_mean=-3.0), record_of(q_mean=-3.0, td_error=1.0)
-    for evaluation in again.evaluations:
-        evaluation.episodes.direction = [0.1] * 4
-    again.base_policy.parameters = 10
+    """Directions, and diagnostics that are newer than the record; but later evaluations are."""
+    record, newer = record_of(q_mean=-3.0), {"base_policy/parameters": 10}
+    newer |= {
+        "evaluations/*/episodes/direction": [0.1] * 4,
+        "evaluations/*/diagnostics/td_error": 1.0,
+    }
+    again = edited(record, newer)
     assert compare_records(record, again)[0] == []
     assert compare_records(again, record)[0] != []
+    again.evaluations.append(make_evaluation([1, 0], 60_000))
+    assert [one.first for one in compare_records(record, again)[0]] == [60_000]
 
 
 # Files and marks
@@ -162,11 +139,8 @@ def two_of_five(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for record in make_cell({"base": 0.4, "standard": 0.5, "equivariant": 0.8}):
         write_record(record, folder / "records" / f"{record.run_id}.json")
         if record.settings.agent == "equivariant" and record.settings.seed < 2:
-            again = copy_of(record)
-            again.wall_clock.total += 1
-            if record.settings.seed == 1:
-                again.evaluations[1].diagnostics["q_mean"] = -1.0
-            reproduce(folder, record, again)
+            other = {"evaluations/1/diagnostics/q_mean": -1.0} if record.settings.seed else {}
+            reproduce(folder, record, edited(record, {"wall_clock/total": 251, **other}))
     return folder
 
 
@@ -276,12 +250,12 @@ def test_a_bad_reproduction_is_one_sentence(results: Path) -> None:
 OTHER_NUMBERS: list[dict[str, Any]] = [
     {"verdict": "different"},
     {"verdict": "exact", "differences": []},
-    {"success": {"repeated": 1.0, "low": -0.1, "high": 0.4}},
-    {"success": {"recorded": 0.9}},
-    {"area": {"recorded": 0.9}},
-    {"record": {"run_id": "run-none-equivariant-4"}},
-    {"repeated": {"sha256": "ab" * 32}},
-    {"repeated": {"started": "2020-01-01T00:00:00+00:00"}},
+    {"success/repeated": 1.0, "success/low": -0.1, "success/high": 0.4},
+    {"success/recorded": 0.9},
+    {"area/recorded": 0.9},
+    {"record/run_id": "run-none-equivariant-4"},
+    {"repeated/sha256": "ab" * 32},
+    {"repeated/started": "2020-01-01T00:00:00+00:00"},
 ]
 
 
@@ -290,25 +264,19 @@ def test_numbers_that_the_records_do_not_give_are_refused(results: Path) -> None
     mark = marks_of(results)["alike"]
     good = mark.read_bytes()
     for changes in OTHER_NUMBERS:
-        data = json.loads(good)
-        for key, value in changes.items():
-            data[key] = data[key] | value if isinstance(value, dict) else value
-        edited = Reproduction.model_validate_json(json.dumps(data))
-        mark.write_bytes(dump_reproduction(edited))
+        data = json.dumps(put(json.loads(good), changes))
+        mark.write_bytes(dump_reproduction(Reproduction.model_validate_json(data)))
         with pytest.raises(UserError, match=rf"{mark.name} says something else than the records"):
             load(results)
     mark.write_bytes(good)
     assert len(load(results)) == 15
     record = read_record(results / "records" / "run-none-equivariant-2.json")
-    config = record.config | {"learning_rate": 1.0}
-    data = copy_of(record).model_dump(by_alias=True, exclude={"config_hash"}) | {"config": config}
-    other = reproduce(results, record, RunRecord.model_validate(data))
+    other = reproduce(results, record, edited(record, {"config/learning_rate": 1.0}))
     with pytest.raises(UserError, match="says something else"):
         load(results)
     other.unlink()
     data = json.loads(mark.with_suffix(REPEATED).read_text())
-    data["evaluations"][-1]["final"] = False
-    data.update(status="failed", failure="stopped")
+    put(data, {"evaluations/-1/final": False, "status": "failed", "failure": "stopped"})
     mark.with_suffix(REPEATED).write_text(json.dumps(data))
     with pytest.raises(UserError, match="says something else"):
         load(results)
@@ -401,8 +369,7 @@ def test_submitted_rows_are_marked_last_and_change_nothing(submitted: Path) -> N
 def test_a_maintainers_reproduction_of_one_run_takes_the_mark_of_its_row(submitted: Path) -> None:
     own = own_files(submitted)
     record = read_record(submitted / "records" / "new-run-none-wonder-3.json")
-    again = copy_of(record)
-    again.wall_clock.total += 1
+    again = edited(record, {"wall_clock/total": 251})
     mark = reproduce(submitted, record, again)
     with pytest.raises(UserError, match=rf"{mark.name} does not count, because the list"):
         table_of(submitted, *own)
