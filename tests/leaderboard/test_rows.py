@@ -5,7 +5,6 @@ from __future__ import annotations
 import random
 import re
 from collections.abc import Sequence
-from datetime import timedelta
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from symsteer.leaderboard.runs import Pair, Run
 from symsteer.leaderboard.sections.cells import render_csv
 from symsteer.leaderboard.statistics import Sample
 from tests.leaderboard.record_factory import (
-    START,
+    edited,
     make_cell,
     make_curve,
     make_evaluation,
@@ -128,8 +127,7 @@ def test_the_difference_to_base_is_paired_by_policy_seed_and_episode() -> None:
 
 
 def test_runs_on_another_base_policy_or_other_episodes_are_not_compared() -> None:
-    other = make_record(agent="base")
-    other.base_policy.content_hash = "f" * 64
+    other = edited(make_record(agent="base"), {"base_policy/content_hash": "f" * 64})
     assert reference_success(of(0.5), [run(other)]) == {}
     episodes = make_record([make_evaluation([1, 0], first_seed=1)], agent="base")
     for base in (other, episodes):
@@ -317,15 +315,13 @@ def test_learners_on_different_base_policies_are_not_compared() -> None:
 
 
 def test_a_second_attempt_replaces_the_first_in_plain_sight() -> None:
-    def later(record: RunRecord, hours: int) -> RunRecord:
-        record.started = START + timedelta(hours=hours)
-        record.ended = START + timedelta(hours=hours + 1)
-        return record
+    def later(record: RunRecord, hour: int, **other: str) -> RunRecord:
+        times = {"started": f"2026-02-01T{hour}:00:00Z", "ended": f"2026-02-01T{hour}:30:00Z"}
+        return edited(record, times | other)
 
-    new = later(make_record([make_evaluation([1] * 10)]), 1)
-    new.run_id = "again"
+    new = later(make_record([make_evaluation([1] * 10)]), 13, run_id="again")
     failed = [run(make_record(status="failed"), "a.json")]
-    failed.append(run(later(make_record(status="failed"), 5), "f.json"))
+    failed.append(run(later(make_record(status="failed"), 15), "f.json"))
     copies = [*failed, of(0.5), run(new, "n.json"), run(new, "copy.json")]
     for seed in range(3):
         random.Random(seed).shuffle(copies)
@@ -337,8 +333,7 @@ def test_a_second_attempt_replaces_the_first_in_plain_sight() -> None:
 
 def test_runs_on_several_base_policies_are_runs_of_one_row() -> None:
     """Of other seeds, or trained again on another machine: none replaces another."""
-    elsewhere = make_record()
-    elsewhere.base_policy.content_hash = "ab" * 32
+    elsewhere = edited(make_record(), {"base_policy/content_hash": "ab" * 32})
     runs = [of(0.5, policy_seed=policy) for policy in (0, 1, 1)]
     summary = summarize([*runs, of(0.5, seed=2, policy_seed=0), run(elsewhere, "elsewhere.json")])
     configs = [r.record.config for r in row(summary, "standard").runs]

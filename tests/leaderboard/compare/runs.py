@@ -11,7 +11,7 @@ from symsteer.leaderboard.compare.changes import Changes
 from symsteer.leaderboard.compare.pairing import pair_runs
 from symsteer.leaderboard.compare.sides import read_sides
 from symsteer.leaderboard.records import RunRecord, write_record
-from tests.leaderboard.record_factory import make_evaluation, make_record
+from tests.leaderboard.record_factory import edited, make_evaluation, make_record
 
 
 def save(folder: Path, records: Iterable[RunRecord]) -> Path:
@@ -45,12 +45,7 @@ def runs_of(
 
 def at_commit(records: Iterable[RunRecord], commit: str) -> list[RunRecord]:
     """The records as if code of another commit had made them."""
-    found = []
-    for record in records:
-        record = record.model_copy(deep=True)
-        record.provenance.commit = commit
-        found.append(record)
-    return found
+    return [edited(record, {"provenance/commit": commit}) for record in records]
 
 
 def changed(a: Path | str, b: Path | str, place: Path | str = "runs", margin: float = 0) -> Changes:

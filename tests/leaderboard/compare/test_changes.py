@@ -10,7 +10,7 @@ import pytest
 from symsteer.leaderboard.runs import episode_success
 from symsteer.leaderboard.statistics import Sample, crossed_bootstrap, paired_differences
 from tests.leaderboard.compare.runs import changed, runs_of, save
-from tests.leaderboard.record_factory import make_cell
+from tests.leaderboard.record_factory import edited, make_cell
 
 EPISODES = 40
 
@@ -92,8 +92,8 @@ def test_the_mean_over_cells_is_over_those_with_enough_pairs(tmp_path: Path):
 
 def test_the_bias_of_q_is_compared_by_its_size(tmp_path: Path):
     a, b = runs_of(*curves(0.5)), runs_of(*curves(0.5, salt=1))
-    for index, record in enumerate(b):
-        record.evaluations[-1].diagnostics = {"q_bias": 0.5} if index else {}
+    last = "evaluations/-1/diagnostics"
+    b = [edited(b[0], {last: {}}), *(edited(record, {f"{last}/q_bias": 0.5}) for record in b[1:])]
     found = changed(*sides(tmp_path, a, b)).overall["q_bias"]
     # A's are -1 to -5; the first run of B has none.
     assert found.pairs == 4

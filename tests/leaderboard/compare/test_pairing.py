@@ -12,7 +12,7 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.compare.sides import read_sides
 from symsteer.leaderboard.records.retired import RETIRED
 from tests.leaderboard.compare.runs import at_commit, changed, runs_of, save
-from tests.leaderboard.record_factory import make_evaluation, make_record
+from tests.leaderboard.record_factory import edited, make_evaluation, make_record
 
 CURVES = [[[1, 0, 1]], [[0, 0, 1]], [[1, 1, 1]]]
 NESTED = {"lr": 0.1, "depth": 2}
@@ -34,19 +34,11 @@ def agents(side):
     return sorted(run.agent for run in side.runs)
 
 
-def test_agents_are_found_at_any_depth(place):
-    a, b = read_sides("standard", "equivariant", Path("runs"))
-    assert (a.kind, b.kind) == ("agent", "agent")
-    assert agents(a) == ["standard"] * 2
-    assert agents(b) == ["equivariant"] * 2
-
-
 def test_a_commit_is_named_by_its_beginning(place):
     """Of an installed package it is the hash of its code."""
-    record = make_record(agent="zero")
-    record.provenance.commit, record.provenance.dirty = None, None
-    record.provenance.sha256 = "beef" * 16
-    save(place / "runs/installed", [record])
+    code = {"commit": None, "dirty": None, "sha256": "beef" * 16}
+    installed = {f"provenance/{name}": value for name, value in code.items()}
+    save(place / "runs/installed", [edited(make_record(agent="zero"), installed)])
     for prefix, agent in (("aaaa2", "equivariant"), ("AAAA2222", "equivariant"), ("beef", "zero")):
         _, b = read_sides("standard", prefix, Path("runs"))
         assert (b.kind, {*agents(b)}) == ("commit", {agent})
@@ -70,6 +62,9 @@ def test_a_name_that_means_nothing(place, name, words):
 
 
 def test_a_path_comes_before_an_agent_and_a_run_belongs_to_one_side(place):
+    a, b = read_sides("standard", "equivariant", Path("runs"))
+    assert (a.kind, agents(a)) == ("agent", ["standard"] * 2)
+    assert (b.kind, agents(b)) == ("agent", ["equivariant"] * 2)
     shutil.copytree(place / "runs/more", place / "standard")
     a, b = read_sides("standard", "runs/some", Path("runs"))
     assert (a.kind, agents(a)) == ("folder", ["equivariant"] * 2)
@@ -82,9 +77,8 @@ def test_a_path_comes_before_an_agent_and_a_run_belongs_to_one_side(place):
 
 def test_unfinished_and_older_runs_are_left_over(place):
     folder = place / "again"
-    newer = make_record([make_evaluation([1, 1])], seed=0)
-    newer.started = newer.started.replace(year=2027)
-    newer.ended = newer.ended.replace(year=2027)
+    times = {"started": "2027-01-31T12:00:00+00:00", "ended": "2027-01-31T13:00:00+00:00"}
+    newer = edited(make_record([make_evaluation([1, 1])]), times)
     save(folder, [make_record(seed=0), newer, make_record(status="interrupted", seed=1)])
     a, _ = read_sides(str(folder), "standard", Path("runs"))
     assert [run.record for run in a.runs] == [newer]
@@ -239,18 +233,15 @@ def test_a_run_has_one_partner(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("field", "episodes", "diagnostics"),
-    [("wall_clock", True, True), ("return_", False, True), ("diagnostics", True, False)],
+    ("place", "value", "episodes", "diagnostics"),
+    [
+        ("wall_clock", 1.0, True, True),
+        ("episodes/return/1", -9.0, False, True),
+        ("diagnostics/q_bias", 7.0, True, False),
+    ],
 )
-def test_what_agrees_bit_for_bit(tmp_path: Path, field, episodes, diagnostics):
-    curve = [[[1, 1], [0, 1], [1, 1]]]
-    a, b = runs_of(*curve), runs_of(*curve)
-    middle = b[0].evaluations[1]
-    if field == "diagnostics":
-        middle.diagnostics = {"q_bias": 7.0}
-    elif field == "wall_clock":
-        middle.wall_clock += 1
-    else:
-        middle.episodes.return_[1] += 1
-    (pair,) = changed(save(tmp_path / "a", a), save(tmp_path / "b", b)).pairs
+def test_what_agrees_bit_for_bit(tmp_path: Path, place, value, episodes, diagnostics):
+    (record,) = runs_of([[1, 1], [0, 1], [1, 1]])
+    other = edited(record, {f"evaluations/1/{place}": value})
+    (pair,) = changed(save(tmp_path / "a", [record]), save(tmp_path / "b", [other])).pairs
     assert (pair.same_episodes, pair.same_diagnostics) == (episodes, diagnostics)
