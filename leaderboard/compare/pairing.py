@@ -49,8 +49,8 @@ def pair_runs(a: Side, b: Side, margin: float = 0.0) -> Changes:
 
     facts: dict[Path, Facts] = {}
     for run in (*a.runs, *b.runs):
-        keys = {*shared.get("" if agents_differ else run.agent, ()), "agent"}
-        facts[run.path] = frozenset(item for item in counted(run).items() if item[0] in keys)
+        common = {*shared.get("" if agents_differ else run.agent, ()), "agent"}
+        facts[run.path] = frozenset(item for item in counted(run).items() if item[0] in common)
     partners: dict[Facts, list[Run]] = defaultdict(list)
     for run in sorted(b.runs, key=lambda run: (run.record.started, run.record.run_id)):
         partners[facts[run.path]].append(run)

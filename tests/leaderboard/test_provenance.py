@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +10,9 @@ import pytest
 
 from symsteer.leaderboard.records import Provenance, provenance
 from symsteer.registry import Extension
+from tests.leaderboard.command_line import git
 
 REPOSITORY = Path(__file__).parents[2]
-
-
-def git(folder: Path, *arguments: str) -> None:
-    identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
-    subprocess.run(["git", *identity, *arguments], cwd=folder, check=True)
 
 
 def test_code_that_git_does_not_track_counts_as_a_local_change(tmp_path: Path) -> None:

@@ -27,7 +27,9 @@ from symsteer.leaderboard.records import (
 )
 from symsteer.leaderboard.records.retired import RETIRED
 from tests.leaderboard.record_factory import (
+    GONE,
     START,
+    edited,
     make_config,
     make_evaluation,
     make_record,
@@ -50,29 +52,27 @@ def test_round_trip_keeps_everything(tmp_path: Path) -> None:
     assert sorted(p.name for p in path.parent.iterdir()) == ["record.json"]
 
 
+ADDED = {
+    6: ("base_policy/equivariance_error", "base_policy/jump"),
+    5: ("wall_clock/diagnose",),
+    4: ("role", *(f"provenance/{name}" for name in ("version", "sha256", "extensions"))),
+    2: ("continued", "wall_clock/resumed"),
+}
+"""What the versions of a record added."""
+
+
 def older(tmp_path: Path, version: int) -> tuple[RunRecord, Path, dict[str, Any]]:
     """A record and its file as a program of an older schema version would have written it."""
     record = make_record([make_evaluation([1, 0, 1, 1], q_mean=-3.25)])
-    data = json.loads(dump_record(record))
-    data["schema_version"] = version
-    del data["base_policy"]["equivariance_error"], data["base_policy"]["jump"]
-    record.base_policy.equivariance_error = record.base_policy.jump = None
-    if version < 5:
-        del data["wall_clock"]["diagnose"]
-        record.wall_clock.diagnose = None
-    if version < 4:
-        del data["role"]
-        for key in ("version", "sha256", "extensions"):
-            del data["provenance"][key]
-        record.provenance.version = None
+    added = [place for newer, places in ADDED.items() for place in places if version < newer]
+    changes = dict.fromkeys(added, GONE) | {"schema_version": version}
     if version < 3:
-        data["training"] = None
-        data["feasible_q"]["entropy_allowance"] = 0.0
-    if version == 1:
-        del data["continued"], data["wall_clock"]["resumed"]
+        changes |= {"training": None, "feasible_q/entropy_allowance": 0.0}
+    data = put(json.loads(dump_record(record)), changes)
     path = tmp_path / "record.json"
     path.write_text(json.dumps(data))
-    return record, path, data
+    measured = ("equivariance_error", "jump", "diagnose", "provenance/version")
+    return edited(record, {p: None for p in added if p.endswith(measured)}), path, data
 
 
 @pytest.mark.parametrize("version", range(1, 6))

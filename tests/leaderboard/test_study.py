@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.study import FOLDER, read_study
+from tests.leaderboard.command_line import git
 
 CLAIM = """
 [[claim]]
@@ -66,23 +66,16 @@ def test_mistakes_in_a_study(text: str, words: str, tmp_path: Path) -> None:
 
 
 def test_a_commit_that_has_not_declared_the_claims_is_refused(tmp_path: Path) -> None:
-    def git(*arguments: str) -> str:
-        settings = ["-c", "user.name=x", "-c", "user.email=x@x", "-c", "init.defaultBranch=main"]
-        command = ["git", *settings, *arguments]
-        return subprocess.run(
-            command, cwd=tmp_path, check=True, capture_output=True, text=True
-        ).stdout
-
     write(tmp_path, CLAIM)
     study = write(tmp_path, 'claims = "mine.toml"\ndeclared = "0123456"', "study.toml")
     assert read_study(study).declared == "0123456"  # nothing to compare with
-    git("init")
-    git("add", "study.toml")
-    git("commit", "-m", "no claims yet")
-    before = git("rev-parse", "HEAD").strip()
-    git("add", "mine.toml")
-    git("commit", "-m", "claims")
-    commit = git("rev-parse", "--short", "HEAD").strip()
+    git(tmp_path, "init")
+    git(tmp_path, "add", "study.toml")
+    git(tmp_path, "commit", "-m", "no claims yet")
+    before = git(tmp_path, "rev-parse", "HEAD")
+    git(tmp_path, "add", "mine.toml")
+    git(tmp_path, "commit", "-m", "claims")
+    commit = git(tmp_path, "rev-parse", "--short", "HEAD")
     for wrong in ("0123456", before):
         write(tmp_path, f'claims = "mine.toml"\ndeclared = "{wrong}"', "study.toml")
         with pytest.raises(UserError, match=f"mine.toml is not as the commit {wrong} has it"):
