@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 Data = dict[str, Any]
@@ -35,45 +34,45 @@ def migrated(data: Data) -> Data:
     `role`, and version, hash and extensions to the provenance. Version 5 added degrees of
     divergence, biases over all decisions, `wall_clock.diagnose`. Version 6 added
     `equivariance_error` and `jump` of the base policy.
+
+    Raises:
+        ValueError: a part of the record is missing or has another form.
     """
-    version, data = data["schema_version"], dict(data)
+    try:
+        return _migrated(dict(data))
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"a record of version {data['schema_version']} has another form"
+        ) from error
+
+
+def _migrated(data: Data) -> Data:
+    version, bounds = data["schema_version"], data.get("feasible_q")
     if version < 3:
         data.pop("training", None)
-        if isinstance(bounds := data.get("feasible_q"), dict):
+        if bounds:
             data["feasible_q"] = {k: v for k, v in bounds.items() if k != "entropy_allowance"}
     if version < 4:
-        config = data.get("config")
-        agent = config.get("agent") if isinstance(config, dict) else None
-        data["role"] = "reference" if agent in REFERENCES_BEFORE_4 else "learner"
-        data["provenance"] = _with(data.get("provenance"), CODE)
-        if isinstance(parts := data.get("continued"), list):
-            data["continued"] = [_with(part, CODE) for part in parts]
+        learns = data["config"].get("agent") not in REFERENCES_BEFORE_4
+        data["role"] = "learner" if learns else "reference"
+        data["provenance"] = {**data["provenance"], **CODE}
+        data["continued"] = [{**part, **CODE} for part in data.get("continued", [])]
     if version < 5:
-        data["wall_clock"] = _with(data.get("wall_clock"), {"diagnose": None})
-        if isinstance(evaluations := data.get("evaluations"), list):
-            bounds = data.get("feasible_q")
-            data["evaluations"] = [_evaluation(old, bounds) for old in evaluations]
+        data["wall_clock"] = {**data["wall_clock"], "diagnose": None}
+        data["evaluations"] = [_evaluation(old, bounds) for old in data["evaluations"]]
     return data
 
 
-def _with(block: Any, values: Mapping[str, Any]) -> Any:
-    return {**block, **values} if isinstance(block, dict) else block
-
-
-def _evaluation(evaluation: Any, bounds: Any) -> Any:
+def _evaluation(evaluation: Data, bounds: Any) -> Data:
     """Older biases get other names. `q_magnitude` and `q_overshoot` come from the extremes.
 
     These are of the smallest critic, so the overshoot is a lower bound.
     """
-    if not isinstance(evaluation, dict) or not isinstance(evaluation.get("diagnostics"), dict):
-        return evaluation
-    old = evaluation["diagnostics"]
+    old, flags = evaluation.get("diagnostics", {}), evaluation.get("nonfinite", {})
     new = {CONDITIONAL_BEFORE_5.get(name, name): value for name, value in old.items()}
-    evaluation = {**evaluation, "diagnostics": {**new, **_beyond(old, bounds)}}
-    if isinstance(flags := evaluation.get("nonfinite"), dict):
-        renamed = {f"diagnostics/{a}": f"diagnostics/{b}" for a, b in CONDITIONAL_BEFORE_5.items()}
-        evaluation["nonfinite"] = {renamed.get(path, path): kind for path, kind in flags.items()}
-    return evaluation
+    renamed = {f"diagnostics/{a}": f"diagnostics/{b}" for a, b in CONDITIONAL_BEFORE_5.items()}
+    flags = {renamed.get(path, path): kind for path, kind in flags.items()}
+    return {**evaluation, "diagnostics": {**new, **_beyond(old, bounds)}, "nonfinite": flags}
 
 
 def _beyond(old: Data, bounds: Any) -> dict[str, float]:
