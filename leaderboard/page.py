@@ -6,8 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from typing import Any
 
+from symsteer.leaderboard.plots import Figure
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary
 from symsteer.leaderboard.sections import (
+    Findings,
     Section,
     View,
     cells,
@@ -70,6 +72,15 @@ def by_title(view: View, sections: Iterable[Section[Any]]) -> Iterator[tuple[str
     for title, members in groupby(sections, key=lambda section: section.title):
         if blocks := [block for section in members for block in view.blocks(section)]:
             yield title, blocks
+
+
+def figures_of(findings: Findings, sections: Iterable[Section[Any]] = SECTIONS) -> list[Figure]:
+    """The figures of sections, in their order; those without data are left out."""
+    return [
+        figure
+        for section in sections
+        for figure in section.figures(findings.of(section), findings.summary)
+    ]
 
 
 def other_files(view: View) -> Mapping[str, str]:

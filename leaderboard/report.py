@@ -14,9 +14,9 @@ from pathlib import Path
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.defects import Audit, read_audit
-from symsteer.leaderboard.figures import render_figures
-from symsteer.leaderboard.page import other_files, render_page
+from symsteer.leaderboard.page import figures_of, other_files, render_page
 from symsteer.leaderboard.paths import reproductions_for
+from symsteer.leaderboard.plots import Figure
 from symsteer.leaderboard.row_numbers import summarize
 from symsteer.leaderboard.runs import Run, load_runs
 from symsteer.leaderboard.sections import Findings, View
@@ -128,17 +128,16 @@ def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[s
     nothing else.
     """
     findings = Findings(summarize(runs), audit, study)
-    files: dict[str, bytes] = {}
-    figures: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
-    for figure in render_figures(findings):
-        stem = "-".join([figure.kind, *([slug(*figure.place)] if figure.place else [])])
-        name = f"figures/{stem}.svg"
-        files[name] = to_image(figure)
-        figures.setdefault(figure.place, {})[figure.kind] = (figure.text, name)
+    figures = [(figure, f"figures/{_stem(figure)}.svg") for figure in figures_of(findings)]
     links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
     view = View(findings, links, figures)
     texts = {"LEADERBOARD.md": render_page(view), **other_files(view)}
+    files = {name: to_image(figure) for figure, name in figures}
     return files | {name: text.encode() for name, text in texts.items()}
+
+
+def _stem(figure: Figure) -> str:
+    return "-".join([figure.kind, *([slug(*figure.place)] if figure.place else [])])
 
 
 def slug(*texts: str, digits: int = 6) -> str:

@@ -1,19 +1,21 @@
 """The sections of the leaderboard: each a file that computes, renders and explains one statistic.
 
 To add one, write a file here that ends with a `Section` (`spread_of_results` is a short one),
-import it in `page` and name it in `SECTIONS` there. The page, the site and the CSV files take it
-from that list. What is known of a run is in `runs.Run`. Tests are in `tests/leaderboard/sections/`:
-`make_cell`, `summary_of` and `view_of` of `record_factory` make records with known success.
+import it in `page` and name it in `SECTIONS` there. The page, the site, the figures and the CSV
+files take it from that list. What is known of a run is in `runs.Run`. Tests are in
+`tests/leaderboard/sections/`: `make_cell`, `summary_of` and `view_of` of `record_factory` make
+records with known success.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
 from symsteer.leaderboard.defects import Audit
+from symsteer.leaderboard.plots import Figure
 from symsteer.leaderboard.rows import Summary
 from symsteer.leaderboard.study import Study
 from symsteer.leaderboard.text import image
@@ -35,6 +37,7 @@ class Section(Generic[Result]):
             by a reader of the page, and are the site's findings; "page" is the page alone, where
             the site has other pages; "site" is the site alone, where the page has another file.
         files: further files of the leaderboard by name, such as a CSV; an empty text is no file.
+        figures: of the result; `render` places them by `View.drawn`.
     """
 
     title: str
@@ -42,6 +45,7 @@ class Section(Generic[Result]):
     render: Callable[[Result, View], list[str]]
     where: Literal["first", "folded", "page", "site"] = "folded"
     files: Mapping[str, Callable[[Result, View], str]] = field(default_factory=dict, hash=False)
+    figures: Callable[[Result, Summary], Sequence[Figure]] = lambda result, summary: ()
 
 
 @dataclass(frozen=True)
@@ -66,9 +70,6 @@ class Findings:
 Links = Mapping[Path, str | None]
 """Address of each record relative to the page, None to show none."""
 
-Figures = Mapping[tuple[str, ...], Mapping[str, tuple[str, str]]]
-"""By place, (task, embodiment), (embodiment,) or (), then by kind: description and address."""
-
 
 @dataclass(frozen=True)
 class View:
@@ -76,7 +77,8 @@ class View:
 
     findings: Findings
     links: Links = field(default_factory=dict)
-    figures: Figures = field(default_factory=dict)
+    figures: Sequence[tuple[Figure, str]] = ()
+    """With their addresses."""
 
     @property
     def summary(self) -> Summary:
@@ -84,8 +86,11 @@ class View:
 
     def drawn(self, *place: str, kind: str = "") -> list[str]:
         """The figures of a place, or the one of a kind, as blocks of markdown."""
-        figures = self.figures.get(place, {})
-        return [image(*figure) for name, figure in figures.items() if kind in ("", name)]
+        return [
+            image(figure.text, address)
+            for figure, address in self.figures
+            if figure.place == place and kind in ("", figure.kind)
+        ]
 
     def blocks(self, section: Section[Any]) -> list[str]:
         """A section as blocks of markdown."""

@@ -6,6 +6,7 @@ import re
 
 from symsteer.files import csv_text
 from symsteer.leaderboard.cell_names import heading
+from symsteer.leaderboard.curve_figures import figures_of_cells
 from symsteer.leaderboard.known_agents import BASE
 from symsteer.leaderboard.records import REPRODUCED, VERDICTS
 from symsteer.leaderboard.records.reproductions import Verdict
@@ -345,4 +346,5 @@ SECTION = Section(
     render,
     where="page",
     files={"leaderboard.csv": lambda summary, view: render_csv(summary)},
+    figures=lambda summary, _: figures_of_cells(summary),
 )

@@ -6,20 +6,26 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from symsteer.leaderboard.advantage_by_defect import Fit, Point, fit, points_of
 from symsteer.leaderboard.cell_names import cell_name
 from symsteer.leaderboard.defects import Audit, defect_of, parts_of
+from symsteer.leaderboard.figures import MARKERS, MEASURE_NAMES
 from symsteer.leaderboard.keys import Key
 from symsteer.leaderboard.known_agents import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.pairs import MEASURES, SHORT_NAMES
+from symsteer.leaderboard.plots import GREY, Axis, Dot, Figure, Look, Plot, Rule, Trace, cut
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
 from symsteer.leaderboard.sections import Section, View, unknown_task
 from symsteer.leaderboard.text import (
+    MARKS,
     NOTHING,
     SPACE,
     code,
     difference,
     folded,
+    interval,
     mark_of,
     number,
     stacked,
@@ -231,8 +237,78 @@ def audit_commands(keys: Sequence[Key]) -> list[str]:
     ]
 
 
+PARTS = {"tool": "#0072B2", "object": "#D55E00", "cost": "#CC79A7", "observation": "#009E73"}
+"""Colours of the map: which part of a decision the defect is of."""
+FIT = "#444444"
+WITHIN = "within base policies, 95 %"
+
+
+def figure(advantages: DefectMap, embodiment: str) -> Figure:
+    """Advantage over the standard agent against the audited defect: agents by measures.
+
+    The colour says which part of a decision the defect is of, the marker the task; bars are 95 %
+    intervals, hollow points have few runs. A line per task has the slope within base policies and
+    goes through the task's mean; the fan around it has the slopes of the 95 % interval.
+    """
+    agents = advantages.agents(embodiment)
+    panels = [advantages.panel(embodiment, a, m) for a in agents for m in MEASURES]
+    points = [point for panel in panels for point in panel.points]
+    tasks = sorted({point.table.key.task for point in points})
+    markers = {task: MARKERS[i % len(MARKERS)] for i, task in enumerate(tasks)}
+    right = 1.04 * max(point.defect.interval.high for point in points)
+    x = Axis(f"audited defect of a decision, {cut(embodiment, 26)}", (-0.02 * right, right))
+    y, zero = Axis(f"advantage over {STANDARD}"), [Rule(0)]
+    plots = []
+    for panel in panels:
+        traces = _lines(panel.fit) if panel.fit else []
+        dots = [_dot(point, markers) for point in panel.points]
+        title = f"{panel.agent}, {MEASURE_NAMES[panel.measure]}"
+        plots.append(Plot(x, y, traces, dots, zero, title, empty="no paired runs"))
+    legend = {cut(task): Look(GREY, marker, "none") for task, marker in markers.items()}
+    parts = {point.defect.part for point in points}
+    legend |= {part: Look(c, edge=c) for part, c in PARTS.items() if part in parts}
+    if any(panel.fit for panel in panels):
+        legend[WITHIN] = Look(FIT)
+    return Figure(
+        plots,
+        legend,
+        height=1.4 + 2.75 * len(agents),
+        columns=len(MEASURES),
+        same_x=True,
+        same_y=True,
+        legend_columns=4,
+        kind="map",
+        place=(embodiment,),
+        text="Advantage of symmetry against the audited defect",
+    )
+
+
+def _dot(point: Point, markers: Mapping[str, str]) -> Dot:
+    key, part, gain = point.table.key, point.defect.part, point.advantage
+    look = Look(PARTS[part], markers[key.task], width=0.8, alpha=0.85, hollow=not point.counts)
+    text = (
+        f"{', '.join(key.broken_by) or 'unbroken'}, {key.base} {key.group}; {part}; advantage "
+        f"{interval(gain, sign=True)}{MARKS[gain.sign]}; {len(point.pairs)} pairs of runs"
+    )
+    return Dot(cut(key.task), point.defect.interval, gain, look, text)
+
+
+def _lines(fit: Fit) -> list[Trace]:
+    slope, traces = fit.slope.interval(), []
+    for line in fit.lines:
+        x, y = line.centre
+        grid = np.array([line.span[0], x, line.span[1]])
+        middle, *fan = (y + s * (grid - x) for s in (slope.value, slope.low, slope.high))
+        low, high = np.minimum(*fan), np.maximum(*fan)
+        traces.append(Trace(WITHIN, grid, middle, Look(FIT, width=1.4), low, high, band=0.1))
+    return traces
+
+
 SECTION = Section(
     "The advantage of symmetry against the defect",
     lambda findings: defect_map(findings.summary, findings.audit),
     render,
+    figures=lambda advantages, summary: [
+        figure(advantages, embodiment) for embodiment in advantages.embodiments
+    ],
 )

@@ -6,12 +6,15 @@ a bootstrap that is stratified by table.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from symsteer.leaderboard.figures import MANY, SHARE, look_of
 from symsteer.leaderboard.known_agents import BASE
 from symsteer.leaderboard.pairs import reference_success
+from symsteer.leaderboard.plots import Axis, Figure, Plot, Rule, Trace, cut
 from symsteer.leaderboard.records import Role
 from symsteer.leaderboard.rows import AgentRow, Summary, Table
 from symsteer.leaderboard.sections import Section, View
@@ -95,4 +98,60 @@ def render(by_group: dict[str, list[Profile]], view: View) -> list[str]:
     return [*view.drawn(kind="profiles"), EXPLAINED]
 
 
-SECTION = Section(TITLE, lambda findings: profiles(findings.summary), render)
+def figure(by_group: dict[str, list[Profile]], summary: Summary) -> Figure:
+    """Share of runs that close at least a share of the gap to certain success, with 95 % bands."""
+    cells = cells_of(summary)
+    title, legend, plots = "share of the gap from the base to certain success", {}, []
+    for group, members in by_group.items():
+        traces = []
+        for profile in members:
+            name, is_reference = cut(profile.agent), profile.role == "reference"
+            legend[name] = replace(look_of(profile.agent, width=1.7), marker="")
+            some = profile.cells < cells[group]
+            remark = f"{cells_text(profile.cells)} only" if some else ""
+            band = () if is_reference else (profile.low, profile.high, 0.13)
+            trace = Trace(name, THRESHOLDS, profile.share, legend[name], *band)
+            traces.append(replace(trace, remark=remark))
+        if traces:
+            x, y = Axis(title, _from_start(members)), Axis("share of runs at or above", SHARE)
+            plot = Plot(
+                x, y, traces, [], [Rule(0, is_vertical=True)], group_title(group, cells[group])
+            )
+            plots.append(replace(plot, is_crowded=sum(bool(t.band) for t in traces) >= MANY))
+    return Figure(
+        plots,
+        legend,
+        height=3.3,
+        columns=len(plots),
+        same_y=True,
+        kind="profiles",
+        text="Performance profiles",
+    )
+
+
+def _from_start(profiles: Sequence[Profile]) -> tuple[float, float]:
+    """From a little left of 0, or of the largest share that all runs reach."""
+    all_in = np.min([profile.share for profile in profiles], axis=0) == 1
+    start = min(THRESHOLDS[all_in].max(initial=THRESHOLDS[0]), 0.0)
+    return float(start - 0.03), float(THRESHOLDS[-1])
+
+
+def cells_of(summary: Summary) -> dict[str, int]:
+    """How many cells each group of tables has."""
+    return {group: len(tables) for group, tables in groups(summary).items()}
+
+
+def cells_text(number: int) -> str:
+    return f"{number} cell{'s' if number > 1 else ''}"
+
+
+def group_title(group: str, cells: int) -> str:
+    return f"{group} symmetry, {cells_text(cells)}"
+
+
+SECTION = Section(
+    TITLE,
+    lambda findings: profiles(findings.summary),
+    render,
+    figures=lambda by_group, summary: [figure(by_group, summary)] if any(by_group.values()) else [],
+)

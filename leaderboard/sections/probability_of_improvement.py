@@ -6,13 +6,21 @@ As in Agarwal et al. 2021 (arXiv 2108.13264), on the same base policy of the sam
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
+from symsteer.leaderboard.figures import SHARE, by_rows, look_of
 from symsteer.leaderboard.known_agents import STANDARD, WITH_SYMMETRY
+from symsteer.leaderboard.plots import Axis, Dot, Figure, Look, cut
 from symsteer.leaderboard.rows import Summary, Table
 from symsteer.leaderboard.sections import Section, View
-from symsteer.leaderboard.sections.performance_profiles import TITLE, groups
+from symsteer.leaderboard.sections.performance_profiles import (
+    TITLE,
+    cells_of,
+    cells_text,
+    group_title,
+    groups,
+)
 from symsteer.leaderboard.statistics import Interval, probability_of_improvement
 from symsteer.leaderboard.text import code, interval, table_text
 
@@ -94,4 +102,31 @@ def render(by_group: dict[str, list[Improvement]], view: View) -> list[str]:
     return [*view.drawn(kind="improvement"), EXPLAINED, table_text(list(rows.values()))]
 
 
-SECTION = Section(TITLE, lambda findings: improvements(findings.summary), render)
+def figure(by_group: dict[str, list[Improvement]], summary: Summary) -> Figure:
+    """P(X > Y) of every pair of learning agents with its 95 % interval; 0.5 is no difference."""
+    cells = cells_of(summary)
+    every = [pair for pairs in by_group.values() for pair in pairs]
+    names = list(dict.fromkeys((pair.first, pair.second) for pair in every))
+    columns: dict[str, list[Dot]] = {}
+    for group, pairs in by_group.items():
+        for pair in pairs:
+            remark = f"{cells_text(pair.cells)} only" if pair.cells < cells[group] else ""
+            look = Look(look_of(pair.first).color, "o", size=5)
+            place = names.index((pair.first, pair.second))
+            dot = Dot("", pair.probability, place, look, remark=remark, thick=True)
+            columns.setdefault(group_title(group, cells[group]), []).append(dot)
+    labels = [f"{cut(first, 24)} > {cut(second, 24)}" for first, second in names]
+    return replace(
+        by_rows(labels, columns, Axis("P(X > Y)", SHARE), undecided=0.5),
+        height=1.1 + 0.3 * len(names),
+        kind="improvement",
+        text="Probability of improvement",
+    )
+
+
+SECTION = Section(
+    TITLE,
+    lambda findings: improvements(findings.summary),
+    render,
+    figures=lambda by_group, summary: [figure(by_group, summary)] if any(by_group.values()) else [],
+)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 from symsteer.leaderboard.defects import Audit, defect_of, dial_of, parts_of
+from symsteer.leaderboard.figures import MEASURE_NAMES, by_rows, look_of
 from symsteer.leaderboard.keys import SYMMETRIC_EMBODIMENT, Key
 from symsteer.leaderboard.known_agents import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.pairs import MEASURES, advantage
+from symsteer.leaderboard.plots import Axis, Dot, Figure, cut
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
 from symsteer.leaderboard.sections import Section, View
 from symsteer.leaderboard.statistics import Interval, stratified_bootstrap
@@ -144,9 +146,39 @@ def render(measured: list[Gain], view: View) -> list[str]:
     return [EXPLAINED, *view.drawn(kind="answer"), *numbers]
 
 
+def figure(measured: Sequence[Gain]) -> Figure:
+    """Advantage over the standard agent by kind of break, with 95 % intervals; hollow: few runs.
+
+    In brackets stand the smallest and the largest audited defect of a kind's cells.
+    """
+    agents = list(dict.fromkeys(gain.agent for gain in measured))
+    defects = {gain.kind: gain.defects for gain in measured}
+    names = list(defects)
+    columns: dict[str, list[Dot]] = {name: [] for name in MEASURE_NAMES.values()}
+    for gain in measured:
+        shift = agents.index(gain.agent) - (len(agents) - 1) / 2
+        look = look_of(gain.agent, width=1.2, size=5, hollow=not gain.enough)
+        text = f"{gain.cells} cells, {gain.pairs} pairs of runs"
+        dot = Dot(gain.agent, gain.effect, names.index(gain.kind) + 0.24 * shift, look, text)
+        columns[MEASURE_NAMES[gain.measure]].append(dot)
+    columns = {f"advantage over {STANDARD}: {name}": dots for name, dots in columns.items()}
+    # A kind's marks of code are for markdown.
+    plain = [cut(name.replace("`", ""), 44) for name in names]
+    brackets = [f" ({ends(between)})" if between else "" for between in defects.values()]
+    labels = [name + bracket for name, bracket in zip(plain, brackets, strict=True)]
+    return replace(
+        by_rows(labels, columns, Axis(), 0, grid=False),
+        legend={agent: look_of(agent) for agent in agents},
+        height=0.9 + 0.28 * len(names),
+        kind="answer",
+        text="Advantage of symmetry over the standard agent, by kind of break",
+    )
+
+
 SECTION = Section(
     "What symmetry gains",
     lambda findings: gains(findings.summary, findings.audit),
     render,
     where="first",
+    figures=lambda measured, summary: [figure(measured)] if measured else [],
 )

@@ -8,13 +8,20 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from symsteer.leaderboard import figures
+from symsteer.leaderboard.curve_figures import (
+    audited_defects,
+    equivariance_errors,
+    learning_curves,
+    q_values,
+    success_by_direction,
+)
 from symsteer.leaderboard.defects import defect_of
-from symsteer.leaderboard.page import SECTIONS, by_title, notices, seed_notice
-from symsteer.leaderboard.plots import Figure
+from symsteer.leaderboard.figures import SHARE, by_rows, look_of
+from symsteer.leaderboard.page import SECTIONS, by_title, figures_of, notices, seed_notice
+from symsteer.leaderboard.plots import GREY, Axis, Dot, Figure, Look, cut
 from symsteer.leaderboard.records import flat
 from symsteer.leaderboard.rows import AgentRow, Table
 from symsteer.leaderboard.runs import Run
@@ -107,13 +114,10 @@ def overview(results: Results) -> Values:
 
 def _view(results: Results) -> tuple[View, dict[str, list[Chart]]]:
     """How pages over all cells show sections, and the charts of the figures by address."""
-    drawn: dict[str, list[Chart]] = {}
-    addresses: dict[tuple[str, ...], dict[str, tuple[str, str]]] = {}
-    for index, figure in enumerate(figures.overall_figures(results.findings)):
-        drawn[str(index)] = charts(figure)
-        addresses.setdefault(figure.place, {})[figure.kind] = (figure.text, str(index))
+    shown = figures_of(results.findings, [s for s in SECTIONS if s.where != "page"])
+    figures = [(figure, str(index)) for index, figure in enumerate(shown)]
     links = {path: results.run(run) for path, run in results.runs.items()}
-    return View(results.findings, links, addresses), drawn
+    return View(results.findings, links, figures), {at: charts(figure) for figure, at in figures}
 
 
 def _notice(results: Results) -> str:
@@ -199,8 +203,8 @@ def cell(results: Results, table: Table) -> Values:
     key = table.key
     links = {run.path: f"../{results.run(run)}" for run in table.runs}
     defect = defect_of(key, results.audit)
-    shown: list[Figure] = [figures.learning_curves([table]), figures.q_values([table])]
-    shown += [figures.equivariance_errors(table), figures.success_by_direction(table)]
+    shown = [learning_curves([table]), q_values([table])]
+    shown += [equivariance_errors(table), success_by_direction(table)]
     return {
         "name": results.names[key],
         "key": key,
@@ -254,9 +258,23 @@ def agent(results: Results, name: str) -> Values:
         "role": results.summary.roles[name],
         "page": results.docs.page(f"agents/{name}.md", "agents.md"),
         "options": options_of(options if isinstance(options, Mapping) else {}),
-        "charts": charts(figures.standing(compared)) if compared else [],
+        "charts": charts(standing(compared)) if compared else [],
         "rows": [_result(results, table, row) for table, row in rows],
     }
+
+
+def standing(rows: Mapping[str, tuple[AgentRow, AgentRow | None]]) -> Figure:
+    """Success of an agent in each cell, by its name, beside that of the best reference."""
+    dots = []
+    for index, (row, reference) in enumerate(rows.values()):
+        best = Look(GREY, "D", "none", width=0.8, hollow=True)
+        look = replace(look_of(row.agent, width=1.7), dash="none")
+        if row.success:
+            dots.append(Dot(cut(row.agent), row.success, index, look))
+        if reference and reference.success:
+            dots.append(Dot("best reference", reference.success, index + 0.2, best))
+    labels, axis = [cut(name, 60) for name in rows], Axis("success in the final window", SHARE)
+    return replace(by_rows(labels, {"": dots}, axis), text="Success in each cell")
 
 
 def options_of(table: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -300,7 +318,7 @@ def variant(results: Results, name: str) -> Values:
         "page": results.docs.page("variants.md"),
         "picture": results.docs.picture("variants", name),
         "audit_page": results.docs.page("audit.md"),
-        "charts": charts(figures.audited_defects(audited)) if audited else [],
+        "charts": charts(audited_defects(audited)) if audited else [],
         "audited": [
             (*place, f"{strength:g}", _percents(defect.interval), defect.part)
             for *place, strength, defect in audited

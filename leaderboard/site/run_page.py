@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from statistics import mean
 from typing import Any
 
-from symsteer.leaderboard.figures import run_curves
+from symsteer.leaderboard.curve_figures import run_curves
 from symsteer.leaderboard.records import REPRODUCED, Evaluation, repeat_command
 from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.site.charts import charts, episodes, grouped

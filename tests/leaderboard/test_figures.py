@@ -13,7 +13,8 @@ from matplotlib.collections import FillBetweenPolyCollection
 from matplotlib.figure import Figure
 
 from symsteer.agents import AGENTS
-from symsteer.leaderboard.figures import MANY, STYLES, learning_curves, q_values
+from symsteer.leaderboard.curve_figures import learning_curves, q_values
+from symsteer.leaderboard.figures import MANY, STYLES
 from symsteer.leaderboard.plots import cut
 from symsteer.leaderboard.row_numbers import summarize
 from symsteer.leaderboard.rows import Table

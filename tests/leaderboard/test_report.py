@@ -18,8 +18,7 @@ import pytest
 from symsteer.files import csv_text
 from symsteer.leaderboard import command, paths
 from symsteer.leaderboard.defects import AuditedDefect
-from symsteer.leaderboard.figures import render_figures
-from symsteer.leaderboard.page import other_files, render_page
+from symsteer.leaderboard.page import figures_of, other_files, render_page
 from symsteer.leaderboard.records import write_record
 from symsteer.leaderboard.report import differences, generate, other_versions, render, slug
 from symsteer.leaderboard.statistics import Interval
@@ -375,7 +374,7 @@ def test_uneven_cells_are_drawn() -> None:
     records = make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.6})
     records += make_cell({"base": 0.3, "standard": 0.5}, variant="wind:1")
     records.append(make_record([make_evaluation([1, 0] * 20)], learning_rate=1e-3, seed=0))
-    drawings = render_figures(view_of(records, audit=audit_of({"none": 0.1})).findings)
+    drawings = figures_of(view_of(records, audit=audit_of({"none": 0.1})).findings)
     kinds = ["answer", "map", "profiles", "improvement", "success", "q"]
     assert [drawing.kind for drawing in drawings] == kinds
 
