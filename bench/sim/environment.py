@@ -66,16 +66,11 @@ def _count(scenes: Iterable[BatchedScene]) -> int:
 _BATCHED_DEVICE = SimpleNamespace(is_cuda=lambda: True, is_cpu=lambda: False)
 
 
-class BatchedCpuMixin(Unique, BaseEnv):
-    """Runs a ManiSkill task for N environments in one process on CPU physics.
+class _OnSimulator(Unique, BaseEnv):
+    """What both kinds of environments do before ManiSkill makes them.
 
-    Mix in before a `BaseEnv` subclass: ``class MyEnv(BatchedCpuMixin, PickCubeEnv)``. Takes the
-    arguments of that class. Cameras exist only if ``render_mode`` or a visual ``obs_mode`` asks
-    for them; they need a Vulkan driver.
-
-    Raises:
-        UserError: ManiSkill or SAPIEN does not have the pinned version, or cameras are asked for
-            without a Vulkan driver.
+    Cameras exist only if ``render_mode``, a visual ``obs_mode`` or the task asks for them; they
+    need a Vulkan driver.
     """
 
     def __init__(
@@ -86,19 +81,33 @@ class BatchedCpuMixin(Unique, BaseEnv):
         render_backend: str | None = None,
         **kwargs: Any,
     ) -> None:
+        visual = obs_mode not in (None, "state", "state_dict", "none")
+        cameras = visual or render_mode is not None or getattr(self, "needs_cameras", False)
         check_versions()
-        patches.install()
         prepare_headless()
-        cameras = _needs_cameras(self, render_mode, obs_mode)
+        backends = self._prepare(cameras, render_backend)
+        super().__init__(*args, obs_mode=obs_mode, render_mode=render_mode, **backends, **kwargs)
+
+    def _prepare(self, cameras: bool, render_backend: str | None) -> dict[str, str]:
+        """Check that the simulator works here; returns ManiSkill's names of the backends."""
+        raise NotImplementedError
+
+
+class BatchedCpuMixin(_OnSimulator):
+    """Runs a ManiSkill task for N environments in one process on CPU physics.
+
+    Mix in before a `BaseEnv` subclass: ``class MyEnv(BatchedCpuMixin, PickCubeEnv)``. Takes the
+    arguments of that class.
+
+    Raises:
+        UserError: ManiSkill or SAPIEN does not have the pinned version, or cameras are asked for
+            without a Vulkan driver.
+    """
+
+    def _prepare(self, cameras: bool, render_backend: str | None) -> dict[str, str]:
+        patches.install()
         self._camera_device = rendering.find_device(render_backend) if cameras else None
-        super().__init__(
-            *args,
-            obs_mode=obs_mode,
-            render_mode=render_mode,
-            sim_backend="physx_cpu",
-            render_backend="none",
-            **kwargs,
-        )
+        return {"sim_backend": "physx_cpu", "render_backend": "none"}
 
     @property
     def backend(self) -> BackendInfo:
@@ -188,34 +197,18 @@ class BatchedCpuMixin(Unique, BaseEnv):
         )
 
 
-class CudaMixin(Unique, BaseEnv):
+class CudaMixin(_OnSimulator):
     """Runs a ManiSkill task on ManiSkill's own GPU simulation, also for one environment.
 
     Raises:
         UserError: CUDA or PhysX's GPU library is missing.
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        obs_mode: str | None = None,
-        render_mode: str | None = None,
-        render_backend: str | None = None,
-        **kwargs: Any,
-    ) -> None:
+    def _prepare(self, cameras: bool, render_backend: str | None) -> dict[str, str]:
         check_cuda()
-        check_versions()
-        prepare_headless()
         self._held: dict[str, tuple[Actor, torch.Tensor]] = {}
-        cameras = _needs_cameras(self, render_mode, obs_mode)
-        super().__init__(
-            *args,
-            obs_mode=obs_mode,
-            render_mode=render_mode,
-            sim_backend="physx_cuda",
-            render_backend=render_backend or ("gpu" if cameras else "none"),
-            **kwargs,
-        )
+        default = "gpu" if cameras else "none"
+        return {"sim_backend": "physx_cuda", "render_backend": render_backend or default}
 
     def hold_force(self, body: Actor, force: torch.Tensor) -> None:
         """Apply a force in every substep; see `BatchedCpuMixin.hold_force`."""
@@ -232,11 +225,6 @@ class CudaMixin(Unique, BaseEnv):
         for body, force in self._held.values():
             body.apply_force(force)
         super()._before_simulation_step()
-
-
-def _needs_cameras(env: BaseEnv, render_mode: str | None, obs_mode: str | None) -> bool:
-    visual = obs_mode not in (None, "state", "state_dict", "none")
-    return visual or render_mode is not None or getattr(env, "needs_cameras", False)
 
 
 def check_cuda() -> None:

@@ -75,15 +75,13 @@ class Embodiment:
         raise NotImplementedError
 
     def reachable_turn(
-        self, qpos: torch.Tensor, turn: torch.Tensor, period: float, later: torch.Tensor
+        self, qpos: torch.Tensor, turn: torch.Tensor, later: torch.Tensor
     ) -> torch.Tensor:
-        """Choose a turn that the joints can reach among equivalent ones, ``[N]`` radians.
+        """Choose a turn that the joints can reach among those that differ by half turns.
 
         Args:
             qpos: joint positions, ``[N, dof]``.
-            turn: the smallest of the equivalent turns about the vertical, ``[N]``.
-            period: equivalent turns differ by multiples of it; pi where the fingers may be
-                exchanged.
+            turn: the smallest of the equivalent turns about the vertical, ``[N]`` radians.
             later: a further turn that will follow, ``[N]``.
         """
         return turn
@@ -251,13 +249,13 @@ class PandaArm(Embodiment):
         arm._clip_and_scale_action = scale_and_drift
 
     def reachable_turn(
-        self, qpos: torch.Tensor, turn: torch.Tensor, period: float, later: torch.Tensor
+        self, qpos: torch.Tensor, turn: torch.Tensor, later: torch.Tensor
     ) -> torch.Tensor:
         """The smallest turn that keeps joint 7 within its limits.
 
         A grasp may end 0.2 rad short of its turn: closing fingers align the object.
         """
-        turns = turn[:, None] + period * turn.new_tensor([0.0, -1.0, 1.0])
+        turns = turn[:, None] + math.pi * turn.new_tensor([0.0, -1.0, 1.0])
         # The joint turns against the tool's yaw (seen from above).
         there = qpos[:, 6:7] - turns
         excess = (there.abs() - self.wrist_limit - 0.2).maximum(

@@ -93,26 +93,31 @@ def finger_width(env: SymmetricTask) -> torch.Tensor:
     return env.agent.robot.get_qpos()[:, -2:].sum(dim=1)
 
 
-def yaw_to_grasp(env: SymmetricTask, cube_q: torch.Tensor) -> torch.Tensor:
-    """Smallest turn ``[N]`` that aligns the fingers with two faces of the cube."""
-    axis = quaternion_to_matrix(env.agent.tcp_pose.q)[:, :2, 0]
-    cube = yaw_up_to(4, cube_q)
-    gripper = torch.atan2(axis[:, 1], axis[:, 0])
-    return wrap(torch.atan2(cube[:, 1], cube[:, 0]) / 4 - gripper, math.pi / 2)
+def yaw_along(
+    env: SymmetricTask, axis: torch.Tensor, later: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Turn ``[N]`` that sets the fingers on both sides of a bar along ``axis [N, 2]``.
+
+    The smallest one that the joints can reach, also if they turn by ``later [N]`` afterwards.
+    """
+    yaw = _turn_to(env, torch.atan2(axis[:, 1], axis[:, 0]), math.pi)
+    later = torch.zeros_like(yaw) if later is None else later
+    return env.body.reachable_turn(env.agent.robot.get_qpos(), yaw, later)
 
 
-def yaw_along(env: SymmetricTask, axis: torch.Tensor) -> torch.Tensor:
-    """Smallest turn ``[N]`` that sets the fingers on both sides of a bar along ``axis [N, 2]``."""
+def _turn_to(env: SymmetricTask, yaw: torch.Tensor, period: float) -> torch.Tensor:
+    """Smallest turn ``[N]`` of the fingers to ``yaw [N]``, or to one that differs by a period."""
     hand = quaternion_to_matrix(env.agent.tcp_pose.q)[:, :2, 0]
-    bar = torch.atan2(axis[:, 1], axis[:, 0])
-    return wrap(bar - torch.atan2(hand[:, 1], hand[:, 0]), math.pi)
+    return wrap(yaw - torch.atan2(hand[:, 1], hand[:, 0]), period)
 
 
 def grasp(
     env: SymmetricTask, cube_p: torch.Tensor, cube_q: torch.Tensor, offset: torch.Tensor
 ) -> tuple[Intent, torch.Tensor]:
     """Approach a cube from above and close on it; also whether it is held, ``[N]`` bool."""
-    return grasp_at(env, cube_p + offset, cube_p, yaw_to_grasp(env, cube_q), 0.04)
+    faces = yaw_up_to(4, cube_q)
+    turn = _turn_to(env, torch.atan2(faces[:, 1], faces[:, 0]) / 4, math.pi / 2)
+    return grasp_at(env, cube_p + offset, cube_p, turn, 0.04)
 
 
 def grasp_at(

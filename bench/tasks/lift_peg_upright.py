@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -100,8 +99,6 @@ class LiftPegUpright(SymmetricTask, LiftPegUprightEnv):
         axis = torch.where(score[:, None] < 0, -axis, axis)
         handle = peg.p + (self.peg_half_length - self.grip_from_end) * axis
         yaw = yaw_along(self, axis[:, :2])
-        qpos = self.agent.robot.get_qpos()
-        yaw = self.body.reachable_turn(qpos, yaw, math.pi, torch.zeros_like(yaw))
         # Half the turn: the fingers come down at twice the usual misalignment, because they turn
         # the peg as they close.
         approach, held = grasp_at(self, handle + offset, handle, yaw / 2, 2 * self.peg_half_width)

@@ -116,12 +116,7 @@ class PokeCube(SymmetricTask, PokeCubeEnv):
         # the offset moves the grasp along the peg.
         along_peg = (offset * axis).sum(dim=1, keepdim=True) * axis
         target = peg.p + along_peg + 0.3 * (offset - along_peg)
-        straddle = self.body.reachable_turn(
-            self.agent.robot.get_qpos(),
-            yaw_along(self, axis[:, :2]),
-            math.pi,
-            torch.zeros_like(distance),
-        )
+        straddle = yaw_along(self, axis[:, :2])
         approach, held = grasp_at(self, target, here, straddle, 2 * self.peg_half_width)
 
         end = peg.p + self._half_peg(axis, torch.cat([ahead, 0 * ahead[:, :1]], dim=1))

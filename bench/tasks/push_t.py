@@ -138,8 +138,7 @@ class PushT(SymmetricTask, PushTEnv):
         handle = tee.p.clone()
         handle[:, :2] += self.grip_on_stem * stem
         turn = torch.atan2(_cross(stem, goal_stem), (stem * goal_stem).sum(dim=1))
-        yaw = yaw_along(self, stem)
-        yaw = self.body.reachable_turn(self.agent.robot.get_qpos(), yaw, math.pi, turn)
+        yaw = yaw_along(self, stem, later=turn)
         # Fingers that grip the 5 cm of the stem slightly askew stop a little further apart.
         approach, held = grasp_at(self, handle + offset, handle, yaw, 0.053)
         # The tool keeps its place in the frame of the block, which becomes that of the goal.
