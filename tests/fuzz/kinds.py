@@ -27,18 +27,22 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from symsteer.agents import presets
 from symsteer.bench.runs import base_policy
 from symsteer.bench.runs import run as run_module
 from symsteer.bench.runs.checkpoint import CHECKSUM_BYTES, FORMAT, load_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.trainer import Trainer
-from symsteer.leaderboard import report
+from symsteer.bench.sweep import grid
+from symsteer.leaderboard import report, study
 from symsteer.leaderboard.records import config_hash, flat, read_record
-from symsteer.policies.files import _sha256, load_policy
+from symsteer.policies.files import _sha256
 from tests.bench.tuning.tiny_plan import TEXT as PLAN
 from tests.fuzz.judge import BadEndingError, Ending, end_of, stopped_at
 from tests.fuzz.mutate import (
     POISON,
+    Way,
+    as_data,
     damage_bits,
     damage_bytes,
     damage_json,
@@ -50,7 +54,7 @@ from tests.fuzz.mutate import (
     nested,
     poison_bytes,
     poison_data,
-    to_toml,
+    write_json,
 )
 
 
@@ -69,7 +73,6 @@ class Workshop:
         demos: its demonstrations, .h5 and .json.
         bundle: its demonstrations and base policy as one file.
         records: of other runs.
-        other: the checkpoint of another run.
     """
 
     config: RunConfig
@@ -82,7 +85,6 @@ class Workshop:
     demos: tuple[bytes, bytes]
     bundle: bytes
     records: dict[str, str]
-    other: bytes
 
     def restore_run(self, folder: Path) -> Path:
         """The stopped run as it was, in ``folder``."""
@@ -94,8 +96,8 @@ class Workshop:
         return path
 
 
-Way = Callable[[Path, Random], None]
-"""Damages the file at a path."""
+Make = Callable[[Workshop, Path], Path]
+"""Writes an intact input into a folder; the file to damage."""
 
 
 @dataclass(frozen=True)
@@ -103,14 +105,14 @@ class Kind:
     """A kind of file.
 
     Attributes:
-        make: writes the intact input into a folder; the file to damage.
+        make: writes the intact input.
         ways: in which it is damaged.
         lines: command lines that read it.
         stop: where their work would begin.
         check: raises if damage was accepted.
     """
 
-    make: Callable[[Workshop, Path], Path]
+    make: Make
     ways: Sequence[Way]
     lines: Sequence[Callable[[Workshop, Path], list[Any]]]
     stop: Sequence[tuple[Any, str]] = ()
@@ -123,10 +125,16 @@ class Kind:
         if number is not None:
             self.ways[number % len(self.ways)](path, random)
         line = self.lines[0] if number is None else random.choice(self.lines)
-        arguments = line(workshop, path)
-        names = (path.stem, workshop.run_id, "record.json", "policy.safetensors", "sweeps")
+        names = (
+            path.stem,
+            workshop.run_id,
+            "record.json",
+            "policy.safetensors",
+            "sweeps",
+            "option",
+        )
         with stopped_at(*self.stop):
-            ending = end_of(arguments, names)
+            ending = end_of(line(workshop, path), names)
         if ending.kind == "accepted" and isinstance(ending.found[0], Trainer):
             ending.found[0].evaluator.close()
         if ending.kind == "done":
@@ -147,7 +155,7 @@ def new_run(workshop: Workshop, *more: Any) -> list[Any]:
     return ["run", "--quiet", *more, "--out", "runs", *workshop.options]
 
 
-def in_run(name: str) -> Callable[[Workshop, Path], Path]:
+def in_run(name: str) -> Make:
     """A file of the stopped run."""
     return lambda workshop, folder: workshop.restore_run(folder) / name
 
@@ -163,51 +171,20 @@ TOML = (damage_toml, damage_toml, damage_toml_text, damage_bytes)
 
 # TOML: suites, presets, plans and studies.
 
-SUITE: dict[str, Any] = {
-    "description": "two tasks, a broken and an unbroken world",
-    "grid": {
-        "task": ["PushCube-v1", "PickCube-v1"],
-        "variant": ["none", "action_gain"],
-        "strength": [0.5, 1],
-        "agent": ["standard", "equivariant"],
-        "demonstrations.count": [5, 20],
-        "seed": [0, 1],
-    },
-    "run": {
-        "env_steps": 20000,
-        "policy": {"steps": 800, "learning_rate": 1e-3, "hold": ["gripper"]},
-        "agent": {"gamma": 0.95, "layer_norm": True},
-        "evaluation": {"every": 5000, "episodes": 25},
-    },
-}
 
-PRESET: dict[str, Any] = {
-    "all": {"lr": 1e-3, "utd": 0.5, "layer_norm": True, "reduce": "min", "batch_size": 64},
-    "equivariant": {"critics": 2, "lr": 2e-3},
-    "standard": {"width": 64},
-}
-
-TEXTS = {
-    "suite": to_toml(SUITE),
-    "preset": to_toml(PRESET),
-    "plan": PLAN + "[[further]]\nlr = 1e-2\ncritics = 4\n[run.agent]\ntau = 0.1\n",
-    "study": (Path(report.__file__).parent / "studies" / "paper.toml").read_text(),
-}
-
-
-def toml_file(name: str) -> Callable[[Workshop, Path], Path]:
+def toml_file(text: str) -> Make:
     def make(workshop: Workshop, folder: Path) -> Path:
         (folder / "a.json").write_text(workshop.records["a"])
-        (folder / "mutant.toml").write_text(TEXTS[name])
+        (folder / "mutant.toml").write_text(text)
         return folder / "mutant.toml"
 
     return make
 
 
 def suite_with_preset(workshop: Workshop, path: Path) -> list[Any]:
-    suite = path.with_name("suite.toml")
-    suite.write_text(to_toml({"grid": {**SUITE["grid"], "agent.preset": [str(path)]}}))
-    return ["sweep", suite, "--dry-run"]
+    """A suite may name a preset, as a run may."""
+    path.with_name("suite.toml").write_text(f'[grid]\n"agent.preset" = ["{path}"]')
+    return ["sweep", path.with_name("suite.toml"), "--dry-run"]
 
 
 # Configurations, records and what a display reads.
@@ -228,19 +205,26 @@ def records(workshop: Workshop, folder: Path) -> Path:
 
 def exaggerate(path: Path, random: Random) -> None:
     data = extreme(json.loads(path.read_text()), random)
-    path.write_text(json.dumps({**data, "config_hash": config_hash(data["config"])}))
+    write_json(path, {**data, "config_hash": config_hash(data["config"])})
 
 
 def nothing_dropped(workshop: Workshop, path: Path, ending: Ending) -> None:
     """A record that was accepted says in memory what its file says."""
     stored = json.loads(path.read_text("utf-8"))
+    # Failures are shortened, without the paths of a machine; times are in UTC.
+    for name in ("schema_version", "failure", "started", "ended"):
+        stored.pop(name, None)
     read = json.loads(read_record(path).model_dump_json(by_alias=True))
-    stored.pop("schema_version"), read.pop("schema_version")
-    for name, value in flat(stored).items():
-        have = flat(read).get(name)
-        # Shortened and without the paths of a machine; in UTC.
-        changed = name == "failure" or (name in ("started", "ended") and have is not None)
-        require(have == value or changed, f"{name} is {have!r} in memory, {value!r} in the file")
+    require(holds(read, stored), "what the record says was dropped")
+
+
+def holds(data: Any, part: Any) -> bool:
+    """Whether nested data have all that a part of them has."""
+    if isinstance(part, dict):
+        return all(name in data and holds(data[name], value) for name, value in part.items())
+    if isinstance(part, list):
+        return len(part) == len(data) and all(map(holds, data, part))
+    return data == part
 
 
 def same_history(workshop: Workshop, path: Path, ending: Ending) -> None:
@@ -277,41 +261,17 @@ def beside(way: Way) -> Way:
     return lambda path, random: way(path.with_suffix(".json"), random)
 
 
-def edit_description(path: Path, random: Random) -> None:
-    data = json.loads(path.read_text())
-    episode, kwargs = random.choice(data["episodes"]), data["env_info"]["env_kwargs"]
-    table, key, values = random.choice(
-        (
-            (episode, "control_mode", ("pd_joint_delta_pos", ["pd_ee_delta_pose"])),
-            (episode, "episode_id", (99, -1, None, "x/y", [], "../x")),
-            (episode, "success", (False, None, "no", [], 0)),
-            (kwargs, "embodiment", ("panda", None, 3, ["floating"])),
-            (kwargs, "variant", ("wind:1", 5, None)),
-            (data["env_info"], "env_id", ("PushCube-v1", "", None, 3)),
-            (data["env_info"], "env_kwargs", ([], None, "x", 3)),
-            (data, "episodes", ([], [None], [[]], ["traj_0"], {"0": {}}, data["episodes"] * 3)),
-            (data, "symsteer", (None, [], "x", {"observation_layout": 3})),
-        )
-    )
-    table[key] = random.choice(values)
-    path.write_text(json.dumps(data))
-
-
 def edit_arrays(path: Path, random: Random) -> None:
     with h5py.File(path, "r+") as file:
         group = file[f"traj_{random.randrange(2)}"]
-        name = random.choice([name for name in ("actions", "obs", "env_states") if name in group])
-        item = group[name]
-        odd: list[Any] = [None, h5py.SoftLink("/nowhere"), np.zeros(3)]
-        odd.append(h5py.ExternalLink("/etc/hostname", "/x"))
-        if isinstance(item, h5py.Dataset):
-            array = np.asarray(item)
-            wrong = array.copy()
-            index = tuple(random.randrange(size) for size in array.shape)
-            wrong[index] = random.choice((np.nan, np.inf, -np.inf, 1e30, 0.125))
-            odd += [wrong, wrong, array[:0], array[:-1], array[:, : array.shape[1] // 2]]
-            odd += [array.astype(random.choice(("i4", "f2", "c8", "S4", "?", "f8"))), array.ravel()]
-            odd += [np.repeat(array, 2, axis=random.randrange(2)), np.array(b"text")]
+        name = random.choice(("actions", "obs"))
+        array = np.asarray(group[name])
+        wrong = array.copy()
+        index = tuple(random.randrange(size) for size in array.shape)
+        wrong[index] = random.choice((np.nan, np.inf, -np.inf, 1e30, 0.125))
+        odd = [None, h5py.SoftLink("/nowhere"), h5py.ExternalLink("/etc/hostname", "/x"), wrong]
+        odd += [array[:0], array[:-1], array[:, : array.shape[1] // 2], np.array(b"text")]
+        odd += [array.astype(random.choice(("i4", "f2", "c8", "S4", "?", "f8"))), array.ravel()]
         del group[name]
         if (changed := random.choice(odd)) is not None:
             group[name] = changed
@@ -320,10 +280,8 @@ def edit_arrays(path: Path, random: Random) -> None:
 def same_arrays(workshop: Workshop, path: Path, ending: Ending) -> None:
     (demos,) = ending.found[1].values()
     with h5py.File(io.BytesIO(workshop.demos[0])) as file:
-        for index, (obs, actions) in enumerate(demos.episodes):
-            require(bool(obs.isfinite().all() and actions.isfinite().all()), "NaN was accepted")
-            require(len(obs) == len(actions) + 1, "a wrong shape was accepted")
-            for name, array in (("obs", obs), ("actions", actions)):
+        for index, arrays in enumerate(demos.episodes):
+            for name, array in zip(("obs", "actions"), arrays, strict=True):
                 same = np.array_equal(np.asarray(file[f"traj_{index}/{name}"]), array.numpy())
                 require(same, "damaged arrays were accepted")
 
@@ -331,14 +289,20 @@ def same_arrays(workshop: Workshop, path: Path, ending: Ending) -> None:
 # Base policies.
 
 
-def policy_file(workshop: Workshop, folder: Path) -> Path:
-    return workshop.restore_run(folder) / "policy.safetensors"
-
-
-def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+def read_policy(path: Path) -> dict[str, Any]:
+    """Tensors, metadata, and what the metadata say of the policy."""
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        return tensors, dict(file.metadata())
+        meta = dict(file.metadata())
+    return {"tensors": tensors, "policy": json.loads(meta.pop("policy")), "meta": meta}
+
+
+def write_policy(path: Path, data: dict[str, Any]) -> None:
+    """What of the data a file of tensors can hold."""
+    tensors, meta = (v if isinstance(v := data.get(k), dict) else {} for k in ("tensors", "meta"))
+    tensors = {k: v.contiguous() for k, v in tensors.items() if isinstance(v, torch.Tensor)}
+    policy = json.dumps(data.get("policy"))
+    save_file(tensors, path, {**{k: str(v) for k, v in meta.items()}, "policy": policy})
 
 
 def damage_header(path: Path, random: Random) -> None:
@@ -348,55 +312,23 @@ def damage_header(path: Path, random: Random) -> None:
     path.write_bytes(flip_bits(data[:size], random) + data[size:])
 
 
-def edit_tensors(path: Path, random: Random) -> None:
-    tensors, meta = read_tensors(path)
-    save_tensors(path, poison_tensors(tensors, random), meta)
-
-
-def edit_metadata(path: Path, random: Random) -> None:
-    tensors, meta = read_tensors(path)
-    if random.random() < 0.5:
-        meta["policy"] = json.dumps(poison_data(json.loads(meta["policy"]), random))
-    else:
-        meta[random.choice(sorted(meta))] = random.choice(("", "{}", "1", "99", "[]", "null"))
-    save_file(tensors, path, meta)
-
-
 def seal_policy(path: Path, random: Random) -> None:
-    """A wrong description, or wrong numbers, with the checksums that belong to it."""
-    tensors, meta = read_tensors(path)
-    said = json.loads(meta["policy"])
-    if random.random() < 0.3:
-        tensors, intact = poison_tensors(tensors, random), load_policy(path)
-        tensors = {key: value for key, value in tensors.items() if isinstance(value, torch.Tensor)}
-        try:
-            intact.load_state_dict(tensors)
-            said["content_hash"] = intact.content_hash()
-        except RuntimeError:
-            pass
-    else:
-        said["training_record"].pop("losses", None)
-        part = random.choice(("options", "report", "obs_layout", "act_layout", None))
-        said = (
-            {**said, part: poison_data(said[part], random)} if part else poison_data(said, random)
-        )
-    meta["policy"] = json.dumps(said)
-    save_tensors(path, tensors, {**meta, "policy_sha256": _sha256(meta["policy"])})
-
-
-def save_tensors(path: Path, tensors: dict[str, Any], meta: dict[str, str]) -> None:
-    tensors = {k: v.contiguous() for k, v in tensors.items() if isinstance(v, torch.Tensor)}
-    save_file(tensors, path, meta)
+    """A wrong description with the checksum that belongs to it."""
+    data = read_policy(path)
+    data["policy"]["training_record"].pop("losses", None)
+    data["policy"] = poison_data(data["policy"], random)
+    data["meta"]["policy_sha256"] = _sha256(json.dumps(data["policy"]))
+    write_policy(path, data)
 
 
 def same_policy(workshop: Workshop, path: Path, ending: Ending) -> None:
     intact = path.with_name("intact.safetensors")
     intact.write_bytes(workshop.run["policy.safetensors"])
-    (have, said), (want, meant) = read_tensors(path), read_tensors(intact)
-    have, want = ({k: v.double() for k, v in tensors.items()} for tensors in (have, want))
-    require(alike(have, want), "other numbers were accepted")
-    reports = [json.loads(meta["policy"])["report"] for meta in (said, meant)]
-    require(reports[0] == reports[1], "another report was accepted")
+    have, want = read_policy(path), read_policy(intact)
+    # The type of numbers may be another one.
+    tensors = [{k: v.double() for k, v in policy["tensors"].items()} for policy in (have, want)]
+    require(alike(*tensors), "other numbers were accepted")
+    require(have["policy"]["report"] == want["policy"]["report"], "another report was accepted")
 
 
 # Checkpoints.
@@ -424,13 +356,17 @@ def set_trap(path: Path, random: Random) -> None:
     path.write_bytes(archives[kind])
 
 
-def edit_state(path: Path, random: Random) -> None:
-    """The state was edited; the checksum is the old one, or there is none."""
-    original = path.read_bytes()
-    content = torch.load(io.BytesIO(original[:-CHECKSUM_BYTES]), weights_only=True)
-    buffer = io.BytesIO()
-    torch.save(poison_tensors(content, random), buffer)
-    path.write_bytes(buffer.getvalue() + original[-CHECKSUM_BYTES:] * random.randrange(2))
+def read_state(path: Path) -> dict[str, Any]:
+    return torch.load(io.BytesIO(path.read_bytes()[:-CHECKSUM_BYTES]), weights_only=True)
+
+
+def archive(data: Any) -> bytes:
+    torch.save(data, buffer := io.BytesIO())
+    return buffer.getvalue()
+
+
+def old_checksum(path: Path, data: Any) -> None:
+    path.write_bytes(archive(data) + path.read_bytes()[-CHECKSUM_BYTES:])
 
 
 def seal_archive(path: Path, random: Random) -> None:
@@ -438,40 +374,17 @@ def seal_archive(path: Path, random: Random) -> None:
 
 
 def seal_state(path: Path, random: Random) -> None:
-    """Another state with the checksum that belongs to it."""
-    file = torch.load(io.BytesIO(path.read_bytes()[:-CHECKSUM_BYTES]), weights_only=True)
-    inner = random.choice([file["state"], file["state"]["agent"], file["state"]["replay"]])
-    key = random.choice(sorted(inner, key=str))
+    """Another state with the checksum that belongs to it; a size may be a lie."""
+    data = read_state(path)
+    inner = random.choice([data["state"], data["state"]["agent"], data["state"]["replay"]])
+    key = random.choice([*sorted(inner, key=str), "more"])
     odd: tuple[Any, ...] = (
-        *(torch.zeros(1).expand(10**9), nested(200, random.randrange(2)), {}, torch.zeros(())),
-        *(torch.zeros(0, 2**40), torch.zeros(3, dtype=torch.complex64), random.choice(POISON)),
+        *(torch.zeros(1).expand(10**9), torch.zeros(0, 2**40), torch.zeros(())),
+        *(torch.zeros(3, dtype=torch.complex64), nested(200, random.randrange(2))),
+        *(*poison_data([inner.get(key)], random), random.choice(POISON)),
     )
-    if random.random() < 0.5:
-        inner[random.choice((key, key, "more"))] = random.choice(odd)
-    else:
-        poison_tensors(inner, random)
-    buffer = io.BytesIO()
-    torch.save(file, buffer, _use_new_zipfile_serialization=random.random() < 0.95)
-    path.write_bytes(sealed(buffer.getvalue()))
-
-
-def poison_tensors(state: dict[str, Any], random: Random) -> dict[str, Any]:
-    """A key dropped, or a value replaced, at any depth; tensors lose an element or get NaN."""
-    container: Any = state
-    key = random.choice(sorted(container, key=str))
-    while isinstance(container[key], dict) and container[key] and random.random() < 0.7:
-        container = container[key]
-        key = random.choice(sorted(container, key=str))
-    value = container[key]
-    if random.random() < 0.3:
-        del container[key]
-    elif isinstance(value, torch.Tensor) and value.numel() > 1 and random.random() < 0.8:
-        line = value.flatten()
-        changed = (line[1:], line.flip(0), value.double(), torch.full_like(value, float("nan")))
-        container[key] = random.choice(changed if value.is_floating_point() else changed[:3])
-    else:
-        container[key] = random.choice(POISON)
-    return state
+    inner[key] = random.choice(odd)
+    path.write_bytes(sealed(archive(data)))
 
 
 def alike(a: Any, b: Any) -> bool:
@@ -499,55 +412,47 @@ def bundle(workshop: Workshop, folder: Path) -> Path:
     return folder / "mutant.zip"
 
 
-def rewrite(edit: Callable[[dict[str, bytes], Random], None]) -> Way:
-    """Edit the files in an archive."""
-
-    def way(path: Path, random: Random) -> None:
-        with zipfile.ZipFile(path) as archive:
-            members = {name: archive.read(name) for name in archive.namelist()}
-        edit(members, random)
-        with zipfile.ZipFile(path, "w", random.choice((0, 0, 0, zipfile.ZIP_DEFLATED))) as archive:
-            for name, data in members.items():
-                archive.writestr(name, data)
-
-    return way
-
-
-def edit_manifest(members: dict[str, bytes], random: Random) -> None:
-    data = poison_data(json.loads(members["manifest.json"]), random)
-    members["manifest.json"] = json.dumps(data).encode("utf-8", "surrogatepass")
-
-
-def rename_member(members: dict[str, bytes], random: Random) -> None:
-    old = random.choice(sorted(members))
-    new = random.choice(("../x", "/x", "a/../../x", ".x", "a/b/c", "x\\y", "x\n", " ", "more"))
-    members[new] = members.pop(old)
-
-
-def edit_member(members: dict[str, bytes], random: Random) -> None:
-    name = random.choice(sorted(members))
-    members[name] = poison_bytes(members[name], random)
+def edit_members(path: Path, random: Random) -> None:
+    """Another manifest, another name, or another content."""
+    with zipfile.ZipFile(path) as packed:
+        members = {name: packed.read(name) for name in packed.namelist()}
+    name, kind = random.choice(sorted(members)), random.randrange(3)
+    if kind == 0:
+        data = poison_data(json.loads(members["manifest.json"]), random)
+        members["manifest.json"] = json.dumps(data).encode("utf-8", "surrogatepass")
+    elif kind == 1:
+        new = random.choice(("../x", "/x", "a/../../x", ".x", "a/b/c", "x\\y", "x\n", " ", "more"))
+        members[new] = members.pop(name)
+    else:
+        members[name] = poison_bytes(members[name], random)
+    with zipfile.ZipFile(path, "w", random.choice((0, 0, 0, zipfile.ZIP_DEFLATED))) as packed:
+        for name, data in members.items():
+            packed.writestr(name, data)
 
 
 def same_members(workshop: Workshop, path: Path, ending: Ending) -> None:
-    with zipfile.ZipFile(io.BytesIO(workshop.bundle)) as archive:
-        whole = {archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(io.BytesIO(workshop.bundle)) as packed:
+        whole = {packed.read(name) for name in packed.namelist()}
     for file in path.with_name("base").rglob("*"):
         known = file.name == "manifest.json" or file.is_dir() or file.read_bytes() in whole
         require(known, f"{file} was written")
 
 
+PRESET = Path(presets.__file__).with_name("tuned.toml").read_text()
+SUITE = (grid.SUITES / "submission.toml").read_text()
+STUDY = (study.FOLDER / "paper.toml").read_text()
+
 KINDS: dict[str, Kind] = {
-    "suite": Kind(toml_file("suite"), TOML, [lambda workshop, path: ["sweep", path, "--dry-run"]]),
+    "suite": Kind(toml_file(SUITE), TOML, [lambda workshop, path: ["sweep", path, "--dry-run"]]),
     "preset": Kind(
-        toml_file("preset"),
+        toml_file(PRESET),
         TOML,
         [lambda workshop, path: new_run(workshop, "--agent.preset", path), suite_with_preset],
         [(run_module, "prepare_base")],
     ),
-    "plan": Kind(toml_file("plan"), TOML, [lambda workshop, path: ["tune", path, "--dry-run"]]),
+    "plan": Kind(toml_file(PLAN), TOML, [lambda workshop, path: ["tune", path, "--dry-run"]]),
     "study": Kind(
-        toml_file("study"),
+        toml_file(STUDY),
         TOML,
         [lambda w, path: ["report", path.with_name("a.json"), "--study", path, "--out", "board"]],
         [(report, "render")],
@@ -566,7 +471,7 @@ KINDS: dict[str, Kind] = {
     "status": Kind(display, (damage_any,) * 4, [lambda w, path: ["status", path.parents[1]]]),
     "demonstrations": Kind(
         demonstrations,
-        (*BYTES, *map(beside, JSON[1:]), beside(edit_description), edit_arrays),
+        (*BYTES, *map(beside, JSON[1:]), edit_arrays),
         [
             lambda workshop, path, count=count: [
                 *new_run(workshop, "--demos", path),
@@ -578,34 +483,30 @@ KINDS: dict[str, Kind] = {
         same_arrays,
     ),
     "policy": Kind(
-        policy_file,
-        (*BYTES, damage_header, edit_tensors, edit_metadata),
+        in_run("policy.safetensors"),
+        (*BYTES, damage_header, as_data(read_policy, write_policy)),
         [lambda workshop, path: new_run(workshop, "--base-policy", path), RESUME],
         WORK,
         same_policy,
     ),
     "checkpoint": Kind(
         in_run("checkpoint.pt"),
-        (*BYTES, set_trap, edit_state),
+        (*BYTES, set_trap, as_data(read_state, old_checksum)),
         [RESUME, EVALUATE],
         WORK,
         same_state,
     ),
     "bundle": Kind(
         bundle,
-        (*BYTES, *map(rewrite, (edit_manifest, rename_member, edit_member))),
+        (*BYTES, edit_members, edit_members),
         [lambda workshop, path: ["fetch-bundle", path, "--out", path.with_name("base")]],
         check=same_members,
     ),
 }
 KINDS |= {
-    "sealed policy": replace(
-        KINDS["policy"], ways=[seal_policy], check=lambda workshop, path, ending: None
-    ),
+    "sealed policy": replace(KINDS["policy"], ways=[seal_policy] * 4, check=lambda *_: None),
     "sealed checkpoint": replace(
-        KINDS["checkpoint"],
-        ways=[seal_archive, seal_state],
-        check=lambda workshop, path, ending: None,
+        KINDS["checkpoint"], ways=[seal_archive, seal_state], check=lambda *_: None
     ),
 }
 """The sealed ones have wrong contents and the checksums that belong to them."""
@@ -624,7 +525,7 @@ VALUES = (
 
 
 def command(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """An option with an odd value, or a misspelt one; the other options keep their values."""
+    """An option with an odd value; the other options keep their values."""
     random = Random(f"command {number}")
     policy = folder / "policy.safetensors"
     policy.write_bytes(workshop.run["policy.safetensors"])
@@ -633,16 +534,9 @@ def command(workshop: Workshop, number: int, folder: Path) -> Ending:
     keys = sorted(set(defaults) - {"agent", "policy.name"})
     key = keys[number % len(keys)]
     option = "--" + key.replace("agent_options.", "agent.").replace("_", "-")
-    at = random.randrange(3, len(option))
-    odd = random.choice(
-        (
-            [option[:at] + random.choice("xy") + option[at + 1 :], "3"],
-            *([option], ["--" + option, "1"], [key, "1"], ["--workers", random.choice(VALUES)]),
-            *([option, random.choice(VALUES)] for _ in range(8)),
-        )
-    )
     with stopped_at((Trainer, "play")):
-        ending = end_of([*new_run(workshop, "--base-policy", policy), *odd])
+        line = new_run(workshop, "--base-policy", policy)
+        ending = end_of([*line, option, random.choice(VALUES)])
     if ending.kind == "accepted":
         trainer = ending.found[0]
         trainer.evaluator.close()

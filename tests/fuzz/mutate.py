@@ -1,4 +1,4 @@
-"""Seeded damage to texts, bytes and nested plain data."""
+"""Seeded damage to texts, bytes and nested plain data; tensors may be among them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import copy
 import json
 import math
 import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
 from typing import Any
+
+import torch
 
 POISON: tuple[Any, ...] = (
     *(None, True, False, 0, 1, -1, 2, 7, 2**31, 2**40, 2**63, 10**9, 10**30, -(2**40)),
@@ -18,6 +21,16 @@ POISON: tuple[Any, ...] = (
     *([], [1], [[]], [None], {}, {"a": 1}, {"": None}),
 )
 """Values that are valid nowhere, or only in some places."""
+
+EXTREME: dict[type, tuple[Any, ...]] = {
+    int: (0, 1, 2, 2**31, 2**53, 10**18),
+    float: (0.0, 1.0, 1e308, -1e308, 1e-308, -0.5, 1e15),
+    str: ("<b>|`a`|</b>", "[x](javascript:1)", "a" * 119, "ä" * 60, "a\nb", "../x", "0"),
+}
+"""Values of the type that they replace."""
+
+Way = Callable[[Path, Random], None]
+"""Damages the file at a path."""
 
 
 def nested(depth: int, kind: int = 0) -> Any:
@@ -45,48 +58,43 @@ def poison_bytes(data: bytes, random: Random) -> bytes:
 
 
 def flip_bits(data: bytes, random: Random, count: int = 1) -> bytes:
-    """Flip ``count`` bits."""
     damaged = bytearray(data)
     for _ in range(count):
         damaged[random.randrange(len(damaged))] ^= 1 << random.randrange(8)
     return bytes(damaged)
 
 
-def places(data: Any) -> list[tuple[Any, Any]]:
+def places(data: Any) -> Iterator[tuple[Any, Any]]:
     """Every (container, key) of nested dicts and lists."""
-    found: list[tuple[Any, Any]] = []
     for key, value in data.items() if isinstance(data, dict) else enumerate(data):
-        found.append((data, key))
+        yield data, key
         if isinstance(value, dict | list):
-            found += places(value)
-    return found
+            yield from places(value)
 
 
 def poison_data(data: Any, random: Random) -> Any:
     """A copy with keys dropped, misspelt, added, or values replaced, wherever they stand."""
     data = copy.deepcopy(data)
     for _ in range(random.choice((1, 1, 1, 2, 3))):
-        if not (everywhere := places(data)):
+        if not (everywhere := list(places(data))):
             break
         container, key = random.choice(everywhere)
-        value, table = container[key], isinstance(container, dict)
+        value, is_table = container[key], isinstance(container, dict)
         kind = random.randrange(8)
         if kind == 0:
             del container[key]
-        elif kind == 1 and table:
+        elif isinstance(value, torch.Tensor):
+            container[key] = poison_tensor(value, random)
+        elif kind == 1 and is_table:
             cut = random.randrange(len(str(key)) + 1)
             del container[key]
             container[str(key)[:cut] + random.choice(("x", "", "_")) + str(key)[cut + 1 :]] = value
-        elif kind == 2 and table:
+        elif kind == 2 and is_table:
             container[random.choice(("colour", "", "a\nb", "\x1b[1m", "k" * 3000))] = value
         elif kind == 2:
             container.insert(key, copy.deepcopy(value))
-        elif kind == 3 and type(value) in (int, float):
-            changed = (-value, value + 1, value * 1e6, str(value), [value], value + 0.5)
-            container[key] = random.choice(changed)
-        elif kind == 3 and isinstance(value, str) and value:
-            at = random.randrange(len(value))
-            container[key] = value[:at] + random.choice("x-/:+\n") + value[at + 1 :]
+        elif kind == 3 and type(value) in EXTREME:
+            container[key] = random.choice((*EXTREME[type(value)], str(value) + "x", [value]))
         elif kind == 4:
             container[key] = nested(random.choice((3, 40, 150)), random.randrange(2))
         else:
@@ -97,19 +105,31 @@ def poison_data(data: Any, random: Random) -> Any:
 def extreme(data: Any, random: Random) -> Any:
     """A copy in which some numbers and texts are extreme, but of the type that they were."""
     data = copy.deepcopy(data)
-    values = {
-        int: (0, 1, 2, 2**31, 2**53, 10**18),
-        float: (0.0, 1.0, 1e308, -1e308, 1e-308, -0.5, 1e15),
-        str: ("<b>|`a`|</b>", "[x](javascript:1)", "a" * 119, "ä" * 60, "a\nb", "../x", "0"),
-    }
-    for _ in range(random.choice((1, 1, 2, 5))):
-        container, key = random.choice(places(data))
-        if type(container[key]) in values:
-            container[key] = random.choice(values[type(container[key])])
+    for container, key in random.choices(list(places(data)), k=random.choice((1, 2, 5))):
+        if type(container[key]) in EXTREME:
+            container[key] = random.choice(EXTREME[type(container[key])])
     return data
 
 
+def poison_tensor(value: torch.Tensor, random: Random) -> Any:
+    """One element less, another order or type, NaN, or no tensor."""
+    line = value.flatten()
+    changed = [line[1:], line.flip(0), value.double(), random.choice(POISON)]
+    if value.is_floating_point():
+        changed.append(torch.full_like(value, float("nan")))
+    return random.choice(changed)
+
+
 # Ways to damage the file at a path.
+
+
+def as_data(read: Callable[[Path], Any], write: Callable[[Path, Any], Any]) -> Way:
+    """Read the file, damage its data, write it."""
+    return lambda path, random: write(path, poison_data(read(path), random))
+
+
+def write_json(path: Path, data: Any) -> None:
+    path.write_text(json.dumps(data), "utf-8", "surrogatepass")
 
 
 def damage_bytes(path: Path, random: Random) -> None:
@@ -120,9 +140,12 @@ def damage_bits(path: Path, random: Random) -> None:
     path.write_bytes(flip_bits(path.read_bytes(), random, random.choice((1, 1, 3))))
 
 
-def damage_json(path: Path, random: Random) -> None:
-    data = poison_data(json.loads(path.read_text()), random)
-    path.write_text(json.dumps(data), "utf-8", "surrogatepass")
+damage_json = as_data(lambda path: json.loads(path.read_text()), write_json)
+
+damage_toml = as_data(
+    lambda path: tomllib.loads(path.read_text()),
+    lambda path, data: path.write_text(to_toml(data), "utf-8", "surrogatepass"),
+)
 
 
 def damage_json_text(path: Path, random: Random) -> None:
@@ -133,11 +156,6 @@ def damage_json_text(path: Path, random: Random) -> None:
         *('{"a":' * 5000 + "1" + "}" * 5000, "3", '"text"', "[]", "{}", text + text, "9" * 5000),
     )
     path.write_text(random.choice(texts))
-
-
-def damage_toml(path: Path, random: Random) -> None:
-    data = poison_data(tomllib.loads(path.read_text()), random)
-    path.write_text(to_toml(data), "utf-8", "surrogatepass")
 
 
 def damage_toml_text(path: Path, random: Random) -> None:
@@ -156,16 +174,9 @@ def damage_toml_text(path: Path, random: Random) -> None:
     path.write_text(random.choice(texts))
 
 
-def to_toml(data: dict[str, Any], prefix: str = "") -> str:
+def to_toml(data: dict[str, Any]) -> str:
     """A table as TOML; values that TOML does not have are written as in JSON."""
-    lines, tables = [], []
-    for key, value in data.items():
-        name = json.dumps(str(key))
-        if isinstance(value, dict):
-            tables.append(f"[{prefix}{name}]\n{to_toml(value, f'{prefix}{name}.')}")
-        else:
-            lines.append(f"{name} = {_inline(value)}")
-    return "\n".join([*lines, *tables])
+    return "\n".join(f"{json.dumps(str(key))} = {_inline(value)}" for key, value in data.items())
 
 
 def _inline(value: Any) -> str:

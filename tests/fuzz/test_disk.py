@@ -90,6 +90,10 @@ def complaint(*arguments):
     return ending.sentence
 
 
+def files_in(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def leftovers(folder):
     """Files that only a write that failed can have left."""
     return [p.name for p in folder.rglob("*") if p.name.endswith((".tmp", ".partial", ".part"))]
@@ -129,29 +133,24 @@ def test_a_run_outlives_a_full_disk(size, undisturbed, tmp_path):
     assert not leftovers(folder)
 
 
-def test_a_disk_that_is_full_from_the_beginning(undisturbed, tmp_path):
-    with files_end_at(0):
-        sentence = complaint("run", "--quiet", *options_of(SHORT), "--out", tmp_path / "runs")
-    assert "config.json" in sentence
-    assert [p for p in (tmp_path / "runs").rglob("*") if p.is_file()] == []
-
-
 @pytest.mark.parametrize(
     ("kept", "size", "blamed"),
-    [("nothing", 10_000, ".h5"), ("demonstrations", 10_000, "policy.safetensors")],
+    [
+        ("", 0, "config.json"),
+        ("", 10_000, ".h5"),
+        ("*.*", 10_000, "policy.safetensors"),
+    ],
 )
-def test_demonstrations_and_base_policies_appear_whole(kept, size, blamed, undisturbed, tmp_path):
-    base = tmp_path / "base"
-    base.mkdir()
-    if kept == "demonstrations":
-        for path in (undisturbed.parent / "base").glob("*.*"):
-            shutil.copy(path, base)
-    before = sorted(p for p in base.rglob("*") if p.is_file())
+def test_what_a_run_begins_with_appears_whole(kept, size, blamed, undisturbed, tmp_path):
+    """Configuration, demonstrations, base policy; what was there stays."""
+    (tmp_path / "base").mkdir()
+    for path in (undisturbed.parent / "base").glob(kept) if kept else ():
+        shutil.copy(path, tmp_path / "base")
+    before = files_in(tmp_path)
     with files_end_at(size):
         sentence = complaint("run", "--quiet", *options_of(SHORT), "--out", tmp_path)
     assert blamed in sentence
-    assert sorted(p for p in base.rglob("*") if p.is_file()) == before
-    assert not (tmp_path / undisturbed.name).exists()
+    assert files_in(tmp_path) == before
 
 
 def test_a_run_outlives_its_terminal(undisturbed, tmp_path):
@@ -182,15 +181,13 @@ def test_the_bookkeeping_of_a_sweep(tmp_path):
     assert not list(tmp_path.rglob("record.json"))
 
 
-SMALL_AUDIT = ("--base-policy", "none", "--count", 8, "--group", "C2")
-
 PAIR = ("standard", "equivariant")
 
 WRITERS = {
     "film": ("film", "RUN", "--episodes", 1, "--out", "OUT/a.gif"),
     "bundle": ("export", "RUN", "--out", "OUT/a.zip"),
     "lerobot": ("export-lerobot", "DEMOS", "--videos", "off", "--out", "OUT/set"),
-    "audit": ("audit", "--task", "PushCube-v1", *SMALL_AUDIT, "--out", "OUT"),
+    "audit": ("audit", "--base-policy", "none", "--count", 8, "--group", "C2", "--out", "OUT"),
     "report": ("report", "RESULTS", "--out", "OUT"),
     "site": ("site", "RESULTS", "--no-docs", "--out", "OUT"),
     "compare": ("compare", *PAIR, "--runs", "RESULTS", "--picture", "OUT/a.png"),
@@ -199,34 +196,38 @@ WRITERS = {
 }
 
 
-@pytest.mark.parametrize("verb", WRITERS)
-def test_what_a_verb_writes_is_whole_or_not_there(verb, undisturbed, tmp_path):
-    """A full disk, and a file in the place of the folder; what was written before stays."""
+@pytest.fixture
+def line(undisturbed, tmp_path):
+    """The command line of a verb that writes into a folder."""
     results = tmp_path / "results"
     results.mkdir()
     for agent in PAIR:
         (results / f"{agent}.json").write_text(dump_record(make_record(agent=agent)))
+    demos = next(undisturbed.parent.glob("base/*.h5"))
 
-    def arguments(out):
-        demos = next(undisturbed.parent.glob("base/*.h5"))
+    def arguments(verb, out):
         places = {"RUN": undisturbed, "DEMOS": demos, "RESULTS": results, "OUT": out}
         return [str(places.get(w, str(w).replace("OUT/", f"{out}/"))) for w in WRITERS[verb]]
 
-    out = tmp_path / "out"
+    return arguments
+
+
+@pytest.mark.parametrize("verb", WRITERS)
+def test_what_a_verb_writes_is_whole_or_not_there(verb, line, tmp_path):
+    """A full disk, and a file in the place of the folder; what was written before stays."""
+    out, before = tmp_path / "out", files_in(tmp_path)
     with files_end_at(200):
-        sentence = complaint(*arguments(out))
-    assert str(out) in sentence
-    assert [p for p in tmp_path.rglob("*") if p.is_file() and p.parent != results] == []
-    assert end_of(arguments(out)).kind == "done"
-    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
-    assert before
+        assert str(out) in complaint(*line(verb, out))
+    assert files_in(tmp_path) == before
+    assert end_of(line(verb, out)).kind == "done"
+    before = files_in(tmp_path)
+    assert files_in(out)
     if verb not in ("audit", "lerobot", "new"):
         with files_end_at(200):
-            complaint(*arguments(out))
-    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+            complaint(*line(verb, out))
+    assert files_in(tmp_path) == before
     (tmp_path / "file").write_text("in the way")
-    sentence = complaint(*arguments(tmp_path / "file" / "out"))
-    assert str(tmp_path / "file") in sentence
+    assert str(tmp_path / "file") in complaint(*line(verb, tmp_path / "file" / "out"))
     assert not leftovers(tmp_path)
 
 
@@ -234,39 +235,29 @@ def test_a_video_is_whole_or_not_there(tmp_path):
     """imageio does not tell of an encoder that fails."""
     frames = np.random.default_rng(0).integers(0, 255, (30, 64, 64, 3), dtype=np.uint8)
     path = tmp_path / "new" / "a.mp4"
-    for size in (0, 20_000):
-        with (
-            files_end_at(size),
-            pytest.raises(UserError, match=f"{path} cannot be written: "),
-        ):
+
+    def fails(size):
+        with files_end_at(size), pytest.raises(UserError, match=f"{path} cannot be written: "):
             write_video(path, iter(frames))
+
+    fails(0), fails(20_000)
     write_video(path, iter(frames))
-    before = path.read_bytes()
-    with files_end_at(20_000), pytest.raises(UserError, match="cannot be written"):
-        write_video(path, iter(frames))
-    assert path.read_bytes() == before
-    assert [p.name for p in path.parent.iterdir()] == ["a.mp4"]
+    before = files_in(tmp_path)
+    fails(20_000)
+    assert files_in(tmp_path) == before
 
 
-def test_read_only_folders(undisturbed, workshop, read_only, tmp_path):
+def test_read_only_folders(undisturbed, workshop, line, read_only, tmp_path):
     """Writing fails; commands that only read still work."""
     runs = tmp_path / "runs"
     shutil.copytree(undisturbed.parent, runs)
-    stopped = workshop.restore_run(runs)
-    finished = runs / undisturbed.name
+    stopped, finished = workshop.restore_run(runs), runs / undisturbed.name
     read_only(runs)
     for arguments in (
         ("run", "--quiet", "--seed", 5, *options_of(SHORT), "--out", runs),
         ("resume", stopped),
         ("sweep", "smoke", "--out", runs),
-        ("demos", runs / "a.h5", "--count", 1),
-        ("report", finished, "--out", runs / "board"),
-        ("audit", "--out", runs / "audit"),
-        ("film", finished, "--episodes", 1),
-        ("export", finished, "--out", runs / "a.zip"),
-        ("export-lerobot", next(runs.glob("base/*.h5")), "--out", runs / "set"),
-        ("site", finished, "--no-docs", "--out", runs / "site"),
-        ("new", "agent", "mine", "--out", runs),
+        *(line(verb, runs / "new") for verb in WRITERS),
     ):
         sentence = complaint(*arguments)
         assert str(runs) in sentence
