@@ -61,7 +61,6 @@ def test_documents_and_examples_import_public_names_alone(path):
             assert not unknown, f"from {package} import {unknown}"
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_packages_are_quick_to_import(package):
-    code = f"import {package}, sys; sys.exit(bool({{'torch', 'mani_skill'}} & set(sys.modules)))"
+def test_packages_are_quick_to_import():
+    code = f"import sys, {', '.join(PACKAGES)}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
