@@ -112,23 +112,13 @@ def test_no_difference_is_undecided_until_it_is_shown_to_be_small() -> None:
 
 
 def test_each_setting_of_a_grid_is_a_cell() -> None:
-    def grid(make: Callable[..., list[RunRecord]]) -> list[RunRecord]:
-        settings = product((0.005, 0.05), (1.0, 4.0))
-        options = [{"tau": tau, "utd": utd} for tau, utd in settings]
-        return [r for each in options for r in make(each["tau"], agent_options=each)]
-
-    def rates(tau: float, **config: Any) -> list[RunRecord]:
-        return make_cell({"standard": 0.5, "equivariant": 0.7 if tau < 0.01 else 0.9}, **config)
-
-    def divergence(tau: float, **config: Any) -> list[RunRecord]:
-        broken = range(5) if tau > 0.01 else []
-        return diverging("standard", broken, **config) + diverging("equivariant", [], **config)
-
-    (found,) = outcomes(grid(rates), claim_of())
+    records = []
+    for tau, utd in product((0.005, 0.05), (1.0, 4.0)):
+        rates = {"standard": 0.5, "equivariant": 0.7 if tau < 0.01 else 0.9}
+        records += make_cell(rates, agent_options={"tau": tau, "utd": utd})
+    (found,) = outcomes(records, claim_of())
     assert (found.cells, found.pairs, found.verdict) == (4, 20, "supported")
     assert value(found) == pytest.approx(0.3)
-    (found,) = outcomes(grid(divergence), DIVERGED)
-    assert (found.counts, value(found)) == ("10/20 against 0/20 diverged", 0.5)
 
 
 def test_of_several_settings_the_usual_ones_stand_for_an_agent() -> None:
@@ -235,25 +225,17 @@ def test_what_is_not_tested_says_why(changes: dict[str, Any], reason: str) -> No
 
 @pytest.mark.parametrize("status", ["finished", "failed"])
 def test_divergence_counts_runs(status: str) -> None:
-    """Also those that broke off after diverging."""
+    """Also those that broke off after diverging; one that goes on can still diverge."""
     standard = diverging("standard", range(5), status)
     (found,) = outcomes(standard + diverging("equivariant", []), DIVERGED)
-    assert (found.pairs, found.verdict, found.counts) == (
-        5,
-        "supported",
-        "5/5 against 0/5 diverged",
-    )
+    assert (found.pairs, found.verdict) == (5, "supported")
+    assert found.counts == "5/5 against 0/5 diverged"
     assert found.effect is not None
     interval = found.effect.interval()
     assert (interval.value, interval.high) == (1.0, 1.0)
     assert 0.3 < interval.low < 0.6
     (found,) = outcomes(diverging("standard", [0]) + diverging("equivariant", [1]), DIVERGED)
     assert (value(found), found.verdict) == (0.0, "undecided")
-    (found,) = outcomes(diverging("standard", []) + diverging("equivariant", range(5)), DIVERGED)
-    assert found.verdict == "contradicted"
-
-
-def test_a_run_that_has_not_finished_can_still_diverge() -> None:
     running = [
         make_record(r.evaluations, "running", seed=r.settings.seed)
         for r in diverging("standard", [])
@@ -262,21 +244,20 @@ def test_a_run_that_has_not_finished_can_still_diverge() -> None:
     assert found.reason.startswith("no runs of both agents")
 
 
-def test_a_policy_in_four_worlds_is_one_trial() -> None:
+def test_a_policy_in_two_worlds_is_one_trial() -> None:
     """A policy that makes both agents diverge, or none, does so in every world."""
 
     def worlds(seeds: Sequence[int]) -> list[RunRecord]:
         return [
             record
-            for variant in ("none", "wind:0.1", "wind:0.5", "wind:1")
+            for variant in ("none", "wind:1")
             for agent, broken in (("standard", seeds), ("equivariant", []))
             for record in diverging(agent, broken, variant=variant)
         ]
 
-    (runs,) = outcomes(worlds(range(3)), DIVERGED)
-    assert (runs.counts, runs.verdict) == ("12/20 against 0/20 diverged", "supported")
+    (runs,) = outcomes(worlds(range(4)), DIVERGED)
+    assert (runs.counts, runs.verdict) == ("8/10 against 0/10 diverged", "supported")
     (drawn,) = outcomes(policies(worlds(range(3)), lambda r: str(r.settings.seed)), DIVERGED)
-    assert drawn.counts == runs.counts
     assert (drawn.policies, drawn.verdict) == (5, "undecided")
     assert value(drawn) == pytest.approx(0.6)
     # Where all agree, too.
@@ -314,41 +295,27 @@ def test_runs_are_compared_on_the_same_base_policy() -> None:
     assert all(t.reason.startswith("no runs of both agents with the same seed") for t in found)
 
 
-def test_few_demonstrations_compare_the_ends() -> None:
-    def demonstrations(advantages: dict[int, float]) -> list[RunRecord]:
-        return [
-            record
-            for count, advantage in advantages.items()
-            for record in make_cell(
-                {"standard": 0.4, "equivariant": 0.4 + advantage},
-                demonstrations={"mode": "diverse", "count": count, "seed": 0},
-            )
-        ]
-
-    fewest, fewer, some = outcomes(
-        demonstrations({10: 0.4, 50: 0.2, 100: 0.1}),
+def test_demonstrations_and_budgets_select_cells() -> None:
+    """Of demonstrations, the fewest and the most, too."""
+    records = [
+        record
+        for count, steps, advantage in ((10, 50, 0.4), (50, 50, 0.2), (100, 50, 0.1), (9, 60, -0.3))
+        for record in make_cell(
+            {"standard": 0.4, "equivariant": 0.4 + advantage},
+            demonstrations={"mode": "diverse", "count": count, "seed": 0},
+            env_steps=1000 * steps,
+        )
+    ]
+    found = outcomes(
+        records,
         claim_of(cells={"demonstrations": "fewest"}),
         claim_of(cells={"demonstrations": "fewest"}, minus={"demonstrations": "most"}),
         claim_of(cells={"demonstrations": [50, 100]}, family="some"),
+        claim_of(cells={"env_steps": [60_000]}, predicted=-1, family="steps"),
     )
-    assert [value(one) for one in (fewest, fewer, some)] == pytest.approx([0.4, 0.3, 0.15])
-    assert (fewest.verdict, fewer.verdict) == ("supported", "supported")
-    assert (fewest.cells, fewest.pairs, fewer.cells, fewer.pairs) == (1, 5, 2, 10)
-
-
-def test_budgets_are_told_apart() -> None:
-    records = [
-        record
-        for steps, advantage in ((12_000, 0.2), (60_000, -0.3))
-        for record in make_cell({"standard": 0.5, "equivariant": 0.5 + advantage}, env_steps=steps)
-    ]
-    short, gained = outcomes(
-        records,
-        claim_of(cells={"env_steps": [12_000]}),
-        claim_of(cells={"env_steps": [60_000]}, minus={"env_steps": [12_000]}, predicted=-1),
-    )
-    assert (value(short), value(gained)) == pytest.approx((0.2, -0.5))
-    assert gained.verdict == "supported"
+    assert [value(one) for one in found] == pytest.approx([0.4, 0.3, 0.15, -0.3])
+    assert {one.verdict for one in found} == {"supported"}
+    assert [one.cells for one in found] == [1, 2, 2, 1]
 
 
 def test_the_slope_is_that_within_base_policies() -> None:
@@ -428,11 +395,3 @@ def test_a_claim_of_no_effect_says_so_wherever_it_is_named() -> None:
     assert f"- **Contradicted** (1): {name}." in text
     assert f"| {name} (divergence under stress) |" in text
     assert "Symmetry prevents value divergence (predicted" not in text
-
-
-def test_the_committed_studies_can_be_tested() -> None:
-    """Those of the paper, with the agents of then and of today."""
-    first, study = read_study("first"), read_study("paper")
-    assert "withdrawn" in first.notice
-    assert [c.name for c in first.claims] == [c.name for c in study.claims]
-    assert {claim.measure for claim in study.claims} == {"auc", "success", "diverged", "bias"}
