@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -47,9 +46,8 @@ def test_a_cell_has_its_defect_its_part_and_its_resets(tmp_path: Path) -> None:
 def test_an_audit_of_another_version_is_refused(tmp_path: Path) -> None:
     old = {key: value for key, value in CELL.items() if key not in ("version", "decision", "part")}
     for rows in ([old], [CELL, CELL | {"version": 3}]):
-        with pytest.raises(UserError, match=r"another version .* measure it again") as error:
+        with pytest.raises(UserError, match=r"another version .* measure it again"):
             read_audit(write(tmp_path, rows))
-        assert "\n" not in str(error.value)
 
 
 def test_the_committed_audit_can_be_read() -> None:
@@ -70,29 +68,14 @@ def test_the_committed_audit_can_be_read() -> None:
     assert of("PickCube-v1", "none", "panda").interval.low > 0.1
 
 
-def bad(**changes: Any) -> list[Any]:
-    return [CELL, CELL | changes]
-
-
 @pytest.mark.parametrize(
     "data",
     [
-        "",
-        json.dumps([CELL])[:-9],
-        "{}",
-        "3",
-        "[3]",
-        "[" * 100_000,
+        *("", json.dumps([CELL])[:-9], "{}", "[3]", "[" * 100_000),
+        *(json.dumps([CELL]).replace("0.15", number) for number in ("NaN", "1e999", "'0.15'")),
         [{"version": 2, "task": "PickCube-v1"}],
-        bad(task=3),
-        bad(decision=[0.1, 0.2]),
-        bad(decision=[0.2, 0.1, "0.3"]),
-        bad(decision=[0.1, 0.2, 0.3]),
-        bad(decision=None),
-        bad(part="arm"),
-        bad(resets=[0.1]),
-        json.dumps([CELL]).replace("0.15", "NaN"),
-        json.dumps([CELL]).replace("0.15", "1e999"),
+        *([CELL, CELL | {"decision": value}] for value in ([0.1, 0.2], [0.1, 0.2, 0.3], None)),
+        [CELL, CELL | {"part": "arm"}],
     ],
 )
 def test_a_bad_audit_is_one_sentence(tmp_path: Path, data: object) -> None:

@@ -100,14 +100,11 @@ LINKS = {
 }
 
 
-def test_links_of_pages() -> None:
+def test_links_of_pages(caplog: pytest.LogCaptureFixture) -> None:
     for place, links in LINKS.items():
         source = PAGES.get(place) or place.removeprefix("docs/")
         for text, expected in links.items():
             assert relinked(text, place, source) == expected
-
-
-def test_a_link_to_a_file_that_is_not_there_is_said(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         relinked("[x](../bench/nowhere.py)", "docs/api.md", "api.md")
     assert "bench/nowhere.py, which does not exist" in caplog.text
