@@ -11,8 +11,6 @@ from symsteer.bench.bundles.bundle import write_bundle
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.trainer import Trainer
-from symsteer.bench.sweep.plan import make_plan, write_sweep
-from symsteer.bench.sweep.suite import Suite
 from symsteer.leaderboard.records import dump_record, repeat_command
 from tests.bench.tiny_run import execute, tiny_config
 from tests.fuzz.kinds import Workshop
@@ -56,21 +54,18 @@ def workshop(tmp_path_factory) -> Workshop:
     write_bundle(folder, out / "bundle.zip")
     state = load_checkpoint(folder)
     assert state is not None
-    write_sweep(make_plan(Suite("one", "", (CONFIG,)), out), 1, {folder.name: "it broke"})
     records = {
         "a": make_record(agent="standard"),
         "b": make_record(agent="equivariant", seed=1),
         "c": make_record(agent="base", status="failed"),
     }
-    names = ("config", "record", "progress")
-    files = [*(f"{name}.json" for name in names), "checkpoint.pt", "policy.safetensors"]
+    files = ("config.json", "record.json", "checkpoint.pt", "policy.safetensors")
     return Workshop(
         config=CONFIG,
         options=options_of(CONFIG),
         run={name: (folder / name).read_bytes() for name in files},
         run_id=folder.name,
         state=state,
-        sweeps=out / "sweeps",
         base=out / "base",
         demos=(h5.read_bytes(), h5.with_suffix(".json").read_bytes()),
         bundle=(out / "bundle.zip").read_bytes(),

@@ -68,7 +68,6 @@ class Workshop:
         run: folder of a run that was stopped after its second checkpoint, name to bytes.
         run_id: its name.
         state: its checkpoint.
-        sweeps: folder of the bookkeeping of a sweep.
         base: folder of its demonstrations and base policy.
         demos: its demonstrations, .h5 and .json.
         bundle: its demonstrations and base policy as one file.
@@ -80,7 +79,6 @@ class Workshop:
     run: dict[str, bytes]
     run_id: str
     state: dict[str, Any]
-    sweeps: Path
     base: Path
     demos: tuple[bytes, bytes]
     bundle: bytes
@@ -187,7 +185,7 @@ def suite_with_preset(workshop: Workshop, path: Path) -> list[Any]:
     return ["sweep", path.with_name("suite.toml"), "--dry-run"]
 
 
-# Configurations, records and what a display reads.
+# Configurations and records.
 
 
 def same_configuration(workshop: Workshop, path: Path, ending: Ending) -> None:
@@ -235,17 +233,6 @@ def same_history(workshop: Workshop, path: Path, ending: Ending) -> None:
         require(found[key] == original[key], f"another {key} was accepted")
 
 
-def display(workshop: Workshop, folder: Path) -> Path:
-    """The files of a run and of a sweep."""
-    shutil.copytree(workshop.sweeps, folder / "sweeps")
-    return workshop.restore_run(folder) / "progress.json"
-
-
-def damage_any(path: Path, random: Random) -> None:
-    path = random.choice([*path.parent.glob("*.json"), *(path.parents[1] / "sweeps").iterdir()])
-    random.choice(JSON if path.suffix == ".json" else BYTES)(path, random)
-
-
 # Demonstrations.
 
 
@@ -259,22 +246,6 @@ def demonstrations(workshop: Workshop, folder: Path) -> Path:
 def beside(way: Way) -> Way:
     """The same for the .json file beside it."""
     return lambda path, random: way(path.with_suffix(".json"), random)
-
-
-def edit_arrays(path: Path, random: Random) -> None:
-    with h5py.File(path, "r+") as file:
-        group = file[f"traj_{random.randrange(2)}"]
-        name = random.choice(("actions", "obs"))
-        array = np.asarray(group[name])
-        wrong = array.copy()
-        index = tuple(random.randrange(size) for size in array.shape)
-        wrong[index] = random.choice((np.nan, np.inf, -np.inf, 1e30, 0.125))
-        odd = [None, h5py.SoftLink("/nowhere"), h5py.ExternalLink("/etc/hostname", "/x"), wrong]
-        odd += [array[:0], array[:-1], array[:, : array.shape[1] // 2], np.array(b"text")]
-        odd += [array.astype(random.choice(("i4", "f2", "c8", "S4", "?", "f8"))), array.ravel()]
-        del group[name]
-        if (changed := random.choice(odd)) is not None:
-            group[name] = changed
 
 
 def same_arrays(workshop: Workshop, path: Path, ending: Ending) -> None:
@@ -412,24 +383,6 @@ def bundle(workshop: Workshop, folder: Path) -> Path:
     return folder / "mutant.zip"
 
 
-def edit_members(path: Path, random: Random) -> None:
-    """Another manifest, another name, or another content."""
-    with zipfile.ZipFile(path) as packed:
-        members = {name: packed.read(name) for name in packed.namelist()}
-    name, kind = random.choice(sorted(members)), random.randrange(3)
-    if kind == 0:
-        data = poison_data(json.loads(members["manifest.json"]), random)
-        members["manifest.json"] = json.dumps(data).encode("utf-8", "surrogatepass")
-    elif kind == 1:
-        new = random.choice(("../x", "/x", "a/../../x", ".x", "a/b/c", "x\\y", "x\n", " ", "more"))
-        members[new] = members.pop(name)
-    else:
-        members[name] = poison_bytes(members[name], random)
-    with zipfile.ZipFile(path, "w", random.choice((0, 0, 0, zipfile.ZIP_DEFLATED))) as packed:
-        for name, data in members.items():
-            packed.writestr(name, data)
-
-
 def same_members(workshop: Workshop, path: Path, ending: Ending) -> None:
     with zipfile.ZipFile(io.BytesIO(workshop.bundle)) as packed:
         whole = {packed.read(name) for name in packed.namelist()}
@@ -468,10 +421,9 @@ KINDS: dict[str, Kind] = {
         check=nothing_dropped,
     ),
     "record of a run": Kind(in_run("record.json"), JSON, [RESUME], WORK, same_history),
-    "status": Kind(display, (damage_any,) * 4, [lambda w, path: ["status", path.parents[1]]]),
     "demonstrations": Kind(
         demonstrations,
-        (*BYTES, *map(beside, JSON[1:]), edit_arrays),
+        (*BYTES, *map(beside, JSON[1:])),
         [
             lambda workshop, path, count=count: [
                 *new_run(workshop, "--demos", path),
@@ -498,7 +450,7 @@ KINDS: dict[str, Kind] = {
     ),
     "bundle": Kind(
         bundle,
-        (*BYTES, edit_members, edit_members),
+        BYTES,
         [lambda workshop, path: ["fetch-bundle", path, "--out", path.with_name("base")]],
         check=same_members,
     ),
