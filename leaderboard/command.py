@@ -1,5 +1,5 @@
 """The verbs that read records: `symsteer report` writes, verifies and checks the leaderboard,
-`symsteer compare` compares two sets of runs."""
+`symsteer site` writes it as a site, `symsteer compare` compares two sets of runs."""
 
 from __future__ import annotations
 
@@ -79,6 +79,47 @@ def report(
     files = report.generate(paths, out, audit, study, reproductions)
     page = next(file for file in files if file.name == "LEADERBOARD.md")
     _say(f"wrote {page} and {len(files) - 1} files beside it")
+    return 0
+
+
+def site(
+    records: tyro.conf.Positional[tuple[Path, ...]] = (),
+    out: Path = Path("site"),
+    study: str | None = None,
+    audit: Path | None = None,
+    reproductions: Path | None = None,
+    docs: bool = True,
+) -> int:
+    """Write results and documentation as a folder of static pages (docs/site.md).
+
+    Args:
+        records: Record files, run folders or folders of runs; default: the committed records.
+        out: Folder of the site: a new one, or that of an earlier site, which is replaced.
+        study: The claims to test: name of a study in leaderboard/studies or path of a .toml file;
+            default: those of the paper, for the committed records those of their study.
+        audit: The folder that `symsteer audit --out` wrote, for its numbers and maps, or its
+            summary.json; default: the committed numbers.
+        reproductions: The folder that `symsteer reproduce --into` wrote to: its runs are marked;
+            default: for committed records the committed one.
+        docs: Build the documentation, too, in a checkout of the repository.
+
+    Returns:
+        0.
+
+    Raises:
+        UserError: for paths that cannot be read or written, records that are not valid, and
+            packages that are not installed.
+    """
+    paths = chosen_records(records, "site")
+    from symsteer.leaderboard.site.build import generate
+    from symsteer.leaderboard.study import PAPER
+
+    study = study or (PAPER if records else STUDY)
+    results = generate(paths, out, study, audit, docs, reproductions)
+    index = out.resolve() / "index.html"
+    _say(f"wrote {index}: the pages of {len(results.runs)} records")
+    if docs and not results.docs.is_built:
+        _say("without the documentation, which only a checkout of the repository has")
     return 0
 
 

@@ -59,7 +59,7 @@ GROUPS = {
     },
     "look at results": {
         "report": Verb("symsteer.leaderboard.command:report", computes=False),
-        "site": Verb("symsteer.leaderboard.site.command:site", computes=False),
+        "site": Verb("symsteer.leaderboard.command:site", computes=False),
         "compare": Verb("symsteer.leaderboard.command:compare", computes=False),
         "evaluate": Verb(f"{BENCH}:evaluate"),
         "film": Verb(f"{BENCH}:film"),

@@ -47,7 +47,7 @@ def generate(
 ) -> Results:
     """Write the site; files of an earlier one that no longer belong to it are removed.
 
-    Arguments are those of `symsteer site` (`command.site`), which names the study.
+    Arguments are those of `symsteer site` (`symsteer.leaderboard.command`), which names the study.
 
     Returns:
         What the site shows.

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.command import site as verb
 from symsteer.leaderboard.defects import read_audit
 from symsteer.leaderboard.page import render_page
 from symsteer.leaderboard.row_numbers import summarize
@@ -16,7 +17,6 @@ from symsteer.leaderboard.runs import load_runs
 from symsteer.leaderboard.sections import Findings, View, claims
 from symsteer.leaderboard.site import build, libraries
 from symsteer.leaderboard.site.build import generate
-from symsteer.leaderboard.site.command import site as verb
 from symsteer.leaderboard.site.docs import Documentation
 from symsteer.leaderboard.site.libraries import as_script
 from symsteer.leaderboard.site.results import Results
