@@ -13,11 +13,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from safetensors import safe_open
-from safetensors.torch import save_file
 
 from symsteer.bench.bundles.fetch import MANIFEST, read_bundle
 from symsteer.leaderboard.records import config_hash, run_id_of
+from tests.fuzz.kinds import read_policy, write_sealed_policy
 
 EVIL = "evilmod:Evil"
 
@@ -180,16 +179,11 @@ def _run(runs: Path, intact: Path, config: dict[str, Any], kind: str) -> None:
 def _policy(intact: Path, path: Path, name: str, task: str | None = None) -> None:
     """A policy file that names another class, or another task, with its checksum mended."""
     path.parent.mkdir(exist_ok=True)
-    with safe_open(intact, framework="pt") as file:
-        metadata = file.metadata()
-        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    description = json.loads(metadata["policy"])
-    description["name"] = name
+    data = read_policy(intact)
+    data["policy"]["name"] = name
     if task:
-        description["report"]["world"]["task"] = task
-    text = json.dumps(description)
-    metadata |= {"policy": text, "policy_sha256": hashlib.sha256(text.encode()).hexdigest()}
-    save_file(tensors, path, metadata)
+        data["policy"]["report"]["world"]["task"] = task
+    write_sealed_policy(path, data)
 
 
 def _demonstrations(place: Path, base: Path, secret: Path) -> list[Path]:

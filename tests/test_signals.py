@@ -14,7 +14,7 @@ from symsteer.bench.runs.folder import RECORD, read_config
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import tiny_config, without_clock, write_suite
 from tests.children import start
-from tests.fuzz.conftest import options_of
+from tests.fuzz.kinds import options_of
 
 WATCH = """
 import os, sys

@@ -30,7 +30,7 @@ from symsteer.bench.runs.config import Execution
 from tests import hostile
 from tests.bench.tiny_run import execute, tiny_config, write_suite
 from tests.children import ROOT, start
-from tests.fuzz.conftest import options_of
+from tests.fuzz.kinds import options_of
 
 pytestmark = pytest.mark.long
 

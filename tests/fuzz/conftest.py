@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import shlex
 from unittest.mock import patch
 
 import pytest
 
 from symsteer.bench.bundles.bundle import write_bundle
 from symsteer.bench.runs.checkpoint import load_checkpoint
-from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.trainer import Trainer
-from symsteer.leaderboard.records import dump_record, repeat_command
+from symsteer.leaderboard.records import dump_record
 from tests.bench.tiny_run import execute, tiny_config
 from tests.fuzz.kinds import Workshop
 from tests.leaderboard.record_factory import make_record
@@ -35,11 +33,6 @@ def stop_after(config, out, checkpoints):
     return written[0]
 
 
-def options_of(config: RunConfig) -> list[str]:
-    """The command line that asks for a configuration."""
-    return shlex.split(str(repeat_command(config.to_json())))[2:]
-
-
 @pytest.fixture(autouse=True)
 def nothing_is_committed(monkeypatch, tmp_path):
     """`report --check` reads all committed records, a thousand of them."""
@@ -50,7 +43,6 @@ def nothing_is_committed(monkeypatch, tmp_path):
 def workshop(tmp_path_factory) -> Workshop:
     out = tmp_path_factory.mktemp("workshop")
     folder = stop_after(CONFIG, out, checkpoints=2)
-    h5 = next((out / "base").glob("*.h5"))
     write_bundle(folder, out / "bundle.zip")
     state = load_checkpoint(folder)
     assert state is not None
@@ -59,15 +51,5 @@ def workshop(tmp_path_factory) -> Workshop:
         "b": make_record(agent="equivariant", seed=1),
         "c": make_record(agent="base", status="failed"),
     }
-    files = ("config.json", "record.json", "checkpoint.pt", "policy.safetensors")
-    return Workshop(
-        config=CONFIG,
-        options=options_of(CONFIG),
-        run={name: (folder / name).read_bytes() for name in files},
-        run_id=folder.name,
-        state=state,
-        base=out / "base",
-        demos=(h5.read_bytes(), h5.with_suffix(".json").read_bytes()),
-        bundle=(out / "bundle.zip").read_bytes(),
-        records={name: dump_record(record) for name, record in records.items()},
-    )
+    texts = {name: dump_record(record) for name, record in records.items()}
+    return Workshop(CONFIG, folder, state, texts)

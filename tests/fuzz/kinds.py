@@ -12,6 +12,7 @@ import io
 import json
 import os
 import pickle
+import shlex
 import shutil
 import struct
 import zipfile
@@ -35,7 +36,7 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep import grid
 from symsteer.leaderboard import report, study
-from symsteer.leaderboard.records import config_hash, flat, read_record
+from symsteer.leaderboard.records import config_hash, flat, read_record, repeat_command
 from symsteer.policies.files import _sha256
 from tests.bench.tuning.tiny_plan import TEXT as PLAN
 from tests.fuzz.judge import BadEndingError, Ending, end_of, stopped_at
@@ -64,34 +65,29 @@ class Workshop:
 
     Attributes:
         config: of the run.
-        options: the command line that asks for it.
-        run: folder of a run that was stopped after its second checkpoint, name to bytes.
-        run_id: its name.
+        run: folder of a run that was stopped after its second checkpoint; beside it are the folder
+            `base` of its demonstrations and base policy, and `bundle.zip` with both.
         state: its checkpoint.
-        base: folder of its demonstrations and base policy.
-        demos: its demonstrations, .h5 and .json.
-        bundle: its demonstrations and base policy as one file.
         records: of other runs.
     """
 
     config: RunConfig
-    options: list[str]
-    run: dict[str, bytes]
-    run_id: str
+    run: Path
     state: dict[str, Any]
-    base: Path
-    demos: tuple[bytes, bytes]
-    bundle: bytes
     records: dict[str, str]
 
     def restore_run(self, folder: Path) -> Path:
         """The stopped run as it was, in ``folder``."""
-        path = folder / self.run_id
-        shutil.rmtree(path, ignore_errors=True)
-        path.mkdir(parents=True)
-        for name, data in self.run.items():
-            (path / name).write_bytes(data)
-        return path
+        return shutil.copytree(self.run, folder / self.run.name)
+
+    @property
+    def demos(self) -> Path:
+        return next(self.run.parent.glob("base/*.h5"))
+
+
+def options_of(config: RunConfig) -> list[str]:
+    """The command line that asks for a configuration."""
+    return shlex.split(str(repeat_command(config.to_json())))[2:]
 
 
 Make = Callable[[Workshop, Path], Path]
@@ -123,14 +119,7 @@ class Kind:
         if number is not None:
             self.ways[number % len(self.ways)](path, random)
         line = self.lines[0] if number is None else random.choice(self.lines)
-        names = (
-            path.stem,
-            workshop.run_id,
-            "record.json",
-            "policy.safetensors",
-            "sweeps",
-            "option",
-        )
+        names = (path.stem, workshop.run.name, "record.json", "policy.safetensors", "option")
         with stopped_at(*self.stop):
             ending = end_of(line(workshop, path), names)
         if ending.kind == "accepted" and isinstance(ending.found[0], Trainer):
@@ -150,7 +139,7 @@ def require(condition: bool, complaint: str) -> None:
 
 
 def new_run(workshop: Workshop, *more: Any) -> list[Any]:
-    return ["run", "--quiet", *more, "--out", "runs", *workshop.options]
+    return ["run", "--quiet", *more, "--out", "runs", *options_of(workshop.config)]
 
 
 def in_run(name: str) -> Make:
@@ -227,7 +216,10 @@ def holds(data: Any, part: Any) -> bool:
 
 def same_history(workshop: Workshop, path: Path, ending: Ending) -> None:
     """The record is written before the run goes on."""
-    found, original = json.loads(path.read_text()), json.loads(workshop.run["record.json"])
+    found, original = (
+        json.loads(path.read_text()),
+        json.loads((workshop.run / "record.json").read_text()),
+    )
     original["evaluations"] = original["evaluations"][: workshop.state["evaluations"]]
     for key in ("run_id", "config", "config_hash", "evaluations"):
         require(found[key] == original[key], f"another {key} was accepted")
@@ -237,10 +229,9 @@ def same_history(workshop: Workshop, path: Path, ending: Ending) -> None:
 
 
 def demonstrations(workshop: Workshop, folder: Path) -> Path:
-    path = folder / "mutant.h5"
-    for file, data in zip((path, path.with_suffix(".json")), workshop.demos, strict=True):
-        file.write_bytes(data)
-    return path
+    for suffix in (".h5", ".json"):
+        shutil.copy(workshop.demos.with_suffix(suffix), folder / f"mutant{suffix}")
+    return folder / "mutant.h5"
 
 
 def beside(way: Way) -> Way:
@@ -250,7 +241,7 @@ def beside(way: Way) -> Way:
 
 def same_arrays(workshop: Workshop, path: Path, ending: Ending) -> None:
     (demos,) = ending.found[1].values()
-    with h5py.File(io.BytesIO(workshop.demos[0])) as file:
+    with h5py.File(workshop.demos) as file:
         for index, arrays in enumerate(demos.episodes):
             for name, array in zip(("obs", "actions"), arrays, strict=True):
                 same = np.array_equal(np.asarray(file[f"traj_{index}/{name}"]), array.numpy())
@@ -276,6 +267,12 @@ def write_policy(path: Path, data: dict[str, Any]) -> None:
     save_file(tensors, path, {**{k: str(v) for k, v in meta.items()}, "policy": policy})
 
 
+def write_sealed_policy(path: Path, data: dict[str, Any]) -> None:
+    """With the checksum of the description."""
+    data["meta"]["policy_sha256"] = _sha256(json.dumps(data["policy"]))
+    write_policy(path, data)
+
+
 def damage_header(path: Path, random: Random) -> None:
     """The header holds all that is not a number of the network."""
     data = path.read_bytes()
@@ -288,14 +285,11 @@ def seal_policy(path: Path, random: Random) -> None:
     data = read_policy(path)
     data["policy"]["training_record"].pop("losses", None)
     data["policy"] = poison_data(data["policy"], random)
-    data["meta"]["policy_sha256"] = _sha256(json.dumps(data["policy"]))
-    write_policy(path, data)
+    write_sealed_policy(path, data)
 
 
 def same_policy(workshop: Workshop, path: Path, ending: Ending) -> None:
-    intact = path.with_name("intact.safetensors")
-    intact.write_bytes(workshop.run["policy.safetensors"])
-    have, want = read_policy(path), read_policy(intact)
+    have, want = read_policy(path), read_policy(workshop.run / "policy.safetensors")
     # The type of numbers may be another one.
     tensors = [{k: v.double() for k, v in policy["tensors"].items()} for policy in (have, want)]
     require(alike(*tensors), "other numbers were accepted")
@@ -379,12 +373,11 @@ def same_state(workshop: Workshop, path: Path, ending: Ending) -> None:
 
 
 def bundle(workshop: Workshop, folder: Path) -> Path:
-    (folder / "mutant.zip").write_bytes(workshop.bundle)
-    return folder / "mutant.zip"
+    return shutil.copy(workshop.run.parent / "bundle.zip", folder / "mutant.zip")
 
 
 def same_members(workshop: Workshop, path: Path, ending: Ending) -> None:
-    with zipfile.ZipFile(io.BytesIO(workshop.bundle)) as packed:
+    with zipfile.ZipFile(workshop.run.parent / "bundle.zip") as packed:
         whole = {packed.read(name) for name in packed.namelist()}
     for file in path.with_name("base").rglob("*"):
         known = file.name == "manifest.json" or file.is_dir() or file.read_bytes() in whole
@@ -479,8 +472,7 @@ VALUES = (
 def command(workshop: Workshop, number: int, folder: Path) -> Ending:
     """An option with an odd value; the other options keep their values."""
     random = Random(f"command {number}")
-    policy = folder / "policy.safetensors"
-    policy.write_bytes(workshop.run["policy.safetensors"])
+    policy = workshop.run / "policy.safetensors"
     defaults = flat(workshop.config.to_json())
     # In turn, so that every option is tested; another agent or policy has other options.
     keys = sorted(set(defaults) - {"agent", "policy.name"})

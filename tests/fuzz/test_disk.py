@@ -24,8 +24,9 @@ from symsteer.bench.runs.trainer import Trainer
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import dump_record, read_record
 from tests.bench.tiny_run import execute, resume, without_clock
-from tests.fuzz.conftest import CONFIG, options_of
+from tests.fuzz.conftest import CONFIG
 from tests.fuzz.judge import end_of
+from tests.fuzz.kinds import options_of
 from tests.leaderboard.record_factory import make_record
 
 pytestmark = pytest.mark.long
@@ -79,7 +80,7 @@ def read_only():
 def undisturbed(workshop, tmp_path_factory):
     """A run without errors; its demonstrations and base policy are in the same folder."""
     out = tmp_path_factory.mktemp("undisturbed")
-    shutil.copytree(workshop.base, out / "base")
+    shutil.copytree(workshop.run.parent / "base", out / "base")
     return execute(SHORT, out)
 
 
