@@ -14,28 +14,10 @@ def test_without_arguments_the_defaults_are_those_of_a_run():
 
 
 def test_options_of_the_named_agent_and_policy():
-    config, execution = parse_run(
-        [
-            "--policy.width",
-            "48",
-            "--agent=residual-pathway",
-            "--agent.penalty",
-            "0.25",
-            "--agent.no-layer-norm",
-            "--policy.name",
-            "plain",
-            "--task",
-            "PushCube-v1",
-            "--evaluation.every",
-            "77",
-            "--out",
-            "a",
-            "--quiet",
-            "--agent=standard",
-            "--agent",
-            "residual-pathway",
-        ]
-    )
+    words = "--policy.width 48 --agent=residual-pathway --agent.penalty 0.25 --policy.name plain"
+    words += " --agent.no-layer-norm --task PushCube-v1 --evaluation.every 77 --out a --quiet"
+    words += " --agent=standard --agent residual-pathway"
+    config, execution = parse_run(words.split())
     assert (config.agent, config.policy_name) == ("residual-pathway", "plain")
     assert config.agent_options.penalty == 0.25
     assert not config.agent_options.layer_norm

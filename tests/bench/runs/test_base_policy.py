@@ -111,18 +111,11 @@ def test_it_is_trained_once_for_the_runs_on_all_tasks(name, tmp_path, monkeypatc
         policy = prepare_base(other, quiet(out=tmp_path))
         assert policy.obs_layout == task_class(task).observation_layout
         assert policy.report["world"]["task"] == task
-        # Its report is kept, and it is that of its own task.
-        assert "steerability" in (again := prepare_base(other, quiet(out=tmp_path))).report
-        assert again.content_hash() == policy.content_hash()
+        assert "steerability" in policy.report
         hashes.add(policy.content_hash())
         if name == "edp-joint":
             assert with_policy_of(other, policy_path(path)).policy == other.policy
     assert len(hashes) == 3
-    record = read_record(
-        execute(joint(TASKS[0], name=name, env_steps=160), tmp_path) / "record.json"
-    )
-    assert (record.status, record.base_policy.name) == ("finished", name)
-    assert record.budget.updates > 0
     # Another seed, or other tasks, are other policies.
     assert find_base(joint(TASKS[0], name=name, policy_seed=7), tmp_path) is None
     assert find_base(joint(TASKS[0], TASKS[:2], name=name), tmp_path) is None

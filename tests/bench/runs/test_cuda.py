@@ -96,7 +96,8 @@ def test_teams_train(name, out):
 
 
 def test_a_stopped_run_goes_on(out):
-    folder = stop(tiny_config(device="cuda", checkpoint_every=40), out, env_steps=160)
+    config = tiny_config(device="cuda", env_steps=320, checkpoint_every=40)
+    folder = stop(config, out, env_steps=160)
     assert read_record(resume(folder) / "record.json").status == "finished"
 
 
@@ -110,7 +111,8 @@ def test_a_run_is_used_where_there_is_no_gpu(out):
     elsewhere = json.loads(done.stdout)
     assert elsewhere["recorded"] is None
     assert elsewhere["episodes"]["seed"] == here.evaluation.episodes.seed
-    stopped = stop(tiny_config(seed=1, device="cuda", checkpoint_every=40), out, env_steps=160)
+    config = tiny_config(seed=1, device="cuda", env_steps=320, checkpoint_every=40)
+    stopped = stop(config, out, env_steps=160)
     refused = without_gpu("resume", str(stopped))
     assert refused.returncode != 0
     assert "was begun with --device cuda, but torch finds no CUDA device" in refused.stderr

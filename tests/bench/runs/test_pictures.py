@@ -49,20 +49,13 @@ def color(picture, name):
 
 def test_turning_the_world_turns_the_view_from_above_alone():
     episodes = walks()
-    above, straight, _ = panels(draw_paths(episodes, LAYOUT, "walks"))
-    other_above, other_straight, _ = panels(
-        draw_paths(turned(episodes, math.pi / 2), LAYOUT, "walks")
-    )
-    assert np.abs(above - other_above).mean() > 1
+    above, straight, rose = panels(draw_paths(episodes, LAYOUT, "walks"))
+    other, other_straight, _ = panels(draw_paths(turned(episodes, math.pi / 2), LAYOUT, "walks"))
+    assert np.abs(above - other).mean() > 1
     # Up to the rounding of the transformation, which shifts a few pixels of thin lines.
     assert np.abs(straight - other_straight).mean() < 0.05
-
-
-def test_colours_tell_success():
-    episodes = walks()
-    rose = panels(draw_paths(episodes, LAYOUT, "walks"))[2]
-    assert color(rose, SUCCESS) > 500
-    assert color(rose, FAILURE) > 500
+    # Colours tell success.
+    assert min(color(rose, SUCCESS), color(rose, FAILURE)) > 500
     episodes.episodes["success_once"][:] = True
     rose = panels(draw_paths(episodes, LAYOUT, "walks"))[2]
     assert color(rose, SUCCESS) > 1000

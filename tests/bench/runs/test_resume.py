@@ -1,17 +1,14 @@
 """A run that is killed and continued has the same record as one that was not stopped."""
 
+import dataclasses
 import functools
 import hashlib
 import io
 import json
 import multiprocessing
 import operator
-import os
-import random
 import re
 import shutil
-import signal
-import time
 import zipfile
 
 import pytest
@@ -39,23 +36,14 @@ PROCESSES.set_forkserver_preload(["tests.bench.runs.test_resume", "torch._dynamo
 
 # Fractions of an update are carried over to the next decision.
 CONFIG = tiny_config(
-    env_steps=640,
+    env_steps=400,
     checkpoint_every=60,
+    evaluation=dataclasses.replace(tiny_config().evaluation, every=320),
     # The world changes in the course of the run.
     variant="action_gain:1@0.2..0.6+perception_bias:0..1",
     # After the first checkpoint some noise is still drawn at random.
-    options={"utd": 0.3, "warmup": 80},
+    options={"utd": 0.3, "warmup": 40},
 )
-
-
-def _work(folder):
-    resume(folder)
-
-
-def start(folder):
-    process = PROCESSES.Process(target=_work, args=(folder,), daemon=True)
-    process.start()
-    return process
 
 
 @pytest.fixture(scope="module")
@@ -74,20 +62,12 @@ def begun(undisturbed, tmp_path):
     return folder
 
 
-def kill_after(folder, seconds):
-    """Run in a process of its own and kill it, unless it has ended before."""
-    process = start(folder)
-    process.join(seconds)
-    if process.is_alive():
-        os.kill(process.pid, signal.SIGKILL)
-    process.join()
-
-
 @pytest.mark.long
 def test_killed_behind_every_checkpoint(undisturbed, begun):
     kills, seen = 0, None
     while not is_finished(begun):
-        process = start(begun)
+        process = PROCESSES.Process(target=resume, args=(begun,), daemon=True)
+        process.start()
         while process.is_alive() and seen == (seen := _version(begun / CHECKPOINT)):
             process.join(0.005)
         if process.is_alive():
@@ -96,7 +76,7 @@ def test_killed_behind_every_checkpoint(undisturbed, begun):
         process.join()
         # A checkpoint that was written after the last check.
         seen = _version(begun / CHECKPOINT)
-    assert kills >= 3
+    assert kills >= 2
     assert without_clock(begun) == without_clock(undisturbed)
 
 
@@ -104,50 +84,17 @@ def _version(path):
     return path.stat().st_mtime_ns if path.exists() else None
 
 
-@pytest.mark.slow
-def test_killed_at_twenty_random_moments(undisturbed, begun):
-    generator, kills, resumed = random.Random(1), 20, []
-    pristine = begun.parent / "pristine"
-    shutil.copytree(begun, pristine)
-    start_time = time.monotonic()
-    kill_after(begun, None)
-    whole = time.monotonic() - start_time
-    assert without_clock(begun) == without_clock(undisturbed)
-    while len(resumed) < kills:
-        moment = generator.uniform(0, whole)
-        shutil.rmtree(begun)
-        shutil.copytree(pristine, begun)
-        kill_after(begun, moment)
-        # Speed varies, so some runs have finished before the kill. They must be intact, too.
-        finished = is_finished(begun)
-        if not finished:
-            assert state_of(begun) == "interrupted"
-            resume(begun)
-            resumed.append(read_record(begun / "record.json").wall_clock.resumed)
-        assert without_clock(begun) == without_clock(undisturbed), f"killed after {moment:.2f} s"
-    # Some kills happen before the first checkpoint, some after it.
-    assert 5 <= sum(resumed) <= kills
-
-
 def test_evaluating_again_gives_the_recorded_episodes(undisturbed):
     before = {path.name: path.stat().st_mtime_ns for path in undisturbed.iterdir()}
-    found = evaluate(undisturbed)
-    record = read_record(undisturbed / "record.json")
+    found, final = evaluate(undisturbed), read_record(undisturbed / "record.json").final
     assert found.recorded is True
-    assert found.evaluation.episodes == record.final.episodes
-    assert found.evaluation.diagnostics == record.final.diagnostics
+    assert found.evaluation.episodes == final.episodes
+    assert found.evaluation.diagnostics == final.diagnostics
+    elsewhere = evaluate(undisturbed, variant="action_gain:1", episodes=2)
+    assert (elsewhere.variant, elsewhere.recorded) == ("action_gain:1", None)
+    assert elsewhere.evaluation.episodes.seed == final.episodes.seed[:2]
+    assert json.loads(json.dumps(elsewhere.to_json()))["episodes"]["episode_len"] == [50] * 2
     assert {path.name: path.stat().st_mtime_ns for path in undisturbed.iterdir()} == before
-
-
-def test_evaluating_in_another_world(undisturbed):
-    found = evaluate(undisturbed, variant="action_gain:1", episodes=4)
-    assert found.variant == "action_gain:1"
-    assert (
-        found.evaluation.episodes.seed
-        == read_record(undisturbed / "record.json").final.episodes.seed[:4]
-    )
-    assert found.recorded is None
-    assert json.loads(json.dumps(found.to_json()))["episodes"]["episode_len"] == [50] * 4
 
 
 @pytest.mark.parametrize(
@@ -214,6 +161,10 @@ def test_what_cannot_be_continued(undisturbed, begun, tmp_path):
     renamed = begun.rename(tmp_path / "renamed")
     with pytest.raises(UserError, match="does not belong"):
         resume(renamed)
+    state = load_checkpoint(undisturbed)
+    assert (state["final"], state["replay"]) == (True, None)
+    progress = read_progress(undisturbed)
+    assert (progress["phase"], progress["budget"]) == ("evaluation", CONFIG.env_steps)
 
 
 def test_a_damaged_or_foreign_checkpoint_is_refused_and_kept(undisturbed, begun):
@@ -238,7 +189,7 @@ def stopped(undisturbed, tmp_path_factory):
     """The folder of a run that was stopped after its first checkpoint, with its checkpoint."""
     out = tmp_path_factory.mktemp("stopped")
     shutil.copytree(undisturbed.parent / "base", out / "base")
-    folder = stop(CONFIG, out, env_steps=480)
+    folder = stop(CONFIG, out, env_steps=320)
     archive = (folder / "checkpoint.pt").read_bytes()[:-CHECKSUM_BYTES]
     return folder, archive
 
@@ -292,13 +243,3 @@ def test_a_tensor_that_is_shorter_than_it_says_is_not_read(stopped):
     sealed(path, content, cut=4)
     with pytest.raises(UserError, match="cannot be read as a checkpoint"):
         load_checkpoint(folder)
-
-
-def test_a_checkpoint_holds_plain_data_and_goes_without_the_replay_at_the_end(undisturbed):
-    state = load_checkpoint(undisturbed)
-    assert state["final"]
-    assert state["replay"] is None
-    assert state["env_steps"] == read_record(undisturbed / "record.json").budget.env_steps
-    progress = read_progress(undisturbed)
-    assert progress["phase"] == "evaluation"
-    assert progress["budget"] == CONFIG.env_steps

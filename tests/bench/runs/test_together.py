@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import time
 from types import SimpleNamespace
 
@@ -11,6 +9,7 @@ import pytest
 
 from symsteer.agents.standard import StandardAgent
 from symsteer.agents.team import Team
+from symsteer.bench.runs import trainer
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.together import _next, execute_together
 from symsteer.leaderboard.records import read_record
@@ -21,8 +20,8 @@ pytestmark = pytest.mark.long
 SEEDS = (0, 1)
 
 
-def configs(agent="standard", seeds=SEEDS, **changes):
-    return [tiny_config(agent, seed=seed, **changes) for seed in seeds]
+def configs(agent="standard", seeds=SEEDS):
+    return [tiny_config(agent, seed=seed, checkpoint_every=15) for seed in seeds]
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +65,11 @@ def test_the_records_are_those_of_single_runs(alone, tmp_path):
         parts = ("simulate", "decode", "update", "evaluate", "diagnose")
         assert 0 < clock.update < sum(getattr(clock, part) for part in parts) <= clock.total
         total += clock.total
-        before[tmp_path / name / "record.json"] = (tmp_path / name / "record.json").read_bytes()
+        before[tmp_path / name] = (tmp_path / name / "record.json").read_bytes()
     assert total <= seconds
     # Finished runs are left alone.
     assert execute_together(configs(), quiet(out=tmp_path)) == [None] * len(SEEDS)
-    assert {path: path.read_bytes() for path in before} == before
+    assert {path: (path / "record.json").read_bytes() for path in before} == before
 
 
 def test_runs_that_are_behind_are_served_first():
@@ -87,10 +86,10 @@ def test_runs_that_are_behind_are_served_first():
     assert _next([ahead]) == [ahead]
 
 
-def test_a_killed_team_continues(lend, tmp_path, monkeypatch):
+def test_a_killed_team_continues_and_an_error_of_one_run_does_not_stop_the_others(
+    alone, lend, tmp_path, monkeypatch
+):
     """One run got further than the others before the process was killed."""
-    from symsteer.bench.runs import trainer
-
     lend(tmp_path)
     written = []
     stock = trainer.save_checkpoint
@@ -102,38 +101,29 @@ def test_a_killed_team_continues(lend, tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(trainer, "save_checkpoint", save)
-    changed = [dataclasses.replace(config, checkpoint_every=5) for config in configs()]
     with pytest.raises(KeyboardInterrupt):
-        execute_together(changed, quiet(out=tmp_path))
-    states = [json.loads((tmp_path / run_id(c, {}) / "record.json").read_text()) for c in changed]
-    assert {state["status"] for state in states} == {"interrupted"}
+        execute_together(configs(), quiet(out=tmp_path))
+    folders = [tmp_path / run_id(config, {}) for config in configs()]
+    assert {read_record(f / "record.json").status for f in folders} == {"interrupted"}
     monkeypatch.setattr(trainer, "save_checkpoint", stock)
-    assert execute_together(changed, quiet(out=tmp_path)) == [None] * len(SEEDS)
-    out = tmp_path / "undisturbed"
-    lend(out)
-    assert execute_together(changed, quiet(out=out)) == [None] * len(SEEDS)
-    for config in changed:
-        assert_same(tmp_path / run_id(config, {}), out / run_id(config, {}))
+    observe = StandardAgent.observe
 
-
-def test_an_error_of_one_run_does_not_stop_the_others(alone, lend, tmp_path, monkeypatch):
-    lend(tmp_path)
-    stock = StandardAgent.observe
-
-    def observe(self, transition):
-        if self.context.seed == 1 and self.decisions > 40:
+    def fail(self, transition):
+        if self.context.seed == 1 and self.decisions > 30:
             raise FloatingPointError("a number is not finite")
-        stock(self, transition)
+        observe(self, transition)
 
-    monkeypatch.setattr(StandardAgent, "observe", observe)
+    monkeypatch.setattr(StandardAgent, "observe", fail)
     first, error = execute_together(configs(), quiet(out=tmp_path))
     assert first is None
-    assert "not finite" in str(error)
-    names = [run_id(config, {}) for config in configs()]
-    assert_same(tmp_path / names[0], alone / names[0])
-    record = read_record(tmp_path / names[1] / "record.json")
+    assert_same(folders[0], alone / folders[0].name)
+    record = read_record(folders[1] / "record.json")
     assert record.status == "failed"
+    assert "not finite" in str(error)
     assert "not finite" in record.failure
+    monkeypatch.setattr(StandardAgent, "observe", observe)
+    assert execute_together(configs(), quiet(out=tmp_path)) == [None] * len(SEEDS)
+    assert_same(folders[1], alone / folders[1].name)
 
 
 @pytest.mark.slow

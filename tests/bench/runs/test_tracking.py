@@ -1,27 +1,27 @@
 """Runs in Weights & Biases: what is logged there, and that a run never depends on it."""
 
+import json
 import shutil
 import sys
 from importlib.machinery import PathFinder
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from symsteer.bench.cli import run, sweep
+from symsteer.bench.cli import run
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.together import execute_together
-from symsteer.bench.runs.tracking import check_tracking
+from symsteer.bench.runs.tracking import WandbLog, check_tracking
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import (
-    execute,
     quiet,
     resume,
     stop,
     tiny_config,
     without_clock,
-    write_suite,
 )
 
 pytestmark = pytest.mark.long
@@ -116,8 +116,8 @@ def test_a_tracked_run_has_the_same_record_and_wandb_has_its_points(finished, ou
 
 
 def test_a_continued_run_goes_on_in_wandb_without_points_twice(out, begun):
-    config = tiny_config(env_steps=480, checkpoint_every=60)
-    folder = stop(config, out, 320, track="wandb", group="suite")
+    config = tiny_config(env_steps=320, checkpoint_every=60)
+    folder = stop(config, out, 160, track="wandb", group="suite")
     assert resume(folder, track="wandb") == folder
     first, second = begun
     for key in ("id", "group", "name"):
@@ -129,24 +129,12 @@ def test_a_continued_run_goes_on_in_wandb_without_points_twice(out, begun):
     tags = first.points | second.points
     both = {tag: first.points.get(tag, {}) | second.points.get(tag, {}) for tag in tags}
     assert_mirrored(both, folder)
-    # A damaged state begins a new run there.
-    other = stop(tiny_config("zero"), out, 0, track="wandb")
-    (other / "wandb.json").write_text('{"id": 3}')
-    resume(other, track="wandb")
-    assert begun[2].options["id"] != begun[3].options["id"]
-    assert_mirrored(begun[3].points, other)
-
-
-@pytest.mark.slow
-def test_a_sweep_tracks_its_runs_as_a_group(out):
-    config = tiny_config(agent="zero")
-    assert sweep(write_suite(out, config, "seed = [0]"), out=out, workers=1, track="wandb") == 0
-    [file] = (out / run_id(config, {})).glob("wandb/offline-run-*/*.wandb")
-    assert b"tiny" in file.read_bytes()
 
 
 @pytest.mark.parametrize("method", ["init", "log", "finish"])
-def test_a_run_does_not_end_with_the_tracking(method, out, begun, monkeypatch, capsys):
+def test_an_error_of_the_tracking_is_told_once_and_ends_nothing(
+    method, finished, begun, tmp_path, monkeypatch, capsys
+):
     def fail(*args, **options):
         raise wandb.errors.CommError("the network\nis down")
 
@@ -157,12 +145,17 @@ def test_a_run_does_not_end_with_the_tracking(method, out, begun, monkeypatch, c
         setattr(run, method, fail)
         return run
 
+    record = read_record(finished[1] / "record.json")
     monkeypatch.setattr(wandb, "init", fail if method == "init" else begin)
-    folder = execute(tiny_config("zero"), out, track="wandb")
-    assert read_record(folder / "record.json").status == "finished"
-    assert scalars(folder)
+    # A damaged state begins a new run there.
+    (tmp_path / "wandb.json").write_text('{"id": 3}')
+    log = WandbLog(tmp_path, record, None)
+    log.scalars({"eval/success_once": 0.5}, 0)
+    log.picture("eval/paths", np.zeros((2, 2, 3), np.uint8), 0)
+    log.end(finished=True)
     said = [line for line in capsys.readouterr().out.splitlines() if "goes on" in line]
-    assert said == [f"{folder.name} goes on without Weights & Biases: the network is down"]
+    assert said == [f"{tmp_path.name} goes on without Weights & Biases: the network is down"]
+    assert json.loads((tmp_path / "wandb.json").read_text())["id"] != 3
 
 
 def test_mistakes_are_told_before_anything_is_built(monkeypatch, tmp_path):

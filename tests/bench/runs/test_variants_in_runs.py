@@ -5,28 +5,34 @@ import pytest
 from symsteer.bench.runs import evaluator
 from symsteer.bench.runs.observers import TerminalProgress
 from symsteer.bench.tasks import make, task_class
-from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from symsteer.variant import variant_text
 from tests.bench.tiny_run import execute, tiny_config
 
 
-def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, monkeypatch):
-    """Evaluation uses the full disc, and the costs of both variants; the record says so."""
-    _, folder = finished
-    made = []
+@pytest.fixture
+def made(monkeypatch):
+    """The number and the variant of all environments that are made."""
+    noted = []
 
-    def noting(task, **kwargs):
-        made.append(variant_text(kwargs["variant"]))
-        return make(task, **kwargs)
+    def noting(task, **options):
+        noted.append((options["num_envs"], variant_text(options["variant"])))
+        return make(task, **options)
 
     monkeypatch.setattr(evaluator, "make", noting)
+    return noted
+
+
+def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, made):
+    """Evaluation uses the full disc, and the costs of both variants; the record says so."""
+    _, folder = finished
     variant = "spawn_sector:1+directional_reward:0.5"
-    config = tiny_config(variant=variant, env_steps=160)
+    config = tiny_config(variant=variant)
     record = read_record(execute(config, folder.parent) / "record.json")
     # Held-out episodes and those that Q is compared with have environments of their own.
-    assert made.count(variant) == 1
-    assert set(made) == {"directional_reward:0.5", variant}
+    variants = [text for _, text in made]
+    assert variants.count(variant) == 1
+    assert set(variants) == {"directional_reward:0.5", variant}
     assert record.config["variant"] == variant
     assert record.config["evaluation_variant"] == "directional_reward:0.5"
     low, _ = task_class(config.task).feasible_return(
@@ -40,14 +46,10 @@ def test_training_alone_sees_the_wedge_and_bounds_follow_the_costs(finished, mon
             assert -1.5 * length <= cost <= 0
 
 
-def test_the_world_may_break_in_the_course_of_a_run(finished, monkeypatch):
+def test_the_world_may_break_in_the_course_of_a_run(finished, made, monkeypatch):
     """At the given shares of the budget, all environments begin in a new world."""
     _, folder = finished
-    made, begun, evaluated = [], [], []
-
-    def noting(task, **kwargs):
-        made.append((kwargs["num_envs"], variant_text(kwargs["variant"])))
-        return make(task, **kwargs)
+    begun, evaluated = [], []
 
     class Noting(TerminalProgress):
         def paused(self, run):
@@ -57,7 +59,6 @@ def test_the_world_may_break_in_the_course_of_a_run(finished, monkeypatch):
             super().evaluated(run, evaluation)
             evaluated.append((run.env_steps, variant_text(run.evaluator.variants)))
 
-    monkeypatch.setattr(evaluator, "make", noting)
     monkeypatch.setattr("symsteer.bench.runs.run.TerminalProgress", Noting)
     config = tiny_config(
         variant="action_gain:1@0.25..0.75+wind:0.5@0.5", env_steps=320, checkpoint_every=28
@@ -71,10 +72,3 @@ def test_the_world_may_break_in_the_course_of_a_run(finished, monkeypatch):
     assert evaluated == [(0, "none"), (160, "none"), (320, whole)]
     assert record.config["variant"] == config.variant
     assert record.config["evaluation_variant"] == whole
-
-
-def test_an_obstacle_cannot_be_drawn_for_each_episode(tmp_path):
-    config = tiny_config(variant="obstacle:0..1")
-    with pytest.raises(UserError, match="built with the scene"):
-        execute(config, tmp_path)
-    assert not list(tmp_path.iterdir())
