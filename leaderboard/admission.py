@@ -100,8 +100,8 @@ class Configuration(BaseModel):
 class Judged:
     """A record, and what follows from its configuration; UserError or ValueError if it is none.
 
-    `own`: the agent is one of SymSteer's, and if it `learns`, has a critic. `limit`: steps of an
-    episode. `step`: environment steps of a decision. `cost`: the most that a step may cost.
+    `is_ours`: the agent is one of SymSteer's, and if it `learns`, has a critic. `limit`: steps of
+    an episode. `step`: environment steps of a decision. `cost`: the most that a step may cost.
     """
 
     def __init__(self, file: Path, record: RunRecord, least: int):
@@ -114,10 +114,10 @@ class Judged:
         values = {re.sub("^sac", "agent_options", k): v for k, v in flat(record.config).items()}
         self.config = c = Configuration.model_validate(values)
         self.specs = parse_variant(self.settings.variant)
-        self.parts = [record.provenance, *record.continued]
-        self.extensions = [extension for part in self.parts for extension in part.extensions]
-        self.own = self.settings.agent in catalogue.AGENTS
-        self.learns = self.own and self.settings.agent not in catalogue.REFERENCES
+        self.processes = [record.provenance, *record.continued]
+        self.extensions = [extension for part in self.processes for extension in part.extensions]
+        self.is_ours = self.settings.agent in catalogue.AGENTS
+        self.learns = self.is_ours and self.settings.agent not in catalogue.REFERENCES
         lengths = [n for evaluation in record.evaluations for n in evaluation.episodes.episode_len]
         self.limit = catalogue.TASKS.get(self.settings.task, max(lengths, default=1))
         self.step = c.num_envs * c.execute
@@ -160,7 +160,7 @@ def check(paths: Iterable[Path], committed: Path) -> list[Admission]:
         for file in record_files([committed]):
             if file not in files:
                 known.add(file, read_record(file), committed=True)
-    verdicts, records, own = [], {}, all_listed()
+    verdicts, records, listed = [], {}, all_listed()
     for file in files:
         verdicts.append(verdict := Admission(file))
         try:
@@ -168,7 +168,7 @@ def check(paths: Iterable[Path], committed: Path) -> list[Admission]:
         except UserError as error:
             verdict.problems.append(str(error))
             continue
-        problems = *_problems(file, record, file_hash(file) in own), *known.duplicates(record)
+        problems = *_problems(file, record, file_hash(file) in listed), *known.duplicates(record)
         verdict.problems += [*problems, *known.contradictions(record)]
         known.add(file, record)
     for verdict in verdicts:
@@ -177,8 +177,8 @@ def check(paths: Iterable[Path], committed: Path) -> list[Admission]:
     return verdicts
 
 
-def _problems(file: Path, record: RunRecord, own: bool) -> Iterator[str]:
-    """What breaks the rules that look at one record alone, a study's `own` or a submitted one."""
+def _problems(file: Path, record: RunRecord, is_listed: bool) -> Iterator[str]:
+    """What breaks the rules about one record alone; those that a study lists may be shorter."""
     if file.name != f"{record.run_id}.json":
         yield f"the file must be named after its run: rename it to {record.run_id}.json"
     if record.status != "finished":
@@ -188,7 +188,7 @@ def _problems(file: Path, record: RunRecord, own: bool) -> Iterator[str]:
         )
         return
     try:
-        judged = Judged(file, record, 0 if own else MIN_EPISODES)
+        judged = Judged(file, record, 0 if is_listed else MIN_EPISODES)
     except (ValidationError, ValueError, UserError) as error:
         yield (
             f"its configuration is none of `symsteer run` ({first_problem(error)}): take the "
@@ -205,23 +205,25 @@ def _problems(file: Path, record: RunRecord, own: bool) -> Iterator[str]:
 
 
 def _unknown_code(j: Judged) -> str:
-    found = []
-    for number, part in enumerate(j.parts, 1):
+    problems = []
+    for number, process in enumerate(j.processes, 1):
         of = f"part {number}: " * (number > 1)
-        released = part.sha256 is not None and RELEASE.fullmatch(part.version or "")
-        if part.commit is None and not released:
-            found.append(f"{of}it names neither a commit nor a released version; use a git clone")
-        if part.commit is not None and part.dirty is not False:
-            found.append(
-                f"{of}its code is not in commit {part.commit[:12]}; commit all files first"
+        released = process.sha256 is not None and RELEASE.fullmatch(process.version or "")
+        if process.commit is None and not released:
+            problems.append(
+                f"{of}it names neither a commit nor a released version; use a git clone"
             )
-        found += [
+        if process.commit is not None and process.dirty is not False:
+            problems.append(
+                f"{of}its code is not in commit {process.commit[:12]}; commit all files first"
+            )
+        problems += [
             f"{of}its {extension.kind} {extension.target} belongs to no installed distribution; "
             "install it as a package with an entry point"
-            for extension in part.extensions
+            for extension in process.extensions
             if extension.distribution is None or extension.version is None
         ]
-    return ", and ".join(found)
+    return ", and ".join(problems)
 
 
 def _unknown_name(j: Judged) -> str | None:
@@ -249,14 +251,14 @@ def _role(j: Judged) -> bool:
 
 def _hash_of_nothing(j: Judged) -> str | None:
     hashes = [j.record.base_policy.content_hash, j.config.demonstrations, j.config.weights]
-    hashes += [text or "" for part in j.parts for text in (part.commit, part.sha256)]
+    hashes += [text or "" for part in j.processes for text in (part.commit, part.sha256)]
     hashes += [extension.sha256 for extension in j.extensions]
     return next((text for text in hashes if text and len(set(text)) < 9), None)
 
 
 def _machine(j: Judged) -> bool:
     cpu = j.config.device == "cpu"
-    return any(part.together > 100 or (part.device == "cpu") != cpu for part in j.parts)
+    return any(part.together > 100 or (part.device == "cpu") != cpu for part in j.processes)
 
 
 def _machine_path(j: Judged) -> str | None:
@@ -266,7 +268,7 @@ def _machine_path(j: Judged) -> str | None:
 
 def _budget(j: Judged) -> str | None:
     used, budget, record = j.record.budget.env_steps, j.config.env_steps, j.record
-    evidence = not j.own and (record.parameters.total > 0 or record.has_critic)
+    evidence = not j.is_ours and (record.parameters.total > 0 or record.has_critic)
     learns = j.learns or record.role != "reference" or evidence
     needless = j.settings.agent in ("base", "zero") and used > 0
     wrong = (learns and used < budget) or used >= budget + j.step or needless
@@ -278,15 +280,15 @@ def _decision(j: Judged) -> bool:
 
 
 def _sizes(j: Judged) -> bool:
-    sizes, reference = j.record.parameters, j.own and not j.learns
+    sizes, reference = j.record.parameters, j.is_ours and not j.learns
     return sizes.total != sizes.actor + sizes.critic or (reference and sizes.total > 0)
 
 
 def _schedule(j: Judged) -> str | None:
     before = [evaluation.env_steps for evaluation in j.record.evaluations][:-1]
     if j.record.role == "reference":
-        return "a reference has one" if j.own and before else None
-    if not before or (j.own and before[0]):
+        return "a reference has one" if j.is_ours and before else None
+    if not before or (j.is_ours and before[0]):
         return "none before the first decision"
     for number, (was, at) in enumerate([*pairwise(before), (before[-1], None)], 1):
         # At the first whole decision that reaches the planned step, one evaluation a decision.
@@ -300,7 +302,7 @@ def _schedule(j: Judged) -> str | None:
 
 def _bounds(j: Judged) -> bool:
     bounds, c = j.record.feasible_q, j.config
-    if bounds is None or not (j.own and j.known_world):
+    if bounds is None or not (j.is_ours and j.known_world):
         return (bounds is None) == j.record.has_critic
     number = math.ceil(j.limit / c.execute) if c.timeouts_terminal else 10_000
     lowest = -j.cost * c.execute * sum(c.gamma**i for i in range(number))
@@ -348,7 +350,7 @@ def _updates(j: Judged, e: Evaluation) -> bool:
     first = c.warmup if c.learning_starts is None else c.learning_starts
     # Whole updates are made, of a sum that is rounded.
     owed = max(0, e.decisions - first) * c.utd * j.learns
-    return j.own and not -1e-6 <= owed - e.updates < 2
+    return j.is_ours and not -1e-6 <= owed - e.updates < 2
 
 
 def _returns(j: Judged, e: Evaluation) -> bool:
@@ -370,22 +372,22 @@ def _unmeasured(j: Judged, e: Evaluation) -> str | None:
 
 
 def _q(j: Judged, e: Evaluation) -> str | None:
-    found = {name: value for name, value in e.diagnostics.items() if value is not None}
-    fits = {name: abs(v) < 1 + 1e-6 for name, v in found.items() if name.endswith("correlation")}
-    fits |= {name: v >= 0 for name, v in found.items() if name.endswith(("_std", "td_error"))}
+    values = {name: value for name, value in e.diagnostics.items() if value is not None}
+    fits = {name: abs(v) < 1 + 1e-6 for name, v in values.items() if name.endswith("correlation")}
+    fits |= {name: v >= 0 for name, v in values.items() if name.endswith(("_std", "td_error"))}
     shares = "overestimated", "violation", "saturated"
-    fits |= {name: 0 <= v <= 1 for name, v in found.items() if name.endswith(shares)}
-    if (bounds := j.record.feasible_q) and found.keys() >= set(NEEDED):
-        mean, low, high, most, magnitude, overshoot = (found[name] for name in NEEDED)
-        allowance, slack = found.get("q_allowance", 0.0), 1e-3 * max(1.0, most)
+    fits |= {name: 0 <= v <= 1 for name, v in values.items() if name.endswith(shares)}
+    if (bounds := j.record.feasible_q) and values.keys() >= set(NEEDED):
+        mean, low, high, most, magnitude, overshoot = (values[name] for name in NEEDED)
+        allowance, slack = values.get("q_allowance", 0.0), 1e-3 * max(1.0, most)
         bottom, top = bounds.low - allowance, bounds.high + allowance
         size, outside = max(-bottom, top) or 1, max(bottom - low, high - top)
         fits["q_mean"] = low - slack <= mean <= high + slack
         fits["q_abs_max"] = most >= max(-low, high) - slack
         fits["q_magnitude"] = math.isclose(magnitude, most / size, rel_tol=1e-3)
         fits["q_overshoot"] = outside - slack <= overshoot * (top - bottom) <= most + size
-        means = [name for name in found if "bias" in name or name.startswith("return_")]
-        fits |= {name: abs(found[name]) <= most + size + slack for name in means}
+        means = [name for name in values if "bias" in name or name.startswith("return_")]
+        fits |= {name: abs(values[name]) <= most + size + slack for name in means}
     return next((name for name, fit in fits.items() if not fit), None)
 
 
@@ -562,7 +564,7 @@ def _code_from_elsewhere(record: RunRecord) -> Iterator[str]:
             yield f"it ran symsteer {version} as installed, not a checkout; sha256 {sha256[:12]}"
     extensions = [e for p in parts for e in p.extensions if e.distribution]
     used = {(e.kind, e.name, e.distribution, e.version, e.sha256[:12]) for e in extensions}
-    here = {found.name: found.version for found in metadata.distributions()} if used else {}
+    here = {one.name: one.version for one in metadata.distributions()} if used else {}
     for kind, name, distribution, version, sha256 in sorted(used, key=str):
         known = "" if here.get(str(distribution)) == version else ", unresolved: not installed here"
         yield f"it uses the {kind} {name} of {distribution} {version}; sha256 {sha256}{known}"

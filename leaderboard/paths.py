@@ -78,7 +78,7 @@ def record_files(paths: Iterable[Path]) -> list[Path]:
             that cannot be listed, a name that is not UTF-8, or when there is no file at all.
     """
     paths = list(paths)
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     for path in paths:
         for file in _in_folder(path) if stat.S_ISDIR(_mode(path)) else [path]:
             if not stat.S_ISREG(_mode(file)):
@@ -89,11 +89,11 @@ def record_files(paths: Iterable[Path]) -> list[Path]:
             except UnicodeEncodeError as error:
                 name = ascii(os.fspath(resolved))
                 raise UserError(f"{name} has a name that is not UTF-8: rename it") from error
-            found[resolved] = None
-    if not found:
+            files[resolved] = None
+    if not files:
         names = ", ".join(str(path) for path in paths)
         raise UserError(f"{names} holds no record: run `symsteer run` first or name its folder")
-    return list(found)
+    return list(files)
 
 
 def _mode(path: Path) -> int:

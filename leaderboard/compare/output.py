@@ -253,16 +253,16 @@ def _value(measure: Measure, value: float) -> str:
 
 def _difference(measure: Measure, change: Change) -> str:
     """The difference with its interval; what decides has a mark where it excludes 0."""
-    found = change.difference
+    difference = change.difference
     if measure in DECISIVE:
-        return _interval(found) + (MARKS[found.sign] if change.counts else "")
-    value, low, high = (compact(v) for v in (found.value, found.low, found.high))
+        return _interval(difference) + (MARKS[difference.sign] if change.counts else "")
+    value, low, high = (compact(v) for v in (difference.value, difference.low, difference.high))
     # Of one run, or of runs that agree, there is no spread to take an interval from.
-    return f"{'+' * (found.value > 0)}{value}" + f" [{low}, {high}]" * (low != high)
+    return f"{'+' * (difference.value > 0)}{value}" + f" [{low}, {high}]" * (low != high)
 
 
-def _interval(found: Interval) -> str:
-    return interval(found, sign=True, digits=3).replace(SPACE, " ")
+def _interval(difference: Interval) -> str:
+    return interval(difference, sign=True, digits=3).replace(SPACE, " ")
 
 
 def _listed(differences: Mapping[str, Interval]) -> str:

@@ -84,7 +84,7 @@ class Provenance(RecordBlock):
             version=_version("symsteer"),
             sha256=None if commit else registry.code_hash("symsteer"),
             extensions=[RecordedExtension(**extension.to_json()) for extension in extensions],
-            packages={name: found for name in PACKAGES if (found := _version(name))},
+            packages={name: version for name in PACKAGES if (version := _version(name))},
             python=platform.python_version(),
             platform=f"{platform.system()} {platform.machine()}",
             processor=processor_name(),

@@ -196,7 +196,7 @@ def read_reproductions(folder: Path) -> dict[str, Reproduction]:
     Raises:
         UserError: for a file that is damaged, or is not named after the hash of its record.
     """
-    found = {}
+    reproductions = {}
     for path in sorted(set(folder.glob("*.json")) - set(folder.glob(f"*{REPEATED}"))):
         try:
             data = path.read_bytes().removeprefix(BOM_UTF8)
@@ -213,17 +213,17 @@ def read_reproductions(folder: Path) -> dict[str, Reproduction]:
                 f"{path} is about a record with another hash; name it "
                 f"{reproduction.record.sha256}.json, or remove it"
             )
-        found[path.stem] = reproduction
-    return found
+        reproductions[path.stem] = reproduction
+    return reproductions
 
 
 def check_reproduction(
-    found: Reproduction, path: Path, record: Path, vouched: bool, alone: bool
+    reproduction: Reproduction, path: Path, record: Path, vouched: bool, alone: bool
 ) -> None:
     """Compute a reproduction again from its record and the repeated one, which lies beside it.
 
     Args:
-        found: the reproduction.
+        reproduction: the reproduction.
         path: of its file.
         record: of the record that it names.
         vouched: whether a maintainers' list has the hash of this file: then it may be without the
@@ -250,8 +250,8 @@ def check_reproduction(
     wanted, made = (flat(with_retired(read_record(file).config)) for file in (record, again))
     try:
         agrees = wanted.items() <= made.items() and _rounded(
-            reproduction_of(record, again, found.conditions)
-        ) == _rounded(found)
+            reproduction_of(record, again, reproduction.conditions)
+        ) == _rounded(reproduction)
     except ValueError:  # one of them is not finished, or they are the same file
         agrees = False
     if not agrees:

@@ -338,13 +338,13 @@ class RunRecord(RecordBlock):
     @property
     def not_finite(self) -> str:
         """Measured numbers that were not finite, and when first; those of Q are its divergence."""
-        found = {f"{name} of the base policy": 0 for name in self.base_policy.nonfinite}
+        first = {f"{name} of the base policy": 0 for name in self.base_policy.nonfinite}
         for evaluation in self.evaluations:
             for path in (*evaluation.nonfinite, *evaluation.episodes.nonfinite):
                 name = path.removeprefix("diagnostics/").partition("/")[0]
                 if not name.startswith("q_"):
-                    found.setdefault(name, evaluation.env_steps)
-        return ", ".join(f"{name} (first after {steps} steps)" for name, steps in found.items())
+                    first.setdefault(name, evaluation.env_steps)
+        return ", ".join(f"{name} (first after {steps} steps)" for name, steps in first.items())
 
     @property
     def divergence(self) -> Divergence | None:
@@ -380,4 +380,5 @@ class RunRecord(RecordBlock):
     @property
     def diverged(self) -> bool | None:
         """Whether the Q-values diverged; None for runs without a critic."""
-        return None if (found := self.divergence) is None else found.diverged
+        divergence = self.divergence
+        return None if divergence is None else divergence.diverged

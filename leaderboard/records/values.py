@@ -196,13 +196,13 @@ def run_id_of(config: Mapping[str, Any]) -> str:
 
 def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested tables as one table, keys joined by dots, e.g. ``policy.width``."""
-    found: dict[str, Any] = {}
+    table: dict[str, Any] = {}
     for key, value in data.items():
         if isinstance(value, Mapping):
-            found |= flat(value, f"{prefix}{key}.")
+            table |= flat(value, f"{prefix}{key}.")
         else:
-            found[prefix + key] = value
-    return found
+            table[prefix + key] = value
+    return table
 
 
 def portable(text: str) -> str:
