@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import pkgutil
 import signal
 import sys
 import tempfile
@@ -24,6 +25,7 @@ import h5py
 import numpy as np
 import pytest
 
+import symsteer
 from symsteer import cli
 from symsteer.bench.bundles.bundle import write_bundle
 from symsteer.bench.runs.config import Execution
@@ -96,6 +98,10 @@ def intact(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("intact")
     run = execute(tiny_config(agent="base"), out)
     write_bundle(run, out / "bundle.zip")
+    # A fork need not import again what is imported here; `launch` takes over signals.
+    for module in pkgutil.walk_packages(symsteer.__path__, "symsteer."):
+        if module.name not in ("symsteer.launch", "symsteer.__main__"):
+            importlib.import_module(module.name)
     return run
 
 
