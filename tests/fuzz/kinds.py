@@ -36,7 +36,7 @@ from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.trainer import Trainer
 from symsteer.bench.sweep import grid
 from symsteer.leaderboard import report, study
-from symsteer.leaderboard.records import config_hash, flat, read_record, repeat_command
+from symsteer.leaderboard.records import config_hash, read_record, repeat_command
 from symsteer.policies.files import _sha256
 from tests.bench.tuning.tiny_plan import TEXT as PLAN
 from tests.fuzz.judge import BadEndingError, Ending, end_of, stopped_at
@@ -455,36 +455,3 @@ KINDS |= {
     ),
 }
 """The sealed ones have wrong contents and the checksums that belong to them."""
-
-
-# The command line of `symsteer run`.
-
-VALUES = (
-    *("-1", "0", "1", "7", "1e9", "nan", "inf", "-inf", "1e308", "-0.5", "0.5", "1.5", "+5", "16"),
-    *("100000", "10000000000000", "9" * 26, "-" + "9" * 26, "1_0", "0x10", " 5", "4,5", "1e-320"),
-    *("many", "", "None", "True", "PickCube-v1", "panda", "none", "D4", "C8", "E8", "C0", "SO2"),
-    *("action_gain:0.5", "action_gain:0.5,wind:0.3", "action_gain:2", "wind:0.2+wind:0.3", "C97"),
-    *("action_gain: 0.5", "action_gain:0.50", "action_gain:nan", "wind:+0.5", "wind:1e-3", "D1"),
-    *("C999999999", "\x1b[31m", "a\nb", "x" * 3000, "../..", "-", "--", "ünï", "C8 C4", "diverse"),
-)
-
-
-def command(workshop: Workshop, number: int, folder: Path) -> Ending:
-    """An option with an odd value; the other options keep their values."""
-    random = Random(f"command {number}")
-    policy = workshop.run / "policy.safetensors"
-    defaults = flat(workshop.config.to_json())
-    # In turn, so that every option is tested; another agent or policy has other options.
-    keys = sorted(set(defaults) - {"agent", "policy.name"})
-    key = keys[number % len(keys)]
-    option = "--" + key.replace("agent_options.", "agent.").replace("_", "-")
-    with stopped_at((Trainer, "play")):
-        line = new_run(workshop, "--base-policy", policy)
-        ending = end_of([*line, option, random.choice(VALUES)])
-    if ending.kind == "accepted":
-        trainer = ending.found[0]
-        trainer.evaluator.close()
-        found = flat(trainer.config.to_json())
-        changed = {name for name in defaults if not alike(found[name], defaults[name])}
-        require(changed <= {key}, f"{changed} have other values")
-    return ending

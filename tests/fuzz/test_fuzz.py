@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz.judge import BadEndingError
-from tests.fuzz.kinds import KINDS, command
+from tests.fuzz.kinds import KINDS
 
 COUNT = 100
 """Inputs of a kind in the whole test."""
@@ -68,13 +68,9 @@ def test_some_damaged_inputs(kind, workshop, tmp_path):
     assert tried(workshop, KINDS[kind], numbers, tmp_path)["refused"] > 0
 
 
-def test_some_odd_options(workshop, tmp_path):
-    tried(workshop, command, range(8), tmp_path)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [*KINDS, "command"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_all_damaged_inputs(kind, workshop, tmp_path, capsys):
-    endings = tried(workshop, KINDS.get(kind, command), range(COUNT), tmp_path)
+    endings = tried(workshop, KINDS[kind], range(COUNT), tmp_path)
     with capsys.disabled():
         print(f"\n{kind}: {COUNT} inputs, " + ", ".join(f"{n} {k}" for k, n in endings.items()))

@@ -12,80 +12,46 @@ MISTAKES = """
 list extra
 run --task Nothing
 run --variant action_gain:0.5,wind:0.3
-run --out file
 run --base-policy file
-run --demos file
 run --demos folder.h5
 run --num-envs many
 run --num-envs 99999999
 run --policy.steps 0
 run --env-steps 100
 sweep nowhere.toml
-sweep demoo
-sweep file
 sweep smoke --out file
-sweep smoke --workers many
-resume nowhere
 resume loop
 resume
 evaluate nowhere
 evaluate folder --episodes -1
-evaluate folder --episodes many
 status nowhere
-status folder extra
 report nowhere
-report file
 report x.json
-report nowhere --check
 report folder --verify
-compare folder
 compare folder folder
-compare x.json x.json
-compare standard equivariant
 compare standard equivariant --runs folder
-compare folder folder --picture file
-reproduce
 reproduce file
-reproduce x.json
-advise
 advise --task Nothing
 advise --task PickCube-v1 --variant wnid:1
 advise --task PickCube-v1 --audit x.json
-advise --task PickCube-v1 --group few
-advise --audit nowhere
 advise --audit x.json
-advise --task PickCube-v1 --records nowhere
 advise --task PickCube-v1 --records folder
 audit --task Nothing
 audit --group E8
 audit-episodes --actions nobody
-audit-episodes --episodes 0
 audit --base-policy folder
-audit --variant wnid:1
 audit --variant all
 audit --out file
-throughput --task Nothing
 throughput --agent nobody
-throughput --num-envs 99999999
 throughput --seconds nan
-throughput --workers 100000
 demos
-demos folder.h5
 demos file/a.h5
 demos a.h5 --seed 99999999999999
-demos a.h5 --mode messy
 export
-export --out a.zip
 export nowhere --out a.zip
-export file --out a.zip
-export nowhere --out a.tar
 export nowhere --out folder
 export-lerobot
-export-lerobot nowhere --out new
-export-lerobot folder.h5 --out new
 export-lerobot file --out file
-fetch-bundle
-fetch-bundle file
 fetch-bundle x.json
 fetch-bundle https://example.org/a.zip
 doctor extra
