@@ -170,8 +170,8 @@ def test_run_sweep_report_and_admission(site, tmp_path):
         for agent, texts in problems(said).items()
     }
     assert unfair["smooth"] == []
-    (refused,) = unfair["leashed"]
-    assert "agent leashed:LeashedAgent belongs to no installed distribution" in refused
+    nobody = "agent leashed:LeashedAgent belongs to no installed distribution"
+    assert any(nobody in text for text in unfair["leashed"])
 
     # Without the package, as here.
     missing = "'smooth' of the distribution symsteer-lab, which is not installed; install it"

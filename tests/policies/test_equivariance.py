@@ -42,7 +42,7 @@ def test_every_way_to_be_symmetric_is_exact(trained, way):
     """Before and after training."""
     # sqrt(a_t) = 5e-4 at the first level divides the rounding errors.
     tolerance = 5e-3 if way == "epsilon" else 1e-5
-    for policy in (untrained(**WAYS[way]), trained(**WAYS[way], steps=30)):
+    for policy in (untrained(**WAYS[way]), trained(**WAYS[way], steps=15)):
         assert policy.group.order > 1
         assert_exact(policy, tolerance=tolerance)
         if policy.name in ("canonical", "so2", "spherical"):
@@ -51,7 +51,7 @@ def test_every_way_to_be_symmetric_is_exact(trained, way):
 
 def test_the_frame_of_a_chunk_is_needed(trained, monkeypatch):
     """Relative actions in the world's frame would not be symmetric."""
-    policy = trained(group="D4", action_frame="goal", steps=30)
+    policy = trained(group="D4", action_frame="goal", steps=15)
     monkeypatch.setattr(policy.frame, "leave", lambda chunk, angle: chunk)
     assert decode_error(policy) > 1e-2
 

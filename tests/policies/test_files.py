@@ -57,7 +57,7 @@ def test_every_policy_is_named_as_it_is_registered(name):
     ],
 )
 def test_round_trip_is_bit_equal(trained, tmp_path, fields):
-    policy = copy.deepcopy(trained(**fields, steps=30))
+    policy = copy.deepcopy(trained(**fields, steps=15))
     policy.report = {"success": 0.25}
     path = save_policy(policy, tmp_path / "run", extra={"note": [1, "two"]})
     assert path == tmp_path / "run" / "policy.safetensors"

@@ -97,7 +97,7 @@ def test_the_anchor_is_the_vector_that_stays_away_from_zero(steady, other):
 
 
 def test_the_averaged_network_is_the_mean_over_the_group(trained):
-    policy = trained("frame-averaged", group="D4", steps=30)
+    policy = trained("frame-averaged", group="D4", steps=15)
     inner, time = policy.denoiser.inner, policy.denoiser.encode_time(torch.tensor([30]))
     x, obs = noises(4), observations(4)
     expected = group_average(
