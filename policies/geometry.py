@@ -276,12 +276,15 @@ class Layout:
         Raises:
             UserError: if escnn is not installed.
         """
-        escnn = escnn_package()
-        space = escnn.gspaces.no_base_space(
-            group.escnn_group(max(f.frequency for f in self.fields))
-        )
+        escnn, n = escnn_package(), group.rotations
+        if n == 0:
+            fibergroup = escnn.group.so2_group(max(1, *(f.frequency for f in self.fields)))
+        else:
+            kind = escnn.group.dihedral_group if group.reflections else escnn.group.cyclic_group
+            fibergroup = kind(n)
+        space = escnn.gspaces.no_base_space(fibergroup)
         representations = [
-            _escnn_representation(space.fibergroup, group, field)
+            _escnn_representation(fibergroup, group, field)
             for field in self.fields
             for _ in range(field.multiplicity)
         ]
@@ -430,19 +433,6 @@ class Group:
     ) -> torch.Tensor:
         """Every element's matrix on ``layout``, ``[order, dim, dim]``; computed in float64."""
         return _representation(self, layout, dtype, torch.device(device))
-
-    def escnn_group(self, maximum_frequency: int = 1) -> escnn.group.Group:
-        """The same group in escnn.
-
-        Raises:
-            UserError: if escnn is not installed.
-        """
-        group = escnn_package().group
-        if self.rotations == 0:
-            return group.so2_group(max(maximum_frequency, 1))
-        if self.reflections:
-            return group.dihedral_group(self.rotations)
-        return group.cyclic_group(self.rotations)
 
 
 @functools.lru_cache(maxsize=256)

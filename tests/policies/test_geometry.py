@@ -91,8 +91,6 @@ def test_escnn_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "escnn", None)
     with pytest.raises(UserError, match=r"symsteer\[escnn\]"):
         LAYOUT.field_type(Group.parse("C4"))
-    with pytest.raises(UserError, match=r"symsteer\[escnn\]"):
-        Group.parse("C4").escnn_group()
 
 
 def test_blocks_cover_the_vector_once():
