@@ -1,11 +1,16 @@
 """One thread a process: sums then do not depend on the machine, and tests run as processes."""
 
 import os
+import signal
 
 import pytest
 
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[name] = "1"
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell starts programs in the background so; tests interrupt themselves.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import torch  # noqa: E402  (reads the number of threads when it is imported)
 
