@@ -23,16 +23,13 @@ from torch import nn
 
 from symsteer.agents.episodes import Played
 from symsteer.agents.equivariant import EquivariantAgent, equivariant_layers
-from symsteer.agents.networks import Dense, Ensemble, dense, shrink_
+from symsteer.agents.networks import Dense, Ensemble, Parameters, dense, dense_of, shrink_, within
 from symsteer.agents.options import SacOptions
 from symsteer.policies.geometry import Layout
-from symsteer.policies.networks.equivariant import EquivariantLayer
-
-Parameters = Mapping[str, torch.Tensor]
-"""Parameters of a layer by name; those of several equal layers have one more dimension in front."""
+from symsteer.policies.networks.equivariant import EquivariantLayer, MatrixLayer
 
 
-class AsymmetricLayer(nn.Module):
+class AsymmetricLayer(MatrixLayer):
     """An equivariant layer that may leave the symmetry, made of one or more equivariant ones.
 
     Attributes:
@@ -40,10 +37,6 @@ class AsymmetricLayer(nn.Module):
     """
 
     strict: EquivariantLayer
-
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Weight ``[out, in]`` and bias ``[out]``."""
-        raise NotImplementedError
 
     def pull(self, parameters: Parameters, factor: float) -> None:
         """Multiply the asymmetric part by a factor, in place."""
@@ -59,6 +52,10 @@ class TwoPaths(AsymmetricLayer):
         outputs, inputs = dense(strict)[0].shape
         self.free = Dense(inputs, outputs)
         shrink_(self.free, 0.0)
+
+    def strict_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the equivariant layer contributes to :meth:`dense_of`."""
+        return dense_of(self.strict, within("strict", parameters))
 
 
 class AsymmetricAgent(EquivariantAgent):
@@ -114,8 +111,8 @@ class PenaltyAgent(AsymmetricAgent):
 def asymmetry(network: Ensemble) -> float:
     """|W - P(W)| / |W| over the matrices and biases of all layers (Frobenius norms)."""
     apart, whole = [], []
-    for layer, _ in network.layers():
-        tensors = dense(layer)
+    for layer, parameters in network.layers():
+        tensors = dense_of(layer, parameters)
         nearest = cast(AsymmetricLayer, layer).strict.nearest(*tensors)
         apart += [(tensor - near).norm() for tensor, near in zip(tensors, nearest, strict=True)]
         whole += [tensor.norm() for tensor in tensors]

@@ -26,10 +26,11 @@ class AugmentedAgent(StandardAgent):
         """Each row is turned by an element of ``group`` of its own."""
         augmentation = Augmentation(Group.parse(self.options.group))
         # The agent's own generator: its state is in the checkpoint, so a resumed run repeats.
-        drawn = augmentation.draw(len(batch.obs), self.generator)
-        turned = {
-            name: augmentation.apply(drawn, batch[name], layout)
-            for name, layout in self.vector_fields.items()
-            if name in batch
-        }
+        count, rows = batch.obs.shape[-2], batch.obs.shape[:-1]
+        drawn = self.random(lambda generator: augmentation.draw(count, generator)).flatten()
+        turned = {}
+        for name, layout in self.vector_fields.items():
+            if name in batch:
+                each = batch[name].flatten(0, len(rows) - 1)
+                turned[name] = augmentation.apply(drawn, each, layout).unflatten(0, rows)
         return batch.replace(**turned)

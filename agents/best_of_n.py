@@ -92,9 +92,8 @@ class BestOfNAgent(EitherAgent):
         states = torch.arange(len(obs), device=self.device)
         return noise.unflatten(0, (len(obs), size))[states, q.argmax(1)]
 
-    def drawn(self, obs: torch.Tensor) -> Drawn:
+    def drawn(self, obs: torch.Tensor, features: torch.Tensor) -> Drawn:
         """Nothing is drawn: the candidates are in the batch."""
-        features = self._features(obs)
         nothing = features[..., :0]
         return Drawn(features, nothing, nothing, lambda: nothing)
 

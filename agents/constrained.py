@@ -23,7 +23,7 @@ from torch import nn
 
 from symsteer.agents.agent import Deterministic
 from symsteer.agents.asymmetry import AsymmetricAgent, TwoPaths
-from symsteer.agents.networks import dense
+from symsteer.agents.networks import Parameters, dense
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
@@ -53,9 +53,11 @@ class Constrained(TwoPaths):
         # A parameter, because a team stacks parameters; the optimiser leaves it alone.
         self.multiplier = nn.Parameter(torch.zeros(()), requires_grad=False)
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        weight, bias = dense(self.strict)
-        return weight + self.gamma * self.free.weight, bias + self.gamma * self.free.bias
+    def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = self.strict_of(parameters)
+        gamma = parameters["gamma"].unsqueeze(-1)
+        bias = bias + gamma * parameters["free.bias"]
+        return weight + gamma.unsqueeze(-1) * parameters["free.weight"], bias
 
 
 @tuned

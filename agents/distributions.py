@@ -26,8 +26,11 @@ from torch import nn
 from symsteer.policies.geometry import Field, Layout
 
 SMALL = 1e-4
-"""Below this |u|^2, functions of |u| are evaluated by their power series in |u|^2, whose first
-dropped terms are below 1e-14."""
+"""Below this |u|^2, the slope of tanh(|u|)/|u| is evaluated by its power series in |u|^2, whose
+first dropped term is below 1e-14."""
+
+LEAST = 1e-30
+"""|u|^2 is taken as at least this, so that nothing is divided by 0."""
 
 LOG_SCALE_MIN, LOG_SCALE_MAX = -5.0, 1.0
 
@@ -58,6 +61,8 @@ class SquashedGaussian(nn.Module):
         self.register_buffer("index", layout.block_index.clone(), persistent=False)
         self.register_buffer("membership", membership, persistent=False)  # [dim, blocks]
         self.register_buffer("sizes", membership.sum(0), persistent=False)
+        # -log of the constant factor of the density.
+        self.constant = self.dim * (0.5 * math.log(2 * math.pi) + math.log(bound))
 
     def parameters_of(self, output: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean ``[..., dim]`` and log-scale ``[..., blocks]`` from an actor's output.
@@ -83,10 +88,9 @@ class SquashedGaussian(nn.Module):
         Returns:
             Noise ``[..., dim]`` and log-probability ``[...]``, both differentiable.
         """
-        noise, log_volume = self._squash(mean + self.spread(log_scale.exp()) * eps)
-        constant = 0.5 * self.dim * math.log(2 * math.pi)
-        gaussian = -0.5 * eps.square().sum(-1) - log_scale @ self.sizes - constant
-        return noise, gaussian - log_volume
+        noise, log_volume = self._squash(torch.addcmul(mean, self.spread(log_scale.exp()), eps))
+        known = eps.square().sum(-1).mul_(-0.5).sub_(self.constant)
+        return noise, known - log_scale @ self.sizes - log_volume
 
     def squash(self, u: torch.Tensor) -> torch.Tensor:
         """``u [..., dim]`` with every block shortened into the ball of radius ``bound``."""
@@ -101,17 +105,16 @@ class SquashedGaussian(nn.Module):
         return per_block.index_select(-1, self.index)
 
     def _squash(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """``w = bound tanh(|u|) u/|u|`` per block and the summed log-determinant."""
-        direction, log_volume = RadialTanh.apply(u, self.membership, self.index, self.sizes)
-        return self.bound * direction, log_volume + self.dim * math.log(self.bound)
+        """``w = bound tanh(|u|) u/|u|`` per block, and the summed log-determinant for bound 1."""
+        return RadialTanh.apply(u, self.bound, self.membership, self.index, self.sizes)
 
 
 class RadialTanh(torch.autograd.Function):
-    """``tanh(|u|) u/|u|`` per block and its log-determinant, with the derivative in closed form.
+    """``bound tanh(|u|) u/|u|`` per block, with the derivative in closed form.
 
     With s = |u|^2 of a block of n numbers and the ratio ``p(s) = tanh(|u|) / |u|``:
 
-        w = p u,   log det = log sech^2 |u| + (n - 1) log p,
+        w = bound p u,   log det = log sech^2 |u| + (n - 1) log p + n log bound,
         dp/ds = (sech^2 |u| - p) / (2 s),   d log det / ds = -p + (n - 1) (dp/ds) / p.
 
     As functions of s (not of |u|) they are smooth at zero. The derivative is written out because
@@ -122,34 +125,66 @@ class RadialTanh(torch.autograd.Function):
     def forward(
         ctx: Any,
         u: torch.Tensor,
+        bound: float,
         membership: torch.Tensor,
         index: torch.Tensor,
         sizes: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """``u [..., dim]`` to ``w [..., dim]`` and log-determinant ``[...]``."""
-        s = u.square() @ membership
-        small = s < SMALL
-        r = s.sqrt()
-        tanh = r.tanh()
-        ratio = torch.where(small, 1 - s * (1 / 3 - s * (2 / 15 - s * 17 / 315)), tanh / r)
-        # sech^2 = 4 / (e^r + e^-r)^2, in a form without overflow or log 0 at large radii.
-        far = 2 * (math.log(2) - r - torch.log1p((-2 * r).exp()))
-        log_sech2 = torch.where(small, -s * (1 - s * (1 / 6 - s * 2 / 45)), far)
-        log_volume = (log_sech2 + (sizes - 1) * ratio.log()).sum(-1)
-        if any(ctx.needs_input_grad):
-            series = -1 / 3 + s * (4 / 15 - s * (17 / 105 - s * 248 / 2835))
-            slope = torch.where(small, series, (1 - tanh * tanh - ratio) / (2 * s))
-            ctx.save_for_backward(u, membership, index, ratio, slope, sizes)
-        return u * ratio.index_select(-1, index), log_volume
+        """``u [..., dim]`` to ``w [..., dim]`` and the log-determinant ``[...]`` for bound 1."""
+        steep = any(ctx.needs_input_grad)
+        noise, log_volume, *slopes = squash(u, bound, membership, index, sizes, steep)
+        if steep:
+            ctx.save_for_backward(u, membership, index, sizes, *slopes)
+            ctx.bound = bound
+        return noise, log_volume
 
     @staticmethod
-    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None, None, None]:
-        """Chain rule through s: du = ``p dw`` + ``2 u`` times the gradient of s."""
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, *tuple[None, ...]]:
+        """Chain rule through s."""
         grad_w, grad_volume = gradients
-        u, membership, index, ratio, slope, sizes = ctx.saved_tensors
-        to_s = slope * ((grad_w * u) @ membership)
-        to_s = to_s + grad_volume.unsqueeze(-1) * ((sizes - 1) * slope / ratio - ratio)
-        spread = torch.cat([ratio, 2 * to_s], dim=-1)
-        spread = spread.unflatten(-1, (2, -1)).index_select(-1, index)
-        ratio, to_s = spread.unbind(-2)
-        return grad_w * ratio + u * to_s, None, None, None
+        gradient = squash_gradient(grad_w, grad_volume, ctx.bound, *ctx.saved_tensors)
+        return gradient, None, None, None, None
+
+
+def squash(
+    u: torch.Tensor,
+    bound: float,
+    membership: torch.Tensor,
+    index: torch.Tensor,
+    sizes: torch.Tensor,
+    steep: bool,
+) -> tuple[torch.Tensor, ...]:
+    """``w``, the log-determinant for bound 1, and if ``steep`` p and dp/ds."""
+    s = (u.square() @ membership).clamp_min_(LEAST)
+    r = s.sqrt()
+    tanh = r.tanh()
+    ratio = tanh / r
+    # sech^2 = 4 / (e^r + e^-r)^2, in a form without overflow or log 0 at large radii.
+    half = r + F.softplus(-2 * r)
+    log_volume = (ratio.log() @ (sizes - 1)).add_(2 * math.log(2) * len(sizes))
+    log_volume.sub_(half.sum(-1), alpha=2)
+    noise = u * (bound * ratio).index_select(-1, index)
+    if not steep:
+        return noise, log_volume
+    series = -1 / 3 + s * (4 / 15 - s * (17 / 105 - s * 248 / 2835))
+    slope = torch.where(s < SMALL, series, (1 - tanh * tanh - ratio) / (2 * s))
+    return noise, log_volume, ratio, slope
+
+
+def squash_gradient(
+    grad_w: torch.Tensor,
+    grad_volume: torch.Tensor,
+    bound: float,
+    u: torch.Tensor,
+    membership: torch.Tensor,
+    index: torch.Tensor,
+    sizes: torch.Tensor,
+    ratio: torch.Tensor,
+    slope: torch.Tensor,
+) -> torch.Tensor:
+    """du = ``bound p dw`` + ``2 u`` times the gradient of s."""
+    to_s = (slope * bound).mul_((grad_w * u) @ membership)
+    of_volume = (slope / ratio).mul_(sizes - 1).sub_(ratio)
+    to_s.addcmul_(grad_volume.unsqueeze(-1), of_volume).mul_(2)
+    ratio, to_s = (x.index_select(-1, index) for x in (bound * ratio, to_s))
+    return torch.addcmul(grad_w * ratio, u, to_s)

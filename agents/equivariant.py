@@ -13,7 +13,7 @@ import math
 import torch
 from torch import nn
 
-from symsteer.agents.networks import shrink_
+from symsteer.agents.networks import Parameters, shrink_
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.sac import SacAgent
@@ -36,8 +36,8 @@ class Pool(Project):
             self.weight.div_(math.sqrt(group.order))
             self.bias.div_(math.sqrt(group.order))
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        weight, bias = super().dense()
+    def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = super().dense_of(parameters)
         return weight * self.group.order, bias
 
 

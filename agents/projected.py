@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from symsteer.agents.asymmetry import AsymmetricLayer, Parameters, PenaltyAgent
-from symsteer.agents.networks import dense
+from symsteer.agents.asymmetry import AsymmetricLayer, PenaltyAgent
+from symsteer.agents.networks import Parameters, dense
 from symsteer.agents.presets import tuned
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
@@ -24,8 +24,8 @@ class Projected(AsymmetricLayer):
         self.weight, self.bias = (nn.Parameter(x.detach().clone()) for x in dense(strict))
         self.strict = strict.without_parameters()
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.weight, self.bias
+    def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
+        return parameters["weight"], parameters["bias"]
 
     def pull(self, parameters: Parameters, factor: float) -> None:
         tensors = parameters["weight"], parameters["bias"]

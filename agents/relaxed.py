@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from symsteer.agents.asymmetry import AsymmetricLayer, Parameters, PenaltyAgent, PenaltyOptions
-from symsteer.agents.networks import dense, shrink_
+from symsteer.agents.asymmetry import AsymmetricLayer, PenaltyAgent, PenaltyOptions
+from symsteer.agents.networks import Parameters, dense_of, shrink_, within
 from symsteer.agents.presets import tuned
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift
 
@@ -51,15 +51,21 @@ class Relaxed(AsymmetricLayer):
         shrink_(self.filters, 1 / math.sqrt(len(filters)))
         self.weights = nn.Parameter(torch.ones(len(filters), filters[0].group.order))
         self.strict = filters[0].without_parameters()
-        # The axis of the matrices [L, out, in] that the group elements divide.
-        self.axis = 1 if isinstance(self.strict, Lift) else 2
+        # The axis of the matrices [..., L, out, in] that the group elements divide.
+        self.axis = -2 if isinstance(self.strict, Lift) else -1
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        matrices, biases = zip(*(dense(layer) for layer in self.filters), strict=True)
-        stacked = torch.stack(matrices)
-        each = stacked.shape[self.axis] // self.weights.shape[1]
-        weights = self.weights.repeat_interleave(each, dim=1).unsqueeze(3 - self.axis)
-        return (stacked * weights).sum(0), torch.stack(biases).sum(0)
+    def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
+        matrices, biases = zip(
+            *(
+                dense_of(layer, within(f"filters.{index}", parameters))
+                for index, layer in enumerate(self.filters)
+            ),
+            strict=True,
+        )
+        stacked, weights = torch.stack(matrices, -3), parameters["weights"]
+        each = stacked.shape[self.axis] // weights.shape[-1]
+        weights = weights.repeat_interleave(each, dim=-1).unsqueeze(-3 - self.axis)
+        return (stacked * weights).sum(-3), torch.stack(biases).sum(0)
 
     def pull(self, parameters: Parameters, factor: float) -> None:
         weights = parameters["weights"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -64,6 +65,8 @@ class Batch(dict[str, torch.Tensor]):
 class ReplayBuffer:
     """A ring buffer of transitions with seeded uniform sampling.
 
+    A transition is one row, so that a batch is one selection of rows.
+
     Args:
         capacity: number of transitions kept; the oldest is overwritten first.
         shapes: shape of each field in one transition, by field name of :class:`Transition`.
@@ -86,13 +89,21 @@ class ReplayBuffer:
             raise UserError(f"the replay capacity must be at least 1, not {capacity}")
         self.capacity, self.device, self.dtype = capacity, torch.device(device), dtype
         self.shapes = dict(shapes)
-        self.storage = {name: self._rows(name, 0) for name in shapes}
+        self.widths = [math.prod(shape) for shape in shapes.values()]
+        self.rows = self._new_rows(0)
         self.position = 0
         self.size = 0
+        # The size on the device: a CUDA graph reads it there.
+        self.filled = torch.zeros((), dtype=torch.int64, device=self.device)
         self.generator = torch.Generator(device=self.device).manual_seed(seed)
 
     def __len__(self) -> int:
         return self.size
+
+    @property
+    def storage(self) -> dict[str, torch.Tensor]:
+        """Each field of all rows, as views."""
+        return self.batch_of(self.rows)
 
     def add(self, transition: Transition | Mapping[str, torch.Tensor]) -> None:
         """Append N transitions, at most the capacity; fields that the buffer lacks are ignored."""
@@ -100,26 +111,35 @@ class ReplayBuffer:
         count = len(new["reward"])
         self._grow(min(self.position + count, self.capacity))
         rows = (torch.arange(count, device=self.device) + self.position) % self.capacity
-        for name, kept in self.storage.items():
-            kept.index_copy_(0, rows, new[name].to(kept))
+        fields = [new[name].to(self.rows).reshape(count, -1) for name in self.shapes]
+        self.rows.index_copy_(0, rows, torch.cat(fields, 1))
         self.position = (self.position + count) % self.capacity
-        self.size = min(self.size + count, self.capacity)
+        self._resize(min(self.size + count, self.capacity))
 
-    def sample(self, batch_size: int, gamma: float) -> Batch:
+    def sample(self, batch_size: int) -> Batch:
         """Draw ``batch_size`` transitions uniformly, with replacement.
-
-        Returns:
-            The fields, and ``discount [B]``: ``gamma``, per decision.
 
         Raises:
             UserError: if the buffer is empty.
         """
+        return self.batch_of(self.sample_rows(batch_size))
+
+    def sample_rows(self, batch_size: int) -> torch.Tensor:
+        """The same as rows ``[B, width]``, see :meth:`batch_of`."""
         if self.size == 0:
             raise UserError("the replay buffer is empty; collect transitions before updating")
-        rows = torch.randint(self.size, (batch_size,), generator=self.generator, device=self.device)
-        batch = Batch({name: kept.index_select(0, rows) for name, kept in self.storage.items()})
-        batch["discount"] = torch.full_like(batch.reward, gamma)
-        return batch
+        drawn = torch.randint(2**62, (batch_size,), generator=self.generator, device=self.device)
+        return self.rows.index_select(0, drawn % self.filled)
+
+    def batch_of(self, rows: torch.Tensor) -> Batch:
+        """The fields of rows ``[..., width]``, as views."""
+        fields = zip(self.shapes.items(), rows.split(self.widths, -1), strict=True)
+        return Batch(
+            {
+                name: x.unflatten(-1, shape) if shape else x.squeeze(-1)
+                for (name, shape), x in fields
+            }
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """The filled rows, the position and the generator."""
@@ -149,18 +169,20 @@ class ReplayBuffer:
         self._grow(size)
         for name, kept in self.storage.items():
             kept[:size] = rows[name].to(kept)
-        self.size, self.position = size, position
+        self._resize(size)
+        self.position = position
         continue_stream(self.generator, state["generator"])
 
-    def _rows(self, name: str, count: int) -> torch.Tensor:
-        return torch.zeros(count, *self.shapes[name], dtype=self.dtype, device=self.device)
+    def _resize(self, size: int) -> None:
+        self.size = size
+        self.filled.fill_(size)
+
+    def _new_rows(self, count: int) -> torch.Tensor:
+        return torch.zeros(count, sum(self.widths), dtype=self.dtype, device=self.device)
 
     def _grow(self, needed: int) -> None:
         """Allocate at least ``needed`` rows."""
-        there = len(next(iter(self.storage.values())))
+        there = len(self.rows)
         if needed > there:
             more = min(self.capacity, max(needed, 2 * there, FIRST_ROWS)) - there
-            self.storage = {
-                name: torch.cat([kept, self._rows(name, more)])
-                for name, kept in self.storage.items()
-            }
+            self.rows = torch.cat([self.rows, self._new_rows(more)])

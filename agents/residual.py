@@ -80,6 +80,11 @@ class ResidualAgent(EitherAgent):
         return self.action_inputs
 
     @property
+    def in_graphs(self) -> bool:
+        """Not while the bound grows: it is a number of the processor."""
+        return super().in_graphs and not self.options.ramp
+
+    @property
     def bound(self) -> float:
         """The bound of the correction now."""
         ramp = self.options.ramp
@@ -126,7 +131,7 @@ class ResidualAgent(EitherAgent):
     def sample(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Actions with a drawn correction, and the log-probability of the correction."""
         action = self.gaussian_noise(len(obs))
-        drawn = self._corrections(obs, self._base_actions(obs, action))
+        drawn = self._corrections(self._features(obs), self._base_actions(obs, action))
         return self._with(action, drawn.noise), drawn.log_prob
 
     def _with_mean(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
@@ -140,19 +145,18 @@ class ResidualAgent(EitherAgent):
 
     # Learning.
 
-    def drawn(self, obs: torch.Tensor) -> Drawn:
-        """Corrections that the actor draws at observations in environment units."""
+    def drawn(self, obs: torch.Tensor, features: torch.Tensor) -> Drawn:
+        """Corrections that the actor draws at observations."""
         count = obs.shape[-2]
         noise = self.random(lambda generator: self.gaussian_noise(count, generator))
-        return self._corrections(obs, self._base_actions(obs, noise))
+        return self._corrections(features, self._base_actions(obs, noise))
 
     def drawn_to_improve(self, batch: Batch) -> Drawn:
         """Corrections of actions of the base policy that were decoded before."""
-        return self._corrections(batch.obs, self.chunk(self._random_pairs(batch)[1]))
+        return self._corrections(batch.features, self.chunk(self._random_pairs(batch)[1]))
 
-    def _corrections(self, obs: torch.Tensor, actions: torch.Tensor) -> Drawn:
+    def _corrections(self, features: torch.Tensor, actions: torch.Tensor) -> Drawn:
         """The actor's corrections of actions ``[..., Ta, Da]``."""
-        features = self._features(obs)
         heads = self._heads(self.actor.weights(), self._inputs(features, actions))
         correction, log_prob = self._sample(*heads)
         judged = self.corrected(actions, self.chunk(correction)).flatten(-2)

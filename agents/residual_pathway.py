@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import torch
 
-from symsteer.agents.asymmetry import Parameters, PenaltyAgent, TwoPaths
-from symsteer.agents.networks import dense
+from symsteer.agents.asymmetry import PenaltyAgent, TwoPaths
+from symsteer.agents.networks import Parameters
 from symsteer.agents.presets import tuned
 
 
 class ResidualPathway(TwoPaths):
     """The sum of both paths."""
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        weight, bias = dense(self.strict)
-        return weight + self.free.weight, bias + self.free.bias
+    def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = self.strict_of(parameters)
+        return weight + parameters["free.weight"], bias + parameters["free.bias"]
 
     def pull(self, parameters: Parameters, factor: float) -> None:
         for name in ("free.weight", "free.bias"):

@@ -29,8 +29,9 @@ from symsteer.agents.diagnostics import critic_diagnostics
 from symsteer.agents.distributions import SquashedGaussian
 from symsteer.agents.episodes import Played
 from symsteer.agents.generators import continue_stream, owned, tensor_like
+from symsteer.agents.graphs import GraphedUpdates
 from symsteer.agents.networks import Ensemble, Weights, detached
-from symsteer.agents.optimization import Adam, Multiplier
+from symsteer.agents.optimization import Adam, Multiplier, in_chunks
 from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Batch, ReplayBuffer, Transition
 from symsteer.errors import UserError
@@ -84,8 +85,8 @@ class SacAgent(Agent):
     replay: ReplayBuffer
 
     in_teams: ClassVar[bool] = False
-    """Whether the hooks of this very class work on the stacked tensors of a team; subclasses say it
-    anew."""
+    """Whether the hooks of this very class work on the stacked tensors of a team, and neither wait
+    for the device nor branch on data; subclasses say it anew. `after_update` stays as it is."""
 
     always_banks: ClassVar[bool] = False
     """Whether a bank of decoded noises is kept with all kinds of critics, not with `aliased` alone.
@@ -113,12 +114,15 @@ class SacAgent(Agent):
         for network in self.networks.values():
             network.to(self.device, self.dtype)
         self.distribution.to(self.device, self.dtype)
-        self.target = [(w.clone(), b.clone()) for w, b in detached(self.critic.weights())]
+        copy = functools.partial(torch.clone, memory_format=torch.contiguous_format)
+        self.target = [(copy(w), copy(b)) for w, b in detached(self.critic.weights())]
         self.optimizers = {
-            name: Adam(network.parameters(), options.lr) for name, network in self.networks.items()
+            name: Adam(network, options.lr) for name, network in self.networks.items()
         }
         self.multipliers = {
-            "alpha": Multiplier(options.initial_alpha, options.alpha_lr, self.device, self.dtype)
+            "alpha": Multiplier.starting_at(
+                options.initial_alpha, options.alpha_lr, self.device, self.dtype
+            )
         }
         self.generators = {"warm_up": self._new_generator(), "bank": self._new_generator(1)}
         self.streams: Sequence[torch.Generator] = [self.generator]
@@ -127,6 +131,7 @@ class SacAgent(Agent):
         self.decisions = self.updates = 0
         self.owed = self.distillation_owed = 0.0
         self.synchronize: Callable[[], None] = lambda: None
+        self.graphs: GraphedUpdates | None = None
 
     @classmethod
     def check(cls, options: SacOptions, budget: Budget) -> None:
@@ -185,7 +190,7 @@ class SacAgent(Agent):
         ends = batch.terminal
         if self.options.timeouts_terminal:
             ends = ends.maximum(batch.truncated)
-        return self.options.reward_scale * batch.reward + batch.discount * (1 - ends) * next_q
+        return self.options.reward_scale * batch.reward + self.options.gamma * (1 - ends) * next_q
 
     def critic_loss(self, q: torch.Tensor, target: torch.Tensor, batch: Batch) -> torch.Tensor:
         """Squared error, mean over the batch, summed over critics; ``q [critics, B]``."""
@@ -333,22 +338,67 @@ class SacAgent(Agent):
         """One batch for each update that is due."""
         while self.owed >= 1:
             self.owed -= 1
-            yield self.replay.sample(self.options.batch_size, self.options.gamma)
+            yield Batch() if self.in_graphs else self.new_batch()
+
+    def new_batch(self) -> Batch:
+        """Transitions from the replay."""
+        return self.replay.sample(self.options.batch_size)
+
+    @property
+    def in_graphs(self) -> bool:
+        """Whether updates are CUDA graphs; these draw their batches, those given to them are empty.
+
+        Only this very class says whether all that it does can be repeated by a graph.
+        """
+        return self.device.type == "cuda" and can_join(type(self))
 
     def update(self, batch: Batch) -> dict[str, torch.Tensor]:
         """One step of critics, actor, multipliers and target critics.
 
+        Args:
+            batch: from :meth:`batches`.
+
         Returns:
             Scalars as tensors on the device; reading them waits for the device.
         """
+        distillations = self.count_update()
+        if not batch:
+            if self.graphs is None:
+                streams = [self.generator, self.replay.generator]
+                self.graphs = GraphedUpdates(self, self._draw, [self.replay], streams)
+            return self.graphs.update(distillations)
         batch = self.augment(batch)
-        return {**self.learn(batch), **self.after_update(batch)}
+        return {**self.learn(batch, distillations), **self.after_update(batch)}
 
-    def learn(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """The same, with the batch as it is; in a team the batches of all members, stacked."""
-        obs = self._features(batch.obs)
+    def _draw(self) -> Batch:
+        """A batch as an update sees it."""
+        return self.augment(self.new_batch())
+
+    def count_update(self) -> int:
+        """Count an update; returns how many distillations it makes."""
+        self.updates += 1
+        if self.options.critic != "aliased":
+            return 0
+        owed = self.distillation_owed + self.options.distill_steps
+        self.distillation_owed = owed - int(owed)
+        return int(owed)
+
+    def tensors(self) -> list[torch.Tensor]:
+        """All that an update changes."""
+        trained = [
+            *((network.vector, self.optimizers[k]) for k, network in self.networks.items()),
+            *((one.vector, one.optimizer) for one in self.multipliers.values()),
+        ]
+        changed = [x for vector, adam in trained for x in (vector, *adam.moments.values())]
+        return changed + _flat(self.target)
+
+    def learn(self, batch: Batch, distillations: int) -> dict[str, torch.Tensor]:
+        """An update without counting it; in a team with the batches of all members, stacked."""
+        both = self._features(torch.cat([batch.obs, batch.next_obs], -2))
+        obs, next_obs = both.chunk(2, -2)
+        batch = batch.replace(features=obs)
         with torch.no_grad():
-            following = self.drawn(batch.next_obs)
+            following = self.drawn(batch.next_obs, next_obs)
             target = self.critic_target(batch, following)
         q = self._q(self.critic.weights(), obs, self._stored(batch))
         critic_loss = self.critic_loss(q, target, batch)
@@ -356,17 +406,17 @@ class SacAgent(Agent):
         scalars = {"losses/critic": critic_loss.detach()}
         judge = detached(self.critic.weights())  # no gradient of other losses in the critics
 
-        if self.options.critic == "aliased":
-            self.distillation_owed += self.options.distill_steps
-            while self.distillation_owed >= 1:
-                self.distillation_owed -= 1
-                scalars["losses/distillation"] = self._distil(batch, obs, following, judge)
+        for _ in range(distillations):
+            scalars["losses/distillation"] = self._distil(batch, obs, following, judge)
 
         scalars |= self._improve(batch, obs, judge)
 
         with torch.no_grad():
-            torch._foreach_lerp_(_flat(self.target), _flat(judge), self.options.tau)
-        self.updates += 1
+            averaged, newest = (
+                [part for tensor in _flat(weights) for part in in_chunks(tensor)]
+                for weights in (self.target, judge)
+            )
+            torch._foreach_lerp_(averaged, newest, self.options.tau)
         q = q.detach() / self.options.reward_scale
         return {
             **scalars,
@@ -393,15 +443,19 @@ class SacAgent(Agent):
             "train/entropy": entropy,
         }
 
-    def drawn(self, obs: torch.Tensor) -> Drawn:
-        """Noise that the actor draws at observations in environment units."""
-        features = self._features(obs)
+    def drawn(self, obs: torch.Tensor, features: torch.Tensor) -> Drawn:
+        """Noise that the actor draws at observations.
+
+        Args:
+            obs: in environment units.
+            features: the same, normalised.
+        """
         noise, log_prob = self._sample(*self._heads(self.actor.weights(), features))
         return Drawn(features, noise, log_prob, lambda: self.judged(obs, noise))
 
     def drawn_to_improve(self, batch: Batch) -> Drawn:
         """Noise that the actor draws at the states of a batch, to be improved."""
-        return self.drawn(batch.obs)
+        return self.drawn(batch.obs, batch.features)
 
     def _distil(
         self, batch: Batch, obs: torch.Tensor, following: Drawn, judge: Weights
@@ -568,6 +622,15 @@ class SacAgent(Agent):
         return self.random(
             lambda generator: torch.randn(shape, generator=generator, device=device, dtype=dtype)
         )
+
+
+def can_join(agent_class: type) -> bool:
+    """Whether agents of a class can be members of a team."""
+    return (
+        issubclass(agent_class, SacAgent)
+        and bool(vars(agent_class).get("in_teams"))
+        and agent_class.after_update is SacAgent.after_update
+    )
 
 
 def _flat(weights: Weights) -> list[torch.Tensor]:

@@ -12,8 +12,9 @@ import torch
 from torch import nn
 
 from symsteer.agents.equivariant import EquivariantAgent
-from symsteer.agents.networks import dense
+from symsteer.agents.networks import Parameters, dense_of, within
 from symsteer.policies.geometry import Layout
+from symsteer.policies.networks.equivariant import MatrixLayer
 
 
 class WrongGroupAgent(EquivariantAgent):
@@ -39,7 +40,7 @@ def mirror(layout: Layout) -> torch.Tensor:
     return layout.matrix(0.0, reflect=True, dtype=torch.get_default_dtype())
 
 
-class Mirrored(nn.Module):
+class Mirrored(MatrixLayer):
     """A layer whose inputs or outputs are multiplied by a fixed matrix."""
 
     matrix: torch.Tensor
@@ -49,9 +50,8 @@ class Mirrored(nn.Module):
         self.layer, self.outputs = layer, outputs
         self.register_buffer("matrix", matrix, persistent=False)
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Weight ``[out, in]`` and bias ``[out]``."""
-        weight, bias = dense(self.layer)
+    def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = dense_of(self.layer, within("layer", parameters))
         if self.outputs:
-            return self.matrix @ weight, self.matrix @ bias
+            return self.matrix @ weight, bias @ self.matrix.mT
         return weight @ self.matrix, bias

@@ -14,7 +14,8 @@ from typing import Any
 import torch
 
 from symsteer.agents.replay import Batch
-from symsteer.agents.team import Team, can_join
+from symsteer.agents.sac import can_join
+from symsteer.agents.team import Team
 from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.folder import is_finished, run_id
 from symsteer.bench.runs.run import opened

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from symsteer.agents import AGENTS
-from symsteer.agents.team import can_join
+from symsteer.agents.sac import can_join
 from symsteer.bench.runs.base_policy import demonstration_path, find_base
 from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.evaluator import check_room

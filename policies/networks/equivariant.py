@@ -16,7 +16,8 @@ from __future__ import annotations
 import abc
 import copy
 import math
-from typing import Self
+from collections.abc import Mapping
+from typing import Any, Self
 
 import torch
 from torch import nn
@@ -24,7 +25,23 @@ from torch import nn
 from symsteer.policies.geometry import Group, Layout
 
 
-class EquivariantLayer(nn.Module, abc.ABC):
+class MatrixLayer(nn.Module):
+    """A linear layer that can be written as one matrix."""
+
+    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The map as (matrix ``[out, in]``, bias ``[out]``)."""
+        return self.dense_of(dict(self.named_parameters()))
+
+    def dense_of(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """The maps of layers like this one, as (matrix ``[..., out, in]``, bias ``[..., out]``).
+
+        Args:
+            parameters: of these layers by name; they have the dimensions ``...`` in front.
+        """
+        raise NotImplementedError
+
+
+class EquivariantLayer(MatrixLayer, abc.ABC):
     """What the layers have in common.
 
     Attributes:
@@ -37,10 +54,6 @@ class EquivariantLayer(nn.Module, abc.ABC):
     bias: torch.Tensor
     in_rank: int
     out_shape: tuple[int, ...]
-
-    @abc.abstractmethod
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The map as (matrix, bias)."""
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Apply it to ``x [..., *in]``."""
@@ -81,12 +94,12 @@ class Lift(EquivariantLayer):
         self.weight = nn.Parameter(torch.empty(channels, layout.dim).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(channels).uniform_(-bound, bound))
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The map as (matrix ``[order * channels, dim]``, bias ``[order * channels]``)."""
+    def dense_of(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = parameters["weight"], parameters["bias"]
         # rho is orthogonal, so rho(g)^-1 is its transpose.
-        rho = self.group.representation(self.layout, self.weight.dtype, self.weight.device)
-        stacked = torch.einsum("cd,ged->gce", self.weight, rho).flatten(0, 1)
-        return stacked, self.bias.repeat(self.group.order)
+        rho = self.group.representation(self.layout, weight.dtype, weight.device)
+        stacked = torch.einsum("...cd,ged->...gce", weight, rho).flatten(-3, -2)
+        return stacked, _everywhere(bias, self.group.order)
 
     def nearest(
         self, matrix: torch.Tensor, bias: torch.Tensor
@@ -105,6 +118,7 @@ class RegularLinear(EquivariantLayer):
     """
 
     index: torch.Tensor
+    same: torch.Tensor
 
     def __init__(self, group: Group, in_channels: int, out_channels: int):
         super().__init__()
@@ -115,17 +129,21 @@ class RegularLinear(EquivariantLayer):
             torch.empty(group.order, out_channels, in_channels).uniform_(-bound, bound)
         )
         self.bias = nn.Parameter(torch.empty(out_channels).uniform_(-bound, bound))
-        # index[g, h] = g^-1 h
-        self.register_buffer("index", group.multiplication[group.inverse], persistent=False)
+        # Of the blocks [g, h] the element g^-1 h; and of each element u the blocks [g, gu].
+        start = group.order * torch.arange(group.order)[:, None]
+        places = {
+            "index": group.multiplication[group.inverse].flatten(),
+            "same": (start + group.multiplication).flatten(),
+        }
+        for name, place in places.items():
+            self.register_buffer(name, place, persistent=False)
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The map as (matrix ``[order * out, order * in]``, bias ``[order * out]``)."""
+    def dense_of(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         order = self.group.order
-        blocks = self.weight.index_select(0, self.index.flatten()).unflatten(0, (order, order))
-        circulant = blocks.permute(0, 2, 1, 3).reshape(
-            order * self.out_channels, order * self.in_channels
-        )
-        return circulant, self.bias.repeat(order)
+        blocks = _Blocks.apply(parameters["weight"], self.index, self.same)
+        blocks = blocks.unflatten(-3, (order, order))
+        circulant = blocks.transpose(-3, -2).flatten(-2).flatten(-3, -2)
+        return circulant, _everywhere(parameters["bias"], order)
 
     def nearest(
         self, matrix: torch.Tensor, bias: torch.Tensor
@@ -134,11 +152,32 @@ class RegularLinear(EquivariantLayer):
         blocks = matrix.unflatten(-1, (order, -1)).unflatten(-3, (order, -1)).transpose(-3, -2)
         # blocks[g, h] is W(g^-1 h), so W(u) is the mean of blocks[g, gu].
         flat = blocks.flatten(-4, -3)
-        start = order * torch.arange(order, device=matrix.device)[:, None]
-        same = (start + self.group.multiplication.to(matrix.device)).flatten()
-        weight = flat.index_select(-3, same).unflatten(-3, (order, order)).mean(-4)
-        blocks = weight.index_select(-3, self.index.flatten()).unflatten(-3, (order, order))
+        weight = flat.index_select(-3, self.same).unflatten(-3, (order, order)).mean(-4)
+        blocks = weight.index_select(-3, self.index).unflatten(-3, (order, order))
         return blocks.transpose(-3, -2).flatten(-2).flatten(-3, -2), _mean_over_group(bias, order)
+
+
+class _Blocks(torch.autograd.Function):
+    """The weights ``[..., order, out, in]`` of all blocks, ``[..., order * order, out, in]``.
+
+    Its derivative sums the same blocks in the same order every time; that of ``index_select`` does
+    not on a GPU.
+    """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(weight: torch.Tensor, index: torch.Tensor, same: torch.Tensor) -> torch.Tensor:
+        return weight.index_select(-3, index)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
+        ctx.same, ctx.order = inputs[2], inputs[0].shape[-3]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        blocks = gradients[0].index_select(-3, ctx.same)
+        return blocks.unflatten(-3, (ctx.order, -1)).sum(-4), None, None
 
 
 class Project(EquivariantLayer):
@@ -155,11 +194,11 @@ class Project(EquivariantLayer):
         self.weight = nn.Parameter(torch.empty(layout.dim, channels).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(layout.dim).uniform_(-bound, bound))
 
-    def dense(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The map as (matrix ``[dim, order * in]``, bias ``[dim]``)."""
-        rho = self.group.representation(self.layout, self.weight.dtype, self.weight.device)
-        stacked = torch.einsum("gde,ec->dgc", rho, self.weight).flatten(1) / self.group.order
-        return stacked, rho.mean(0) @ self.bias
+    def dense_of(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = parameters["weight"], parameters["bias"]
+        rho = self.group.representation(self.layout, weight.dtype, weight.device)
+        stacked = torch.einsum("gde,...ec->...dgc", rho, weight).flatten(-2) / self.group.order
+        return stacked, bias @ rho.mean(0).mT
 
     def nearest(
         self, matrix: torch.Tensor, bias: torch.Tensor
@@ -168,6 +207,11 @@ class Project(EquivariantLayer):
         blocks = matrix.unflatten(-1, (self.group.order, -1))
         weight = torch.einsum("gde,...dgc->...ec", rho, blocks) / self.group.order
         return torch.einsum("gde,...ec->...dgc", rho, weight).flatten(-2), bias @ rho.mean(0).mT
+
+
+def _everywhere(bias: torch.Tensor, order: int) -> torch.Tensor:
+    """``[..., channels]`` for each element of the group, ``[..., order * channels]``."""
+    return bias.unsqueeze(-2).expand(*bias.shape[:-1], order, bias.shape[-1]).flatten(-2)
 
 
 def _mean_over_group(bias: torch.Tensor, order: int) -> torch.Tensor:

@@ -109,7 +109,6 @@ class Problem:
             ends if terminal is None else torch.full((size,), terminal, dtype=dtype)
         )
         fields["truncated"] = torch.zeros(size, dtype=dtype)
-        fields["discount"] = torch.full((size,), 0.95, dtype=dtype)
         return Batch(fields)
 
     def transition(self, size=32, seed=0, rows=None):

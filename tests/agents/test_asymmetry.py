@@ -128,7 +128,7 @@ def solve(problem, name, rounds=400, **options):
         ends = {"terminal": torch.ones(len(obs)), "truncated": torch.zeros(len(obs))}
         actions, reward = agent.executed(obs, noise), bandit_reward(obs, noise)
         agent.observe(Transition(obs, noise, actions, reward, obs, **ends))
-        agent.update(agent.replay.sample(128, agent.options.gamma))
+        agent.update(agent.replay.sample(128))
     obs = torch.randn(512, BANDIT_OBS.dim, generator=generator)
     reward = bandit_reward(obs, agent.act(obs, deterministic=True)).mean().item()
     return reward, actor_equivariance_error(agent, obs, Group.parse("C8"))

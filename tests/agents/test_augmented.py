@@ -33,7 +33,7 @@ def test_turned_batches_teach_the_critics_the_symmetry():
         agent = kind(context, kind.Options(width=32, batch_size=64, lr=3e-3, gamma=0.0, warmup=0))
         agent.observe(Transition(obs, noise, noise, reward, obs, **ends))
         for _ in range(300):
-            agent.update(agent.replay.sample(64, agent.options.gamma))
+            agent.update(agent.replay.sample(64))
         for q_values in (agent.q_values, agent.noise_q_values):
             agent.q_values = q_values
             within = orbit_variance(agent, obs, noise, Group.parse("C8"))
@@ -47,7 +47,7 @@ def test_turned_batches_teach_the_critics_the_symmetry():
 def test_each_row_is_turned_as_a_whole_and_anew(problem, monkeypatch, group, images):
     """Every vector of a row, in observations, noise, actions and bank, by one symmetry."""
     seen = []
-    monkeypatch.setattr(StandardAgent, "learn", lambda self, batch: seen.append(batch) or {})
+    monkeypatch.setattr(StandardAgent, "learn", lambda self, batch, _: seen.append(batch) or {})
     batch = problem.batch(96, dtype=torch.float64)
     for seed in (0, 0):
         agent = problem.agent("augmented", seed, group=group, dtype=torch.float64)
@@ -59,7 +59,7 @@ def test_each_row_is_turned_as_a_whole_and_anew(problem, monkeypatch, group, ima
     turned, later, again, _ = seen
     assert torch.equal(turned.obs, again.obs)
     assert torch.equal(turned.obs, later.obs) == (group == "C1")
-    assert set(batch) - set(fields) == {"reward", "terminal", "truncated", "discount"}
+    assert set(batch) - set(fields) == {"reward", "terminal", "truncated"}
     for name in set(batch) - set(fields):
         assert torch.equal(turned[name], batch[name])
     obs = problem.obs_layout

@@ -31,17 +31,17 @@ def test_with_one_candidate_it_is_the_base_policy(problem):
 def test_the_target_takes_the_best_candidate_of_the_next_state(problem):
     agent = problem.agent("best-of-n", noise_bank=4, **DOUBLE)
     agent.observe(problem.transition(64))
-    batch = agent.replay.sample(32, agent.options.gamma)
+    batch = agent.replay.sample(32)
     # The bank is decoded at the next state.
     noise = batch["bank_noise"]
     for i in range(4):
         wanted = agent.context.decode(batch.next_obs, noise[:, i])[:, :EXECUTE]
         torch.testing.assert_close(batch["bank_actions"][:, i], wanted)
-    target = agent.critic_target(batch, agent.drawn(batch.next_obs))
+    target = agent.critic_target(batch, agent.drawn(batch.next_obs, batch.next_obs))
     # At the start the targets are the critics.
     q = [agent.q_values(batch.next_obs, noise[:, i]).amin(0) for i in range(4)]
     following = torch.stack(q).amax(0)
-    expected = batch.reward + batch.discount * (1 - batch.terminal) * following
+    expected = batch.reward + agent.options.gamma * (1 - batch.terminal) * following
     torch.testing.assert_close(target, expected)
 
 

@@ -13,7 +13,7 @@ SOURCES = ["gaussian", "squashed", "actor", "mixture"]
 def filled(problem, name="standard", **options):
     agent = problem.agent(name, lr=3e-3, gamma=0.0, **options)
     # The critics stay as they are; large enough for differences between actions.
-    agent.optimizers["critic"].param_groups[0]["lr"] = 0.0
+    agent.optimizers["critic"].lr = 0.0
     agent.observe(problem.transition(256))  # reward scale 1: values in units of rewards
     return agent
 
@@ -46,7 +46,7 @@ def test_noise_critics_approach_the_action_critics(problem, source, bank):
     agent = filled(problem, distill=source, noise_bank=bank)
     before = {key: gap(agent, *point) for key, point in where_it_distils(agent).items()}
     for _ in range(300):
-        assert "losses/distillation" in agent.update(agent.replay.sample(64, agent.options.gamma))
+        assert "losses/distillation" in agent.update(agent.replay.sample(64))
     after = {key: gap(agent, *point) for key, point in where_it_distils(agent).items()}
     for key, value in after.items():
         assert value < min(0.6, 0.5 * before[key]), (before, after)
@@ -56,9 +56,7 @@ def test_without_distillation_they_stay_apart(problem):
     agent = filled(problem, distill_steps=1e-9)
     before = gap(agent, *where_it_distils(agent)["random"])
     for _ in range(300):
-        assert "losses/distillation" not in agent.update(
-            agent.replay.sample(64, agent.options.gamma)
-        )
+        assert "losses/distillation" not in agent.update(agent.replay.sample(64))
     assert gap(agent, *where_it_distils(agent)["random"]) == before > 1
 
 
@@ -66,7 +64,7 @@ def test_without_distillation_they_stay_apart(problem):
 def test_the_loss_is_the_hand_computed_one(problem, source):
     """Head by head, at the noise that the option names and nowhere else."""
     agent = filled(problem, distill=source, dtype=torch.float64)
-    batch = agent.replay.sample(32, agent.options.gamma)
+    batch = agent.replay.sample(32)
     generator = copy.deepcopy(agent.generator)
     with torch.no_grad():
         mean, log_scale = agent.moments(batch.next_obs)
@@ -90,9 +88,8 @@ def test_the_loss_is_the_hand_computed_one(problem, source):
 def test_distillation_steps_per_update(problem, steps, made):
     agent, counted = filled(problem, distill_steps=steps), []
     for _ in range(4):
-        agent.update(agent.replay.sample(32, agent.options.gamma))
-        (*_, moments) = agent.optimizers["noise_critic"].state.values() or [{"step": 0}]
-        counted.append(int(moments["step"]))
+        agent.update(agent.replay.sample(32))
+        counted.append(int(agent.optimizers["noise_critic"].moments["step"]))
     assert counted == made
 
 
@@ -119,5 +116,5 @@ def test_the_bank_is_decoded_when_a_decision_is_stored(problem):
     assert len(kept["bank_noise"].flatten(0, 1).unique(dim=0)) == 32
     # In an update, only the actor's noise at the next states is decoded.
     decoded.clear()
-    agent.update(agent.replay.sample(32, agent.options.gamma))
+    agent.update(agent.replay.sample(32))
     assert decoded == [32]

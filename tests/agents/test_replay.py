@@ -10,9 +10,6 @@ from symsteer.errors import UserError
 SHAPES = {"obs": (2,), "noise": (3, 2), "reward": (), "next_obs": (2,), "terminal": ()}
 
 
-GAMMA = 0.5
-
-
 def numbered(start, count):
     n = torch.arange(start, start + count, dtype=torch.float32)
     return {
@@ -25,7 +22,7 @@ def numbered(start, count):
 
 
 def held(buffer):
-    return sorted(buffer.sample(2000, GAMMA).reward.unique().int().tolist())
+    return sorted(buffer.sample(2000).reward.unique().int().tolist())
 
 
 @pytest.mark.parametrize("first_rows", [1, 3, 4096])
@@ -45,9 +42,8 @@ def test_rows_stay_together():
     buffer = ReplayBuffer(7, SHAPES)
     for start in range(0, 20, 4):
         buffer.add(numbered(start, 4))
-    batch = buffer.sample(100, GAMMA)
-    assert set(batch) == {*SHAPES, "discount"}
-    assert batch.discount.eq(GAMMA).all()
+    batch = buffer.sample(100)
+    assert set(batch) == set(SHAPES)
     for name in SHAPES:
         tensor = batch[name]
         assert torch.equal(tensor.flatten(1).mean(1) if tensor.ndim > 1 else tensor, batch.reward)
@@ -59,7 +55,7 @@ def test_keeps_copies():
     rows = numbered(1, 2)
     buffer.add(rows)
     rows["obs"].zero_()
-    assert buffer.sample(50, GAMMA).obs.min() >= 1
+    assert buffer.sample(50).obs.min() >= 1
 
 
 def test_holds_the_fields_that_were_asked_for():
@@ -68,8 +64,8 @@ def test_holds_the_fields_that_were_asked_for():
     step = Transition(**rows, actions=actions, truncated=torch.ones(4, dtype=torch.bool))
     buffer = ReplayBuffer(8, {"actions": (2, 2), "reward": (), "truncated": ()})
     buffer.add(step)
-    batch = buffer.sample(64, GAMMA)
-    assert set(batch) == {"actions", "reward", "truncated", "discount"}
+    batch = buffer.sample(64)
+    assert set(batch) == {"actions", "reward", "truncated"}
     assert torch.equal(batch.actions.unique(), torch.arange(16.0))
     assert batch.truncated.eq(1).all()
     with pytest.raises(
@@ -85,11 +81,11 @@ def test_sampling_is_seeded_and_continues_after_loading():
         return buffer
 
     first, second, third = filled(3), filled(3), filled(4)
-    draws = first.sample(64, GAMMA).reward
-    assert torch.equal(draws, second.sample(64, GAMMA).reward)
-    assert not torch.equal(draws, third.sample(64, GAMMA).reward)
+    draws = first.sample(64).reward
+    assert torch.equal(draws, second.sample(64).reward)
+    assert not torch.equal(draws, third.sample(64).reward)
     third.load_state_dict(first.state_dict())
-    assert torch.equal(first.sample(64, GAMMA).reward, third.sample(64, GAMMA).reward)
+    assert torch.equal(first.sample(64).reward, third.sample(64).reward)
     for buffer in (first, third):
         buffer.add(numbered(8, 5))
     assert held(first) == held(third) == list(range(3, 13))
@@ -98,7 +94,7 @@ def test_sampling_is_seeded_and_continues_after_loading():
 
 def test_mistakes_are_named():
     with pytest.raises(UserError, match="empty"):
-        ReplayBuffer(4, SHAPES).sample(1, GAMMA)
+        ReplayBuffer(4, SHAPES).sample(1)
     with pytest.raises(UserError, match="capacity"):
         ReplayBuffer(0, SHAPES)
     other = ReplayBuffer(4, {**SHAPES, "obs": (3,)})

@@ -109,7 +109,7 @@ def test_actor_step_leaves_the_critics_alone_and_climbs_q(problem, critic):
     def value():
         return agent.q_values(obs, agent.act(obs, deterministic=True)).amin(0).mean().item()
 
-    agent.optimizers["critic"].param_groups[0]["lr"] = 0.0
+    agent.optimizers["critic"].lr = 0.0
     frozen = [p.clone() for p in agent.critic.parameters()]
     before = value()
     for seed in range(60):
@@ -125,7 +125,7 @@ def test_actor_loss_is_the_hand_computed_one(problem, critic):
         agent.update(problem.batch(seed=10 + seed, dtype=torch.float64))
     for name in ("critic", "noise_critic"):
         if name in agent.optimizers:
-            agent.optimizers[name].param_groups[0]["lr"] = 0.0
+            agent.optimizers[name].lr = 0.0
     batch = problem.batch(dtype=torch.float64)
     generator = copy.deepcopy(agent.generator)
     with torch.no_grad():
@@ -176,7 +176,7 @@ def test_same_seed_same_agent(problem, name):
         torch.randn(seed + 3)  # the global generator must not matter
         agent, replay = problem.agent(name, seed=seed), problem.replay()
         for _ in range(5):
-            agent.update(replay.sample(32, agent.options.gamma))
+            agent.update(replay.sample(32))
         return agent, agent.act(problem.batch().obs)
 
     (first, noise), (second, again), (other, _) = run(0), run(0), run(1)

@@ -8,7 +8,11 @@ import pytest
 import torch
 
 from symsteer.agents import AGENTS
-from symsteer.agents.team import Team, can_join
+from symsteer.agents.agent import AgentContext
+from symsteer.agents.sac import can_join
+from symsteer.agents.team import Team
+from symsteer.policies import POLICIES
+from tests.agents.conftest import EXECUTE, HORIZON
 
 LEARNERS = [name for name in AGENTS.builtin if can_join(AGENTS.get(name))]
 SEEDS = (3, 1, 2)
@@ -38,7 +42,7 @@ def members(problem, name, seeds=SEEDS, **options):
 
 
 def batch_of(agent):
-    return agent.replay.sample(ROWS, agent.options.gamma)
+    return agent.replay.sample(ROWS)
 
 
 def alone(agents, updates):
@@ -106,6 +110,37 @@ def test_with_other_options(problem, options):
     alone(single, 5)
     together(team, 5)
     assert_same_state(team, single)
+
+
+@pytest.mark.parametrize("bases", [(0, 0), (0, 1)], ids=["one", "two"])
+def test_members_decode_together_if_they_steer_the_same_policy(problem, bases, monkeypatch):
+    """Copies of a policy are the same; another one is not taken for it."""
+    kind, calls = POLICIES.get("plain"), []
+    options = kind.Options(channels=8, width=8, depth=1, horizon=HORIZON, execute=EXECUTE)
+
+    decode = kind.decode
+    monkeypatch.setattr(
+        kind, "decode", lambda self, obs, noise: calls.append(len(obs)) or decode(self, obs, noise)
+    )
+
+    def member(base, seed):
+        with torch.random.fork_rng():
+            torch.manual_seed(base)
+            policy = kind(options, problem.obs_layout, problem.act_layout)
+        agent_class = AGENTS.get("standard")
+        options_of = agent_class.Options(**problem.options)
+        agent = agent_class(AgentContext.of(policy.freeze(), seed=seed), options_of)
+        agent.observe(problem.transition(64, seed))
+        return agent
+
+    single, team = ([member(base, seed) for seed, base in enumerate(bases)] for _ in range(2))
+    alone(single, 2)
+    calls.clear()
+    together(team, 2)
+    assert set(calls) == ({2 * ROWS} if len(set(bases)) == 1 else {ROWS})
+    for agent, other in zip(team, single, strict=True):
+        x, y = (one.networks["critic"].state_dict() for one in (agent, other))
+        torch.testing.assert_close(x, y, rtol=1e-3, atol=1e-4)
 
 
 def test_agents_join_and_leave(problem):

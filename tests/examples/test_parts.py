@@ -57,7 +57,7 @@ def trained(agent, reward, updates=50):
     executed = agent.context.decode(obs, noise)[:, :2]
     agent.observe(Transition(obs, noise, executed, reward(obs, noise), obs, **ends))
     for _ in range(updates):
-        scalars = agent.update(agent.replay.sample(64, agent.options.gamma))
+        scalars = agent.update(agent.replay.sample(64))
     return scalars, obs
 
 

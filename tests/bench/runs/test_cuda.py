@@ -13,7 +13,7 @@ import torch
 
 import symsteer
 from symsteer.agents import AGENTS
-from symsteer.agents.team import can_join
+from symsteer.agents.sac import can_join
 from symsteer.bench.runs.base_policy import prepare_base
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.run import evaluate
