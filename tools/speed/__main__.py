@@ -16,6 +16,7 @@ from typing import Literal
 import torch
 import tyro
 
+from symsteer.agents import AGENTS
 from symsteer.bench.runs.config import RunConfig
 from symsteer.errors import UserError
 from symsteer.terminal import complain
@@ -56,11 +57,16 @@ def memory(task: str = "PickCube-v1") -> None:
 def learner(
     task: str = "PickCube-v1",
     repeats: int = 5,
+    agents: tuple[str, ...] = tuple(AGENTS.builtin),
     device: Literal["cpu", "cuda"] = "cpu",
+    sbx: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Measure an update of each learner: CPU time, or with a GPU wall-clock time on both."""
-    rows = learners.measure(task, 20, repeats, _tell, devices=_devices(device))
+    """Measure an update of each learner: CPU time, or with a GPU wall-clock time on both.
+
+    With `--sbx PYTHON` also that of SBX (JAX), by a Python that has sbx-rl.
+    """
+    rows = learners.measure(task, 20, repeats, _tell, agents, _devices(device), sbx)
     print(simulating.dump({"rows": rows}) if json else learners.table(rows))
 
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import json
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,16 +20,16 @@ import torch
 from symsteer.agents import AGENTS
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.options import SacOptions
-from symsteer.agents.replay import Transition
-from symsteer.agents.sac import SacAgent
-from symsteer.agents.team import Team, can_join
+from symsteer.agents.replay import Batch, Transition
+from symsteer.agents.sac import SacAgent, can_join
+from symsteer.agents.team import Team
 from symsteer.bench.throughput import new_agent, new_policy
-from tools.speed.timing import clock_of, in_turns, products_of, time_on
+from tools.speed.timing import OtherProgram, clock_of, in_turns, products_of, time_on
 
 DECISIONS = 512
 """Random decisions in the replay."""
 
-TEAMS = {"cpu": (5,), "cuda": (5, 20)}
+TEAMS = {"cpu": (5,), "cuda": (5, 20, 80)}
 """Members of the teams on each device."""
 
 
@@ -37,7 +39,7 @@ class Contender:
 
     Attributes:
         device: of its tensors.
-        what: the update, or its matrix products alone.
+        what: the update, the same as a CUDA graph, or its matrix products alone.
         critic: of a learner.
         members: learners that are updated at once.
         batch_size: transitions in an update of one learner; 0 without batches.
@@ -63,6 +65,7 @@ def measure(
     report: Callable[[str], None],
     agents: Sequence[str] = tuple(AGENTS.builtin),
     devices: Sequence[str] = ("cpu",),
+    sbx: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Time the updates of learners.
 
@@ -73,6 +76,7 @@ def measure(
         report: receives a line for each round.
         agents: names; those that are no learners are left out.
         devices: ``cpu``, ``cuda``.
+        sbx: a Python that has SBX (JAX); None: without it.
 
     Returns:
         One row each: the fields of :class:`Contender` but ``run``, and milliseconds of one update
@@ -82,6 +86,9 @@ def measure(
     contenders = [
         contender for device in devices for contender in _contenders(task, agents, device)
     ]
+    if sbx:
+        size = _standard_options().batch_size
+        contenders.append(Contender("cpu", "sbx", "update", "noise", 1, 0, size, _sbx(task, sbx)))
     runs = [contender.run for contender in contenders]
     times = [
         [spent / contender.updates for spent in found]
@@ -113,15 +120,16 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"{time_on([*devices])} of one update of one learner, one thread; "
         "median of the measurements (smallest to largest)",
         "",
-        f"{'device':6s} {'agent':18s} {'what':16s} {'critic':9s} {'parameters':>10s} {'batch':>6s} "
+        f"{'device':6s} {'agent':18s} {'what':18s} {'critic':9s} {'parameters':>10s} {'batch':>6s} "
         f"{'ms':>7s} {'':18s} ratio",
     ]
     for row in rows:
         spread = f"({row['min']:.1f} to {row['max']:.1f})"
         parameters = f"{row['parameters']:,d}" if row["parameters"] else ""
-        what = row["what"] if row["members"] == 1 else f"in a team of {row['members']}"
+        team = f", team of {row['members']}" if row["members"] > 1 else ""
+        what = row["what"] + team
         lines.append(
-            f"{row['device']:6s} {row['agent']:18s} {what:16s} {row['critic']:9s} "
+            f"{row['device']:6s} {row['agent']:18s} {what:18s} {row['critic']:9s} "
             f"{parameters:>10s} {row['batch_size'] or '':>6} {row['median']:7.2f} {spread:18s} "
             f"{row['median'] / unit:5.2f}"
         )
@@ -142,11 +150,19 @@ def _contenders(task: str, agents: Sequence[str], device: str) -> list[Contender
             if name == "standard":
                 products = products_of(update)
                 found.append(Contender(device, name, "products alone", critic, 1, *sizes, products))
+            if alone.in_graphs:
+                graph = functools.partial(_update, alone, Batch())
+                found.append(Contender(device, name, "graph", critic, 1, *sizes, graph))
             for count in TEAMS[device] if can_join(agent_class) else ():
                 seeds = range(1, 1 + count)
                 team = Team([_learner(task, name, critic, seed, device) for seed in seeds])
                 run = functools.partial(_update_team, team)
                 found.append(Contender(device, name, "update", critic, count, *sizes, run, count))
+                if alone.in_graphs:
+                    run = functools.partial(_update_team, team, [Batch()] * count)
+                    found.append(
+                        Contender(device, name, "graph", critic, count, *sizes, run, count)
+                    )
     context = AgentContext.of(new_policy(task).to(device), device)
     if importlib.util.find_spec("stable_baselines3"):
         size = _standard_options().batch_size
@@ -184,16 +200,28 @@ def _decisions(context: AgentContext, rows: int, count: int) -> Transition:
     )
 
 
-def _batch(agent: SacAgent) -> Any:
-    return agent.replay.sample(agent.options.batch_size, agent.options.gamma)
+def _update(agent: SacAgent, batch: Batch | None = None) -> None:
+    agent.update(agent.new_batch() if batch is None else batch)
 
 
-def _update(agent: SacAgent) -> None:
-    agent.update(_batch(agent))
+def _update_team(team: Team, batches: Sequence[Batch] | None = None) -> None:
+    team.update(batches or [agent.new_batch() for agent in team.members])
 
 
-def _update_team(team: Team) -> None:
-    team.update([_batch(agent) for agent in team.members])
+def _sbx(task: str, python: Path) -> OtherProgram:
+    """SBX's SAC with networks and batches of the same sizes, on the noise."""
+    options, context = _standard_options(), AgentContext.of(new_policy(task))
+    sizes = {
+        "obs": context.obs_layout.dim,
+        "noise": context.noise_layout.dim,
+        "batch": options.batch_size,
+        "width": options.width,
+        "depth": options.depth,
+        "critics": options.critics,
+        "decisions": DECISIONS,
+    }
+    program = Path(__file__).with_name("sbx_update.py")
+    return OtherProgram([str(python), str(program), json.dumps(sizes)])
 
 
 def _sb3(context: AgentContext) -> Callable[[], None]:

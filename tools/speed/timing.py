@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
+
+from symsteer.errors import UserError
 
 WARM_UP = 5
 """Calls before the first measurement."""
@@ -54,17 +58,54 @@ def in_turns(
         clock: see :func:`clock_of`.
     """
     for run in contenders:
-        for _ in range(WARM_UP):
-            run()
+        _seconds(run, WARM_UP, clock)
     times: list[list[float]] = [[] for _ in contenders]
     for turn in range(repeats):
-        for found, run in zip(times, contenders, strict=True):
-            begin = clock()
-            for _ in range(calls):
-                run()
-            found.append(1e3 * (clock() - begin) / calls)
+        for measured, run in zip(times, contenders, strict=True):
+            measured.append(1e3 * _seconds(run, calls, clock) / calls)
         report(f"round {turn + 1} of {repeats}")
     return times
+
+
+def _seconds(run: Callable[[], Any], calls: int, clock: Callable[[], float]) -> float:
+    if isinstance(run, OtherProgram):
+        return run.seconds(calls)
+    begin = clock()
+    for _ in range(calls):
+        run()
+    return clock() - begin
+
+
+class OtherProgram:
+    """A computation in a program of its own, which times itself.
+
+    The program reads a number of calls from each line of its input, and answers with the seconds
+    of CPU time that they took.
+
+    Args:
+        command: starts it.
+    """
+
+    def __init__(self, command: Sequence[str]):
+        one_thread = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "XLA_FLAGS": one_thread}
+        pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self.program = command[0]
+        self.process = subprocess.Popen(command, env=environment, **pipes)
+
+    def __call__(self) -> None:
+        self.seconds(1)
+
+    def seconds(self, calls: int) -> float:
+        """CPU seconds of some calls."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(f"{calls}\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        if not answer:
+            raise UserError(f"{self.program} ended early; its error is above")
+        return float(answer)
 
 
 def products_of(run: Callable[[], Any]) -> Callable[[], None]:
