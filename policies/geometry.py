@@ -242,10 +242,10 @@ class Layout:
 
     def rotate(self, x: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
         """Rotate every row of ``x [N, ..., dim]`` by its own ``angle [N]`` (radians)."""
-        frequency, partner, sign = self._quarter_turn
-        turn = angle.to(x).view(-1, *(1,) * (x.dim() - 1)) * frequency.to(x)
+        frequency, partner, sign = _quarter_turn(self, x.dtype, x.device)
+        turn = angle.to(x).view(-1, *(1,) * (x.dim() - 1)) * frequency
         # x cos(k a) + J x sin(k a), where J rotates each vector by 90 degrees.
-        return turn.cos() * x + turn.sin() * sign.to(x) * x[..., partner.to(x.device)]
+        return turn.cos() * x + turn.sin() * sign * x[..., partner]
 
     def turn(self, x: torch.Tensor, rotation: torch.Tensor) -> torch.Tensor:
         """Turn the vectors in space of every row of ``x [N, dim]`` by ``rotation [N, 3, 3]``."""
@@ -258,17 +258,6 @@ class Layout:
             moved = next(columns) + next(columns) + next(columns)
             turned[:, parts[0]], turned[:, parts[1]] = moved[:, :2], moved[:, 2:]
         return turned
-
-    @functools.cached_property
-    def _quarter_turn(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Each number's frequency, and J as (index, sign): (J x)[i] = sign[i] x[index[i]]."""
-        frequency = torch.cat([torch.full((f.dim,), float(f.frequency)) for f in self.fields])
-        partner, sign = torch.arange(self.dim), torch.zeros(self.dim)
-        for block in self.blocks:
-            if block.stop - block.start == 2:
-                partner[block] = partner[block].flip(0)
-                sign[block] = torch.tensor([-1.0, 1.0])
-        return frequency, partner, sign
 
     def field_type(self, group: Group) -> escnn.nn.FieldType:
         """escnn's field type over a point, in the same basis as :meth:`matrix`.
@@ -551,3 +540,17 @@ def _escnn_representation(
     if name not in known:
         known[name] = escnn_package().group.Representation(fibergroup, name, irreps, basis)
     return known[name]
+
+
+@functools.lru_cache(maxsize=256)
+def _quarter_turn(
+    layout: Layout, dtype: torch.dtype, device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Each number's frequency, and J as (index, sign): (J x)[i] = sign[i] x[index[i]]."""
+    frequency = torch.cat([torch.full((f.dim,), float(f.frequency)) for f in layout.fields])
+    partner, sign = torch.arange(layout.dim), torch.zeros(layout.dim)
+    for block in layout.blocks:
+        if block.stop - block.start == 2:
+            partner[block] = partner[block].flip(0)
+            sign[block] = torch.tensor([-1.0, 1.0])
+    return frequency.to(device, dtype), partner.to(device), sign.to(device, dtype)

@@ -43,10 +43,13 @@ class Irreps(abc.ABC):
     def __init__(self, dims: list[int]):
         self.dims, self.degrees, self.dim = dims, range(len(dims)), sum(dims)
 
-    @functools.cached_property
-    def degree(self) -> torch.Tensor:
+    def degree(self, device: torch.device) -> torch.Tensor:
         """Degree of each number, ``[dim]`` int64."""
-        return torch.repeat_interleave(torch.arange(len(self.dims)), torch.tensor(self.dims))
+        return _degree(tuple(self.dims), device)
+
+    def sizes(self, device: torch.device) -> torch.Tensor:
+        """Numbers of an irrep of each degree."""
+        return _sizes(tuple(self.dims), device)
 
     def slice(self, degree: int) -> slice:
         """Where an irrep lies in the last axis."""
@@ -187,7 +190,7 @@ class EquivariantMap(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         # [dim, out, in]: the matrix of each number's degree.
-        degree = self.irreps.degree.to(x.device)
+        degree = self.irreps.degree(x.device)
         out = torch.einsum("doi,...id->...od", self.weight[0][degree], x)
         if self.irreps.complex_weights:
             out = out + torch.einsum("doi,...id->...od", self.weight[1][degree], quarter_turn(x))
@@ -251,6 +254,19 @@ class Leave(_Ends):
         return out
 
 
+# Copied to a device once: a copy within a CUDA graph would end its recording.
+
+
+@functools.lru_cache(maxsize=64)
+def _sizes(dims: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    return torch.tensor(dims, device=device)
+
+
+@functools.lru_cache(maxsize=64)
+def _degree(dims: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    return torch.repeat_interleave(torch.arange(len(dims)), torch.tensor(dims)).to(device)
+
+
 def turned_pairs(x: torch.Tensor) -> torch.Tensor:
     """Pairs in the last axis turned by 90 degrees."""
     return torch.stack([-x[..., 1], x[..., 0]], dim=-1)
@@ -271,8 +287,7 @@ class Norm(nn.Module):
         self.scale = nn.Parameter(torch.ones(channels, len(irreps.dims)))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        degree = self.irreps.degree.to(x.device)
-        sizes = torch.tensor(self.irreps.dims, device=x.device, dtype=x.dtype)
+        degree, sizes = self.irreps.degree(x.device), self.irreps.sizes(x.device)
         squares = x.square().mean(-2)
         means = torch.zeros_like(squares[..., : len(sizes)]).index_add(-1, degree, squares) / sizes
         return x * (means + EPSILON).rsqrt()[..., degree].unsqueeze(-2) * self.scale[:, degree]
@@ -313,7 +328,7 @@ class Gate(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         invariant = x[..., 0]
         factors = self.factors(invariant).sigmoid().unflatten(-1, (x.shape[-2], -1))
-        degree = self.irreps.degree[1:].to(x.device) - 1
+        degree = self.irreps.degree(x.device)[1:] - 1
         return torch.cat(
             [functional.silu(invariant)[..., None], x[..., 1:] * factors[..., degree]], dim=-1
         )
@@ -330,5 +345,5 @@ class Film(nn.Module):
     def forward(self, x: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         """Modulate ``x [B, channels, dim]`` by ``condition [B or 1, condition_dim]``."""
         values = condition.unflatten(-1, (self.channels, -1))
-        scaled = x * (1 + values[..., self.irreps.degree.to(x.device)])
+        scaled = x * (1 + values[..., self.irreps.degree(x.device)])
         return torch.cat([scaled[..., :1] + values[..., -1:], scaled[..., 1:]], dim=-1)

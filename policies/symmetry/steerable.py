@@ -239,5 +239,5 @@ class LevelDenoiser(SpatialDenoiser):
     """Adds the vertical to an observation above a level table."""
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
-        vertical = obs.new_tensor([0.0, 0.0, 1.0]).expand(len(obs), 3)
-        return super().encode(torch.cat([obs, vertical], dim=-1))
+        level, up = obs.new_zeros(len(obs), 2), obs.new_ones(len(obs), 1)
+        return super().encode(torch.cat([obs, level, up], dim=-1))
