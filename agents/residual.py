@@ -105,7 +105,7 @@ class ResidualAgent(EitherAgent):
     def gaussian_noise(self, count: int, generator: torch.Generator | None = None) -> torch.Tensor:
         """Actions of the base policy ``[count, Tp + Ta, Da]``: the correction is 0."""
         noise = super().gaussian_noise(count, generator)
-        noise[:, self.context.horizon :] = 0
+        noise[:, self.context.horizon :].zero_()
         return noise
 
     def bank_noise(self, count: int, generator: torch.Generator) -> torch.Tensor:

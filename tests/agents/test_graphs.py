@@ -17,9 +17,12 @@ from symsteer.agents import AGENTS, graphs
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import can_join
 from symsteer.agents.team import Team
+from symsteer.policies import POLICIES
+from tests.agents.conftest import HORIZON
 
 LEARNERS = [name for name in AGENTS.builtin if can_join(AGENTS.get(name))]
 WAITS = ("_local_scalar_dense", "nonzero", "is_nonzero", "masked_select", "unique", "equal")
+WAITS += ("lift_fresh",)  # a constant of the processor, which would be copied to the device
 
 
 class Recorder(TorchDispatchMode):
@@ -119,6 +122,16 @@ def test_a_team_as_a_graph_is_the_team(problem, name):
     graphed[0].update(Batch())
     update(eager[0])
     assert_same(graphed, eager)
+
+
+@pytest.mark.parametrize("name", [name for name in POLICIES.builtin if name != "escnn"])
+def test_base_policies_can_be_recorded(problem, name):
+    kind = POLICIES.get(name)
+    policy = kind(kind.Options(horizon=HORIZON, execute=2), problem.obs_layout, problem.act_layout)
+    batch = problem.batch()
+    policy.decode(batch.obs, batch.noise)  # caches
+    with Recorder():
+        policy.decode(batch.obs, batch.noise)
 
 
 def test_it_goes_on_from_a_checkpoint_as_it_would_have(problem):
