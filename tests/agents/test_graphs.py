@@ -85,17 +85,17 @@ def test_an_update_as_a_graph_is_the_update(problem, name):
     """Also with the numbers of distillations that follow, and when the replay has grown."""
     options = {"distill_steps": 1.5} if name in ("standard", "equivariant") else {}
     graphed, eager = (filled(problem, name, **options) for _ in range(2))
+    obs = problem.batch(dtype=torch.float64).obs
     for _ in range(4):
         mine, theirs = graphed.update(Batch()), update(eager)
         torch.testing.assert_close(mine, theirs)
+        torch.testing.assert_close(graphed.act(obs), eager.act(obs))
     assert_same([graphed], [eager])
     for agent in (graphed, eager):
         agent.observe(problem.transition(64, 5, agent.rows))
     graphed.update(Batch())
     update(eager)
     assert_same([graphed], [eager])
-    obs = problem.batch(dtype=torch.float64).obs
-    torch.testing.assert_close(graphed.act(obs), eager.act(obs))
 
 
 def test_a_grown_replay_is_recorded_anew(problem):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from symsteer.policies.geometry import Group, Layout
+from symsteer.policies.networks.equivariant import RegularLinear
 from tests.marks import long_except
 from tests.policies.conftest import (
     ACT,
@@ -161,3 +162,15 @@ def test_new_weights_reach_decode():
         policy.denoiser.project.weight.mul_(3)
     policy.freeze()
     assert not torch.allclose(policy.decode(obs, noise), after, atol=1e-3)
+
+
+@pytest.mark.parametrize("group", ["C4", "D4"])
+def test_the_derivative_of_a_group_convolution(group):
+    layer = RegularLinear(Group.parse(group), 2, 3).double()
+    bias = layer.bias.detach()
+
+    def matrix(weight):
+        return layer.dense_of({"weight": weight, "bias": bias})[0]
+
+    weight = torch.randn_like(layer.weight).requires_grad_()
+    assert torch.autograd.gradcheck(matrix, weight)
