@@ -167,7 +167,7 @@ class RunConfig(_Checked):
             )
         # The variant is a part of the run's identity: each strength in its shortest form.
         specs = parse_variant(with_numbers(self.variant, self.task, self.embodiment))
-        complete["variant"] = variant_text(specs)
+        complete |= {"variant": variant_text(specs), "variants": specs}
         for spec in specs:
             VARIANTS.check_allowed(spec.name)
 
