@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import time
@@ -91,7 +92,10 @@ class OtherProgram:
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "XLA_FLAGS": one_thread}
         pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         self.program = command[0]
-        self.process = subprocess.Popen(command, env=environment, **pipes)
+        try:
+            self.process = subprocess.Popen(command, env=environment, **pipes)
+        except OSError as error:
+            raise UserError(f"{command[0]} does not start ({error.strerror})") from error
 
     def __call__(self) -> None:
         self.seconds(1)
@@ -100,11 +104,13 @@ class OtherProgram:
         """CPU seconds of some calls."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
-        self.process.stdin.write(f"{calls}\n")
-        self.process.stdin.flush()
-        answer = self.process.stdout.readline()
+        answer = ""
+        with contextlib.suppress(BrokenPipeError):
+            self.process.stdin.write(f"{calls}\n")
+            self.process.stdin.flush()
+            answer = self.process.stdout.readline()
         if not answer:
-            raise UserError(f"{self.program} ended early; its error is above")
+            raise UserError(f"{self.program} ended early; it may lack a package (see above)")
         return float(answer)
 
 
