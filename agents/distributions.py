@@ -114,7 +114,7 @@ class RadialTanh(torch.autograd.Function):
 
     With s = |u|^2 of a block of n numbers and the ratio ``p(s) = tanh(|u|) / |u|``:
 
-        w = bound p u,   log det = log sech^2 |u| + (n - 1) log p + n log bound,
+        w = bound p u,   log det = log sech^2 |u| + (n - 1) log p   (for bound 1),
         dp/ds = (sech^2 |u| - p) / (2 s),   d log det / ds = -p + (n - 1) (dp/ds) / p.
 
     As functions of s (not of |u|) they are smooth at zero. The derivative is written out because
