@@ -215,11 +215,14 @@ def sweep(
     from dataclasses import replace
 
     from symsteer.bench.runs.tracking import check_tracking
-    from symsteer.bench.sweep.command import preview, run_plan
+    from symsteer.bench.sweep.command import preview, run_plan, settled
     from symsteer.bench.sweep.plan import make_plan, sweep_path
     from symsteer.bench.sweep.suite import load_suite
+    from symsteer.bench.throughput import measure
 
     plan = make_plan(load_suite(suite), out, elsewhere=workforce.ray is not None)
+    if workforce.workers == "auto" and workforce.ray is None:
+        workforce = settled(plan, workforce, None if dry_run else measure, _tell)
     if dry_run:
         print(preview(plan, workforce))
         return 0
@@ -516,25 +519,34 @@ def audit_episodes(
 def throughput(
     task: str = "PickCube-v1",
     agent: str = "standard",
-    num_envs: tuple[int, ...] = (4, 16, 64),
-    workers: tuple[int, ...] = (1,),
-    seconds: float = 10.0,
+    num_envs: tuple[int, ...] = (64, 16, 256),
 ) -> int:
-    """Measure how fast this machine steers: steps per second of a run, and where its time goes.
+    """Measure how many runs an hour this machine executes, and which setting is fastest.
 
-    Other programs disturb the measurement, so close them first.
+    It takes one to two minutes. Other programs disturb the measurement, so close them first.
 
     Args:
         task: Task; `symsteer list` names them.
-        agent: Agent; it has its default options.
+        agent: Learner; it has its default options.
         num_envs: Numbers of environments.
-        workers: Numbers of processes that share the simulation.
-        seconds: Length of each measurement.
     """
     allow(task, agent)
-    from symsteer.bench.throughput import measure, table
+    from dataclasses import replace
 
-    print(table(measure(task, agent, num_envs, workers, seconds, _tell)))
+    import torch
+
+    from symsteer.agents import AGENTS
+    from symsteer.bench.sweep.command import choices
+    from symsteer.bench.sweep.pool import LocalPool
+    from symsteer.bench.sweep.suite import load_suite
+    from symsteer.bench.throughput import measure, to_text
+
+    run = load_suite("second").runs[0]
+    run = replace(run, task=task, agent=agent, agent_options=AGENTS.get(agent).Options())
+    rates = measure(run, choices("cpu", num_envs), LocalPool, _tell)
+    if torch.cuda.is_available():
+        rates |= measure(run, choices("cuda", num_envs), LocalPool, _tell)
+    print(to_text(run, rates))
     return 0
 
 

@@ -1,112 +1,170 @@
-"""How fast this machine steers: the steps of a real run, by part, for several numbers of
-environments."""
+"""How many runs an hour this machine executes, and in which way: measured with short runs, in
+as many processes at the same time as a sweep would have."""
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
+import itertools
 import math
-import os
-import time
-from collections.abc import Callable, Sequence
-from typing import Any
+import statistics
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import torch
 
 from symsteer.agents import AGENTS
-from symsteer.agents.agent import Agent, AgentContext
-from symsteer.bench.sim.environment import MAX_SCENES
-from symsteer.bench.steering.latent_env import Clock, LatentNoiseEnv
-from symsteer.bench.tasks import make, task_class
+from symsteer.agents.sac import can_join
+from symsteer.bench.runs.config import EvaluationConfig, Execution, RunConfig
+from symsteer.bench.runs.evaluator import check_room
+from symsteer.bench.runs.folder import RECORD, run_id
+from symsteer.bench.runs.run import check
+from symsteer.bench.tasks import task_class
 from symsteer.errors import UserError
+from symsteer.leaderboard.records import RunRecord, read_record
 from symsteer.policies import POLICIES
+from symsteer.policies.files import save_policy
 from symsteer.tables import aligned
 
-PARTS = ("simulate", "decode", "learn")
+UPDATES = {"cpu": 128, "cuda": 1000}
+"""Of a short run. On a GPU the first ones, which record graphs, must not count much."""
+
+LEAST = EvaluationConfig(**dict.fromkeys(vars(EvaluationConfig()), 1))
+
+
+class Setting(NamedTuple):
+    """How runs are executed: in so many processes at a time, each with so many runs together."""
+
+    device: Literal["cpu", "cuda"]
+    num_envs: int
+    workers: int
+    together: int
+
+    def __str__(self) -> str:
+        return "--workers {2} --together {3} with {1} environments on {0}".format(*self)
+
+
+def fastest(
+    choices: Mapping[str, Sequence[Any]], measure: Callable[[Setting], float]
+) -> dict[Setting, float]:
+    """What ``measure`` says of settings, the highest first.
+
+    The values of each field of a setting are tried with the best ones of the fields before it.
+    """
+    best = Setting(**{name: values[0] for name, values in choices.items()})
+    rates: dict[Setting, float] = {}
+    for name, values in choices.items():
+        for setting in [best._replace(**{name: value}) for value in values]:
+            rates[setting] = rates[setting] if setting in rates else measure(setting)
+        best = max(rates, key=rates.__getitem__)
+    return dict(sorted(rates.items(), key=lambda item: -item[1]))
 
 
 def measure(
-    task: str,
-    agent: str,
-    num_envs: Sequence[int],
-    workers: Sequence[int],
-    seconds: float,
-    report: Callable[[str], None] = lambda line: None,
-) -> list[dict[str, Any]]:
-    """Steer an untrained base policy of the default size, as a run does after its warm-up.
+    config: RunConfig,
+    choices: Mapping[str, Sequence[Any]],
+    new_pool: Callable[[int, Path], Any],
+    report: Callable[[str], None],
+) -> dict[Setting, float]:
+    """Runs per hour of a learner with untrained base policies.
 
     Args:
-        task, agent: names; the agent has its default options.
-        num_envs: numbers of environments.
-        workers: numbers of processes that share the simulation.
-        seconds: length of each measurement.
-        report: receives a line for each measurement.
+        config: of a run, but for what is chosen.
+        choices: for each field of :class:`Setting`, in this order, the values to try.
+        new_pool: :class:`symsteer.bench.sweep.pool.LocalPool`.
+        report: receives a line for each setting.
 
     Returns:
-        A row for each combination: ``num_envs``, ``workers``, ``rate`` (control steps per second,
-        summed over the environments), and milliseconds of a control step of all environments by
-        part: ``simulate``, ``decode``, ``learn`` (choosing noise, and updates).
+        Those of each setting, the fastest first; 0 for one with too little memory or room.
 
     Raises:
-        UserError: an unknown name, or a number out of range.
+        UserError: if the run cannot be started or does not learn, or no setting can be measured.
     """
-    most = max(num_envs, default=0)
-    if not 0 < seconds < math.inf or min(*num_envs, *workers, most) < 1:
-        raise UserError("--seconds, --num-envs and --workers must be positive")
-    cores = len(os.sched_getaffinity(0))
-    if max(workers, default=1) > cores:
-        raise UserError(
-            f"--workers is {max(workers)}; this machine has {cores} cores, so name at most {cores}"
-        )
-    if any(most > MAX_SCENES * processes for processes in workers):
-        raise UserError(
-            f"one process simulates at most {MAX_SCENES} environments, and --num-envs has {most}; "
-            "lower it"
-        )
-    task_class(task)
-    AGENTS.get(agent)
-    rows = []
-    for processes in workers:
-        for count in (count for count in num_envs if count >= processes):
-            report(f"{count} environments, {processes} processes")
-            row = {"num_envs": count, "workers": processes}
-            rows.append(row | _steer(task, agent, count, processes, seconds))
-    return rows
+    agent = AGENTS.get(config.agent)
+    for num_envs in choices["num_envs"] or [0]:  # none at all is refused like 0
+        check(replace(config, num_envs=num_envs))
+    if agent.role != "learner":
+        raise UserError(f"{config.agent} does not learn; name a learner with --agent")
+    if not can_join(agent):
+        choices = {**choices, "together": [1]}
+    evaluating: dict[tuple[str, int], float] = {}
+
+    def play(teams: Sequence[Sequence[RunConfig]], out: Path) -> list[str]:
+        """Why runs failed."""
+        futures = [pool.submit("run", team, Execution(out, quiet=True)) for team in teams]
+        results = itertools.chain(*[pool.result(future) for future in futures])
+        return [result.reason for result in results if result.status != "done"]
+
+    def rate(setting: Setting) -> float:
+        report(f"trying {setting}")
+        device, num_envs, workers, together = setting
+        full = replace(config, device=device, num_envs=num_envs)
+        evaluation = LEAST if (device, workers) in evaluating else full.evaluation
+        runs = [_shortened(full, evaluation, seed) for seed in range(workers * together)]
+        with tempfile.TemporaryDirectory() as folder:
+            places = [Path(folder) / run_id(run, {}) for run in runs]
+            for run, place in zip(runs, places, strict=True):
+                policy = new_policy(run.task, run.policy_name, run.seed, **vars(run.policy))
+                save_policy(policy, place)
+            try:
+                check_room([full] * together, cure="lower --num-envs or --together")
+                failures = play([runs[i::workers] for i in range(workers)], Path(folder))
+            except UserError as error:
+                failures = [str(error)]
+            if failures:
+                report(f"it is left out: {failures[0]}")
+                return 0.0
+            records = [read_record(place / RECORD) for place in places]
+        each = [_seconds(full, *pair) for pair in zip(runs, records, strict=True)]
+        train, evaluate = map(statistics.fmean, zip(*each, strict=True))
+        return 3600 * workers / (train + evaluating.setdefault((device, workers), evaluate))
+
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        pool = new_pool(max(choices["workers"]), folder / "log")
+        stack.callback(pool.stop)
+        pool.patience = 0.0  # for base policies, which short runs have in their own folders
+        play([()] * pool.capacity, folder)  # imports take seconds
+        rates = fastest(choices, rate)
+    if not any(rates.values()):
+        raise UserError("no setting can be measured here; correct what the lines above say")
+    return rates
 
 
-def _steer(task: str, agent: str, num_envs: int, workers: int, seconds: float) -> dict[str, float]:
-    learner = new_agent(task, agent, warmup=num_envs)
-    simulated = make(task, num_envs=num_envs, workers=workers)
-    env = LatentNoiseEnv(simulated, new_policy(task), decode=learner.decode)
-    try:
-        obs = env.reset(env.training_seeds(0, num_envs))
-        for _ in range(3):
-            obs = _decide(env, learner, obs)
-        env.clock, env.control_steps = Clock(), 0
-        begin = time.perf_counter()
-        while (elapsed := time.perf_counter() - begin) < seconds:
-            obs = _decide(env, learner, obs)
-        steps, clock = env.control_steps, env.clock
-    finally:
-        env.close()
-    spent = (clock.simulate, clock.decode, elapsed - clock.simulate - clock.decode)
-    each = {part: 1e3 * s * num_envs / steps for part, s in zip(PARTS, spent, strict=True)}
-    return {"rate": steps / elapsed, **each}
+def _shortened(config: RunConfig, evaluation: EvaluationConfig, seed: int) -> RunConfig:
+    """A run with one decision of warm-up, few updates, an evaluation before and after them."""
+    options: Any = config.agent_options
+    if hasattr(options, "warmup"):
+        options = replace(options, warmup=config.num_envs)
+    turns = math.ceil(UPDATES[config.device] / getattr(options, "utd", 1.0) / config.num_envs)
+    steps = (1 + turns) * config.num_envs * config.policy.execute
+    evaluation = replace(evaluation, every=steps)
+    changes: dict[str, Any] = {"env_steps": steps, "evaluation": evaluation, "seed": seed}
+    return replace(config, agent_options=options, **changes)
 
 
-def _decide(env: LatentNoiseEnv, agent: Agent, obs: torch.Tensor) -> torch.Tensor:
-    """One decision of a run, with the updates that are due."""
-    step = env.step(agent.act(obs))
-    agent.observe(step)
-    for batch in agent.batches():
-        agent.update(batch)
-    return step.obs_after
+def _seconds(full: RunConfig, short: RunConfig, record: RunRecord) -> tuple[float, float]:
+    """Seconds of a run without its evaluations, and with only them, from a short run's record."""
+    clock, (first, last) = record.wall_clock, record.evaluations
+    simulated, evaluated = clock.simulate + clock.decode, clock.evaluate + (clock.diagnose or 0.0)
+    final = last.wall_clock - first.wall_clock - simulated - clock.update
+    learning, learned = (
+        run.env_steps - getattr(run.agent_options, "warmup", 0) * run.policy.execute
+        for run in (full, short)
+    )
+    other = clock.total - simulated - clock.update - evaluated
+    train = simulated * full.env_steps / short.env_steps + clock.update * learning / learned
+    evaluations = math.ceil(full.env_steps / full.evaluation.every)
+    return train + other, evaluations * (evaluated - final) + final
 
 
-def new_policy(task: str, name: str = "edp", **options: Any) -> Any:
+def new_policy(task: str, name: str = "edp", seed: int = 0, **options: Any) -> Any:
     """An untrained base policy; its weights do not change what it costs."""
     kind, policy_class = task_class(task), POLICIES.get(name)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         policy = policy_class(
             policy_class.Options(**options), kind.observation_layout, kind.action_layout
         )
@@ -114,27 +172,12 @@ def new_policy(task: str, name: str = "edp", **options: Any) -> Any:
     return policy
 
 
-def new_agent(
-    task: str, name: str, device: str = "cpu", seed: int = 0, warmup: int = 1, **options: Any
-) -> Agent:
-    """An agent on an untrained base policy; learners begin after ``warmup`` decisions."""
-    agent_class = AGENTS.get(name)
-    if "warmup" in {field.name for field in dataclasses.fields(agent_class.Options)}:
-        options["warmup"] = warmup
-    context = AgentContext.of(new_policy(task).to(device), device, seed)
-    return agent_class(context, agent_class.Options(**options))
-
-
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows of :func:`measure` for a terminal."""
-    header = ["environments", "processes", "steps/s", *(f"{part}, ms" for part in PARTS)]
-    lines = [
-        [
-            str(row["num_envs"]),
-            str(row["workers"]),
-            f"{row['rate']:,.0f}",
-            *(f"{row[part]:.1f}" for part in PARTS),
-        ]
-        for row in rows
-    ]
-    return aligned(header, lines, left=0)
+def to_text(run: RunConfig, rates: Mapping[Setting, float]) -> str:
+    """Runs per hour, the fastest setting, and what a run is, for a terminal."""
+    header = ["device", "environments", "workers", "together", "runs/hour"]
+    lines = [[*map(str, setting), f"{rate:.1f}"] for setting, rate in rates.items()]
+    return (
+        f"{aligned(header, lines)}\n\nfastest: {max(rates, key=rates.__getitem__)}\n"
+        f"a run: {run.env_steps:,} steps of {run.agent} on {run.task}, and the evaluations of the "
+        "suite second; its base policy comes on top"
+    )

@@ -5,7 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
+from symsteer.agents import AGENTS
 from symsteer.bench.sweep.display import Display
 from symsteer.bench.sweep.plan import Plan, PlannedRun, sweep_path, title, write_sweep
 from symsteer.bench.sweep.pool import LocalPool, Workers
@@ -25,17 +29,62 @@ def _workers(workforce: Workforce, plan: Plan) -> int | None:
     On this machine that is one per core, if the user says nothing, or only one on CUDA, because the
     runs would share a device.
     """
+    if workforce.workers == "auto":
+        raise UserError("--workers auto is for a sweep on this machine alone; name a number")
     if workforce.workers < 0:
         raise UserError(
             f"--workers is {workforce.workers}; it must be at least 1, or 0 for one per core"
         )
-    if workforce.together < 1:
+    if workforce.together is not None and workforce.together < 1:
         raise UserError(f"--together is {workforce.together}; it must be at least 1")
     if workforce.workers or workforce.ray is not None:
         return workforce.workers or None
     if any("cuda" in (config.sim, config.device) for config in plan.configs.values()):
         return 1
+    return _cores()
+
+
+def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def choices(device: str, num_envs: Sequence[int]) -> dict[str, Sequence[Any]]:
+    """The settings, by name, that are tried to find the fastest."""
+    cuda, cores = device == "cuda", _cores()
+    workers = [*dict.fromkeys((*(1,) * cuda, cores, max(1, cores // 2)))]
+    together = (1, 5, 20, 80) if cuda else (1, 2, 5)
+    return {"device": [device], "num_envs": num_envs, "workers": workers, "together": together}
+
+
+def settled(
+    plan: Plan,
+    workforce: Workforce,
+    measure: Callable[..., Any] | None,
+    tell: Callable[[str], None],
+) -> Workforce:
+    """The fastest workforce for what is left of a plan; ``together`` stays if it is given.
+
+    ``measure`` is :func:`symsteer.bench.throughput.measure`; None: tell only what would be tried.
+    """
+    workforce = replace(workforce, workers=0)
+    _workers(workforce, plan)
+    left = [run for run, sighting in look_at(plan).items() if sighting.state != "finished"]
+    learners = [run for run in left if AGENTS.get(run.agent).role == "learner"]
+    cores, given = _cores(), workforce.together
+    if len(learners) <= cores:
+        return workforce
+    config = plan.configs[learners[0]]
+    tried = choices(config.device, [config.num_envs])
+    # Larger teams would leave some cores without one.
+    few = [n for n in tried["together"] if n <= len(learners) // cores]
+    tried["together"] = [given] if given else few
+    tell("--workers auto: tries {workers} at a time, {together} together".format(**tried))
+    if measure is None:
+        return workforce
+    rates = measure(config, tried, LocalPool, tell)
+    best, rate = next(iter(rates.items()))
+    tell(f"the fastest: {best}, about {rate:.0f} runs an hour")
+    return replace(workforce, workers=best.workers, together=given or best.together)
 
 
 def run_plan(plan: Plan, workforce: Workforce) -> list[EndedRun]:
@@ -57,7 +106,8 @@ def run_plan(plan: Plan, workforce: Workforce) -> list[EndedRun]:
         if sighting.state == "finished"
     ]
     # Before anything is written: they may be too large.
-    teams_of(plan, todo, workforce.together)
+    together = workforce.together or 1
+    teams_of(plan, todo, together)
     log = sweep_path(plan.out, plan.name).with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     output = sys.stdout
@@ -81,7 +131,7 @@ def run_plan(plan: Plan, workforce: Workforce) -> list[EndedRun]:
         display = stack.enter_context(Display(plan, seen, pool.capacity, output))
         failures = {}
         try:
-            for end in execute_plan(plan, todo, pool, display, workforce.together):
+            for end in execute_plan(plan, todo, pool, display, together):
                 ends.append(end)
                 display.ended(end)
                 if end.status == "failed":

@@ -20,6 +20,7 @@ run --policy.steps 0
 run --env-steps 100
 sweep nowhere.toml
 sweep smoke --out file
+sweep smoke --workers automatic
 resume loop
 resume
 evaluate nowhere
@@ -43,7 +44,7 @@ audit --base-policy folder
 audit --variant all
 audit --out file
 throughput --agent nobody
-throughput --seconds nan
+throughput --agent zero
 demos
 demos file/a.h5
 demos a.h5 --seed 99999999999999

@@ -23,7 +23,7 @@ from symsteer.agents.options import SacOptions
 from symsteer.agents.replay import Batch, Transition
 from symsteer.agents.sac import SacAgent, can_join
 from symsteer.agents.team import Team
-from symsteer.bench.throughput import new_agent, new_policy
+from symsteer.bench.throughput import new_policy
 from tools.speed.timing import OtherProgram, clock_of, in_turns, products_of, time_on
 
 DECISIONS = 512
@@ -172,7 +172,9 @@ def _contenders(task: str, agents: Sequence[str], device: str) -> list[Contender
 
 
 def _learner(task: str, name: str, critic: str, seed: int, device: str) -> SacAgent:
-    agent = new_agent(task, name, device, seed, critic=critic)
+    agent_class = AGENTS.get(name)
+    options = agent_class.Options(critic=critic, warmup=1)
+    agent = agent_class(AgentContext.of(new_policy(task).to(device), device, seed), options)
     assert isinstance(agent, SacAgent)
     agent.observe(_decisions(agent.context, agent.rows, DECISIONS))
     return agent

@@ -22,6 +22,7 @@ from symsteer.bench.sweep.schedule import EndedRun, Task, Watcher, execute_plan
 from symsteer.bench.sweep.status import read_status, to_text
 from symsteer.bench.sweep.suite import Suite, load_suite
 from symsteer.bench.sweep.work import Result
+from symsteer.bench.throughput import Setting
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import tiny_config, without_clock, write_suite
@@ -226,6 +227,55 @@ def test_the_command_line(undisturbed, command, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("options", "tried", "used"),
+    [
+        ((), {"workers": [2, 1], "together": [1, 2]}, (1, 2)),
+        (("--together", 5), {"workers": [2, 1], "together": [5]}, (1, 5)),
+        (("--together", 1), {"workers": [2, 1], "together": [1]}, (1, 1)),
+    ],
+)
+def test_the_fastest_setting_reaches_the_pool(options, tried, used, command, monkeypatch, tmp_path):
+    """With five runs and two cores, teams of five would leave a core without work."""
+    path = write_suite(tmp_path, tiny_config("standard"), "seed = [0, 1, 2, 3, 4]")
+    measured, begun = [], []
+
+    def measure(run, choices, *rest):
+        measured.append((run.agent, choices))
+        settings = [Setting("cpu", 4, w, t) for w in (1, 2) for t in choices["together"][::-1]]
+        return {setting: 9.0 - index for index, setting in enumerate(settings)}
+
+    def execute(plan, todo, pool, display, together):
+        begun.append((pool.capacity, together))
+        return iter(())
+
+    monkeypatch.setattr("symsteer.bench.throughput.measure", measure)
+    monkeypatch.setattr("symsteer.bench.sweep.command._cores", lambda: 2)
+    monkeypatch.setattr("symsteer.bench.sweep.command.execute_plan", execute)
+    sweep = ("sweep", path, "--out", tmp_path / "runs", "--workers", "auto", *options)
+    shown = command(*sweep, "--dry-run")[1]
+    assert not measured
+    assert f"tries [2, 1] at a time, {tried['together']} together" in shown.err
+    assert command(*sweep)[0] == 0
+    [(agent, choices)] = measured
+    assert agent == "standard"
+    assert choices == {"device": ["cpu"], "num_envs": [4], **tried}
+    assert begun == [used]
+
+
+def test_nothing_is_measured_if_every_learner_has_a_core(command, monkeypatch, tmp_path):
+    path = write_suite(tmp_path, tiny_config("standard"), 'agent = ["standard", "base", "zero"]')
+    begun = []
+    monkeypatch.setattr("symsteer.bench.throughput.measure", None)
+    monkeypatch.setattr("symsteer.bench.sweep.command._cores", lambda: 2)
+    monkeypatch.setattr(
+        "symsteer.bench.sweep.command.execute_plan",
+        lambda plan, todo, pool, display, together: begun.append((pool.capacity, together)) or [],
+    )
+    assert command("sweep", path, "--out", tmp_path / "runs", "--workers", "auto")[0] == 0
+    assert begun == [(2, 1)]
+
+
+@pytest.mark.parametrize(
     ("run", "options", "words"),
     [
         ("embodiment = 'hand'", [], "there is no embodiment 'hand'"),
@@ -233,6 +283,13 @@ def test_the_command_line(undisturbed, command, tmp_path):
         ("agent = 'ppo'", ["--dry-run"], "there is no agent"),
         ("", ["--workers", "-1"], "--workers is -1"),
         ("", ["--workers", "-1", "--dry-run"], "--workers is -1"),
+        ("", ["--workers", "auto", "--together", "0"], "--together is 0"),
+        (
+            "",
+            ["--workers", "auto", "--ray", "auto"],
+            "--workers auto is for a sweep on this machine",
+        ),
+        ("", ["--workers", "auto", "--ray", "auto", "--dry-run"], "--workers auto is for"),
         ("num_envs = 600", ["--dry-run"], "1258 are needed while those of 600 .* lower num_envs"),
         ("num_envs = 300", ["--together", "2"], "1016 are needed .* lower --together"),
         ("", ["--ray", "here"], "--ray here is not an address"),
