@@ -264,15 +264,15 @@ def test_the_fastest_setting_reaches_the_pool(options, tried, used, command, mon
 
 def test_nothing_is_measured_if_every_learner_has_a_core(command, monkeypatch, tmp_path):
     path = write_suite(tmp_path, tiny_config("standard"), 'agent = ["standard", "base", "zero"]')
-    begun = []
-    monkeypatch.setattr("symsteer.bench.throughput.measure", None)
+    begun, measured = [], []
+    monkeypatch.setattr("symsteer.bench.throughput.measure", lambda *given: measured.append(given))
     monkeypatch.setattr("symsteer.bench.sweep.command._cores", lambda: 2)
     monkeypatch.setattr(
         "symsteer.bench.sweep.command.execute_plan",
         lambda plan, todo, pool, display, together: begun.append((pool.capacity, together)) or [],
     )
     assert command("sweep", path, "--out", tmp_path / "runs", "--workers", "auto")[0] == 0
-    assert begun == [(2, 1)]
+    assert (begun, measured) == ([(2, 1)], [])
 
 
 @pytest.mark.parametrize(
