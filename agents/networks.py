@@ -51,8 +51,8 @@ class Dense(nn.Linear, MatrixLayer):
 class Ensemble(nn.Module):
     """``members`` perceptrons of equal shape, evaluated together.
 
-    All parameters lie in one vector, so that one operation changes them all. Those of the layers
-    are views of it. Equal layers of the members lie side by side: their matrices are one tensor.
+    Equal layers of the members lie side by side: a parameter of all is one tensor, and those of the
+    layers are views of it.
 
     Args:
         members: the layers of each member, first to last.
@@ -61,8 +61,7 @@ class Ensemble(nn.Module):
 
     Attributes:
         width: features of the first hidden layer.
-        vector: all parameters, which the optimiser changes.
-        shared: whether a team keeps the parameters in a vector of its own now.
+        tensors: all parameters, which the optimiser changes; of a team's member they are views.
     """
 
     def __init__(
@@ -75,61 +74,44 @@ class Ensemble(nn.Module):
         self.width = len(dense(members[0][0])[1])
         self.members = nn.ModuleList([nn.ModuleList(layers) for layers in members])
         self.layer_norm, self.activation = layer_norm, activation
-        self._expanded: Weights | None = None
+        self._expanded: list[Weights] = []
         # Per layer the equal ones of successive members.
         self._equal: list[list[list[nn.Module]]] = [
             _equal_layers(layers) for layers in zip(*members, strict=True)
         ]
-        self._collect()
-
-    def _collect(self) -> None:
-        """Move the parameters into a new vector."""
         self._names = [[k for k, _ in equal[0].named_parameters()] for equal in self._layers()]
-        stacks = [
-            torch.stack([layer.get_parameter(name).detach() for layer in equal])
-            for equal, names in zip(self._layers(), self._names, strict=True)
-            for name in names
-        ]
-        self._shapes = [stack.shape for stack in stacks]
-        self._sizes = [stack.numel() for stack in stacks]
-        self.vector = torch.cat([stack.flatten() for stack in stacks]).requires_grad_()
         self.own()
 
     def own(self) -> None:
-        """Make the parameters views of :attr:`vector`; they keep their values."""
-        with torch.no_grad():
-            for parameter, view in zip(self.parameters(), self.pieces(self.vector), strict=True):
-                view.copy_(parameter)
-                parameter.data = view
-        self.values, self.shared = self._stacks(self.vector.detach()), False
+        """Move the parameters into new tensors; they keep their values."""
+        self.tensors = [
+            torch.stack([p.detach() for p in parameters]).requires_grad_()
+            for parameters in self._stacks()
+        ]
+        for parameter, view in zip(self.parameters(), self.pieces(self.tensors), strict=True):
+            parameter.data = view
 
-    def share(self, values: list[Parameters]) -> None:
-        """Use stacked parameters that a team keeps."""
-        self.values, self.shared = values, True
-
-    def pieces(self, vector: torch.Tensor) -> list[torch.Tensor]:
-        """A vector of the form of :attr:`vector` as tensors like :meth:`parameters`."""
+    def pieces(self, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """Tensors of the form of :attr:`tensors` as ones like :meth:`parameters`."""
         views: dict[torch.Tensor, torch.Tensor] = {}
-        for layers, stacks in zip(self._layers(), self._stacks(vector.detach()), strict=True):
-            for name, stack in stacks.items():
-                owners = (layer.get_parameter(name) for layer in layers)
-                views |= zip(owners, stack, strict=True)
+        for parameters, tensor in zip(self._stacks(), tensors, strict=True):
+            views |= zip(parameters, tensor.detach(), strict=True)
         return [views[parameter] for parameter in self.parameters()]
+
+    def _stacks(self) -> Iterator[list[nn.Parameter]]:
+        """The parameters that are one tensor, for each of :attr:`tensors`."""
+        for layers, names in zip(self._layers(), self._names, strict=True):
+            for name in names:
+                yield [layer.get_parameter(name) for layer in layers]
 
     def _layers(self) -> Iterator[list[nn.Module]]:
         return itertools.chain.from_iterable(self._equal)
 
-    def _stacks(self, vector: torch.Tensor) -> list[Parameters]:
-        """The parameters in a vector, of all equal layers as one, by name."""
-        split = vector.split(self._sizes)
-        stacks = iter([x.view(shape) for x, shape in zip(split, self._shapes, strict=True)])
-        return [{name: next(stacks) for name in names} for names in self._names]
-
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
-        """As of any module; afterwards the parameters are in one vector again."""
+        """As of any module; afterwards the parameters are in tensors side by side again."""
         result = super()._apply(*args, **kwargs)
         self.changed()
-        self._collect()
+        self.own()
         return result
 
     def weights(self) -> Weights:
@@ -138,24 +120,23 @@ class Ensemble(nn.Module):
         The result is cached until :meth:`changed` is called, so acting, critic values and the next
         update use the same one. Only one backward pass per expansion: it frees the graph.
         """
-        if self._expanded is None:
+        if not self._expanded:
             with torch.enable_grad():
-                self._expanded = self._expand()
-        return self._expanded
+                self._expanded.append(self._expand())
+        return self._expanded[0]
 
     def layers(self) -> Iterator[tuple[nn.Module, Parameters]]:
         """Equal layers of all members as one: the first of them, with the parameters of all.
 
         With gradients they are differentiable, without they may be changed in place.
         """
-        differentiable = torch.is_grad_enabled() and not self.shared
-        values = self._stacks(self.vector) if differentiable else self.values
-        for equal, stacks in zip(self._layers(), values, strict=True):
-            yield equal[0], stacks
+        tensors = iter(self.tensors)
+        for equal, names in zip(self._layers(), self._names, strict=True):
+            yield equal[0], {name: next(tensors) for name in names}
 
     def changed(self) -> None:
         """Drop the cache. Call this after every change of parameters."""
-        self._expanded = None
+        self._expanded.clear()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
         """As of any module; the cache is dropped."""
@@ -163,22 +144,23 @@ class Ensemble(nn.Module):
         return super().load_state_dict(state_dict, *args, **kwargs)
 
     def _expand(self) -> Weights:
-        expanded = [dense_of(*layer) for layer in self.layers()]
+        expanded = iter([dense_of(*layer) for layer in self.layers()])
         weights: Weights = []
         for equal in self._equal:
-            (matrix, bias), *others = (expanded.pop(0) for _ in equal)
-            if others:
-                matrix = torch.cat([matrix, *(more for more, _ in others)])
-                bias = torch.cat([bias, *(more for _, more in others)])
+            matrix, bias = next(expanded)
+            for more, more_bias in itertools.islice(expanded, len(equal) - 1):
+                matrix, bias = torch.cat([matrix, more]), torch.cat([bias, more_bias])
             weights.append((matrix, bias.unsqueeze(1)))
         return weights
 
     def apply_weights(self, weights: Weights, x: torch.Tensor) -> torch.Tensor:
         """Evaluate with the given matrices: ``[B, in] -> [members, B, out]``."""
-        return self.propagate(weights, x.expand(len(weights[0][0]), *x.shape))
+        return self.propagate(weights, x.expand(weights[0][0].shape[0], *x.shape))
 
     def propagate(self, weights: Weights, x: torch.Tensor) -> torch.Tensor:
         """The same with an input for each member: ``[members, B, in] -> [members, B, out]``."""
+        if not torch.is_grad_enabled():
+            return perceptrons(x, weights, self.layer_norm, self.activation)[0]
         flat = itertools.chain.from_iterable(weights)
         return cast(torch.Tensor, Perceptron.apply(x, self.layer_norm, self.activation, *flat))
 
@@ -187,11 +169,34 @@ class Ensemble(nn.Module):
         return self.apply_weights(self.weights(), x)
 
 
-class Perceptron(torch.autograd.Function):
+def perceptrons(
+    x: torch.Tensor, weights: Weights, layer_norm: bool, activation: Activation
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Multilayer perceptrons of equal shape, ``[members, B, in] -> [members, B, out]``.
 
-    The derivative is written out: autograd of the same operations takes a third longer, most of it
-    in products with a last matrix of one row and in copies. It has no second derivative.
+    Also what their derivative needs: of each hidden layer the sums, the moments of LayerNorm, and
+    the features.
+    """
+    kept = []
+    *hidden, (last, bias) = weights
+    for matrix, offset in hidden:
+        x = torch.baddbmm(offset, x, matrix.mT)
+        kept.append(x)
+        if layer_norm:
+            x, *moments = normalized(x)
+            kept += moments
+        x = x.relu_() if activation == "relu" else x.tanh_()
+        kept.append(x)
+    if _is_slow(last):
+        return (x * last).sum(-1, keepdim=True) + bias, kept
+    return torch.baddbmm(bias, x, last.mT), kept
+
+
+class Perceptron(torch.autograd.Function):
+    """:func:`perceptrons` with a derivative that is written out.
+
+    Autograd of the same operations takes a third longer, most of it in products with a last matrix
+    of one row and in copies. There is no second derivative.
     """
 
     @staticmethod
@@ -203,51 +208,36 @@ class Perceptron(torch.autograd.Function):
         *weights: torch.Tensor,
     ) -> torch.Tensor:
         """Weights are a matrix ``[members, out, in]`` and a bias ``[members, 1, out]`` a layer."""
-        kept = []
-        out = x
-        for index in range(0, len(weights), 2):
-            matrix, bias = weights[index : index + 2]
-            if index:
-                sums = out
-                kept.append(sums)
-                if layer_norm:
-                    out, *moments = normalized(out)
-                    kept += moments
-                out = out.relu_() if activation == "relu" else out.tanh_()
-                kept.append(out)
-            if _is_slow(matrix):
-                out = (out * matrix).sum(-1, keepdim=True) + bias
-            else:
-                out = torch.baddbmm(bias, out, matrix.mT)
+        matrices, biases = weights[::2], weights[1::2]
+        pairs = list(zip(matrices, biases, strict=True))
+        out, kept = perceptrons(x, pairs, layer_norm, activation)
         ctx.layer_norm, ctx.activation = layer_norm, activation
-        ctx.save_for_backward(x, *weights[::2], *kept)
+        ctx.save_for_backward(x, *matrices, *kept)
         return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Chain rule from the last layer to the first."""
         (gradient,) = gradients
-        needed = ctx.needs_input_grad
-        depth = (len(needed) - 3) // 2
+        of_x, _, _, *of_weights = ctx.needs_input_grad
+        depth, wanted = len(of_weights) // 2, any(of_weights)
         x, *saved = ctx.saved_tensors
         matrices, kept = saved[:depth], saved[depth:]
-        step = len(kept) // (depth - 1) if depth > 1 else 0
+        step = 4 if ctx.layer_norm else 2
+        single = _is_slow(matrices[-1])
         found: list[torch.Tensor | None] = []
         for index in reversed(range(depth)):
             matrix = matrices[index]
             sums, *moments, seen = kept[(index - 1) * step : index * step] if index else (x, x)
-            single = _is_slow(matrix)
-            of_matrix = of_bias = None
-            if needed[3 + 2 * index]:
-                if single:
-                    of_matrix = (gradient * seen).sum(-2, keepdim=True)
-                else:
-                    of_matrix = torch.bmm(gradient.mT, seen)
-            if needed[4 + 2 * index]:
-                of_bias = gradient.sum(-2, keepdim=True)
-            found += [of_bias, of_matrix]
-            if index or needed[0]:
+            if not wanted:
+                found += [None, None]
+            elif single:
+                found += [gradient.sum(-2, True), (gradient * seen).sum(-2, True)]
+            else:
+                found += [gradient.sum(-2, True), torch.bmm(gradient.mT, seen)]
+            if index or of_x:
                 gradient = gradient * matrix if single else torch.bmm(gradient, matrix)
+            single = False
             if index:
                 if ctx.activation == "relu":
                     gradient = relu_backward(gradient, seen, 0)
@@ -257,7 +247,7 @@ class Perceptron(torch.autograd.Function):
                     gradient = layer_norm_backward(
                         gradient, sums, sums.shape[-1:], *moments, None, None, (True, False, False)
                     )[0]
-        return (gradient if needed[0] else None, None, None, *reversed(found))
+        return (gradient if of_x else None, None, None, *reversed(found))
 
 
 EPSILON = 1e-5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
@@ -15,13 +16,14 @@ class Trained(Protocol):
     """What an optimiser trains.
 
     Attributes:
-        vector: all its parameters.
+        tensors: all its parameters.
     """
 
-    vector: torch.Tensor
+    @property
+    def tensors(self) -> list[torch.Tensor]: ...
 
-    def pieces(self, vector: torch.Tensor) -> list[torch.Tensor]:
-        """A vector of the form of :attr:`vector` as tensors like :meth:`parameters`."""
+    def pieces(self, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """Tensors of the form of :attr:`tensors` as ones like :meth:`parameters`."""
 
     def parameters(self) -> Any:
         """The parameters one by one, in the order of a checkpoint."""
@@ -30,53 +32,61 @@ class Trained(Protocol):
 class Adam:
     """Adam (Kingma and Ba, arXiv 1412.6980) of one part of the learner.
 
-    It changes one vector with one call. ``torch.optim.Adam`` calls the same function, after more
+    It changes all tensors with one call. ``torch.optim.Adam`` calls the same function, after more
     work than the step itself. A checkpoint has the moments parameter by parameter.
 
     Attributes:
-        moments: ``step``, and ``exp_avg`` and ``exp_avg_sq`` in the form of the vector.
+        steps: their number, on the device.
+        moments: ``exp_avg`` and ``exp_avg_sq``, in the form of what is trained.
     """
 
     def __init__(self, trained: Trained, lr: float):
         self.trained, self.lr = trained, lr
-        vector = trained.vector.detach()
+        self.steps = torch.zeros((), dtype=torch.float32, device=trained.tensors[0].device)
         self.moments = {
-            "step": torch.zeros((), dtype=torch.float32, device=vector.device),
-            "exp_avg": torch.zeros_like(vector),
-            "exp_avg_sq": torch.zeros_like(vector),
+            name: [torch.zeros_like(tensor) for tensor in trained.tensors]
+            for name in ("exp_avg", "exp_avg_sq")
         }
 
     def descend(self, loss: torch.Tensor, penalty: torch.Tensor | None = None) -> None:
         """One gradient step on a loss plus its regulariser; in a team on the sum over members."""
-        vector = self.trained.vector
-        if penalty is None:
-            (gradient,) = torch.autograd.grad(loss.sum(), vector)
-        else:
+        trained, parameters = self.trained, []
+        total = loss.sum()
+        if penalty is not None:
             # A regulariser may be a function of the parameters themselves.
-            parameters = [p for p in self.trained.parameters() if p.requires_grad]
-            total = loss.sum() + penalty.sum()
-            gradient, *others = torch.autograd.grad(total, [vector, *parameters], allow_unused=True)
-            given = dict(zip(parameters, others, strict=True))
-            pieces = self.trained.pieces(gradient)
-            for parameter, piece in zip(self.trained.parameters(), pieces, strict=True):
-                if (other := given.get(parameter)) is not None:
-                    piece.add_(other)
-        self.step(gradient)
+            parameters = [p for p in trained.parameters() if p.requires_grad]
+            total = total + penalty.sum()
+        wanted = [*trained.tensors, *parameters]
+        found = torch.autograd.grad(total, wanted, allow_unused=True)
+        gradients = [
+            torch.zeros_like(tensor) if gradient is None else gradient
+            for tensor, gradient in zip(trained.tensors, found, strict=False)
+        ]
+        others = dict(zip(parameters, found[len(gradients) :], strict=True))
+        with torch.no_grad():
+            if any(other is not None for other in others.values()):
+                gradients = [gradient.clone() for gradient in gradients]
+                for parameter, piece in zip(
+                    trained.parameters(), trained.pieces(gradients), strict=True
+                ):
+                    if (other := others.get(parameter)) is not None:
+                        piece.add_(other)
+            self.step(gradients)
 
-    @torch.no_grad()
-    def step(self, gradient: torch.Tensor) -> None:
-        """One step with a gradient in the form of the vector."""
-        step, mean, square = self.moments.values()
-        step.add_(1)
-        vectors = (self.trained.vector, gradient, mean, square)
-        vector, gradients, means, squares = (in_chunks(x) for x in vectors)
+    def step(self, gradients: Sequence[torch.Tensor]) -> None:
+        """One step with gradients in the form of what is trained; called without gradients."""
+        self.steps.add_(1)
+        # The function reads memory in order, whatever the strides are.
+        gradients = [gradient.contiguous() for gradient in gradients]
+        changed = (self.trained.tensors, gradients, *self.moments.values())
+        parts, gradients, means, squares = (in_chunks(tensors) for tensors in changed)
         torch._fused_adam_(
-            vector,
+            parts,
             gradients,
             means,
             squares,
             [],
-            [step] * len(vector),
+            [self.steps] * len(parts),
             lr=self.lr,
             beta1=0.9,
             beta2=0.999,
@@ -86,37 +96,40 @@ class Adam:
             maximize=False,
         )
 
+    def tensors(self) -> list[torch.Tensor]:
+        """All that a step changes."""
+        return [self.steps, *self.trained.tensors, *itertools.chain(*self.moments.values())]
+
     def gather(self, members: Sequence[Adam]) -> None:
         """Take the state of the optimisers of a team's members."""
-        self.moments["step"].copy_(members[0].moments["step"])
+        self.steps.copy_(members[0].steps)
         for own, other in self._beside(members):
             own.copy_(other)
 
     def scatter(self, members: Sequence[Adam]) -> None:
         """Give it back."""
         for member in members:
-            member.moments["step"].copy_(self.moments["step"])
+            member.steps.copy_(self.steps)
         for own, other in self._beside(members):
             other.copy_(own)
 
     def _beside(self, members: Sequence[Adam]) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Each moment of each parameter, and the same in the optimisers of the members."""
         pairs = []
-        for name in ("exp_avg", "exp_avg_sq"):
-            own = self.trained.pieces(self.moments[name])
+        for name, moments in self.moments.items():
+            own = self.trained.pieces(moments)
             others = [x for m in members for x in m.trained.pieces(m.moments[name])]
             pairs += list(zip(own, others, strict=True))
         return pairs
 
     def state_dict(self) -> dict[str, Any]:
         """The moments of each parameter."""
-        moments = self.moments
-        pieces = (self.trained.pieces(moments[name]) for name in ("exp_avg", "exp_avg_sq"))
+        pieces = (self.trained.pieces(moments) for moments in self.moments.values())
         state = {
-            index: {"step": moments["step"], "exp_avg": mean, "exp_avg_sq": square}
-            for index, (mean, square) in enumerate(zip(*pieces, strict=True))
+            index: {"step": self.steps, **dict(zip(self.moments, each, strict=True))}
+            for index, each in enumerate(zip(*pieces, strict=True))
         }
-        return {"state": state if moments["step"] else {}}
+        return {"state": state if self.steps else {}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with stored moments.
@@ -124,13 +137,12 @@ class Adam:
         Raises:
             ValueError: if they do not fit the parameters.
         """
-        moments = self.moments
         for stored in state["state"].values():
-            if stored.keys() != {"step", "exp_avg", "exp_avg_sq"} or not stored["step"] >= 1:
+            if stored.keys() != {"step", *self.moments} or not stored["step"] >= 1:
                 raise ValueError("an optimiser has other moments")
-            moments["step"].copy_(stored["step"])
-        for name in ("exp_avg", "exp_avg_sq"):
-            pieces = self.trained.pieces(moments[name])
+            self.steps.copy_(stored["step"])
+        for name, moments in self.moments.items():
+            pieces = self.trained.pieces(moments)
             for index, stored in state["state"].items():
                 pieces[index].copy_(tensor_like(stored[name], pieces[index]))
 
@@ -139,11 +151,12 @@ CHUNK, PARTS = 2048, 512
 """Least numbers in a part that a GPU's processor changes, and the largest number of parts."""
 
 
-def in_chunks(x: torch.Tensor) -> list[torch.Tensor]:
-    """A tensor for functions of lists; on a GPU in parts, of which each processor takes one."""
-    if not x.is_cuda:
-        return [x]
-    return list(x.detach().reshape(-1).split(max(CHUNK, -(-x.numel() // PARTS))))
+def in_chunks(tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """Tensors for functions of lists; on a GPU in parts, of which each processor takes one."""
+    if not tensors[0].is_cuda:
+        return list(tensors)
+    size = max(CHUNK, -(-sum(x.numel() for x in tensors) // PARTS))
+    return [part for x in tensors for part in x.detach().reshape(-1).split(size)]
 
 
 class Multiplier:
@@ -155,7 +168,7 @@ class Multiplier:
     """
 
     def __init__(self, log: torch.Tensor, lr: float):
-        self.vector = log.requires_grad_()
+        self.log = log
         self.optimizer = Adam(self, lr)
 
     @classmethod
@@ -165,31 +178,36 @@ class Multiplier:
         """A single number."""
         return cls(torch.tensor(math.log(initial), dtype=dtype, device=device), lr)
 
-    def pieces(self, vector: torch.Tensor) -> list[torch.Tensor]:
+    @property
+    def tensors(self) -> list[torch.Tensor]:
+        """The numbers, as the optimiser changes them."""
+        return [self.log]
+
+    def pieces(self, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The numbers one by one."""
-        return list(vector.view(-1).detach())
+        return list(tensors[0].view(-1))
 
     def parameters(self) -> list[torch.Tensor]:
         """The numbers one by one."""
-        return self.pieces(self.vector)
+        return self.pieces(self.tensors)
 
     @property
     def value(self) -> torch.Tensor:
-        """The current value, without gradient."""
-        return self.vector.detach().exp()
+        """The current value."""
+        return self.log.exp()
 
     def step(self, gap: torch.Tensor) -> torch.Tensor:
         """One gradient step with a gap without gradient; returns the loss."""
-        loss = self.vector.detach() * gap
-        self.optimizer.step(gap)
+        loss = self.log * gap
+        self.optimizer.step([gap])
         return loss
 
     def state_dict(self) -> dict[str, Any]:
         """Value and optimiser."""
-        return {"log": self.vector.detach(), "optimizer": self.optimizer.state_dict()}
+        return {"log": self.log, "optimizer": self.optimizer.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self.optimizer.load_state_dict(state["optimizer"])
         with torch.no_grad():
-            self.vector.copy_(tensor_like(state["log"], self.vector))
+            self.log.copy_(tensor_like(state["log"], self.log))

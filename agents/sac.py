@@ -385,11 +385,8 @@ class SacAgent(Agent):
 
     def tensors(self) -> list[torch.Tensor]:
         """All that an update changes."""
-        trained = [
-            *((network.vector, self.optimizers[k]) for k, network in self.networks.items()),
-            *((one.vector, one.optimizer) for one in self.multipliers.values()),
-        ]
-        changed = [x for vector, adam in trained for x in (vector, *adam.moments.values())]
+        trained = [*self.optimizers.values(), *(one.optimizer for one in self.multipliers.values())]
+        changed = [tensor for adam in trained for tensor in adam.tensors()]
         return changed + _flat(self.target)
 
     def learn(self, batch: Batch, distillations: int) -> dict[str, torch.Tensor]:
@@ -412,10 +409,7 @@ class SacAgent(Agent):
         scalars |= self._improve(batch, obs, judge)
 
         with torch.no_grad():
-            averaged, newest = (
-                [part for tensor in _flat(weights) for part in in_chunks(tensor)]
-                for weights in (self.target, judge)
-            )
+            averaged, newest = (in_chunks(_flat(weights)) for weights in (self.target, judge))
             torch._foreach_lerp_(averaged, newest, self.options.tau)
         q = q.detach() / self.options.reward_scale
         return {
@@ -605,7 +599,7 @@ class SacAgent(Agent):
 
     def _actor_output(self, policy: Weights, obs: torch.Tensor) -> torch.Tensor:
         """``[B, dim]`` of ``actor_layout``."""
-        return self.actor.apply_weights(policy, obs).select(-3, 0)
+        return self.actor.apply_weights(policy, obs).squeeze(-3)
 
     def _q(self, critics: Weights, obs: torch.Tensor, judged: torch.Tensor) -> torch.Tensor:
         """Values ``[critics, B]`` of normalised observations, and flat noise or actions."""

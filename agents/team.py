@@ -59,11 +59,10 @@ class Team:
             core.optimizers[name] = self._adam(stacked, [m.optimizers[name] for m in members])
         for name in first.multipliers:
             each = [member.multipliers[name] for member in members]
-            logs = torch.stack([one.vector.detach() for one in each])
             core.multipliers[name] = stack = copy.copy(each[0])
-            stack.vector = logs.requires_grad_()
-            for one, log in zip(each, stack.pieces(logs), strict=True):
-                one.vector.data = log
+            stack.log = torch.stack([one.log for one in each])
+            for one, log in zip(each, stack.log, strict=True):
+                one.log = log
             stack.optimizer = self._adam(stack, [one.optimizer for one in each])
         count, layers = len(members), zip(*(member.target for member in members), strict=True)
         core.target = [
@@ -110,7 +109,7 @@ class Team:
             member.target = [(w.clone(), b.clone()) for w, b in member.target]
             member.synchronize = lambda: None
             for multiplier in member.multipliers.values():
-                multiplier.vector.data = multiplier.vector.data.clone()
+                multiplier.log = multiplier.log.clone()
             for network in member.networks.values():
                 network.own()
                 network.changed()
@@ -137,9 +136,9 @@ class StackedEnsemble(Ensemble):
             [*cast(nn.ModuleList, member)] for ensemble in ensembles for member in ensemble.members
         ]
         super().__init__(layers, first.layer_norm, first.activation)
-        rows = [{k: x.chunk(len(ensembles)) for k, x in stacks.items()} for stacks in self.values]
-        for index, ensemble in enumerate(ensembles):
-            ensemble.share([{k: x[index] for k, x in stacks.items()} for stacks in rows])
+        parts = zip(*(x.detach().chunk(len(ensembles)) for x in self.tensors), strict=True)
+        for ensemble, tensors in zip(ensembles, parts, strict=True):
+            ensemble.tensors = list(tensors)
 
     def changed(self) -> None:
         super().changed()

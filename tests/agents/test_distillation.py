@@ -89,7 +89,7 @@ def test_distillation_steps_per_update(problem, steps, made):
     agent, counted = filled(problem, distill_steps=steps), []
     for _ in range(4):
         agent.update(agent.replay.sample(32))
-        counted.append(int(agent.optimizers["noise_critic"].moments["step"]))
+        counted.append(int(agent.optimizers["noise_critic"].steps))
     assert counted == made
 
 
