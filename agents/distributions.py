@@ -17,7 +17,7 @@ Squashed Gaussians: Haarnoja et al., arXiv 1812.05905, appendix C; the radial fo
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -27,7 +27,7 @@ from symsteer.policies.geometry import Field, Layout
 
 SMALL = 1e-4
 """Below this |u|^2, the slope of tanh(|u|)/|u| is evaluated by its power series in |u|^2, whose
-first dropped term is below 1e-14."""
+first dropped term is below 2e-9."""
 
 LEAST = 1e-30
 """|u|^2 is taken as at least this, so that nothing is divided by 0."""
@@ -48,6 +48,7 @@ class SquashedGaussian(nn.Module):
 
     index: torch.Tensor
     sizes: torch.Tensor
+    weights: torch.Tensor
     membership: torch.Tensor
 
     def __init__(self, layout: Layout, bound: float):
@@ -60,9 +61,13 @@ class SquashedGaussian(nn.Module):
         membership = F.one_hot(layout.block_index, self.blocks).to(torch.get_default_dtype())
         self.register_buffer("index", layout.block_index.clone(), persistent=False)
         self.register_buffer("membership", membership, persistent=False)  # [dim, blocks]
-        self.register_buffer("sizes", membership.sum(0), persistent=False)
-        # -log of the constant factor of the density.
+        self.register_buffer("sizes", sizes := membership.sum(0), persistent=False)
+        # A log-density is a sum, with these weights, of the log-scale, log p and log 2 cosh |u| of
+        # each block (see `RadialSample`) and of the squares of eps, less a constant.
+        weights = [-sizes, 1 - sizes, torch.full_like(sizes, 2), torch.full((self.dim,), -0.5)]
+        self.register_buffer("weights", torch.cat(weights), persistent=False)
         self.constant = self.dim * (0.5 * math.log(2 * math.pi) + math.log(bound))
+        self.constant += 2 * math.log(2) * self.blocks
 
     def parameters_of(self, output: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean ``[..., dim]`` and log-scale ``[..., blocks]`` from an actor's output.
@@ -88,13 +93,16 @@ class SquashedGaussian(nn.Module):
         Returns:
             Noise ``[..., dim]`` and log-probability ``[...]``, both differentiable.
         """
-        noise, log_volume = self._squash(torch.addcmul(mean, self.spread(log_scale.exp()), eps))
-        known = eps.square().sum(-1).mul_(-0.5).sub_(self.constant)
-        return noise, known - log_scale @ self.sizes - log_volume
+        if not torch.is_grad_enabled():
+            noise, log_prob, *_ = self.draw(mean, log_scale, eps)
+            return noise, log_prob
+        drawn = RadialSample.apply(mean, log_scale, eps, self)
+        return cast(tuple[torch.Tensor, torch.Tensor], drawn)
 
     def squash(self, u: torch.Tensor) -> torch.Tensor:
         """``u [..., dim]`` with every block shortened into the ball of radius ``bound``."""
-        return self._squash(u)[0]
+        _, radius = self._radius(u)
+        return u * self.spread(self.bound * radius.tanh() / radius)
 
     def saturated(self, noise: torch.Tensor, share: float = 0.95) -> torch.Tensor:
         """Blocks with a norm above ``share`` of the bound, ``[..., blocks]`` bool."""
@@ -104,87 +112,69 @@ class SquashedGaussian(nn.Module):
         """``[..., blocks]`` to ``[..., dim]``: each number gets its block's value."""
         return per_block.index_select(-1, self.index)
 
-    def _squash(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """``w = bound tanh(|u|) u/|u|`` per block, and the summed log-determinant for bound 1."""
-        return RadialTanh.apply(u, self.bound, self.membership, self.index, self.sizes)
+    def draw(
+        self, mean: torch.Tensor, log_scale: torch.Tensor, eps: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Noise, log-probability, and what :class:`RadialSample` needs of the way there."""
+        scale = self.spread(log_scale.exp())
+        step = scale * eps
+        u = mean + step
+        square, radius = self._radius(u)
+        tanh = radius.tanh()
+        ratio = tanh / radius
+        factor = self.spread(self.bound * ratio)
+        noise = u * factor
+        # sech |u| = 1 / cosh |u| in a form without overflow or log 0 at large radii.
+        parts = [log_scale, ratio.log(), torch.logaddexp(radius, -radius), eps.square()]
+        log_prob = (torch.cat(parts, -1) @ self.weights).sub_(self.constant)
+        return noise, log_prob, scale, step, u, square, tanh, ratio, factor
+
+    def _radius(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """|u|^2 and |u| of every block."""
+        square = (u.square() @ self.membership).clamp_min(LEAST)
+        return square, square.sqrt()
 
 
-class RadialTanh(torch.autograd.Function):
-    """``bound tanh(|u|) u/|u|`` per block, with the derivative in closed form.
+class RadialSample(torch.autograd.Function):
+    """``u = mean + scale eps`` and ``w = bound tanh(|u|) u/|u|`` per block; the log-density of w.
 
-    With s = |u|^2 of a block of n numbers and the ratio ``p(s) = tanh(|u|) / |u|``:
+    The derivative is in closed form. With s = |u|^2 of a block of n numbers and the ratio
+    ``p(s) = tanh(|u|) / |u|``:
 
-        w = bound p u,   log det = log sech^2 |u| + (n - 1) log p   (for bound 1),
+        w = bound p u,   log det dw/du = log sech^2 |u| + (n - 1) log p   (for bound 1),
         dp/ds = (sech^2 |u| - p) / (2 s),   d log det / ds = -p + (n - 1) (dp/ds) / p.
 
-    As functions of s (not of |u|) they are smooth at zero. The derivative is written out because
-    automatic differentiation of the same formulas took a sixth of an update's time.
+    As functions of s (not of |u|) they are smooth at zero. Automatic differentiation of the same
+    formulas took a sixth of an update's time.
     """
 
     @staticmethod
     def forward(
         ctx: Any,
-        u: torch.Tensor,
-        bound: float,
-        membership: torch.Tensor,
-        index: torch.Tensor,
-        sizes: torch.Tensor,
+        mean: torch.Tensor,
+        log_scale: torch.Tensor,
+        eps: torch.Tensor,
+        gaussian: SquashedGaussian,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """``u [..., dim]`` to ``w [..., dim]`` and the log-determinant ``[...]`` for bound 1."""
-        steep = any(ctx.needs_input_grad)
-        noise, log_volume, *slopes = squash(u, bound, membership, index, sizes, steep)
-        if steep:
-            ctx.save_for_backward(u, membership, index, sizes, *slopes)
-            ctx.bound = bound
-        return noise, log_volume
+        """As :meth:`SquashedGaussian.sample`."""
+        noise, log_prob, scale, step, u, s, tanh, ratio, factor = gaussian.draw(
+            mean, log_scale, eps
+        )
+        fall = torch.addcmul(ratio, tanh, tanh).sub_(1).div_(s)  # -2 dp/ds
+        fall = torch.where(s < SMALL, 2 / 3 - 8 / 15 * s, fall).div_(ratio)
+        ctx.gaussian = gaussian
+        ctx.save_for_backward(noise, eps, scale, step, u, ratio, factor, fall)
+        return noise, log_prob
 
     @staticmethod
-    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor, *tuple[None, ...]]:
-        """Chain rule through s."""
-        grad_w, grad_volume = gradients
-        gradient = squash_gradient(grad_w, grad_volume, ctx.bound, *ctx.saved_tensors)
-        return gradient, None, None, None, None
-
-
-def squash(
-    u: torch.Tensor,
-    bound: float,
-    membership: torch.Tensor,
-    index: torch.Tensor,
-    sizes: torch.Tensor,
-    steep: bool,
-) -> tuple[torch.Tensor, ...]:
-    """``w``, the log-determinant for bound 1, and if ``steep`` p and dp/ds."""
-    s = (u.square() @ membership).clamp_min_(LEAST)
-    r = s.sqrt()
-    tanh = r.tanh()
-    ratio = tanh / r
-    # sech^2 = 4 / (e^r + e^-r)^2, in a form without overflow or log 0 at large radii.
-    half = r + F.softplus(-2 * r)
-    log_volume = (ratio.log() @ (sizes - 1)).add_(2 * math.log(2) * len(sizes))
-    log_volume.sub_(half.sum(-1), alpha=2)
-    noise = u * (bound * ratio).index_select(-1, index)
-    if not steep:
-        return noise, log_volume
-    series = -1 / 3 + s * (4 / 15 - s * (17 / 105 - s * 248 / 2835))
-    slope = torch.where(s < SMALL, series, (1 - tanh * tanh - ratio) / (2 * s))
-    return noise, log_volume, ratio, slope
-
-
-def squash_gradient(
-    grad_w: torch.Tensor,
-    grad_volume: torch.Tensor,
-    bound: float,
-    u: torch.Tensor,
-    membership: torch.Tensor,
-    index: torch.Tensor,
-    sizes: torch.Tensor,
-    ratio: torch.Tensor,
-    slope: torch.Tensor,
-) -> torch.Tensor:
-    """du = ``bound p dw`` + ``2 u`` times the gradient of s."""
-    to_s = (slope * bound).mul_((grad_w * u) @ membership)
-    of_volume = (slope / ratio).mul_(sizes - 1).sub_(ratio)
-    to_s.addcmul_(grad_volume.unsqueeze(-1), of_volume).mul_(2)
-    ratio, to_s = (x.index_select(-1, index) for x in (bound * ratio, to_s))
-    return torch.addcmul(grad_w * ratio, u, to_s)
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Chain rule through s and u."""
+        of_noise, of_density = gradients[0], gradients[1].unsqueeze(-1)
+        gaussian, sizes = ctx.gaussian, ctx.gaussian.sizes
+        noise, eps, scale, step, u, ratio, factor, fall = ctx.saved_tensors
+        of_volume = (fall * (sizes - 1)).add_(ratio, alpha=2).mul_(of_density)
+        per_block = ((of_noise * noise) @ gaussian.membership).mul_(fall).sub_(of_volume)
+        of_u = torch.addcmul(of_noise * factor, u, gaussian.spread(per_block), value=-1)
+        of_scale = (of_u * step) @ gaussian.membership - of_density * sizes
+        of_eps = of_u * scale - of_density * eps if ctx.needs_input_grad[2] else None
+        return of_u, of_scale, of_eps, None

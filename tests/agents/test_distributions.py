@@ -91,8 +91,11 @@ class PerAxis(SquashedGaussian):
         super().__init__(LAYOUT, 1.5)
         self.inner = SquashedGaussian(PER_AXIS, 1.5)
 
-    def _squash(self, u):
-        return self.inner._squash(u)
+    def sample(self, mean, log_scale, eps):
+        return self.inner.sample(mean, self.spread(log_scale), eps)
+
+    def squash(self, u):
+        return self.inner.squash(u)
 
 
 def test_a_tanh_per_axis_breaks_c8_and_keeps_c4():
