@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import sapien.physx as physx
 import torch
+from mani_skill.utils.common import compute_angle_between
+from mani_skill.utils.geometry.rotation_conversions import quaternion_to_matrix
 
 
 class Buffer:
@@ -124,3 +126,15 @@ class ContactReader:
         for query in self._queries:
             array = query.cuda_impulses.array
             array[:] = total[query.start : query.start + len(array)]
+
+
+def is_grasping(robot: Any, body: Any, min_force: float = 0.5, max_angle: float = 85) -> Any:
+    """``Panda.is_grasping`` of ManiSkill, ``[N]`` bool, with both fingers in one operation."""
+    fingers = robot.finger1_link, robot.finger2_link
+    force = torch.cat([robot.scene.get_pairwise_contact_forces(f, body) for f in fingers])
+    pressing = torch.linalg.norm(force, axis=1) >= min_force
+    if pressing.any():
+        opening = quaternion_to_matrix(torch.cat([f.pose.q for f in fingers]))[:, :, 1]
+        opening[len(force) // 2 :] *= -1
+        pressing &= torch.rad2deg(compute_angle_between(opening, force)) <= max_angle
+    return pressing.view(2, -1).all(dim=0)

@@ -7,11 +7,12 @@ versions in `versions.PINNED`.
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, wraps
 from typing import Any
 
 import torch
 
+from symsteer.bench.sim.contacts import is_grasping
 from symsteer.bench.sim.kinematics import SerialChain
 
 
@@ -36,6 +37,7 @@ def _dispatch_property(cls: type, name: str, ours: Any) -> None:
 def install() -> None:
     """Install the patches, once per process. Call `versions.check_versions` first."""
     from mani_skill.agents.controllers.utils.kinematics import Kinematics
+    from mani_skill.agents.robots import Panda
     from mani_skill.envs.tasks.tabletop.push_t import WhiteTableSceneBuilder
     from mani_skill.utils.structs.articulation import Articulation
     from mani_skill.utils.structs.articulation_joint import ArticulationJoint
@@ -63,6 +65,15 @@ def install() -> None:
             stock_setup_cpu(self)
 
     Kinematics._setup_cpu = setup_cpu
+
+    stock_grasping = Panda.is_grasping
+
+    @wraps(stock_grasping)
+    def grasping(self: Any, *args: Any, **kwargs: Any) -> torch.Tensor:
+        found = is_grasping if is_batched(self.scene) else stock_grasping
+        return found(self, *args, **kwargs)
+
+    Panda.is_grasping = grasping
 
     stock_table = WhiteTableSceneBuilder.build
 

@@ -20,8 +20,9 @@ from mani_skill.agents.controllers import (
 )
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.agents.registration import register_agent
-from mani_skill.agents.robots import FloatingPandaGripper, Panda
+from mani_skill.agents.robots import FloatingPandaGripper
 
+from symsteer.bench.sim.contacts import is_grasping
 from symsteer.bench.sim.rotations import (
     euler_to_matrix,
     matrix_to_euler_facing_down,
@@ -50,14 +51,11 @@ def bound_blocks(action: torch.Tensor, layout: Layout) -> torch.Tensor:
     The rule depends on norms only, so it commutes with rotations and reflections. Applying it
     twice gives the same bits as applying it once.
     """
-    bounded = []
-    for block in layout.blocks:
-        values = action[..., block]
-        norm = values.norm(dim=-1, keepdim=True)
-        # The margin keeps a block that was scaled to length 1 (up to rounding) from being
-        # scaled again.
-        bounded.append(torch.where(norm > 1 + 1e-6, values / norm.clamp_min(1e-12), values))
-    return torch.cat(bounded, dim=-1)
+    blocks = [action[..., block] for block in layout.blocks]
+    norms = [block.norm(dim=-1, keepdim=True).expand_as(block) for block in blocks]
+    norm = torch.cat(norms, dim=-1)
+    # The margin keeps a block that was scaled to length 1 (up to rounding) from being scaled again.
+    return torch.where(norm > 1 + 1e-6, action / norm.clamp_min(1e-12), action)
 
 
 class PlanarPoseController(PDJointPosController):
@@ -82,10 +80,10 @@ class PlanarPoseController(PDJointPosController):
         action = bound_blocks(torch.cat([action, gripper], dim=1), ACTION_LAYOUT)
         xy, z, tilt, yaw = (action[:, ACTION_LAYOUT.slice(n)] for n in ("xy", "z", "tilt", "yaw"))
 
-        rotation = euler_to_matrix(self._target_qpos[:, 3:])
-        position = self._target_qpos[:, :3] + TCP_OFFSET * rotation[:, :, 2]
         actual = self.qpos
-        tcp = actual[:, :3] + TCP_OFFSET * euler_to_matrix(actual[:, 3:])[:, :, 2]
+        joints = torch.stack([self._target_qpos, actual])
+        rotation = euler_to_matrix(joints[:, :, 3:])
+        position, tcp = joints[:, :, :3] + TCP_OFFSET * rotation[:, :, :, 2]
         # The target of a blocked gripper must not run away: it stays within max_lag of the body.
         lag = position - tcp
         position = tcp + torch.cat(
@@ -107,7 +105,7 @@ class PlanarPoseController(PDJointPosController):
             dim=1,
         )
         turn = torch.cat([config.tilt_step * tilt, config.yaw_step * yaw], dim=1)
-        rotation = _limit_tilt(rotation_vector_to_matrix(turn) @ rotation, config.max_tilt)
+        rotation = _limit_tilt(rotation_vector_to_matrix(turn) @ rotation[0], config.max_tilt)
 
         self._step = 0
         self._start_qpos = actual
@@ -144,6 +142,8 @@ def _limit_tilt(rotation: torch.Tensor, limit: float) -> torch.Tensor:
     axis = rotation[:, :, 2]
     horizontal = axis[:, :2].norm(dim=1)
     excess = (torch.atan2(horizontal, -axis[:, 2]) - limit).clamp_min(0.0)
+    if not excess.any():
+        return rotation
     # The horizontal direction about which the axis falls back: axis x down, normalised.
     back = torch.stack([-axis[:, 1], axis[:, 0], torch.zeros_like(horizontal)], dim=1)
     back = back / horizontal.clamp_min(1e-9)[:, None]
@@ -217,7 +217,7 @@ class FloatingGripper(FloatingPandaGripper):
         }
         return {"pd_ee_delta_pose": {"root": root, "gripper": gripper}, **joints}
 
-    is_grasping = Panda.is_grasping
+    is_grasping = is_grasping
 
     @property
     def tcp_pose(self):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from mani_skill.agents.robots import Panda
 from scipy.spatial.transform import Rotation
 
 from symsteer.bench.sim.rotations import (
@@ -15,6 +16,7 @@ from symsteer.bench.sim.rotations import (
     rotation_vector_to_matrix,
     transform_quaternion,
 )
+from symsteer.bench.tasks.experts import Expert
 from symsteer.bench.tasks.floating import ACTION_LAYOUT, PlanarPoseControllerConfig, bound_blocks
 from symsteer.policies.geometry import Group
 from tests.bench.shared import shared
@@ -38,6 +40,21 @@ def test_bound_blocks_shortens_norms_and_is_idempotent():
         turned = bound_blocks(ACTION_LAYOUT.transform(action, angle, reflect), ACTION_LAYOUT)
         expected = ACTION_LAYOUT.transform(bounded, angle, reflect)
         assert torch.allclose(turned, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("embodiment", ["floating", "panda"])
+def test_a_grasp_is_what_maniskill_calls_one(embodiment):
+    env = shared("PickCube-v1", 8, embodiment=embodiment)
+    env.reset(seed=list(range(8)))
+    expert, stock = Expert(env), Panda.is_grasping.__wrapped__
+    noise, shares = torch.Generator().manual_seed(0), []
+    for _ in range(25):
+        env.step(expert.act(0.3 * torch.randn(8, 7, generator=noise)))
+        for limits in ((0.5, 85), (2.0, 85), (0.5, 5)):
+            found = env.agent.is_grasping(env.cube, *limits)
+            assert torch.equal(found, stock(env.agent, env.cube, *limits))
+            shares.append(found.float().mean())
+    assert 0.1 < sum(shares) / len(shares) < 0.9
 
 
 @pytest.mark.parametrize("name", ["xy", "vertical", "tilt", "yaw"])
