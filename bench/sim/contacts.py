@@ -56,7 +56,7 @@ class ImpulseQuery:
 
 
 class ContactReader:
-    """Reads the contacts of all scenes at most once per substep, for all queries."""
+    """Reads the contacts of each scene at most once per substep, for all queries."""
 
     def __init__(self, systems: Sequence[physx.PhysxCpuSystem]) -> None:
         self._systems = systems
@@ -64,7 +64,7 @@ class ContactReader:
         # Of each scene, for every contact point that enters a result: impulse, row and sign.
         self._points: list[list[tuple[np.ndarray, int, int]]] = [[] for _ in systems]
         self._forgotten: set[int] = set(range(len(systems)))
-        self._must_read = True
+        self._unread: set[int] = set()
         self._must_sum = True
         # What a contact between two bodies enters, filled as pairs come into contact.
         self._known_pairs: dict[tuple[Any, Any], list[tuple[int, int]]] = {}
@@ -74,29 +74,27 @@ class ContactReader:
         query = ImpulseQuery(sum(len(q.cuda_impulses.array) for q in self._queries), bodies)
         self._queries.append(query)
         self._known_pairs.clear()
-        self._must_read = True
+        self._unread = set(range(len(self._systems))) - self._forgotten
         return query
 
-    def invalidate(self) -> None:
-        """Mark all contacts as out of date, after a substep of all scenes."""
-        self._must_read = True
-        self._forgotten.clear()
+    def invalidate(self, scenes: Iterable[int]) -> None:
+        """Mark the contacts of scenes as out of date, after a substep of these."""
+        self._unread.update(scenes)
+        self._forgotten.difference_update(scenes)
 
     def forget(self, scene: int) -> None:
         """Drop the contacts of a scene whose state was set, until its next substep."""
         self._forgotten.add(scene)
+        self._unread.discard(scene)
         self._points[scene] = []
         self._must_sum = True
 
     def update(self) -> None:
         """Update the results of all queries."""
-        if self._must_read:
-            self._points = [
-                [] if scene in self._forgotten else self._read(system)
-                for scene, system in enumerate(self._systems)
-            ]
-            self._must_read, self._must_sum = False, True
-        if self._must_sum:
+        for scene in self._unread:
+            self._points[scene] = self._read(self._systems[scene])
+        if self._unread or self._must_sum:
+            self._unread.clear()
             self._sum()
             self._must_sum = False
 

@@ -22,6 +22,7 @@ from symsteer.bench.sim import patches, rendering
 from symsteer.bench.sim.errors import Unique
 from symsteer.bench.sim.headless import prepare_headless
 from symsteer.bench.sim.scene import BatchedScene
+from symsteer.bench.sim.trees import merge
 from symsteer.bench.sim.versions import check_versions
 from symsteer.errors import UserError
 
@@ -87,6 +88,51 @@ class _OnSimulator(Unique, BaseEnv):
         prepare_headless()
         backends = self._prepare(cameras, render_backend)
         super().__init__(*args, obs_mode=obs_mode, render_mode=render_mode, **backends, **kwargs)
+
+    looks = True
+    brief = False
+
+    def step_chunk(self, actions: torch.Tensor, due: torch.Tensor, ends: bool) -> tuple:
+        """Execute an action chunk, also the steps after an episode's end.
+
+        No environment is reset in between. So scenes have the same history in one process and in
+        several, and results are equal bit for bit.
+
+        Args:
+            actions: ``[N, T, action_dim]``.
+            due: steps that end an episode by time, ``[N, T]`` bool.
+            ends: whether success ends an episode.
+
+        Returns:
+            Observations ``[N, T, ...]``, new where some episode ends and in the last step, else the
+            last ones; info of all steps, stacked alike.
+        """
+        n, steps = actions.shape[:2]
+        obs: Any = self._last_obs
+        results = []
+        for t in range(steps):
+            self.looks, self.brief = t == steps - 1, True
+            try:
+                *_, info = self.step(actions[:, t])
+            finally:
+                self.brief = False
+            if self.looks or due[:, t].any() or (ends and info["success"].any()):
+                obs = self._last_obs = self.get_obs(info)
+            # The simulation may reuse its tensors.
+            results.append(merge([(obs, info)], [n], lambda tensors: tensors[0].clone()))
+        return merge(results, [n] * steps, lambda tensors: torch.stack(tensors, dim=1))
+
+    def get_obs(self, info: dict | None = None, unflattened: bool = False) -> Any:
+        return self._last_obs if self.brief else super().get_obs(info, unflattened)
+
+    def _flatten_raw_obs(self, obs: Any) -> Any:
+        return obs if self.brief else super()._flatten_raw_obs(obs)
+
+    def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """As ManiSkill's; zero where nobody asks for it."""
+        if self.brief:
+            return torch.zeros(self.num_envs, device=self.device)
+        return super().get_reward(obs, action, info)
 
     def _prepare(self, cameras: bool, render_backend: str | None) -> dict[str, str]:
         """Check that the simulator works here; returns ManiSkill's names of the backends."""

@@ -143,35 +143,16 @@ class ShardedEnv(Unique, gym.Env):
 
     def step(self, action: Any) -> tuple:
         """One control step of every environment; see ManiSkill's ``BaseEnv.step``."""
-        if hasattr(action, "shape"):
-            self._check_rows(action, "step")
+        if hasattr(action, "shape") and list(action.shape[:1]) != [self.num_envs]:
+            raise UserError(
+                f"step takes one row of actions for each of the {self.num_envs} environments; the "
+                f"actions' shape is {list(action.shape)}"
+            )
         return self._ask("step", [(select(action, self.num_envs, r),) for r in self._shards])
 
-    def step_chunk(self, actions: torch.Tensor) -> tuple:
-        """Execute an action chunk, with one exchange between processes.
-
-        Args:
-            actions: ``[N, T, action_dim]``.
-
-        Returns:
-            The results of T calls of :meth:`step`, stacked along a second axis: observations
-            ``[N, T, ...]``, rewards, terminated and truncated ``[N, T]``, info. No environment is
-            reset in between.
-        """
-        self._check_rows(actions, "step_chunk")
-        if len(actions.shape) != 3 or actions.shape[1] == 0:
-            raise UserError(
-                "step_chunk takes actions of shape [environments, steps, action]; their shape is "
-                f"{list(actions.shape)}"
-            )
-        return self._ask("step_chunk", [(actions[rows],) for rows in self._shards])
-
-    def _check_rows(self, actions: Any, method: str) -> None:
-        if list(actions.shape[:1]) != [self.num_envs]:
-            raise UserError(
-                f"{method} takes one row of actions for each of the {self.num_envs} environments; "
-                f"the actions' shape is {list(actions.shape)}"
-            )
+    def step_chunk(self, actions: torch.Tensor, due: torch.Tensor, ends: bool) -> tuple:
+        """Execute an action chunk, with one exchange; see ``BatchedCpuMixin.step_chunk``."""
+        return self._ask("step_chunk", [(actions[r], due[r], ends) for r in self._shards])
 
     def reset(self, seed: Any = None, options: dict | None = None) -> tuple:
         """Reset all or some environments; see ``SymmetricTask.reset``.

@@ -190,8 +190,8 @@ class BatchedPhysx:
         if count == 0:
             return
         substeps = range(count)
-        moving = np.flatnonzero(~self._paused)
-        for i in moving.tolist():
+        moving = np.flatnonzero(~self._paused).tolist()
+        for i in moving:
             step, held = self.systems[i].step, self._held[i]
             pushes = [(self._bodies[row].add_force_torque, force) for row, force in held.items()]
             for _ in substeps:
@@ -200,7 +200,7 @@ class BatchedPhysx:
                 step()
         if self._initialized:
             self._stale[moving] = True
-            self._contacts.invalidate()
+            self._contacts.invalidate(moving)
 
     # ------------------------------------------------------------------ fetch
     def _refresh(self) -> None:

@@ -9,7 +9,6 @@ its own ``decode`` what the action does.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -112,41 +111,44 @@ class LatentNoiseEnv:
         action in its field ``noise``.
         """
         start = time.perf_counter()
-        obs = next_obs = self._obs
+        obs = self._obs
         chunk = (self.decode or self.policy.decode)(obs, action)
         actions = chunk.to(self.env.device)
         decoded = time.perf_counter()
-        alive = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        reward = torch.zeros(self.num_envs, device=self.device)
-        terminal, truncated = torch.zeros_like(alive), torch.zeros_like(alive)
-        success_at_end = torch.zeros_like(alive)
         # If all episodes reach their time limit within the chunk, its rest is not needed.
         steps = min(self.execute, self.max_episode_steps - int(self._elapsed.min()))
-        for seen, info in self._play(actions[:, :steps]):
-            if not alive.any():
-                continue
-            self.control_steps += self.num_envs
-            success = info["success"].to(self.device)
-            next_obs = torch.where(alive[:, None], seen.to(self.device), next_obs)
-            self._elapsed += alive
-            self._success_once |= alive & success
-            cost = 1 + info["extra_cost"].to(self.device) if "extra_cost" in info else 1
-            reward -= (alive & ~self._success_once).float() * cost
-            if not self.ignore_terminations:
-                terminal |= alive & success
-            timed_out = alive & ~terminal & (self._elapsed >= self.max_episode_steps)
-            truncated |= timed_out
-            success_at_end |= success & (terminal | timed_out) & alive
-            alive &= ~(terminal | truncated)
+        after = self._elapsed[:, None] + torch.arange(1, steps + 1, device=self.device)
+        due = after == self.max_episode_steps
+        seen, info = self.env.step_chunk(
+            actions[:, :steps], due.to(self.env.device), not self.ignore_terminations
+        )
+        success = info["success"].to(self.device)
+        ends = due if self.ignore_terminations else due | success
+        # What follows the first end does not count.
+        counts = ends.cumsum(dim=1) - ends.long() == 0
+        rows, last = torch.arange(self.num_envs, device=self.device), counts.sum(dim=1) - 1
+        succeeded = self._success_once[:, None] | ((success & counts).cumsum(dim=1) > 0)
+        costs = (counts & ~succeeded).float()
+        if "extra_cost" in info:
+            costs = costs * (1 + info["extra_cost"].to(self.device))
+        reward = torch.zeros(self.num_envs, device=self.device)
+        for cost in costs.unbind(dim=1):
+            reward -= cost
+        over, success = ends[rows, last], success[rows, last]
+        terminal = over & success & (not self.ignore_terminations)
+        truncated = over & ~terminal
+        next_obs = seen.to(self.device)[rows, last]
+        self._elapsed += last + 1
+        self._success_once = success_once = succeeded[:, -1]
+        self.control_steps += self.num_envs * (int(last.max()) + 1)
         self.decisions += self.num_envs
         self._return += reward
-        success_once = self._success_once.clone()
-        ended = (terminal | truncated).nonzero().flatten()
+        ended = over.nonzero().flatten()
         episodes = {
             "success_once": success_once[ended],
-            "success_at_end": success_at_end[ended].clone(),
-            "return": self._return[ended].clone(),
-            "episode_len": self._elapsed[ended].clone(),
+            "success_at_end": success[ended],
+            "return": self._return[ended],
+            "episode_len": self._elapsed[ended],
         }
         self._obs = next_obs
         if len(ended):
@@ -155,7 +157,7 @@ class LatentNoiseEnv:
             self._obs[ended] = fresh.to(self.device)[ended]
             self._elapsed[ended] = 0
             self._return[ended] = 0
-            self._success_once[ended] = False
+            self._success_once = success_once & ~over
         self.clock.decode += decoded - start
         self.clock.simulate += time.perf_counter() - decoded
         return Step(
@@ -170,24 +172,6 @@ class LatentNoiseEnv:
             success_once=success_once,
             episodes=episodes,
         )
-
-    def _play(self, actions: torch.Tensor) -> Iterator[tuple[torch.Tensor, dict[str, Any]]]:
-        """Observation and info after each step of ``actions [N, T, Da]``.
-
-        With several processes, the environments get the whole chunk in one exchange. So they also
-        simulate the steps after all episodes have ended. One process does the same: its scenes
-        then have the same history, and the results are equal bit for bit.
-        """
-        if not hasattr(self.env, "step_chunk"):
-            for t in range(actions.shape[1]):
-                # In between nobody decides; cameras need not look.
-                self.env.unwrapped.looks = t == actions.shape[1] - 1
-                obs, _, _, _, info = self.env.step(actions[:, t])
-                yield obs, info
-            return
-        obs, _, _, _, info = self.env.step_chunk(actions)
-        for t in range(actions.shape[1]):
-            yield obs[:, t], {key: value[:, t] for key, value in info.items()}
 
     def pause(self, rows: torch.Tensor) -> None:
         """Let environments ``[N]`` bool, whose results do not matter, stand still until a reset."""

@@ -102,9 +102,12 @@ class SymmetricTask(BaseEnv):
     x-z, the plane by which a reflection mirrors all others."""
     needs_cameras: ClassVar[bool] = False
     """Whether the observation is rendered, for which there must be a Vulkan driver."""
-    looks: bool = True
+    looks: bool
     """Whether a decision follows the next observation. If not, a task that needs cameras may report
     what it saw last, but for episodes at their time limit."""
+    brief: bool
+    """Whether only success is asked for, between two decisions of a steering agent: ``evaluate``
+    may leave out all else."""
     observation_layout: ClassVar[Layout]
     _gripper_layout: ClassVar[Layout]
     _task_layout: ClassVar[Layout]

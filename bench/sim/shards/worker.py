@@ -19,7 +19,6 @@ from mani_skill.envs.sapien_env import BaseEnv
 
 from symsteer.bench.sim.environment import make_env_class
 from symsteer.bench.sim.errors import WorkerError
-from symsteer.bench.sim.trees import merge
 from symsteer.errors import UserError
 
 FACTS = (
@@ -137,17 +136,6 @@ class Worker:
 
         self.env = make_env_class(Shard)(num_envs=count, **kwargs)
         return {name: getattr(self.env, name) for name in FACTS if hasattr(self.env, name)}
-
-    def step_chunk(self, actions: torch.Tensor) -> tuple:
-        """All steps of a chunk ``[n, T, dim]``; results are stacked along a second axis."""
-        n, steps = actions.shape[:2]
-        results = []
-        for t in range(steps):
-            # As in one process (`LatentNoiseEnv`).
-            self.env.unwrapped.looks = t == steps - 1
-            # The simulation may reuse its tensors.
-            results.append(merge([self.env.step(actions[:, t])], [n], lambda x: x[0].clone()))
-        return merge(results, [n] * steps, lambda tensors: torch.stack(tensors, dim=1))
 
     def reset(self, seed: list[int] | None, options: dict) -> tuple:
         """Reset the environments in ``options["env_idx"]``: all if it is absent, maybe none."""

@@ -59,6 +59,19 @@ def test_paused_environments_stand_still_and_the_others_do_not_notice():
     assert not torch.equal(env.get_state()[[0, 2]], before[[0, 2]])
 
 
+def test_contacts_are_read_of_environments_that_moved(monkeypatch):
+    env, _, _ = twins("PickCube")
+    finger, cube = env.agent.finger1_link, env.cube
+    before = env.scene.get_pairwise_contact_forces(finger, cube)
+    read, reader = [], env.scene.px._contacts
+    monkeypatch.setattr(reader, "_read", lambda system: read.append(system) or [])
+    env.pause(torch.tensor([True, False, True, False]))
+    env.step(torch.zeros(N, 7))
+    assert read == [env.scene.px.systems[i] for i in (1, 3)]
+    after = env.scene.get_pairwise_contact_forces(finger, cube)
+    assert torch.equal(after[[0, 2]], before[[0, 2]])
+
+
 def test_partial_set_state_leaves_others_alone():
     env, _, _ = twins("PickCube")
     state, before = env.get_state(), packed(env)

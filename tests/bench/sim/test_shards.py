@@ -196,7 +196,6 @@ def test_bad_input(pair):
     partial = {"env_idx": torch.tensor([1]), "reconfigure": True}
     for use, words in (
         (lambda: two.step(torch.zeros(4, 7)), "one row of actions for each of the 5"),
-        (lambda: two.step_chunk(torch.zeros(5, 7)), r"\[environments, steps, action\]"),
         (lambda: two.step([[0.0] * 7] * 5), "not a list"),
         (lambda: two.reset(seed=[1, 2, 3]), "3 seeds were given for 5"),
         (lambda: two.reset(options=partial), "env_idx or reconfigure"),

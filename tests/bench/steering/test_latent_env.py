@@ -67,6 +67,33 @@ def test_step_is_the_decoded_chunk_played_by_hand(env):
     assert latent.control_steps == 3 * policy.execute * 4
 
 
+def test_an_episode_that_ends_within_a_chunk_ends_with_its_own_observation(env):
+    """Between decisions nobody looks, but where an episode ends."""
+    latent = LatentNoiseEnv(env, NoiseIsAction(execute=8))
+    noise = 0.1 * torch.randn(4, 8, 7, generator=torch.Generator().manual_seed(1))
+    noise[:, :2, :3], noise[:, :, 6] = 1.0, 1.0
+    steps, states = [], []
+    for play in (lambda: steps.extend(env.step(noise[:, t]) for t in range(8)), None):
+        latent.reset([0, 1, 2, 3])
+        env.elapsed_steps[3] = latent._elapsed[3] = env.max_episode_steps - 1
+        state = env.get_state_dict()
+        # Cubes that lie in their goals: success, once the hand stands still.
+        state["actors"]["goal_site"][:2, :3] = state["actors"]["cube"][:2, :3]
+        env.set_state_dict(state)
+        states.append(env.get_state())
+        result = play() if play else latent.step(noise)
+    assert torch.equal(*states)
+    success = torch.stack([info["success"] for *_, info in steps])
+    first = [int(column.int().argmax()) if column.any() else 7 for column in success.T[:3]]
+    assert result.terminal.tolist() == [True, True, False, False]
+    assert result.truncated.tolist() == [False, False, False, True]
+    assert 0 < first[0] < 7
+    for row, t in enumerate([*first, 0]):
+        assert torch.equal(result.next_obs[row], steps[t][0][row])
+    assert result.reward.tolist() == [-float(t) for t in first[:2]] + [-8.0, -1.0]
+    assert set(steps[0][4]) > {"is_grasped", "success"}
+
+
 def expert_chunk(env, expert: Expert) -> torch.Tensor:
     """One expert action as a chunk of one, with environment 0 held still."""
     action = expert.act()
