@@ -50,7 +50,7 @@ def yaw_quaternion(yaw: torch.Tensor) -> torch.Tensor:
 
 def rotation_vector_to_matrix(v: torch.Tensor) -> torch.Tensor:
     """Matrices ``[..., 3, 3]`` of rotations about ``v [..., 3]`` by ``|v|`` (rad)."""
-    half = v.norm(dim=-1, keepdim=True) / 2
+    half = torch.linalg.vector_norm(v, dim=-1, keepdim=True) / 2
     # sin(h)/h is sinc(h/pi) in torch's convention and smooth at zero.
     return quaternion_to_matrix(
         torch.cat([torch.cos(half), v / 2 * torch.sinc(half / math.pi)], dim=-1)

@@ -30,7 +30,8 @@ Act = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 def _batches(seeds: Sequence[int], num_envs: int) -> Iterator[tuple[list[int], torch.Tensor, int]]:
     """Seeds in batches of ``num_envs``: the seeds, their rows in the list, and how many count.
 
-    If the last batch is not full, the other environments repeat a seed and do not count.
+    If the last batch is not full, the other environments repeat a seed, stand still and do not
+    count.
     """
     for start in range(0, len(seeds), num_envs):
         rows = torch.arange(start, start + num_envs).clamp(max=len(seeds) - 1)
@@ -61,6 +62,7 @@ def _rollout_batch(
     env: LatentNoiseEnv, act: Act, seeds: list[int], rows: torch.Tensor, keep: int
 ) -> Rollout:
     obs = env.reset(seeds)
+    env.pause(torch.arange(env.num_envs) >= keep)
     direction = directions(obs, env.policy.obs_layout)
     steps: dict[str, list[torch.Tensor]] = {name: [] for name in DECISION_FIELDS}
     running = torch.ones(env.num_envs, dtype=torch.bool, device=obs.device)
@@ -179,7 +181,7 @@ def long_episodes(
     parts = []
     for batch, rows, keep in _batches(seeds, env.num_envs):
         begins = begin[rows.to(env.device)]
-        part = _long_batch(env, sample, draw, batch, begins, tail, generator)
+        part = _long_batch(env, sample, draw, batch, keep, begins, tail, generator)
         parts.append({name: value[:, :keep] for name, value in part.items()})
     longest = max(len(part["reward"]) for part in parts)
 
@@ -201,6 +203,7 @@ def _long_batch(
     sample: Sample,
     draw: Draw,
     seeds: list[int],
+    keep: int,
     begin: torch.Tensor,
     tail: int,
     generator: torch.Generator,
@@ -214,8 +217,9 @@ def _long_batch(
     wanted = counted_last + tail if limit > within else torch.full_like(begin, limit)
     names = ("obs", "noise", "log_prob", "reward", "terminal", "last", "on_policy", "off_policy")
     steps: dict[str, list[torch.Tensor]] = {name: [] for name in names}
-    running = torch.ones_like(begin, dtype=torch.bool)
+    running = torch.arange(env.num_envs, device=env.device) < keep
     for t in range(int(wanted.max())):
+        env.pause(~running)
         noise, log_prob = sample(obs)
         random = draw(len(obs), generator)
         noise = torch.where((t < begin)[:, None, None], random, noise)
@@ -230,7 +234,6 @@ def _long_batch(
         running = running & ~succeeded & ~last
         if not running.any():
             break
-        env.pause(~running)
         obs = result.obs_after
     return {name: torch.stack(values) for name, values in steps.items()}
 

@@ -21,6 +21,7 @@ from mani_skill.agents.controllers import (
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots import FloatingPandaGripper
+from torch.linalg import vector_norm
 
 from symsteer.bench.sim.contacts import is_grasping
 from symsteer.bench.sim.rotations import (
@@ -52,7 +53,7 @@ def bound_blocks(action: torch.Tensor, layout: Layout) -> torch.Tensor:
     twice gives the same bits as applying it once.
     """
     blocks = [action[..., block] for block in layout.blocks]
-    norms = [block.norm(dim=-1, keepdim=True).expand_as(block) for block in blocks]
+    norms = [vector_norm(block, dim=-1, keepdim=True).expand_as(block) for block in blocks]
     norm = torch.cat(norms, dim=-1)
     # The margin keeps a block that was scaled to length 1 (up to rounding) from being scaled again.
     return torch.where(norm > 1 + 1e-6, action / norm.clamp_min(1e-12), action)
@@ -133,14 +134,14 @@ class PlanarPoseController(PDJointPosController):
 
 def _shorten(vector: torch.Tensor, length: float) -> torch.Tensor:
     """Scale ``vector [N, 2]`` down to ``length`` where it is longer."""
-    norm = vector.norm(dim=1, keepdim=True)
+    norm = vector_norm(vector, dim=1, keepdim=True)
     return vector * (length / norm.clamp_min(length))
 
 
 def _limit_tilt(rotation: torch.Tensor, limit: float) -> torch.Tensor:
     """Turn the tool axis back towards straight down where it leans by more than ``limit``."""
     axis = rotation[:, :, 2]
-    horizontal = axis[:, :2].norm(dim=1)
+    horizontal = vector_norm(axis[:, :2], dim=1)
     excess = (torch.atan2(horizontal, -axis[:, 2]) - limit).clamp_min(0.0)
     if not excess.any():
         return rotation

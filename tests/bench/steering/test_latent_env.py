@@ -175,6 +175,8 @@ def test_rollout_does_not_depend_on_the_number_of_environments(env):
         for e in (env, wide)
     ]
     wide.close()
+    # Of the last batch of four, two count.
+    assert env.scene.px._paused.tolist() == [False, False, True, True]
     assert runs[0].episodes["seed"].tolist() == seeds
     assert torch.equal(runs[0].obs, runs[1].obs)
     for name, value in runs[0].episodes.items():
