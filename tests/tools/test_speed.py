@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +12,14 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from symsteer.agents import AGENTS
+from symsteer.errors import UserError
 from tests.bench.tiny_run import tiny_config
 from tools.speed import decode, learner, runs, simulation
 from tools.speed.simulation import Replay, Row, Turn
 from tools.speed.timing import clock_of, products_of, time_on
 
 TASK = "PickCube-v1"
+CHECKOUT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -174,6 +177,24 @@ def test_whole_runs_are_timed_alone_and_in_teams(tmp_path):
     *_, alone, team = runs.table(rows).splitlines()
     assert alone.split()[:2] == ["standard", "1"]
     assert team.split()[:2] == ["standard", "2"]
+
+
+@pytest.mark.slow
+def test_two_versions_execute_the_same_run_in_turns(tmp_path):
+    config = tiny_config("standard", env_steps=160)
+    lines = []
+    rows = runs.compare(CHECKOUT, [config], 1, tmp_path, lines.append)
+    assert [row["agent"] for row in rows] == ["standard, before", "standard, now"]
+    assert all(row["median"] > row["evaluate"] / 2 > 0 for row in rows)
+    assert lines[1] == "round 1 of 1: standard, now"
+    # Both had the base policy that was trained before.
+    assert [path.name for path in tmp_path.iterdir()] == ["base"]
+    assert len(list(tmp_path.glob("base/*/policy.safetensors"))) == 1
+
+
+def test_a_folder_without_a_version_is_named(tmp_path):
+    with pytest.raises(UserError, match=f"{tmp_path} is no checkout"):
+        runs.compare(tmp_path, [], 1, tmp_path, print)
 
 
 def test_the_products_of_an_update_are_the_same_products():

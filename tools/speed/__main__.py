@@ -18,6 +18,7 @@ import tyro
 
 from symsteer.agents import AGENTS
 from symsteer.bench.runs.config import RunConfig
+from symsteer.bench.sweep.suite import load_suite
 from symsteer.errors import UserError
 from symsteer.terminal import complain
 from tools.speed import decode as decoding
@@ -85,11 +86,22 @@ def runs(
     task: str = "PickCube-v1",
     repeats: int = 1,
     out: Path = Path("runs"),
+    before: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Measure the CPU time of whole runs with the default settings; OUT keeps the base policy."""
-    configs = [RunConfig(task=task, agent=agent) for agent in ("standard", "equivariant")]
-    rows = whole_runs.measure(configs, repeats, out, _tell)
+    """Measure the CPU time of whole runs with the default settings; OUT keeps the base policy.
+
+    With `--before CHECKOUT`, of another version, compare both with the settings of the suite
+    `second`, in turns.
+    """
+    agents = ("standard", "equivariant")
+    if before is None:
+        configs = [RunConfig(task=task, agent=agent) for agent in agents]
+        rows = whole_runs.measure(configs, repeats, out, _tell)
+    else:
+        suite = (c for c in load_suite("second").runs if (c.task, c.variant) == (task, "none"))
+        first = {config.agent: config for config in reversed(list(suite))}
+        rows = whole_runs.compare(before, [first[a] for a in agents], repeats, out, _tell)
     print(simulating.dump({"rows": rows}) if json else whole_runs.table(rows))
 
 
