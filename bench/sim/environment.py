@@ -91,6 +91,7 @@ class _OnSimulator(Unique, BaseEnv):
 
     looks = True
     brief = False
+    _last_obs: Any
 
     def step_chunk(self, actions: torch.Tensor, due: torch.Tensor, ends: bool) -> tuple:
         """Execute an action chunk, also the steps after an episode's end.
@@ -108,8 +109,7 @@ class _OnSimulator(Unique, BaseEnv):
             last ones; info of all steps, stacked alike.
         """
         n, steps = actions.shape[:2]
-        obs: Any = self._last_obs
-        results = []
+        obs, results = self._last_obs, []
         for t in range(steps):
             self.looks, self.brief = t == steps - 1, True
             try:
