@@ -5,17 +5,19 @@ import math
 import numpy as np
 import pytest
 import torch
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from sapien.physx import PhysxCollisionShapeBox, PhysxCollisionShapeSphere
 
 from symsteer.bench.sim.trees import join_trees, map_trees, rows_of
 from symsteer.bench.tasks import make, task_class
+from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Group
 from tests.bench.shared import FLAT_TASKS, STATE_TASKS, assert_same, roam, shared
 
-# Stock evaluates these with Euler angles; their own tests compare.
-OWN_EVALUATE = {"LiftPegUpright-v1", "PokeCube-v1"}
+# Stock evaluates the first two with Euler angles; their own tests compare. The third may be brief.
+OWN_EVALUATE = {"LiftPegUpright-v1", "PokeCube-v1", "PickCube-v1"}
 ELEMENTS = [*Group.parse("D4").elements, (0.3, False), (-2.0, True)]
 
 
@@ -47,6 +49,24 @@ def test_tasks_are_maniskills(task):
     assert stock.__module__.startswith("mani_skill.")
     assert issubclass(ours, stock)
     assert (ours.evaluate is stock.evaluate) == (task not in OWN_EVALUATE)
+
+
+@pytest.mark.parametrize("embodiment", ["floating", "panda"])
+def test_a_brief_evaluation_finds_maniskills_success(embodiment):
+    env = shared("PickCube-v1", 8, embodiment=embodiment)
+    env.reset(seed=list(range(8)))
+    expert, found = Expert(env), []
+    for _ in range(50):
+        env.step(expert.act())
+        stock = PickCubeEnv.evaluate(env)
+        assert_same(env.evaluate(), stock)
+        env.brief = True
+        brief = env.evaluate()
+        env.brief = False
+        assert_same(brief, {"success": stock["success"]})
+        found.append(stock)
+    for part in ("success", "is_obj_placed", "is_robot_static"):
+        assert 0 < torch.stack([stock[part] for stock in found]).float().mean() < 1
 
 
 @pytest.mark.parametrize(
