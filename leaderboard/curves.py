@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,10 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from symsteer.leaderboard.known_agents import STANDARD
+from symsteer.leaderboard.pairs import success_pairs
 from symsteer.leaderboard.row_numbers import summarize
-from symsteer.leaderboard.rows import AgentRow, Table
+from symsteer.leaderboard.rows import MIN_SEEDS, AgentRow, Table
 from symsteer.leaderboard.runs import Run, aligned, episode_success, load_runs
-from symsteer.leaderboard.statistics import Sample, success_interval
+from symsteer.leaderboard.statistics import Sample, crossed_bootstrap, success_interval
+from symsteer.leaderboard.text import interval
 from symsteer.tables import aligned as aligned_table
 
 BAND_RESAMPLES = 1000
@@ -114,7 +118,7 @@ def _places(points: Sequence[tuple[int, ...]]) -> list[float]:
 
 
 def curves_as_text(records: Sequence[Path]) -> str:
-    """Mean success of each agent at every evaluation, one table per cell.
+    """Mean success of each agent at every evaluation, and how sure its place is; by cell.
 
     Args:
         records: record files, run folders, or folders of these.
@@ -134,7 +138,29 @@ def _cell(table: Table) -> str:
         for name, curve in curves.items()
     ]
     header = ["  success after steps", *(f"{step}k" for step in steps)]
-    return f"{table.key.task} {table.key.embodiment}, {world}\n{aligned_table(header, rows)}"
+    title = f"{table.key.task} {table.key.embodiment}, {world}"
+    return "\n".join([title, aligned_table(header, rows), *_certainties(table)])
+
+
+def _certainties(table: Table) -> list[str]:
+    """How sure it is that a learner ends above or below the plain one: a sentence for each."""
+    sentences, plain = [], table.row_of(STANDARD)
+    for row in table.learners:
+        pairs = success_pairs(row, plain) if plain and row is not plain else {}
+        if not plain or not pairs:
+            continue
+        success, few = crossed_bootstrap(list(pairs.values())), len(pairs) < MIN_SEEDS
+        verb = "may be" if few else "is clearly" if success.sign else "is not clearly"
+        sentence = (
+            f"{row.label} {verb} {'above' if success.value > 0 else 'below'} {plain.label}: "
+            f"{interval(success, sign=True)} of success in the last fifth of the steps (95 % "
+            f"interval; pairs of runs: {len(pairs)}, base policies: "
+            f"{len({pair.policy for pair in pairs.values()})})."
+        )
+        if few:
+            sentence += f" To be sure takes {MIN_SEEDS} pairs."
+        sentences.append(textwrap.indent(textwrap.fill(sentence, 98), "  "))
+    return sentences
 
 
 def _curve(row: AgentRow) -> dict[int, float]:

@@ -16,13 +16,12 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
 from symsteer.names import unknown
 from symsteer.registry import summary_of
-from symsteer.terminal import BOARD, careful_output, complain, folded, to_paste
+from symsteer.terminal import careful_output, complain, folded
 
 ABOUT = "How much symmetry should an RL agent keep when it steers an equivariant diffusion policy?"
 
@@ -50,7 +49,7 @@ BENCH = "symsteer.bench.cli"
 
 GROUPS = {
     "run experiments": {
-        "demo": Verb("symsteer.cli:demo"),
+        "demo": Verb("symsteer.demo:demo"),
         "run": Verb(f"{BENCH}:run", parses=True),
         "resume": Verb(f"{BENCH}:resume"),
         "sweep": Verb(f"{BENCH}:sweep"),
@@ -130,29 +129,6 @@ def main() -> int:
         )
 
 
-def demo(out: Path = Path("runs/demo")) -> int:
-    """Run a small suite and write its leaderboard: minutes on a CPU.
-
-    Demonstrations, base policy, five agents, leaderboard.
-
-    Args:
-        out: Folder of the runs and of their leaderboard.
-    """
-    from symsteer.bench.cli import Workforce, sweep
-    from symsteer.leaderboard.command import report
-    from symsteer.leaderboard.curves import curves_as_text
-
-    exit_code = sweep("demo", out=out, workforce=Workforce(together=2))
-    report((out,), out=out / "leaderboard")
-    print(f"\n{curves_as_text((out,))}")
-    print(
-        f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
-        f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', out)}"
-        f"  then {BOARD}"
-    )
-    return exit_code
-
-
 def _run(arguments: Sequence[str]) -> int:
     """Run a verb; without a verb or with --help, print the list of verbs."""
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -219,12 +195,3 @@ def _is_out_of_memory(error: Exception) -> bool:
     torch = sys.modules.get("torch")
     on_cuda = torch is not None and isinstance(error, torch.OutOfMemoryError)
     return on_cuda or isinstance(error, MemoryError) or "allocate memory" in str(error)
-
-
-def _script(name: str) -> str:
-    """How to call a console script of this environment from the current folder."""
-    path = Path(sys.executable).with_name(name)
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return name

@@ -72,3 +72,24 @@ def test_learners_have_a_curve_and_references_one_number(tmp_path: Path):
     assert base.split() == ["base", "50%"]
     assert len(base) == len(head) == len(standard)
     assert standard.split() == ["standard", "25%", "25%", "88%"]
+
+
+@pytest.mark.parametrize(
+    ("gains", "verdict", "success"),
+    [
+        ([1] * 5, "is clearly above", "+1.00 [+1.00, +1.00]"),
+        ([-1] * 5, "is clearly below", "\u22121.00 [\u22121.00, \u22121.00]"),
+        ([1, -1, 1, -1, 1], "is not clearly above", "+0.20 ["),
+        ([1] * 4, "may be above", "+1.00 [+1.00, +1.00]"),
+    ],
+)
+def test_a_sentence_says_how_sure_a_comparison_is(tmp_path, gains, verdict, success):
+    for seed, gain in enumerate(gains):
+        for agent, wins in {"standard": gain < 0, "equivariant": gain > 0}.items():
+            curve = [make_evaluation([0] * 9, 0, False), make_evaluation([wins] * 9, 10_000)]
+            record = make_record(curve, agent=agent, seed=seed, env_steps=10_000)
+            write_record(record, tmp_path / f"{record.run_id}.json")
+    sentence = " ".join(" ".join(curves_as_text([tmp_path]).splitlines()[4:]).split())
+    assert sentence.startswith(f"equivariant {verdict} standard: {success}")
+    assert f"pairs of runs: {len(gains)}, base policies: 1)." in sentence
+    assert sentence.endswith("To be sure takes 5 pairs.") == (len(gains) < 5)

@@ -4,6 +4,9 @@ import tomllib
 import zipfile
 from pathlib import PurePosixPath
 
+from symsteer.bench.sweep.suite import load_suite
+from symsteer.demo import base_files
+from symsteer.leaderboard.paths import PAGE_FOLDER
 from tests.packaging.conftest import FOLDERS, ROOT, build_wheel, python
 
 AUDIT = "leaderboard/results/audit/summary.json"
@@ -32,6 +35,8 @@ def test_the_wheel_is_complete_and_installs_one_name(wheel, source):
         "leaderboard/studies/*.sha256",
     ):
         wanted |= {f"symsteer/{file.relative_to(source)}" for file in source.glob(pattern)}
+    base = base_files(load_suite("demo").runs[0])
+    wanted |= {f"symsteer/leaderboard/{file.relative_to(PAGE_FOLDER)}" for file in base}
     assert names == wanted
 
 
