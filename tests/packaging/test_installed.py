@@ -21,6 +21,14 @@ policy = { channels = 8, width = 16, depth = 1, steps = 20 }
 evaluation = { final_episodes = 3, final_diagnostic_episodes = 2, steerability_states = 2 }
 """
 
+TAKE = """
+from pathlib import Path
+from symsteer.bench.sweep.suite import load_suite
+from symsteer.demo import copy_base
+copy_base(load_suite("demo").runs[0], Path("demo"))
+"""
+"""What `symsteer demo` does first."""
+
 FOREIGN = 'raise ImportError("another project\'s package")\n'
 
 
@@ -32,6 +40,8 @@ def test_list_sweep_and_report_in_an_empty_folder(installed, tmp_path):
     for name in ("PickCube-v1", "action_gain", "equivariant", "golden-ticket", "smoke", "demo"):
         assert re.search(rf"^  {name} ", names, re.MULTILINE), names
     assert not list(tmp_path.iterdir())
+    installed.run(tmp_path, "python", "-c", TAKE)
+    assert list(tmp_path.glob("demo/base/*/policy.safetensors"))
     (tmp_path / "tiny.toml").write_text(SUITE)
     installed.run(tmp_path, "symsteer", "sweep", "tiny.toml", "--workers", "1")
     installed.run(tmp_path, "symsteer", "report", "runs")
