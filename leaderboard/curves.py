@@ -149,16 +149,15 @@ def _certainties(table: Table) -> list[str]:
         pairs = success_pairs(row, plain) if plain and row is not plain else {}
         if not plain or not pairs:
             continue
-        success, few = crossed_bootstrap(list(pairs.values())), len(pairs) < MIN_SEEDS
-        verb = "may be" if few else "is clearly" if success.sign else "is not clearly"
+        success, policies = crossed_bootstrap([*pairs.values()]), {p.policy for p in pairs.values()}
+        sure = "is clearly" if success.sign else "is not clearly"
         sentence = (
-            f"{row.label} {verb} {'above' if success.value > 0 else 'below'} {plain.label}: "
+            f"{row.label} {sure if len(pairs) >= MIN_SEEDS else 'may be'} "
+            f"{'above' if success.value > 0 else 'below'} {plain.label}: "
             f"{interval(success, sign=True)} of success in the last fifth of the steps (95 % "
-            f"interval; pairs of runs: {len(pairs)}, base policies: "
-            f"{len({pair.policy for pair in pairs.values()})})."
+            f"interval; base policies: {len(policies)}; pairs of runs: {len(pairs)}, and a verdict "
+            f"needs {MIN_SEEDS})."
         )
-        if few:
-            sentence += f" To be sure takes {MIN_SEEDS} pairs."
         sentences.append(textwrap.indent(textwrap.fill(sentence, 98), "  "))
     return sentences
 

@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from symsteer.errors import UserError
+from symsteer.files import write_together
+from symsteer.leaderboard import paths
 from symsteer.terminal import BOARD, to_paste
 
 if TYPE_CHECKING:
     from symsteer.bench.runs.config import RunConfig
 
-TOGETHER = 5
-"""Runs that share a process: all of an agent."""
-
 
 def demo(out: Path = Path("runs/demo")) -> int:
-    """See in a world that breaks it whether symmetry is worth keeping: minutes on a CPU.
+    """See a plain and an equivariant agent in a world that breaks the symmetry: minutes on a CPU.
 
-    A plain and an equivariant agent steer a base policy that comes with SymSteer.
+    They steer a base policy that comes with SymSteer.
 
     Args:
         out: Folder of the runs and of their leaderboard.
@@ -30,13 +29,12 @@ def demo(out: Path = Path("runs/demo")) -> int:
     from symsteer.leaderboard.curves import curves_as_text
 
     copy_base(load_suite("demo").runs[0], out)
-    exit_code = sweep("demo", out=out, workforce=Workforce(together=TOGETHER))
+    exit_code = sweep("demo", out=out, workforce=Workforce(together=5))
     report((out,), out=out / "leaderboard")
     print(f"\n{curves_as_text((out,))}")
     print(
-        "\nThe motors drift to one side, which no symmetric agent can undo. In a symmetric world"
-        "\nsymmetry gains: leaderboard/LEADERBOARD.md in the repository compares many worlds, and"
-        "\nmore than this one base policy.\n"
+        "\nThe motors drift to one side, and no symmetric agent can undo that. In symmetric worlds"
+        "\nsymmetry gains: leaderboard/LEADERBOARD.md in the repository compares many of both.\n"
         f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
         f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', out)}"
         f"  then {BOARD}"
@@ -50,29 +48,13 @@ def copy_base(run: RunConfig, out: Path) -> None:
     Raises:
         UserError: if this copy of SymSteer lacks them, or they cannot be written.
     """
-    from symsteer.files import write_together
-    from symsteer.leaderboard.paths import RESULTS
-
-    files = {out / file.relative_to(RESULTS): file.read_bytes() for file in base_files(run)}
-    write_together(files)
-
-
-def base_files(run: RunConfig) -> list[Path]:
-    """The files of a base policy that comes with SymSteer, and of its demonstrations.
-
-    Raises:
-        UserError: if this copy of SymSteer lacks them.
-    """
     from symsteer.bench.runs.base_policy import demonstration_path, find_base
-    from symsteer.leaderboard.paths import RESULTS
 
-    folder = find_base(run, RESULTS)
-    if folder is None:
-        raise UserError(
-            f"{RESULTS / 'base'} lacks the base policy of the demo; install SymSteer again"
-        )
-    demonstrations = demonstration_path(run, RESULTS)
-    return [demonstrations, demonstrations.with_suffix(".json"), *folder.iterdir()]
+    if (folder := find_base(run, paths.RESULTS)) is None:
+        raise UserError(f"{paths.RESULTS / 'base'} lacks the base policy; install SymSteer again")
+    demos = demonstration_path(run, paths.RESULTS)
+    files = [demos, demos.with_suffix(".json"), *folder.iterdir()]
+    write_together({out / file.relative_to(paths.RESULTS): file.read_bytes() for file in files})
 
 
 def _script(name: str) -> str:

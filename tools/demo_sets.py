@@ -19,7 +19,7 @@ from symsteer.bench.sweep.command import run_plan
 from symsteer.bench.sweep.plan import make_plan
 from symsteer.bench.sweep.suite import Suite, load_suite
 from symsteer.bench.sweep.workforce import Workforce
-from symsteer.demo import TOGETHER, copy_base
+from symsteer.demo import copy_base
 from symsteer.errors import UserError
 from symsteer.leaderboard.curves import curves_as_text
 from symsteer.terminal import complain
@@ -39,7 +39,7 @@ def main() -> int:
             runs = tuple(replace(run, seed=run.seed + 100 * number) for run in suite.runs)
             copy_base(runs[0], out)
             run_plan(
-                make_plan(Suite(suite.name, "", runs), out), Workforce(args.workers, None, TOGETHER)
+                make_plan(Suite(suite.name, "", runs), out), Workforce(args.workers, together=5)
             )
             table = curves_as_text([out])
             clear += "equivariant is clearly below standard" in table

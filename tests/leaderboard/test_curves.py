@@ -91,5 +91,5 @@ def test_a_sentence_says_how_sure_a_comparison_is(tmp_path, gains, verdict, succ
             write_record(record, tmp_path / f"{record.run_id}.json")
     sentence = " ".join(" ".join(curves_as_text([tmp_path]).splitlines()[4:]).split())
     assert sentence.startswith(f"equivariant {verdict} standard: {success}")
-    assert f"pairs of runs: {len(gains)}, base policies: 1)." in sentence
-    assert sentence.endswith("To be sure takes 5 pairs.") == (len(gains) < 5)
+    few = f"base policies: 1; pairs of runs: {len(gains)}, and a verdict needs 5)."
+    assert sentence.endswith(few)

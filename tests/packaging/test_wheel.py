@@ -5,8 +5,7 @@ import zipfile
 from pathlib import PurePosixPath
 
 from symsteer.bench.sweep.suite import load_suite
-from symsteer.demo import base_files
-from symsteer.leaderboard.paths import PAGE_FOLDER
+from symsteer.demo import copy_base
 from tests.packaging.conftest import FOLDERS, ROOT, build_wheel, python
 
 AUDIT = "leaderboard/results/audit/summary.json"
@@ -19,7 +18,7 @@ def contents(wheel):
         return {name: file.read(name) for name in file.namelist() if not name.endswith("/RECORD")}
 
 
-def test_the_wheel_is_complete_and_installs_one_name(wheel, source):
+def test_the_wheel_is_complete_and_installs_one_name(wheel, source, tmp_path):
     names = {name for name in contents(wheel) if ".dist-info/" not in name}
     wanted = {f"symsteer/{AUDIT}", "symsteer/py.typed"}
     for folder in FOLDERS:
@@ -35,8 +34,9 @@ def test_the_wheel_is_complete_and_installs_one_name(wheel, source):
         "leaderboard/studies/*.sha256",
     ):
         wanted |= {f"symsteer/{file.relative_to(source)}" for file in source.glob(pattern)}
-    base = base_files(load_suite("demo").runs[0])
-    wanted |= {f"symsteer/leaderboard/{file.relative_to(PAGE_FOLDER)}" for file in base}
+    copy_base(load_suite("demo").runs[0], tmp_path)
+    base = (file.relative_to(tmp_path) for file in tmp_path.rglob("*") if file.is_file())
+    wanted |= {f"symsteer/leaderboard/results/{file}" for file in base}
     assert names == wanted
 
 
