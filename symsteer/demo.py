@@ -33,8 +33,9 @@ def demo(out: Path = Path("runs/demo")) -> int:
     report((out,), out=out / "leaderboard")
     print(f"\n{curves_as_text((out,))}")
     print(
-        "\nThe motors drift to one side, and no symmetric agent can undo that. In symmetric worlds"
-        "\nsymmetry gains: leaderboard/LEADERBOARD.md in the repository compares many of both.\n"
+        "\nOne motor is weak. This breaks the symmetry, but a symmetric agent can see what it did and"
+        "\ncorrect it. Other breaks cost symmetric agents success, and this table has one base policy:"
+        "\nleaderboard/LEADERBOARD.md in the repository compares many worlds, with several of them.\n"
         f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
         f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', out)}"
         f"  then {BOARD}"

@@ -3,7 +3,7 @@
 python -m tools.demo_sets runs/demo-sets
 
 Set k is the suite ``demo`` on the same base policy, with seeds that are 100 k higher. A set shows
-the effect if its sentence has `equivariant` below `standard`; it is counted, too, in how many this
+the effect if its sentence has `equivariant` above `standard`; it is counted, too, in how many this
 is clear. The same command continues after a stop; a set takes as long as the demo.
 """
 
@@ -42,8 +42,8 @@ def main() -> int:
                 make_plan(Suite(suite.name, "", runs), out), Workforce(args.workers, together=5)
             )
             table = curves_as_text([out])
-            clear += "equivariant is clearly below standard" in table
-            shown += bool(re.search("equivariant is (not )?clearly below standard", table))
+            clear += "equivariant is clearly above standard" in table
+            shown += bool(re.search("equivariant is (not )?clearly above standard", table))
             print(f"\nset {number}: {table}\n", flush=True)
     except UserError as error:
         return complain(error, f"error: {error}", 2)
