@@ -33,9 +33,9 @@ def demo(out: Path = Path("runs/demo")) -> int:
     report((out,), out=out / "leaderboard")
     print(f"\n{curves_as_text((out,))}")
     print(
-        "\nOne motor is weak. This breaks the symmetry, but a symmetric agent can see what it did and"
-        "\ncorrect it. Other breaks cost symmetric agents success, and this table has one base policy:"
-        "\nleaderboard/LEADERBOARD.md in the repository compares many worlds, with several of them.\n"
+        "\nOne motor is weak. This breaks the symmetry, but a symmetric agent sees what it did and"
+        "\ncan correct it. Other breaks cost symmetric agents success: leaderboard/LEADERBOARD.md in"
+        "\nthe repository compares many worlds, each with several base policies.\n"
         f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
         f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', out)}"
         f"  then {BOARD}"
