@@ -34,8 +34,8 @@ def demo(out: Path = Path("runs/demo")) -> int:
     print(f"\n{curves_as_text((out,))}")
     print(
         "\nOne motor is weak. This breaks the symmetry, but a symmetric agent sees what it did and"
-        "\ncan correct it. Other breaks cost symmetric agents success: leaderboard/LEADERBOARD.md in"
-        "\nthe repository compares many worlds, each with several base policies.\n"
+        "\ncan correct it. Other breaks cost symmetric agents success: in the repository the page"
+        "\nleaderboard/LEADERBOARD.md compares many worlds, each with several base policies.\n"
         f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
         f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', out)}"
         f"  then {BOARD}"
