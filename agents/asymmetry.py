@@ -14,6 +14,7 @@ below 1 / (2 penalty): 0 lets A go, infinity is the equivariant agent.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, cast
@@ -23,7 +24,7 @@ from torch import nn
 
 from symsteer.agents.episodes import Played
 from symsteer.agents.equivariant import EquivariantAgent, equivariant_layers
-from symsteer.agents.networks import Dense, Ensemble, Parameters, dense, dense_of, shrink_, within
+from symsteer.agents.networks import Dense, Ensemble, Parameters, dense, dense_of, within
 from symsteer.agents.options import SacOptions
 from symsteer.policies.geometry import Layout
 from symsteer.policies.networks.equivariant import EquivariantLayer, MatrixLayer
@@ -38,7 +39,7 @@ class AsymmetricLayer(MatrixLayer):
 
     strict: EquivariantLayer
 
-    def pull(self, parameters: Parameters, factor: float) -> None:
+    def pull(self, parameters: Parameters, factor: torch.Tensor) -> None:
         """Multiply the asymmetric part by a factor, in place."""
         raise NotImplementedError
 
@@ -50,8 +51,10 @@ class TwoPaths(AsymmetricLayer):
         super().__init__()
         self.strict = strict
         outputs, inputs = dense(strict)[0].shape
-        self.free = Dense(inputs, outputs)
-        shrink_(self.free, 0.0)
+        # It must not draw: the strict layers are those of the equivariant agent.
+        self.free = torch.nn.utils.skip_init(Dense, inputs, outputs)
+        for parameter in self.free.parameters():
+            nn.init.zeros_(parameter)
 
     def strict_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
         """What the equivariant layer contributes to :meth:`dense_of`."""
@@ -87,10 +90,13 @@ class PenaltyOptions(SacOptions):
     penalty: float = 1.0
     """The dial: weight of the squared asymmetric part, which keeps its numbers below
     1 / (2 penalty). 0: free; 1e8: strict to 1e-4."""
+    half_life: float = math.inf
+    """Updates of a network after which the penalty has fallen to a half."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("not be negative", lambda value: value >= 0, "penalty")
+        self._require("be positive", lambda value: value > 0, "half_life")
 
 
 class PenaltyAgent(AsymmetricAgent):
@@ -101,8 +107,9 @@ class PenaltyAgent(AsymmetricAgent):
 
     def settle(self, name: str) -> None:
         """The proximal step."""
-        factor = 1 / (1 + 2 * self.options.lr * self.options.penalty)
-        if factor < 1:
+        if step := 2 * self.options.lr * self.options.penalty:
+            updates = self.optimizers[name].moments["step"].to(self.dtype)
+            factor = 1 / (1 + step * 0.5 ** (updates / self.options.half_life))
             for layer, parameters in self.networks[name].layers():
                 cast(AsymmetricLayer, layer).pull(parameters, factor)
 

@@ -27,7 +27,7 @@ class Projected(AsymmetricLayer):
     def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
         return parameters["weight"], parameters["bias"]
 
-    def pull(self, parameters: Parameters, factor: float) -> None:
+    def pull(self, parameters: Parameters, factor: torch.Tensor) -> None:
         tensors = parameters["weight"], parameters["bias"]
         for tensor, near in zip(tensors, self.strict.nearest(*tensors), strict=True):
             tensor.lerp_(near, 1 - factor)

@@ -67,7 +67,7 @@ class Relaxed(AsymmetricLayer):
         weights = weights.repeat_interleave(each, dim=-1).unsqueeze(-3 - self.axis)
         return (stacked * weights).sum(-3), torch.stack(biases).sum(0)
 
-    def pull(self, parameters: Parameters, factor: float) -> None:
+    def pull(self, parameters: Parameters, factor: torch.Tensor) -> None:
         weights = parameters["weights"]
         weights.lerp_(weights.mean(-1, keepdim=True), 1 - factor)
 

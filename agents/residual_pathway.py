@@ -21,7 +21,7 @@ class ResidualPathway(TwoPaths):
         weight, bias = self.strict_of(parameters)
         return weight + parameters["free.weight"], bias + parameters["free.bias"]
 
-    def pull(self, parameters: Parameters, factor: float) -> None:
+    def pull(self, parameters: Parameters, factor: torch.Tensor) -> None:
         for name in ("free.weight", "free.bias"):
             parameters[name].mul_(factor)
 

@@ -330,9 +330,13 @@ class SacAgent(Agent):
         """Store the decisions; each one after the warm-up adds ``utd`` due updates."""
         fields = vars(transition)
         self.replay.add({**fields, **self._banked(fields[self.bank_at])})
+        self.owe(len(transition.reward))
+
+    def owe(self, decisions: int) -> None:
+        """Count decisions that are in the replay, and the updates that are due for them."""
         if self.decisions >= self.options.warmup:
-            self.owed += len(transition.reward) * self.options.utd
-        self.decisions += len(transition.reward)
+            self.owed += decisions * self.options.utd
+        self.decisions += decisions
 
     def batches(self) -> Iterator[Batch]:
         """One batch for each update that is due."""
@@ -406,7 +410,7 @@ class SacAgent(Agent):
         for _ in range(distillations):
             scalars["losses/distillation"] = self._distil(batch, obs, following, judge)
 
-        scalars |= self._improve(batch, obs, judge)
+        scalars |= self._improve(batch, judge)
 
         with torch.no_grad():
             averaged, newest = (in_chunks(_flat(weights)) for weights in (self.target, judge))
@@ -419,14 +423,14 @@ class SacAgent(Agent):
             "train/target_mean": target.mean(-1) / self.options.reward_scale,
         }
 
-    def _improve(self, batch: Batch, obs: torch.Tensor, judge: Weights) -> dict[str, torch.Tensor]:
+    def _improve(self, batch: Batch, judge: Weights) -> dict[str, torch.Tensor]:
         """One step of the actor and the temperature; returns scalars."""
         drawn, alpha = self.drawn_to_improve(batch), self.alpha
         if self.options.critic == "aliased":
             climbed = detached(self.networks["noise_critic"].weights())
-            values = self._q(climbed, obs, drawn.noise)
+            values = self._q(climbed, drawn.obs, drawn.noise)
         else:
-            values = self._q(judge, obs, drawn.judged)
+            values = self._q(judge, drawn.obs, drawn.judged)
         actor_loss = self.actor_loss(values, drawn.noise, drawn.log_prob, batch)
         self._descend("actor", actor_loss, batch)
         entropy = -drawn.log_prob.detach().mean(-1)

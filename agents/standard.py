@@ -8,7 +8,7 @@ from torch import nn
 
 from symsteer.agents.equivariant import equivariant_layers
 from symsteer.agents.networks import Dense, count, shrink_
-from symsteer.agents.options import EitherOptions
+from symsteer.agents.options import EitherOptions, SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.sac import SacAgent
 from symsteer.policies.geometry import Layout
@@ -22,14 +22,29 @@ class StandardAgent(SacAgent):
     in_teams = True
 
     def layers(self, inputs: Layout, outputs: Layout, scale: float = 1.0) -> list[nn.Module]:
-        sizes = [inputs.dim, *[self.width_of(inputs, outputs)] * self.options.depth, outputs.dim]
-        layers: list[nn.Module] = [Dense(a, b) for a, b in itertools.pairwise(sizes)]
-        shrink_(layers[-1], scale)
-        return layers
+        width = self.width_of(inputs, outputs)
+        return plain_layers(inputs, outputs, self.options, scale, width)
 
     def width_of(self, inputs: Layout, outputs: Layout) -> int:
         """Hidden features of a network."""
         return self.options.width
+
+
+def plain_layers(
+    inputs: Layout,
+    outputs: Layout,
+    options: SacOptions,
+    scale: float = 1.0,
+    width: int | None = None,
+) -> list[nn.Module]:
+    """``depth`` hidden layers of equal width, by default that of the options, and an output layer.
+
+    The parameters of the output layer are multiplied by ``scale``.
+    """
+    sizes = [inputs.dim, *[width or options.width] * options.depth, outputs.dim]
+    layers: list[nn.Module] = [Dense(a, b) for a, b in itertools.pairwise(sizes)]
+    shrink_(layers[-1], scale)
+    return layers
 
 
 @tuned

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import math
 
 import pytest
@@ -9,15 +10,27 @@ import torch
 
 from symsteer.agents.asymmetry import asymmetry
 from symsteer.agents.diagnostics import actor_equivariance_error
-from symsteer.agents.networks import dense
+from symsteer.agents.networks import dense, dense_of, within
 from symsteer.agents.replay import Transition
 from symsteer.policies.geometry import Field, Group, Layout
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
-from tests.agents.conftest import ACT, DOUBLE, OBS, errors, learn, trained
+from tests.agents.conftest import ACT, OBS, errors, trained
 
 WITH_DIAL = ("residual-pathway", "relaxed", "projected")
-ALL = (*WITH_DIAL, "constrained")
-FREE = {"constrained": {"dual_lr": 0.0}, **{name: {"penalty": 0.0} for name in WITH_DIAL}}
+ALL = (*WITH_DIAL, "constrained", "slow", "free-bias", "resilient")
+FREE = {
+    "constrained": {"dual_lr": 0.0},
+    "slow": {"rate": 1.0},
+    "free-bias": {},
+    "resilient": {"initial_multiplier": 0.0, "dual_lr": 0.0},
+    **{name: {"penalty": 0.0} for name in WITH_DIAL},
+}
+STRICT = {
+    "slow": {"rate": 0.0},
+    "residual-pathway": {"penalty": math.inf},
+    "free-bias": {"penalty": math.inf},
+    "chooser": {"rate": 0.0, "actors": "strict"},
+}
 
 
 def layers_of(name):
@@ -71,29 +84,16 @@ def test_they_start_where_the_strict_agent_starts_and_leave_it(problem, name):
     assert min(asymmetry(network) for network in agent.networks.values()) > 1e-4
 
 
-def test_with_a_large_penalty_the_residual_pathway_is_the_equivariant_agent(problem):
-    strict = trained("equivariant")
-    agent = problem.agent("residual-pathway", penalty=math.inf, **DOUBLE)
-    # The plain paths draw numbers when they are made.
-    agent.load_state_dict(with_strict_layers(agent, trained("equivariant", 0)))
-    learn(problem, agent)
+@pytest.mark.parametrize("name", STRICT)
+def test_at_the_strict_end_of_its_dial_an_agent_is_the_equivariant_one(problem, name):
+    """From the first number on; after 20 updates to rounding."""
     batch = problem.batch(seed=9, dtype=torch.float64)
-    for mine, theirs in zip(agent.moments(batch.obs), strict.moments(batch.obs), strict=True):
-        torch.testing.assert_close(mine, theirs)
-    torch.testing.assert_close(
-        agent.q_values(batch.obs, batch.noise), strict.q_values(batch.obs, batch.noise)
-    )
-
-
-def with_strict_layers(agent, strict):
-    """The agent's state with the equivariant layers and the target critics of another agent."""
-    state = agent.state_dict()
-    for name, network in strict.state_dict()["networks"].items():
-        for key, value in network.items():
-            *path, last = key.split(".")
-            state["networks"][name][".".join([*path, "strict", last])] = value
-    state["target"] = strict.state_dict()["target"]
-    return state
+    for updates in (0, 20):
+        agent, strict = (trained(n, updates, **STRICT.get(n, {})) for n in (name, "equivariant"))
+        same = torch.equal if updates == 0 else functools.partial(torch.allclose, rtol=1e-12)
+        for one, other in zip(agent.moments(batch.obs), strict.moments(batch.obs), strict=True):
+            assert same(one, other)
+        assert same(*(x.q_values(batch.obs, batch.noise) for x in (agent, strict)))
 
 
 # A bandit: the best noise is a known function of the observation, the reward is minus the squared
@@ -180,6 +180,44 @@ def test_the_penalty_limits_the_asymmetric_numbers(problem):
             agent.settle("actor")
     for weight in numbers:
         torch.testing.assert_close(weight, torch.full_like(weight, 0.1), rtol=1e-3, atol=0)
+
+
+def test_an_annealed_penalty_lets_the_numbers_go(problem):
+    """After one half-life steps of lr end at twice the size."""
+    sizes = []
+    for half_life in (math.inf, 100):
+        agent = problem.agent("residual-pathway", lr=0.01, penalty=5.0, half_life=half_life)
+        agent.optimizers["actor"].moments["step"].fill_(100)
+        with torch.no_grad():
+            number = next(agent.actor.layers())[1]["free.weight"]
+            for _ in range(300):
+                number += 0.01
+                agent.settle("actor")
+        sizes.append(number.mean().item())
+    assert sizes == pytest.approx([0.1, 0.2], rel=1e-2)
+
+
+def test_slow_numbers_move_at_a_fraction_of_the_rate(problem):
+    """The first step of Adam is lr for every number that has a gradient."""
+    options = {"rate": 0.25, "bias_speed": 0.5, "critic_speed": 2.0}
+    agent = trained("slow", 1, lr=1e-3, **options)
+    for name, rate in (("actor", 0.25), ("critic", 0.5)):
+        layer, parameters = next(agent.networks[name].layers())
+        strict = dense_of(layer.strict, within("strict", parameters))
+        whole = dense_of(layer, parameters)
+        for one, other, wanted in zip(whole, strict, (rate, rate / 2), strict=True):
+            assert (one - other).abs().max().item() == pytest.approx(1e-3 * wanted, rel=1e-3)
+
+
+def test_the_multiplier_falls_until_the_plain_path_pays(problem):
+    agent = problem.agent("resilient", price=2.0, initial_multiplier=1.0, dual_lr=0.5)
+    layers = [parameters for _, parameters in agent.actor.layers()]
+    with torch.no_grad():
+        layers[1]["gamma"].fill_(-1.0)
+        assert agent.penalty("actor", None).item() == pytest.approx(1.0)
+        agent.settle("actor")
+    # lambda + 0.5 (|gamma| - lambda / 2)
+    assert [layer["multiplier"].item() for layer in layers] == pytest.approx([0.75, 1.25, 0.75])
 
 
 @pytest.mark.parametrize("elastic", [False, True])

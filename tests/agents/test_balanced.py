@@ -1,0 +1,114 @@
+"""The balanced agent: who plays, who leads, and what all learn from."""
+
+import dataclasses
+import itertools
+
+import pytest
+import torch
+
+from symsteer.agents.agent import Budget
+from symsteer.agents.balanced import Balance, BalancedOptions
+
+BUDGET = Budget(env_steps=1000, num_envs=4, execute=2, max_episode_steps=10)
+
+
+def test_a_worse_learner_plays_fewer_episodes_and_does_not_lead():
+    balance = Balance(3, BalancedOptions())
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(600):
+        learner = balance.begin()
+        chance = (0.8, 0.8, 0.3)[learner]
+        balance.end(learner, float(torch.rand((), generator=generator) < chance))
+    assert balance.plays[2] < 100 < 200 < min(balance.plays[:2])
+    assert balance.best != 2
+
+
+def test_equal_learners_share_the_episodes():
+    balance = Balance(3, BalancedOptions())
+    for _ in range(300):
+        balance.end(balance.begin(), 0.5)
+    assert balance.plays == [100] * 3
+    assert balance.bounds == [BalancedOptions().bound] * 3
+
+
+def test_episodes_under_way_and_given_up_count_as_they_should():
+    balance = Balance(3, BalancedOptions())
+    assert [balance.begin() for _ in range(4)] == [0, 1, 2, 0]
+    balance.end(0, None)
+    assert balance.pending == [1, 1, 1]
+    assert balance.plays == [0, 0, 0]
+
+
+def test_a_bound_doubles_where_a_learner_is_worse_in_spite_of_it():
+    """By hand, with n = 100 and no doubt: .5 + .1 / 10 < .52, not < .505."""
+    for other, wanted in ((0.52, 0.2), (0.505, 0.1)):
+        balance = Balance(2, BalancedOptions(confidence=0.0))
+        balance.plays, balance.scores, balance.pending = [99, 100], [49.5, 100 * other], [1, 0]
+        balance.end(0, 0.5)
+        assert balance.bounds[0] == pytest.approx(wanted)
+
+
+def steps(problem, agent, count, terminal=0.0):
+    """Decisions of four environments, one after the other."""
+    batches = [problem.transition(4, seed) for seed in range(count + 1)]
+    for batch, after in itertools.pairwise(batches):
+        zeros = torch.zeros(4)
+        ends = zeros + terminal
+        agent.act(batch.obs)
+        agent.observe(
+            dataclasses.replace(
+                batch, next_obs=after.obs, reward=zeros - 1, terminal=ends, truncated=zeros
+            )
+        )
+        for due in agent.batches():
+            agent.update(due)
+
+
+def test_scores_are_returns_as_a_share_of_the_limit(problem):
+    agent = problem.agent("balanced")
+    agent.prepare(None, BUDGET)
+    steps(problem, agent, 3)
+    assert sum(agent.balance.plays) == 0
+    steps(problem, agent, 1, terminal=1.0)
+    # The second loop began other episodes, so that the first ones were given up.
+    assert sum(agent.balance.plays) == 4
+    assert sum(agent.balance.scores) == pytest.approx(4 * 0.9)
+
+
+def test_all_learn_from_all_decisions(problem):
+    agent = problem.agent("balanced", utd=0.5)
+    agent.prepare(None, BUDGET)
+    steps(problem, agent, 4)
+    assert len(agent.replay) == 16
+    assert [learner.updates for learner in agent.learners] == [8] * 3
+    assert [learner.decisions for learner in agent.learners] == [16] * 3
+    assert all(learner.replay is agent.replay for learner in agent.learners)
+
+
+def test_evaluations_play_the_best_one(problem):
+    agent = problem.agent("balanced")
+    obs = problem.batch(8, seed=3).obs
+    for index, learner in enumerate(agent.learners):
+        agent.balance.recent = [(float(i == index), 1.0) for i in range(3)]
+        assert torch.equal(agent.act(obs, True), learner.act(obs, True))
+
+
+def test_a_loaded_agent_goes_on_alike(problem):
+    whole, first = problem.agent("balanced"), problem.agent("balanced")
+    for agent in (whole, first):
+        agent.prepare(None, BUDGET)
+        steps(problem, agent, 3, terminal=1.0)
+    second = problem.agent("balanced")
+    second.load_state_dict(first.state_dict())
+    second.replay.load_state_dict(first.replay.state_dict())
+    for agent in (whole, second):
+        steps(problem, agent, 3, terminal=1.0)
+    assert whole.balance.plays == second.balance.plays
+    for one, other in zip(whole.networks.values(), second.networks.values(), strict=True):
+        assert torch.equal(one.vector, other.vector)
+
+
+def test_unknown_sizes_are_refused():
+    for options in ({"bound": 0.0}, {"memory": 1.0}, {"confidence": -1.0}):
+        with pytest.raises(Exception, match="agent option"):
+            BalancedOptions(**options)
