@@ -108,7 +108,7 @@ class PenaltyAgent(AsymmetricAgent):
     def settle(self, name: str) -> None:
         """The proximal step."""
         if step := 2 * self.options.lr * self.options.penalty:
-            updates = self.optimizers[name].moments["step"].to(self.dtype)
+            updates = self.optimizers[name].steps.to(self.dtype)
             factor = 1 / (1 + step * 0.5 ** (updates / self.options.half_life))
             for layer, parameters in self.networks[name].layers():
                 cast(AsymmetricLayer, layer).pull(parameters, factor)

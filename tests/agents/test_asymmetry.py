@@ -187,7 +187,7 @@ def test_an_annealed_penalty_lets_the_numbers_go(problem):
     sizes = []
     for half_life in (math.inf, 100):
         agent = problem.agent("residual-pathway", lr=0.01, penalty=5.0, half_life=half_life)
-        agent.optimizers["actor"].moments["step"].fill_(100)
+        agent.optimizers["actor"].steps.fill_(100)
         with torch.no_grad():
             number = next(agent.actor.layers())[1]["free.weight"]
             for _ in range(300):
