@@ -20,6 +20,7 @@ from symsteer.leaderboard.sections import (
     performance_profiles,
     probability_of_improvement,
     provenance,
+    regret,
     soundness,
     spread_of_results,
     success_in_every_cell,
@@ -33,6 +34,7 @@ from symsteer.leaderboard.text import folded
 SECTIONS: tuple[Section[Any], ...] = (
     what_symmetry_gains.SECTION,
     wins_and_losses.SECTION,
+    regret.SECTION,
     verdicts.SECTION,
     verdicts.TESTS,
     how_to_read.SECTION,

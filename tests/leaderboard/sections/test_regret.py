@@ -1,0 +1,75 @@
+"""Regret: known truth, and the table."""
+
+import numpy as np
+import pytest
+
+from symsteer.leaderboard.regret import of_an_agent_without_regret, regrets
+from symsteer.leaderboard.sections import regret
+from tests.leaderboard.record_factory import make_cell, view_of
+
+GAPS = np.array([[0.0], [0.1], [0.3]])
+"""By how much three agents are below the best one."""
+
+
+def cell(generator, gaps=GAPS, policies=12, scatter=0.1):
+    """Values with a part of the base policy and one of agent and base policy."""
+    shared = 0.1 * generator.standard_normal((1, policies))
+    return 0.7 - gaps + shared + scatter * generator.standard_normal((len(gaps), policies))
+
+
+def test_without_scatter_regrets_are_the_gaps():
+    np.testing.assert_allclose(regrets(cell(np.random.default_rng(0), scatter=0.0)), GAPS[:, 0])
+
+
+def test_equal_agents_have_no_regret_on_average():
+    """The naive regret, below the largest mean, would be about half of the scatter of a mean."""
+    generator = np.random.default_rng(0)
+    cells = [cell(generator, np.zeros((3, 1))) for _ in range(300)]
+    naive = np.mean([each.mean(1).max() - each.mean(1) for each in cells])
+    assert naive > 0.02
+    assert abs(np.mean([regrets(each, splits=20) for each in cells])) < 0.005
+
+
+def test_the_worst_cell_of_an_agent_without_regret_is_known():
+    """Simulated from the cells, it is that of an agent which is truly one of the best."""
+    generator = np.random.default_rng(0)
+    gaps = np.vstack([GAPS, [[0.0]]])
+    repetitions = [[cell(generator, gaps) for _ in range(8)] for _ in range(60)]
+    true = np.mean([max(regrets(c, 10)[3] for c in cells) for cells in repetitions])
+    simulated = np.mean(
+        [
+            of_an_agent_without_regret([c[:3] for c in cells], 20, 10).max(1).mean()
+            for cells in repetitions[:10]
+        ]
+    )
+    assert simulated == pytest.approx(true, abs=0.01)
+    assert true > 0.01
+
+
+def test_the_table_orders_learners_by_their_worst_cell():
+    """In one world the first is best, in the other one the second."""
+    worlds = {"none": (0.9, 0.5), "wind:1": (0.7, 0.8)}
+    records = [
+        record
+        for variant, (first, second) in worlds.items()
+        for record in make_cell(
+            {"base": 0.2, "standard": first, "equivariant": second}, variant=variant
+        )
+    ]
+    for record in records:
+        record.base_policy.content_hash = f"{record.settings.seed:064d}"
+    view = view_of(records)
+    result = view.findings.of(regret.SECTION)
+    np.testing.assert_allclose(result.success, [[0.0, 0.1], [0.4, 0.0]], atol=1e-9)
+    explained, table = regret.render(result, view)
+    assert explained.endswith("Cells: 2.")
+    first, second, last = table.splitlines()[2:]
+    assert first.startswith("| `standard` | 0.050 | 0.10 |")
+    assert "`wind:1`" in first
+    assert second.startswith("| `equivariant` | 0.200 | 0.40 |")
+    assert last.startswith("| *without regret* |")
+
+
+def test_one_learner_has_no_regret():
+    view = view_of(make_cell({"base": 0.2, "standard": 0.5}))
+    assert regret.render(view.findings.of(regret.SECTION), view) == []
