@@ -71,13 +71,11 @@ def _common(table: Table) -> tuple[frozenset[str], set[str]]:
 
 
 def _values(table: Table, learners: list[str], measure: str) -> Values:
-    rows = {agent: table.row_of(agent) for agent in learners}
-    by_policy = {
-        agent: {run.policy: [] for run in row.finished} for agent, row in rows.items() if row
-    }
-    for agent, row in rows.items():
+    by_policy: dict[str, dict[str, list[float]]] = {agent: {} for agent in learners}
+    for agent, of_policy in by_policy.items():
+        row = table.row_of(agent)
         for run in row.finished if row else ():
-            by_policy[agent][run.policy].append(getattr(run, measure))
+            of_policy.setdefault(run.policy, []).append(getattr(run, measure))
     shared = sorted(set.intersection(*map(set, by_policy.values())))
     return np.array([[np.mean(by_policy[a][policy]) for policy in shared] for a in learners])
 

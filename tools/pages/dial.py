@@ -23,6 +23,7 @@ from pydantic import TypeAdapter
 from symsteer.agents import AGENTS
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
+from symsteer.leaderboard.keys import agent_options
 from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.records.measures import area_under_curve
 from symsteer.tables import markdown
@@ -66,17 +67,18 @@ def trial_of(path: Path) -> Trial | None:
     record = read_record(path)
     if record.status != "finished" or record.final is None:
         return None
-    config = record.config
-    defaults = vars(AGENTS.get(config["agent"]).Options())
-    changed = {k: x for k, x in config["agent_options"].items() if defaults.get(k) != x}
-    curve = [(evaluation.env_steps, evaluation.success_once) for evaluation in record.evaluations]
-    steps, successes = zip(*curve, strict=True)
+    config = record.settings
+    usual = agent_options({"agent_options": vars(AGENTS.get(config.agent).Options())})
+    options = agent_options(record.config)
+    changed = {name: text for name, text in options.items() if usual.get(name) != text}
+    steps = [evaluation.env_steps for evaluation in record.evaluations]
+    successes = [evaluation.success_once for evaluation in record.evaluations]
     return Trial(
-        config["agent"],
+        config.agent,
         " ".join(f"{name}={value}" for name, value in sorted(changed.items())) or "defaults",
-        f"{config['task']} {config['variant']}",
-        config["seed"],
-        area_under_curve(steps, successes, config["env_steps"]),
+        f"{config.task} {config.variant}",
+        config.seed,
+        area_under_curve(steps, successes, config.env_steps),
         record.final.success_once,
         record.wall_clock.total,
     )
@@ -137,7 +139,15 @@ def render(trials: Sequence[Trial]) -> str:
                 f"{np.mean([t.seconds for t in runs]):.0f}",
             ]
         )
-    header = ["agent", "setting", "runs", "area", "success", "mean regret", "worst regret of success"]
+    header = [
+        "agent",
+        "setting",
+        "runs",
+        "area",
+        "success",
+        "mean regret",
+        "worst regret of success",
+    ]
     header += ["of area", "loss", "seconds"]
     return markdown(header, rows)
 
