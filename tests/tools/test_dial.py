@@ -1,0 +1,42 @@
+"""The choice between trials."""
+
+import pytest
+
+from symsteer.errors import UserError
+from tools.pages.dial import Trial, loss, regrets, render
+
+
+def trials(values):
+    """Success and area by agent, world and base policy."""
+    return [
+        Trial(agent, "defaults", world, seed, area, success, 60.0)
+        for (agent, world), pairs in values.items()
+        for seed, (success, area) in enumerate(pairs)
+    ]
+
+
+VALUES = {
+    ("standard", "none"): [(0.8, 0.5), (0.6, 0.5)],
+    ("slow", "none"): [(0.8, 0.53), (0.8, 0.53)],
+    ("standard", "bias"): [(0.5, 0.4), (0.5, 0.4)],
+    ("slow", "bias"): [(0.4, 0.4), (0.4, 0.4)],
+}
+
+
+def test_a_loss_is_the_largest_regret_in_units_of_what_may_be_lost():
+    of_candidate = regrets(trials(VALUES))
+    standard, slow = (of_candidate[name, "defaults"] for name in ("standard", "slow"))
+    assert standard["none"] == pytest.approx((0.1, 0.03))
+    assert slow["bias"] == pytest.approx((0.1, 0.0))
+    assert loss(standard) == pytest.approx(2.0)
+    assert [row.split()[1] for row in render(trials(VALUES)).splitlines()[2:]] == [
+        "`slow`",
+        "`standard`",
+    ]
+
+
+def test_only_base_policies_that_all_have_count():
+    more = [*trials(VALUES), Trial("slow", "defaults", "none", 7, 0.0, 0.0, 60.0)]
+    assert regrets(more) == regrets(trials(VALUES))
+    with pytest.raises(UserError, match="no base policy of none has been tried by all"):
+        regrets([*trials(VALUES), Trial("free-bias", "defaults", "none", 7, 0.0, 0.0, 60.0)])
