@@ -14,7 +14,6 @@ below 1 / (2 penalty): 0 lets A go, infinity is the equivariant agent.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, cast
@@ -90,13 +89,12 @@ class PenaltyOptions(SacOptions):
     penalty: float = 1.0
     """The dial: weight of the squared asymmetric part, which keeps its numbers below
     1 / (2 penalty). 0: free; 1e8: strict to 1e-4."""
-    half_life: float = math.inf
-    """Updates of a network after which the penalty has fallen to a half."""
+    half_life: float = 0.0
+    """Updates of a network after which the penalty has fallen to a half; 0: it stays."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require("not be negative", lambda value: value >= 0, "penalty")
-        self._require("be positive", lambda value: value > 0, "half_life")
+        self._require("not be negative", lambda value: value >= 0, "penalty", "half_life")
 
 
 class PenaltyAgent(AsymmetricAgent):
@@ -109,7 +107,8 @@ class PenaltyAgent(AsymmetricAgent):
         """The proximal step."""
         if step := 2 * self.options.lr * self.options.penalty:
             updates = self.optimizers[name].steps.to(self.dtype)
-            factor = 1 / (1 + step * 0.5 ** (updates / self.options.half_life))
+            rate = 1 / self.options.half_life if self.options.half_life else 0.0
+            factor = 1 / (1 + step * 0.5 ** (updates * rate))
             for layer, parameters in self.networks[name].layers():
                 cast(AsymmetricLayer, layer).pull(parameters, factor)
 

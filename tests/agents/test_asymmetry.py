@@ -185,7 +185,7 @@ def test_the_penalty_limits_the_asymmetric_numbers(problem):
 def test_an_annealed_penalty_lets_the_numbers_go(problem):
     """After one half-life steps of lr end at twice the size."""
     sizes = []
-    for half_life in (math.inf, 100):
+    for half_life in (0, 100):
         agent = problem.agent("residual-pathway", lr=0.01, penalty=5.0, half_life=half_life)
         agent.optimizers["actor"].steps.fill_(100)
         with torch.no_grad():
