@@ -78,7 +78,11 @@ class AsymmetricAgent(EquivariantAgent):
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Also |A| / |W| of each network, over all layers."""
-        shares = {f"asymmetry_{k}": asymmetry(network) for k, network in self.networks.items()}
+        shares = {
+            f"asymmetry_{name}": asymmetry(network)
+            for name, network in self.networks.items()
+            if all(isinstance(layer, AsymmetricLayer) for layer, _ in network.layers())
+        }
         return {**super().diagnostics(played), **shares}
 
 
