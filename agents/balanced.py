@@ -246,4 +246,10 @@ class BalancedAgent(Agent):
             learner.load_state_dict(stored)
         vars(self.balance).update({k: list(x) for k, x in state["balance"].items()})
         self.players, self.limit = list(state["players"]), state["limit"]
-        self.returns, self.following = state["returns"], state["following"]
+        self.returns, self.following = (
+            state[name].to(self.device) for name in ("returns", "following")
+        )
+        if not {*self.players} <= {*range(len(self.learners))}:
+            raise ValueError(f"episodes are played by the learners {sorted({*self.players})}")
+        if any(len(x) not in (0, len(self.players)) for x in (self.returns, self.following)):
+            raise ValueError("not every environment has an episode")

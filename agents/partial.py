@@ -238,13 +238,13 @@ class PartialAgent(StandardAgent):
         self, obs: torch.Tensor, actions: torch.Tensor, wanted: torch.Tensor, error: torch.Tensor
     ) -> torch.Tensor:
         """1 where the plain predictor's error is larger for a turned copy, else 0, ``[B]``."""
-        group = Augmentation(Group.parse(self.options.group))
+        group = Group.parse(self.options.group)
         # All elements but the identity.
         drawn = torch.randint(
-            1, group.group.order, (len(obs),), generator=self.generator, device=self.device
+            1, group.order, (len(obs),), generator=self.generator, device=self.device
         )
         obs, actions, wanted = (
-            group.apply(drawn, x, layout)
+            Augmentation(group).apply(drawn, x, layout)
             for x, layout in (
                 (obs, self.obs_layout),
                 (actions, self.act_layout),

@@ -21,8 +21,9 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from symsteer.agents.asymmetry import AsymmetricAgent, TwoPaths
-from symsteer.agents.networks import Parameters, dense, shrink_
+from symsteer.agents.asymmetry import AsymmetricAgent
+from symsteer.agents.constrained import Constrained
+from symsteer.agents.networks import dense, shrink_
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
@@ -47,8 +48,8 @@ class ResilientOptions(SacOptions):
         self._require("be positive", lambda value: value > 0, "price")
 
 
-class Resilient(TwoPaths):
-    """The equivariant path plus gamma times the plain one; keeps the multiplier lambda."""
+class Resilient(Constrained):
+    """The layer of ``constrained`` with gamma = 0 and a plain path that is not 0."""
 
     def __init__(self, strict: EquivariantLayer):
         super().__init__(strict)
@@ -56,15 +57,7 @@ class Resilient(TwoPaths):
             self.free.reset_parameters()
         size = dense(strict)[0].norm() / self.free.weight.norm()
         shrink_(self.free, size.item())
-        self.gamma = nn.Parameter(torch.zeros(()))
-        # A parameter, because a team stacks parameters; the optimiser leaves it alone.
-        self.multiplier = nn.Parameter(torch.zeros(()), requires_grad=False)
-
-    def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
-        weight, bias = self.strict_of(parameters)
-        gamma = parameters["gamma"].unsqueeze(-1)
-        bias = bias + gamma * parameters["free.bias"]
-        return weight + gamma.unsqueeze(-1) * parameters["free.weight"], bias
+        nn.init.zeros_(self.gamma)
 
 
 @tuned

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,9 @@ loses by taking it without knowing the world. The best learner is chosen on one 
 policies and measured on the other, so that luck does not count; a regret may be negative. The cells
 are those in which all these learners have {MIN_SEEDS} base policies. The last row is an agent that
 loses nothing, simulated with the scatter of these cells: its worst cell is bad luck alone."""
+
+
+MEASURES = ("success", "area")
 
 
 @dataclass(frozen=True)
@@ -40,34 +44,37 @@ class Regret:
 
 def compute(summary: Summary) -> Regret | None:
     """None if no two learners share a cell."""
-    by_cell = [(table, _common(table)) for table in summary.usual_tables]
-    counts: dict[frozenset[str], int] = {}
-    for _, (learners, _) in by_cell:
-        counts[learners] = counts.get(learners, 0) + 1
-    # The learners that most cells have.
-    wanted = max(
-        counts, key=lambda names: (counts[names] * (len(names) > 1), len(names)), default=()
-    )
-    if len(wanted) < 2:
+    learners = {id(table): _learners(table) for table in summary.usual_tables}
+    counts = Counter(names for names in learners.values() if len(names) > 1)
+    if not counts:
         return None
+    # The learners that most cells have.
+    wanted = max(counts, key=lambda names: (counts[names], len(names)))
     names = [agent for agent in summary.agents if agent in wanted]
-    chosen = [table for table, (learners, _) in by_cell if learners >= frozenset(wanted)]
-    measured, nothing = {}, {}
-    for measure in ("success", "area"):
-        values = [_values(table, names, measure) for table in chosen]
-        measured[measure] = np.array([regrets(each) for each in values]).T
-        draws = of_an_agent_without_regret(values)
+    cells, values = [], {measure: [] for measure in MEASURES}
+    for table in summary.usual_tables:
+        each = [_values(table, names, m) for m in MEASURES] if wanted <= learners[id(table)] else []
+        if each and each[0].shape[1] >= MIN_SEEDS:
+            cells.append(table)
+            for measure, of_policies in zip(MEASURES, each, strict=True):
+                values[measure].append(of_policies)
+    if not cells:
+        return None
+    measured = {
+        measure: np.array([regrets(each) for each in values[measure]]).T for measure in MEASURES
+    }
+    nothing = {}
+    for measure in MEASURES:
+        draws = of_an_agent_without_regret(values[measure])
         nothing[measure] = float(draws.mean()), float(draws.max(1).mean())
-    return Regret(names, chosen, measured["success"], measured["area"], nothing)
+    return Regret(names, cells, **measured, nothing=nothing)
 
 
-def _common(table: Table) -> tuple[frozenset[str], set[str]]:
-    """The learners of a cell with enough base policies in common, and these."""
-    rows = {row.agent: table.row_of(row.agent) for row in table.learners if row.role == "learner"}
-    policies = {agent: {run.policy for run in row.finished} for agent, row in rows.items() if row}
-    enough = {agent: found for agent, found in policies.items() if len(found) >= MIN_SEEDS}
-    shared = set.intersection(*enough.values()) if enough else set()
-    return (frozenset(enough), shared) if len(shared) >= MIN_SEEDS else (frozenset(), set())
+def _learners(table: Table) -> frozenset[str]:
+    """The learners of a cell with enough base policies."""
+    rows = [table.row_of(row.agent) for row in table.learners if row.role == "learner"]
+    policies = {row.agent: {run.policy for run in row.finished} for row in rows if row}
+    return frozenset(agent for agent, hashes in policies.items() if len(hashes) >= MIN_SEEDS)
 
 
 def _values(table: Table, learners: list[str], measure: str) -> Values:

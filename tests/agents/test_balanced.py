@@ -8,6 +8,7 @@ import torch
 
 from symsteer.agents.agent import Budget
 from symsteer.agents.balanced import Balance, BalancedOptions
+from symsteer.errors import UserError
 
 BUDGET = Budget(env_steps=1000, num_envs=4, execute=2, max_episode_steps=10)
 
@@ -108,7 +109,16 @@ def test_a_loaded_agent_goes_on_alike(problem):
         assert all(map(torch.equal, one.parameters(), other.parameters()))
 
 
-def test_unknown_sizes_are_refused():
-    for options in ({"bound": 0.0}, {"memory": 1.0}, {"confidence": -1.0}):
-        with pytest.raises(Exception, match="agent option"):
-            BalancedOptions(**options)
+@pytest.mark.parametrize("option", [{"bound": 0.0}, {"memory": 1.0}, {"confidence": -1.0}])
+def test_options_out_of_range_are_refused(option):
+    with pytest.raises(UserError, match=f"agent option {next(iter(option))} must"):
+        BalancedOptions(**option)
+
+
+def test_a_checkpoint_with_other_learners_is_refused(problem):
+    agent = problem.agent("balanced")
+    agent.prepare(None, BUDGET)
+    steps(problem, agent, 2)
+    for change in ({"players": [0, 1, 2, 7]}, {"players": [0, 1]}):
+        with pytest.raises(ValueError, match=r"played by the learners|not every environment"):
+            problem.agent("balanced").load_state_dict({**agent.state_dict(), **change})

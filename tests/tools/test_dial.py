@@ -3,7 +3,7 @@
 import pytest
 
 from symsteer.errors import UserError
-from tools.pages.dial import Trial, loss, regrets, render
+from tools.pages.dial import Trial, below_best, loss, render, shared
 
 
 def trials(values):
@@ -24,7 +24,7 @@ VALUES = {
 
 
 def test_a_loss_is_the_largest_regret_in_units_of_what_may_be_lost():
-    of_candidate = regrets(trials(VALUES))
+    of_candidate = below_best(trials(VALUES))
     standard, slow = (of_candidate[name, "defaults"] for name in ("standard", "slow"))
     assert standard["none"] == pytest.approx((0.1, 0.03))
     assert slow["bias"] == pytest.approx((0.1, 0.0))
@@ -37,6 +37,20 @@ def test_a_loss_is_the_largest_regret_in_units_of_what_may_be_lost():
 
 def test_only_base_policies_that_all_have_count():
     more = [*trials(VALUES), Trial("slow", "defaults", "none", 7, 0.0, 0.0, 60.0)]
-    assert regrets(more) == regrets(trials(VALUES))
+    assert below_best(more) == below_best(trials(VALUES))
     with pytest.raises(UserError, match="no base policy of none has been tried by all"):
-        regrets([*trials(VALUES), Trial("free-bias", "defaults", "none", 7, 0.0, 0.0, 60.0)])
+        below_best([*trials(VALUES), Trial("free-bias", "defaults", "none", 7, 0.0, 0.0, 60.0)])
+
+
+def test_a_setting_that_all_share_is_chosen_by_the_mean_over_agents():
+    """One agent loses .1 by it, the other one gains .3."""
+    success = {
+        ("standard", "a"): 0.5,
+        ("standard", "b"): 0.6,
+        ("slow", "a"): 0.8,
+        ("slow", "b"): 0.5,
+    }
+    runs = [Trial(*key, "none", 0, 0.5, value, 60.0) for key, value in success.items()]
+    of_candidate = below_best(shared(runs))
+    assert of_candidate["all", "a"]["none"] == pytest.approx((0.0, 0.0))
+    assert of_candidate["all", "b"]["none"] == pytest.approx((0.1, 0.0))

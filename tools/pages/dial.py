@@ -3,6 +3,8 @@
 python -m tools.pages.dial                       # the tables of the committed trials
 python -m tools.pages.dial RUNS [RUNS ...]       # adds finished runs of these folders
 
+If all agents have the same settings, as in dial-a, a table before the others takes them together.
+
 The committed trials are leaderboard/results/dial/trials.json: a run each, with its setting (the
 options that are not the agent's defaults), its area under the success curve and its final success.
 """
@@ -13,7 +15,7 @@ import json
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +90,7 @@ Candidate = tuple[str, str]
 """An agent and its setting."""
 
 
-def regrets(trials: Iterable[Trial]) -> dict[Candidate, dict[str, tuple[float, float]]]:
+def below_best(trials: Iterable[Trial]) -> dict[Candidate, dict[str, tuple[float, float]]]:
     """By how much each candidate is below the best one of each world, in success and in area.
 
     Both are means over the base policies that all candidates of a world have.
@@ -116,9 +118,21 @@ def loss(regret: Mapping[str, tuple[float, float]]) -> float:
     return max(max(success / SUCCESS, area / AREA) for success, area in regret.values())
 
 
+def shared(trials: Iterable[Trial]) -> list[Trial]:
+    """The same trials as those of one agent, ``all``: its policies are pairs of agent and policy.
+
+    So a setting that all agents share is chosen by the mean over agents in each world.
+    """
+    agents = sorted({trial.agent for trial in trials})
+    return [
+        replace(trial, agent="all", seed=trial.seed * len(agents) + agents.index(trial.agent))
+        for trial in trials
+    ]
+
+
 def render(trials: Sequence[Trial]) -> str:
     """A row for each candidate, the best of an agent first; in markdown."""
-    of_candidate = regrets(trials)
+    of_candidate = below_best(trials)
     rows = []
     for (agent, setting), regret in sorted(
         of_candidate.items(), key=lambda item: (item[0][0], loss(item[1]))
@@ -139,16 +153,8 @@ def render(trials: Sequence[Trial]) -> str:
                 f"{np.mean([t.seconds for t in runs]):.0f}",
             ]
         )
-    header = [
-        "agent",
-        "setting",
-        "runs",
-        "area",
-        "success",
-        "mean regret",
-        "worst regret of success",
-    ]
-    header += ["of area", "loss", "seconds"]
+    header = ["agent", "setting", "runs", "area", "success", "mean regret"]
+    header += ["worst regret of success", "of area", "loss", "seconds"]
     return markdown(header, rows)
 
 
@@ -157,16 +163,22 @@ def main(arguments: Sequence[str]) -> int:
     known: list[Trial] = []
     if TRIALS.is_file():
         known = TypeAdapter(list[Trial]).validate_json(TRIALS.read_bytes())
-    found: dict[Any, Trial] = {trial.key: trial for trial in known}
+    by_key: dict[Any, Trial] = {trial.key: trial for trial in known}
     for folder in arguments:
         for path in sorted(Path(folder).glob("*/record.json")):
             if (trial := trial_of(path)) is not None:
-                found[trial.key] = trial
+                by_key[trial.key] = trial
     if arguments:
-        text = json.dumps([asdict(found[key]) for key in sorted(found)], indent=0)
+        text = json.dumps([asdict(by_key[key]) for key in sorted(by_key)], indent=0)
         TRIALS.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(TRIALS, f"{text}\n".encode())
-    print(render(list(found.values())))
+    trials = list(by_key.values())
+    settings = [
+        {t.setting for t in trials if t.agent == agent} for agent in {t.agent for t in trials}
+    ]
+    if len(settings) > 1 and all(one == settings[0] for one in settings):
+        print(f"{render(shared(trials))}\n")
+    print(render(trials))
     return 0
 
 
