@@ -51,7 +51,8 @@ def compute(summary: Summary) -> Regret | None:
     # The learners that most cells have.
     wanted = max(counts, key=lambda names: (counts[names], len(names)))
     names = [agent for agent in summary.agents if agent in wanted]
-    cells, values = [], {measure: [] for measure in MEASURES}
+    cells: list[Table] = []
+    values: dict[str, list[Values]] = {measure: [] for measure in MEASURES}
     for table in summary.usual_tables:
         each = [_values(table, names, m) for m in MEASURES] if wanted <= learners[id(table)] else []
         if each and each[0].shape[1] >= MIN_SEEDS:

@@ -209,6 +209,12 @@ def test_slow_numbers_move_at_a_fraction_of_the_rate(problem):
             assert (one - other).abs().max().item() == pytest.approx(1e-3 * wanted, rel=1e-3)
 
 
+def test_the_plain_path_that_may_come_in_has_the_norm_of_the_strict_one(problem):
+    for layer, _ in problem.agent("resilient").actor.layers():
+        strict = dense(layer.strict)[0].norm()
+        torch.testing.assert_close(layer.free.weight.norm(), strict, rtol=1e-4, atol=0)
+
+
 def test_the_multiplier_falls_until_the_plain_path_pays(problem):
     agent = problem.agent("resilient", price=2.0, initial_multiplier=1.0, dual_lr=0.5)
     layers = [parameters for _, parameters in agent.actor.layers()]

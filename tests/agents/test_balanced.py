@@ -76,6 +76,15 @@ def test_scores_are_returns_as_a_share_of_the_limit(problem):
     assert sum(agent.balance.scores) == pytest.approx(4 * 0.9)
 
 
+def test_episodes_of_the_warm_up_do_not_count(problem):
+    agent = problem.agent("balanced", warmup=8)
+    agent.prepare(None, BUDGET)
+    steps(problem, agent, 2, terminal=1.0)
+    assert sum(agent.balance.plays) == 0
+    steps(problem, agent, 2, terminal=1.0)
+    assert sum(agent.balance.plays) == 8
+
+
 def test_all_learn_from_all_decisions(problem):
     agent = problem.agent("balanced", utd=0.5)
     agent.prepare(None, BUDGET)

@@ -147,6 +147,16 @@ def test_turned_copies_tell_a_break_that_is_everywhere(broken, least, most):
         assert relative._share(relative._features(seen.obs), None).mean() < 0.35
 
 
+def test_copies_are_turned(problem, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        "symsteer.agents.partial.Augmentation.apply",
+        lambda self, elements, x, layout: drawn.append(elements) or x,
+    )
+    learn(problem, problem.agent("partial", label="turned"), 3)
+    assert {*torch.cat(drawn).tolist()} == {*range(1, 8)}
+
+
 @pytest.mark.long
 def test_turned_copies_find_where_the_symmetry_is_broken():
     agent, seen, windy = learned("dynamics", label="turned")

@@ -46,6 +46,15 @@ def test_the_worst_cell_of_an_agent_without_regret_is_known():
     assert true > 0.01
 
 
+def test_its_scatter_is_not_too_small_with_few_policies():
+    """Residuals from a mean of four policies are too small by a seventh."""
+    generator, gaps = np.random.default_rng(0), 3 * GAPS
+    cells = [cell(generator, np.vstack([gaps, [[0.0]]]), 4) for _ in range(1500)]
+    true = np.std([regrets(each, 10)[3] for each in cells])
+    simulated = np.std(of_an_agent_without_regret([c[:3] for c in cells[:150]], 20, 10))
+    assert 0.85 < simulated / true < 1.1
+
+
 def test_the_table_orders_learners_by_their_worst_cell():
     """In one world the first is best, in the other one the second."""
     worlds = {"none": (0.9, 0.5), "wind:1": (0.7, 0.8)}
