@@ -31,7 +31,7 @@ DRAWN_WITH = ("matplotlib", "numpy", "pandas", "scipy")
 REQUIREMENTS = Path(__file__).resolve().parents[1] / "requirements.txt"
 
 FIGURE_NAME = re.compile(
-    r"(map|answer|profiles|improvement|(map|success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg"
+    r"(map|answer|profiles|improvement|regret|(map|success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg"
 )
 
 

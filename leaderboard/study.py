@@ -91,6 +91,18 @@ class Statement(_Table):
     """Names of claims of the same file."""
 
 
+class Safe(_Table):
+    """The agent that is declared safe to take in an unknown world.
+
+    Its largest regret over cells may exceed that of an agent without regret by so much, and is
+    below that of every other learner.
+    """
+
+    agent: str
+    success: Annotated[float, Field(gt=0)]
+    area: Annotated[float, Field(gt=0)]
+
+
 class _File(_Table):
     description: str = ""
     notice: str = ""
@@ -100,6 +112,7 @@ class _File(_Table):
     """Another file of the same folder, which holds the claims."""
     claim: tuple[Claim, ...] = ()
     statement: tuple[Statement, ...] = ()
+    safe: Safe | None = None
 
     @model_validator(mode="after")
     def _names_fit(self) -> _File:
@@ -127,6 +140,7 @@ class Study:
         sha256: of its content.
         listed: hashes of the records and reproductions of the study's own (`read_list`); None if
             the study has no list.
+        safe: the agent that is declared safe, if there is one.
     """
 
     notice: str
@@ -137,6 +151,7 @@ class Study:
     source: str
     sha256: str
     listed: frozenset[str] | None = None
+    safe: Safe | None = None
 
 
 def read_study(name_or_path: str) -> Study:
@@ -168,6 +183,7 @@ def read_study(name_or_path: str) -> Study:
         declared=file.declared,
         claims=file.claim,
         statements=file.statement,
+        safe=file.safe,
         source=source.name,
         sha256=hashlib.sha256(source.read_bytes()).hexdigest(),
         listed=read_list(path),

@@ -122,6 +122,8 @@ def _check_names(study: Study, summary: Summary, audit: Audit) -> None:
         "embodiment": sorted({place[1] for place in places}),
         "variant": sorted(variants),
     }
+    if study.safe and study.safe.agent not in valid["agent"]:
+        raise unknown("agent", study.safe.agent, valid["agent"], f"{study.source}, safe")
     for claim in study.claims:
         named: list[tuple[str, tuple[str, ...]]] = [("agent", claim.agents)]
         for cells in (claim.cells, claim.minus or Cells()):

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from symsteer.leaderboard.cell_names import cell_name
+from symsteer.leaderboard.figures import by_rows, look_of
+from symsteer.leaderboard.plots import Axis, Dot, Figure
 from symsteer.leaderboard.regret import Values, of_an_agent_without_regret, regrets
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
 from symsteer.leaderboard.sections import Section, View
+from symsteer.leaderboard.statistics import Interval
+from symsteer.leaderboard.study import Safe
 from symsteer.leaderboard.text import code, number, table_text
 
 EXPLAINED = f"""\
@@ -89,7 +93,8 @@ def _values(table: Table, learners: list[str], measure: str) -> Values:
 
 
 def render(regret: Regret | None, view: View) -> list[str]:
-    """The table, the smallest worst regret of success first."""
+    """The verdict on a declared agent, the picture, and the table, the smallest worst regret of
+    success first."""
     if regret is None:
         return []
     order = regret.success.max(1).argsort(kind="stable")
@@ -107,11 +112,66 @@ def render(regret: Regret | None, view: View) -> list[str]:
     last = {"Learner": "*without regret*"}
     for measure, (mean, worst) in regret.nothing.items():
         last |= _columns(measure, mean, worst)
-    return [f"{EXPLAINED} Cells: {len(regret.cells)}.", table_text([*rows, last], sparse=True)]
+    safe = view.findings.study.safe
+    return [
+        f"{EXPLAINED} Cells: {len(regret.cells)}.",
+        *([verdict(regret, safe)] if safe else []),
+        *view.drawn(kind="regret"),
+        table_text([*rows, last], sparse=True),
+    ]
+
+
+def verdict(regret: Regret, safe: Safe) -> str:
+    """Whether the agent that is declared safe is so, in both measures."""
+    allowed = f"{number(safe.success)} of success and {number(safe.area)} of area"
+    declared = (
+        f"Declared before the runs: in its worst cell {code(safe.agent)} loses at most {allowed} "
+        "more than an agent without regret, and less than every other learner."
+    )
+    if safe.agent not in regret.learners:
+        return f"{declared} **Not tested**: it is not in all of these cells."
+    holds, texts = [], []
+    for measure, most in (("success", safe.success), ("area", safe.area)):
+        worst = dict(zip(regret.learners, getattr(regret, measure).max(1), strict=True))
+        above = worst.pop(safe.agent) - regret.nothing[measure][1]
+        best = min(worst, key=lambda agent: worst[agent])
+        least = worst[best] - regret.nothing[measure][1]
+        holds.append(above <= most and above < least)
+        texts.append(
+            f"{number(above, 3, sign=True)} of {measure} ({code(best)}, the best of the others: "
+            f"{number(least, 3, sign=True)})"
+        )
+    result = "Supported" if all(holds) else "Contradicted"
+    return f"{declared} **{result}**: above an agent without regret by {' and '.join(texts)}."
 
 
 def _columns(measure: str, mean: float, worst: float) -> dict[str, str]:
     return {f"{measure}: mean": number(mean, 3), f"{measure}: worst": number(worst)}
 
 
-SECTION = Section("Regret", lambda findings: compute(findings.summary), render)
+def figure(regret: Regret, summary: Summary) -> Figure:
+    """The regret of every learner in every cell."""
+    columns = {
+        f"regret of {name}": [
+            Dot(agent, Interval(value, value, value), row, look_of(agent), text=f"{value:.3f}")
+            for agent, values in zip(regret.learners, getattr(regret, measure), strict=True)
+            for row, value in enumerate(map(float, values))
+        ]
+        for measure, name in (("success", "success"), ("area", "area under the curve"))
+    }
+    labels = [cell_name(table, summary).replace("`", "") for table in regret.cells]
+    return replace(
+        by_rows(labels, columns, Axis("below the best learner of the cell"), undecided=0.0),
+        legend={agent: replace(look_of(agent), dash="none") for agent in regret.learners},
+        height=1.4 + 0.25 * len(labels),
+        kind="regret",
+        text="What each learner loses against the best one of each cell",
+    )
+
+
+SECTION = Section(
+    "Regret",
+    lambda findings: compute(findings.summary),
+    render,
+    figures=lambda regret, summary: [figure(regret, summary)] if regret else [],
+)

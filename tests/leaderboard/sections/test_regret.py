@@ -1,10 +1,13 @@
 """Regret: known truth, and the table."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from symsteer.leaderboard.regret import of_an_agent_without_regret, regrets
 from symsteer.leaderboard.sections import regret
+from symsteer.leaderboard.study import Safe
 from tests.leaderboard.record_factory import make_cell, view_of
 
 GAPS = np.array([[0.0], [0.1], [0.3]])
@@ -55,8 +58,8 @@ def test_its_scatter_is_not_too_small_with_few_policies():
     assert 0.85 < simulated / true < 1.1
 
 
-def test_the_table_orders_learners_by_their_worst_cell():
-    """In one world the first is best, in the other one the second."""
+def two_worlds():
+    """In one world the first learner is best, in the other one the second."""
     worlds = {"none": (0.9, 0.5), "wind:1": (0.7, 0.8)}
     records = [
         record
@@ -67,7 +70,11 @@ def test_the_table_orders_learners_by_their_worst_cell():
     ]
     for record in records:
         record.base_policy.content_hash = f"{record.settings.seed:064d}"
-    view = view_of(records)
+    return view_of(records)
+
+
+def test_the_table_orders_learners_by_their_worst_cell():
+    view = two_worlds()
     result = view.findings.of(regret.SECTION)
     np.testing.assert_allclose(result.success, [[0.0, 0.1], [0.4, 0.0]], atol=1e-9)
     explained, table = regret.render(result, view)
@@ -77,6 +84,41 @@ def test_the_table_orders_learners_by_their_worst_cell():
     assert "`wind:1`" in first
     assert second.startswith("| `equivariant` | 0.200 | 0.40 |")
     assert last.startswith("| *without regret* |")
+
+
+@pytest.mark.parametrize(
+    ("agent", "success", "verdict"),
+    [
+        ("standard", 0.11, "**Supported**: above an agent without regret by +0.100 of success"),
+        ("standard", 0.09, "**Contradicted**"),
+        ("equivariant", 0.5, "**Contradicted**"),  # within what is allowed, but not the best
+        ("slow", 0.5, "**Not tested**"),
+    ],
+)
+def test_a_declared_agent_is_safe_or_not(agent, success, verdict):
+    """The worst cells of the two lose .1 and .4; nothing scatters."""
+    result = two_worlds().findings.of(regret.SECTION)
+    assert verdict in regret.verdict(result, Safe(agent=agent, success=success, area=0.5))
+
+
+def test_the_page_tells_the_verdict():
+    view = two_worlds()
+    study = replace(view.findings.study, safe=Safe(agent="standard", success=0.11, area=0.5))
+    view = replace(view, findings=replace(view.findings, study=study))
+    assert "**Supported**" in regret.render(view.findings.of(regret.SECTION), view)[1]
+
+
+def test_the_figure_has_every_learner_in_every_cell():
+    view = two_worlds()
+    figure = regret.figure(view.findings.of(regret.SECTION), view.summary)
+    success, area = figure.plots
+    assert [(dot.name, dot.y, dot.x.value) for dot in success.dots] == [
+        ("standard", 0, pytest.approx(0.0)),
+        ("standard", 1, pytest.approx(0.1)),
+        ("equivariant", 0, pytest.approx(0.4)),
+        ("equivariant", 1, pytest.approx(0.0)),
+    ]
+    assert len(area.dots) == 4
 
 
 def test_one_learner_has_no_regret():
