@@ -90,6 +90,9 @@ class EvaluationConfig(_Checked):
     Half of them begin with noise from N(0, I)."""
     final_diagnostic_episodes: Count = 64
     """Long episodes at the last evaluation."""
+    stochastic_episodes: Annotated[int, Field(ge=0, le=10**12)] = 0
+    """Episodes of the stochastic actor at the last evaluation, to compare with the first
+    `final_episodes`, which are deterministic."""
     steerability_states: Count = 24
     """Initial states of the base policy's steerability report, each with 16 noise draws."""
 
@@ -192,8 +195,13 @@ class RunConfig(_Checked):
         return f"{self.agent} on {self.task} ({self.variant}), seed {self.seed}"
 
     def to_json(self) -> dict[str, Any]:
-        """Nested plain data; :func:`build_config` reads it."""
+        """Nested plain data; :func:`build_config` reads it.
+
+        An option that older configurations lack is left out where it is as they were.
+        """
         data = dataclasses.asdict(self)
+        if not self.evaluation.stochastic_episodes:
+            del data["evaluation"]["stochastic_episodes"]
         data["policy"] = {"name": data.pop("policy_name"), **data["policy"]}
         return json.loads(json.dumps(data))
 

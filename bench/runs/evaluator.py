@@ -177,14 +177,24 @@ class Evaluator:
             generator = torch.Generator(agent.device).manual_seed(seed)
             return agent.diagnostics(Played(self.played, long, self.steered.feasible, generator))
 
-    def compare(self, count: int) -> dict[str, float]:
-        """Success of the agent's other ways to act, on the first ``count`` held-out seeds."""
-        success = {}
+    def compare(self) -> dict[str, float]:
+        """Shares of successes of the agent's other ways to act, on the first held-out seeds."""
+        wanted, shares = self.steered.config.evaluation, {}
         with self._unchanged_agent() as agent:
             for name, way in agent.alternatives().items():
-                played = rollout(self.env, _every_row(way), held_out_seeds(count)).episodes
-                success[f"success_{name}"] = played["success_once"].double().mean().item()
-        return success
+                played = self._episodes(_every_row(way), wanted.final_episodes)
+                shares[f"success_{name}"] = _share(played, "success_once")
+            if wanted.stochastic_episodes and isinstance(agent, HasCritic):
+                agent.generator.manual_seed(DIAGNOSTIC_SEED + self.steered.config.seed + 2)
+                played = self._episodes(
+                    lambda obs, _: agent.sample(obs)[0], wanted.stochastic_episodes
+                )
+                shares["success_stochastic"] = _share(played, "success_once")
+                shares["success_at_end_stochastic"] = _share(played, "success_at_end")
+        return shares
+
+    def _episodes(self, act: Act, count: int) -> Mapping[str, torch.Tensor]:
+        return rollout(self.env, act, held_out_seeds(count)).episodes
 
     def close(self) -> None:
         """Free the simulation."""
@@ -216,3 +226,7 @@ class Evaluator:
 
 def _every_row(act: Deterministic) -> Act:
     return lambda obs, rows: act(obs)
+
+
+def _share(episodes: Mapping[str, torch.Tensor], success: str) -> float:
+    return episodes[success].double().mean().item()

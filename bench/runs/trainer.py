@@ -176,7 +176,7 @@ class Trainer(Steered):
         long = wanted.final_diagnostic_episodes if final else wanted.diagnostic_episodes
         diagnostics = dict(self.evaluator.diagnose(long))
         if final:
-            diagnostics |= self.evaluator.compare(wanted.final_episodes)
+            diagnostics |= self.evaluator.compare()
         self.clock.evaluate += played - begin
         self.clock.diagnose += time.perf_counter() - played
         evaluation = Evaluation(

@@ -83,6 +83,22 @@ def test_evaluating_more_often_does_not_change_training(finished, lend, tmp_path
     assert last[0]["diagnostics"] == last[1]["diagnostics"]
 
 
+def test_the_stochastic_actor_is_evaluated_if_asked_and_changes_nothing_else(
+    finished, lend, tmp_path
+):
+    config, folder = finished
+    lend(tmp_path)
+    evaluation = dataclasses.replace(config.evaluation, stochastic_episodes=6)
+    both = execute(tiny_config(evaluation=evaluation), tmp_path)
+    *before, last = without_clock(both)["evaluations"]
+    plain = without_clock(folder)["evaluations"]
+    for name in ("success_stochastic", "success_at_end_stochastic"):
+        share = last["diagnostics"].pop(name)
+        assert share * 6 == pytest.approx(round(share * 6))
+    assert [*before, last] == plain
+    assert "stochastic_episodes" not in config.to_json()["evaluation"]
+
+
 def test_what_the_learner_stores_of_a_time_out(finished, monkeypatch):
     """No success here, so nothing is terminal, and the last observation is the old episode's."""
     stored = []
