@@ -196,6 +196,8 @@ def sweep(
     /,
     out: Path = Path("runs"),
     workforce: Annotated[Workforce, tyro.conf.arg(name="")] = THIS_MACHINE,
+    launcher: Annotated[str | None, tyro.conf.arg(metavar="slurm|FILE")] = None,
+    shard: Annotated[str | None, tyro.conf.arg(metavar="I/N")] = None,
     track: Literal["wandb"] | None = None,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
     trust: Trust = (),
@@ -208,6 +210,9 @@ def sweep(
     Args:
         suite: Name of a suite (see `symsteer list`) or path of a .toml file.
         out: Folder of the runs; a sweep on a cluster needs one that all its machines share.
+        launcher: Queue the runs as one array of Slurm, and return: slurm, or a .toml file with
+            partition, time, memory and set-up of its tasks (docs/clusters.md).
+        shard: Only a share of the runs: 3/16 is the third of 16, for any other scheduler.
         track: Show the runs in Weights & Biases, too, in a group with the name of the suite.
         dry_run: Only show which runs are left and how long they may take.
     """
@@ -216,11 +221,20 @@ def sweep(
 
     from symsteer.bench.runs.tracking import check_tracking
     from symsteer.bench.sweep.command import preview, run_plan, settled
-    from symsteer.bench.sweep.plan import make_plan, sweep_path
+    from symsteer.bench.sweep.plan import make_plan, share_of
     from symsteer.bench.sweep.suite import load_suite
     from symsteer.bench.throughput import measure
 
-    plan = make_plan(load_suite(suite), out, elsewhere=workforce.ray is not None)
+    plan = make_plan(load_suite(suite), out, bool(workforce.ray or launcher))
+    if shard is not None:
+        plan = share_of(plan, shard)
+    if launcher is not None:
+        from symsteer.bench.sweep.slurm import launch
+
+        check_tracking(track)
+        more = (*(("--track", track) if track else ()), *(("--trust", *trust) if trust else ()))
+        print(printable(launch(plan, suite, launcher, workforce, more, dry_run)))
+        return 0
     if workforce.workers == "auto" and workforce.ray is None:
         workforce = settled(plan, workforce, None if dry_run else measure, _tell)
     if dry_run:
@@ -232,8 +246,7 @@ def sweep(
     for end in failed:
         print(f"failed: {end.run.label}: {end.reason}", file=sys.stderr)
     if any(end.trace for end in failed):
-        log = sweep_path(out, plan.name).with_suffix(".log")
-        print(f"tracebacks: {log}", file=sys.stderr)
+        print(f"tracebacks: {plan.path.with_suffix('.log')}", file=sys.stderr)
     elsewhere = sum(end.status == "elsewhere" for end in ends)
     if elsewhere:
         print(

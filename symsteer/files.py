@@ -191,6 +191,22 @@ def staged(path: Path) -> Iterator[Path]:
             temporary.unlink()
 
 
+@contextlib.contextmanager
+def built_once(path: Path) -> Iterator[None]:
+    """One process at a time builds what others need, too; they wait, and then look whether it is
+    there."""
+    from filelock import FileLock  # slow to import
+
+    lock = FileLock(path.with_name(f".{path.name}.lock"))
+    with _explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def prepare_folder(folder: Path) -> None:
     """Make a folder before the work whose results go there; a `UserError` if it is not possible."""
     with _explained(folder):

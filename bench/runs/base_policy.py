@@ -16,7 +16,7 @@ from symsteer.bench.steering.evaluation import DRAWS, steerability
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
-from symsteer.files import write_together
+from symsteer.files import built_once, write_together
 from symsteer.leaderboard.records import BasePolicy, flat
 from symsteer.policies import POLICIES
 from symsteer.policies.contract import ChunkPolicy
@@ -50,20 +50,23 @@ def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
         paths[name] = given or demonstration_file(_on(config, name), how.out, how.quiet)
     demos = _loaded(config, paths)
     folder = _policy_folder(config, how.out, demos)
-    if not policy_path(folder).is_file():
-        for name, policy in _train(config, demos, how.quiet).items():
-            policy.report["world"] = {
-                "task": name,
-                "embodiment": config.embodiment,
-                "demonstrations": dataclasses.asdict(config.demonstrations),
-                "policy_seed": config.policy_seed,
-            }
-            save_policy(policy, _policy_folder(_on(config, name), how.out, demos))
-    policy = load_policy(folder, *layouts)
-    new = "steerability" not in policy.report
-    policy = _measured(config, policy, how)
-    if new:
-        save_policy(policy, folder)
+    # The policies of several tasks are trained at once.
+    place = _policy_folder(_on(config, min(config.policy_tasks)), how.out, demos)
+    with contextlib.nullcontext() if policy_path(folder).is_file() else built_once(place):
+        if not policy_path(folder).is_file():
+            for name, policy in _train(config, demos, how.quiet).items():
+                policy.report["world"] = {
+                    "task": name,
+                    "embodiment": config.embodiment,
+                    "demonstrations": dataclasses.asdict(config.demonstrations),
+                    "policy_seed": config.policy_seed,
+                }
+                save_policy(policy, _policy_folder(_on(config, name), how.out, demos))
+        policy = load_policy(folder, *layouts)
+        new = "steerability" not in policy.report
+        policy = _measured(config, policy, how)
+        if new:
+            save_policy(policy, folder)
     return policy
 
 
@@ -108,6 +111,13 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
                 "that"
             )
     return told
+
+
+def base_key(config: RunConfig) -> tuple:
+    """Runs with the same key steer the same base policy, if they do not begin from files."""
+    # A policy of several tasks is trained once for the runs on all of them.
+    data = (config.policy_tasks, config.embodiment, config.demonstrations)
+    return (*data, config.policy_name, config.policy, config.policy_seed)
 
 
 def find_base(config: RunConfig, out: Path) -> Path | None:
@@ -170,9 +180,12 @@ def demonstration_file(config: RunConfig, out: Path, quiet: bool = False) -> Pat
     path = demonstration_path(config, out)
     if path.is_file():
         return path
-    with progress_bar("demonstrations", wanted.count, quiet) as advance:
-        how = (wanted.count, wanted.mode, wanted.seed, path)
-        return collect(config.task, config.embodiment, *how, progress=advance)
+    with built_once(path):
+        if not path.is_file():
+            with progress_bar("demonstrations", wanted.count, quiet) as advance:
+                how = (wanted.count, wanted.mode, wanted.seed, path)
+                collect(config.task, config.embodiment, *how, progress=advance)
+    return path
 
 
 def describe_base(policy: ChunkPolicy) -> BasePolicy:

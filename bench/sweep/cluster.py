@@ -14,6 +14,7 @@ from typing import Any
 import grpc
 
 from symsteer.bench.runs.config import Execution, RunConfig
+from symsteer.bench.sweep.pool import SHARED_PATIENCE
 from symsteer.bench.sweep.work import Kind, Result, work
 from symsteer.errors import UserError
 from symsteer.files import away
@@ -38,8 +39,7 @@ class RayCluster:
         UserError: if Ray is not installed, no cluster answers, or a machine does not see ``out``.
     """
 
-    # A file server can need this long to release the lock of a lost machine.
-    patience = 120.0
+    patience = SHARED_PATIENCE
 
     def __init__(self, address: str, out: Path, capacity: int | None):
         self.capacity = capacity

@@ -11,8 +11,8 @@ from typing import Any
 
 from symsteer.agents import AGENTS
 from symsteer.bench.sweep.display import Display
-from symsteer.bench.sweep.plan import Plan, PlannedRun, sweep_path, title, write_sweep
-from symsteer.bench.sweep.pool import LocalPool, Workers
+from symsteer.bench.sweep.plan import Plan, PlannedRun, title, write_sweep
+from symsteer.bench.sweep.pool import SHARED_PATIENCE, LocalPool, Workers
 from symsteer.bench.sweep.schedule import EndedRun, execute_plan, tasks_of, teams_of
 from symsteer.bench.sweep.survey import Sighting, duration, look, time_left
 from symsteer.bench.sweep.workforce import Workforce
@@ -23,11 +23,19 @@ from symsteer.tables import aligned
 COLUMNS = ("runs", "finished", "running", "unfinished", "missing")
 
 
-def _workers(workforce: Workforce, plan: Plan) -> int | None:
+def workers_of(workforce: Workforce, plan: Plan, cores: int | None = None) -> int | None:
     """How many runs are executed at the same time; None if the cluster decides.
 
-    On this machine that is one per core, if the user says nothing, or only one on CUDA, because the
+    On one machine that is one per core, if the user says nothing, or only one on CUDA, because the
     runs would share a device.
+
+    Args:
+        workforce: what the user says.
+        plan: of the runs.
+        cores: of the machine; None: of this one.
+
+    Raises:
+        UserError: if a number is wrong.
     """
     if workforce.workers == "auto":
         raise UserError("--workers auto is for a sweep on this machine alone; name a number")
@@ -41,7 +49,7 @@ def _workers(workforce: Workforce, plan: Plan) -> int | None:
         return workforce.workers or None
     if any("cuda" in (config.sim, config.device) for config in plan.configs.values()):
         return 1
-    return _cores()
+    return cores or _cores()
 
 
 def _cores() -> int:
@@ -67,7 +75,7 @@ def settled(
     ``measure`` is :func:`symsteer.bench.throughput.measure`; None: tell only what would be tried.
     """
     workforce = replace(workforce, workers=0)
-    _workers(workforce, plan)
+    workers_of(workforce, plan)
     left = [run for run, sighting in look_at(plan).items() if sighting.state != "finished"]
     learners = [run for run in left if AGENTS.get(run.agent).role == "learner"]
     cores, given = _cores(), workforce.together
@@ -97,7 +105,7 @@ def run_plan(plan: Plan, workforce: Workforce) -> list[EndedRun]:
         UserError: if a number or an address of the workforce is wrong.
         OSError: if the folder of the runs cannot be created.
     """
-    workers = _workers(workforce, plan)
+    workers = workers_of(workforce, plan)
     seen = look_at(plan)
     todo = [run for run, sighting in seen.items() if sighting.state != "finished"]
     ends = [
@@ -108,7 +116,7 @@ def run_plan(plan: Plan, workforce: Workforce) -> list[EndedRun]:
     # Before anything is written: they may be too large.
     together = workforce.together or 1
     teams_of(plan, todo, together)
-    log = sweep_path(plan.out, plan.name).with_suffix(".log")
+    log = plan.path.with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     output = sys.stdout
     with contextlib.ExitStack() as stack:
@@ -121,6 +129,8 @@ def run_plan(plan: Plan, workforce: Workforce) -> list[EndedRun]:
             pool = RayCluster(workforce.ray, plan.out, workers)
         elif todo:
             pool = LocalPool(min(workers or 1, len(todo)), log)
+            if plan.part:  # others work in the same folder
+                pool.patience = SHARED_PATIENCE
         write_sweep(plan, workers or 0, {})
         if ends:
             words = f"{len(ends)} of {len(plan.configs)} runs are finished already"
@@ -157,7 +167,7 @@ def preview(plan: Plan, workforce: Workforce) -> str:
     Raises:
         UserError: if a number or an address of the workforce is wrong.
     """
-    workers = _workers(workforce, plan)
+    workers = workers_of(workforce, plan)
     if workforce.ray is not None:
         from symsteer.bench.sweep.cluster import check_address
 

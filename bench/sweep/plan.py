@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
@@ -11,6 +13,7 @@ from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
+from symsteer.bench.runs.base_policy import base_key
 from symsteer.bench.runs.config import RunConfig
 from symsteer.bench.runs.folder import run_id, write_json
 from symsteer.bench.runs.run import check
@@ -20,6 +23,9 @@ from symsteer.leaderboard.records import flat
 
 BASIC = ("task", "embodiment", "variant", "agent", "seed")
 """Keys of a configuration that all tables and lines show."""
+
+PART = re.compile(r"-[1-9][0-9]*-of-[1-9][0-9]*$")
+"""What the name of a share's file has behind that of its suite."""
 
 FOLLOWERS = ("policy_seed", "demonstrations.seed")
 """Keys that say nothing new where they are the run's seed."""
@@ -71,6 +77,13 @@ class Plan:
     configs: dict[PlannedRun, RunConfig]
     track: Literal["wandb"] | None = None
     """A service that shows the runs."""
+    part: str = ""
+    """``-3-of-16`` if these are not all runs of the suite, but the third of 16 shares."""
+
+    @property
+    def path(self) -> Path:
+        """The file with the list of the runs."""
+        return sweep_path(self.out, self.name + self.part)
 
     @property
     def runs(self) -> list[PlannedRun]:
@@ -80,7 +93,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class SweepFile:
-    """What is kept of a sweep in ``OUT/sweeps/SUITE.json``."""
+    """What is kept of a sweep in ``OUT/sweeps/SUITE.json``, or of a share in another file."""
 
     suite: str
     description: str
@@ -91,6 +104,8 @@ class SweepFile:
     failures: dict[str, str] = field(default_factory=dict)
     """Why runs failed in the last sweep, by run id. The record of a run whose process was killed
     cannot hold it."""
+    jobs: dict[str, str] = field(default_factory=dict)
+    """The Slurm jobs that runs were handed to, by run id."""
 
 
 def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
@@ -117,6 +132,44 @@ def make_plan(suite: Suite, out: Path, elsewhere: bool = False) -> Plan:
         PlannedRun.of(config.to_json(), run_id(config, {}), extra): config for config in suite.runs
     }
     return Plan(suite.name, suite.description, out.resolve() if elsewhere else out, runs)
+
+
+def shares(plan: Plan, count: int) -> list[Plan]:
+    """Split a plan for machines that do not know of each other.
+
+    Each run is in one share. The split depends on the runs and their order alone, not on which are
+    finished. Runs with the same base policy stay together, unless there are more shares than base
+    policies: machines that share no folder do not train the same policy twice.
+    """
+    groups: dict[tuple, list[PlannedRun]] = {}
+    for run, config in plan.configs.items():
+        groups.setdefault(base_key(config), []).append(run)
+    runs = [run for group in groups.values() for run in group]
+    ends = [0, *itertools.accumulate(map(len, groups.values()))]
+    cuts = [len(runs) * number / count for number in range(count + 1)]
+    if count <= len(groups):
+        cuts = [min(ends, key=lambda end: abs(end - cut)) for cut in cuts]
+    return [
+        replace(
+            plan,
+            configs={run: plan.configs[run] for run in runs[round(begin) : round(end)]},
+            part=f"-{number}-of-{count}",
+        )
+        for number, (begin, end) in enumerate(itertools.pairwise(cuts), 1)
+    ]
+
+
+def share_of(plan: Plan, shard: str) -> Plan:
+    """The share of a plan that ``--shard`` names: ``3/16`` is the third of 16.
+
+    Raises:
+        UserError: if it names none.
+    """
+    numbers = re.fullmatch("([1-9][0-9]{0,4})/([1-9][0-9]{0,4})", shard)
+    number, count = map(int, numbers.groups()) if numbers else (1, 0)
+    if number > count:
+        raise UserError(f"--shard {shard} is no share; 3/16 is the third of 16")
+    return shares(plan, count)[number - 1]
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -150,7 +203,9 @@ def sweep_path(out: Path, suite: str) -> Path:
     return out / "sweeps" / f"{suite}.json"
 
 
-def write_sweep(plan: Plan, workers: int, failures: Mapping[str, str]) -> None:
+def write_sweep(
+    plan: Plan, workers: int, failures: Mapping[str, str], jobs: Mapping[str, str] | None = None
+) -> None:
     """Write the file of a sweep atomically.
 
     Raises:
@@ -163,8 +218,9 @@ def write_sweep(plan: Plan, workers: int, failures: Mapping[str, str]) -> None:
         updated=datetime.now(UTC).isoformat(timespec="seconds"),
         runs=tuple(plan.configs),
         failures=dict(failures),
+        jobs=dict(jobs or {}),
     )
-    write_json(sweep_path(plan.out, plan.name), asdict(file))
+    write_json(plan.path, asdict(file))
 
 
 def read_sweep(path: Path) -> SweepFile:

@@ -24,6 +24,10 @@ from symsteer.files import open_log
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
+SHARED_PATIENCE = 120.0
+"""A file server can need so long to release the lock of a lost machine."""
+
+
 class Workers(Protocol):
     """Executes tasks."""
 

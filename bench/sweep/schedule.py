@@ -12,7 +12,7 @@ from typing import Literal
 
 from symsteer.agents import AGENTS
 from symsteer.agents.sac import can_join
-from symsteer.bench.runs.base_policy import demonstration_path, find_base
+from symsteer.bench.runs.base_policy import base_key, demonstration_path, find_base
 from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.evaluator import check_room
 from symsteer.bench.sweep.plan import Plan, PlannedRun
@@ -79,9 +79,7 @@ def tasks_of(plan: Plan, todo: list[PlannedRun], together: int = 1) -> list[Task
     for run in todo:
         config = plan.configs[run]
         wanted = config.demonstrations
-        # A policy of several tasks is trained once for the runs on all of them.
-        trained = (config.policy_tasks, config.embodiment, wanted)
-        key = (*trained, config.policy_name, config.policy, config.policy_seed)
+        key = base_key(config)
         if key not in bases:
             words = f"{config.task} {config.embodiment}, {wanted.count} {wanted.mode}"
             base = Task("base policy", f"{config.policy_name} for {words} demonstrations", [])

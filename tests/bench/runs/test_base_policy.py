@@ -1,8 +1,11 @@
 """Base policies of runs: made once, found again, steered; of several tasks, and of strangers."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 from symsteer.bench.demos import collect
+from symsteer.bench.runs import base_policy
 from symsteer.bench.runs.base_policy import describe_base, find_base, prepare_base, with_policy_of
 from symsteer.bench.runs.config import build_config
 from symsteer.bench.runs.folder import run_id
@@ -155,3 +158,18 @@ def test_tasks_that_cannot_be_joined_are_refused():
     allow(other)
     with pytest.raises(UserError, match=f"the actions of {other} have another layout than those"):
         check(joint("PickCube-v1", (other,)))
+
+
+def test_processes_that_need_the_same_policy_at_the_same_time_build_it_once(tmp_path, monkeypatch):
+    built = []
+
+    def counted(make):
+        return lambda *given, **options: built.append(make.__name__) or make(*given, **options)
+
+    for name in ("collect", "_train"):
+        monkeypatch.setattr(base_policy, name, counted(getattr(base_policy, name)))
+    with ThreadPoolExecutor(3) as machines:
+        how = quiet(out=tmp_path)
+        policies = list(machines.map(lambda _: prepare_base(tiny_config(), how), range(3)))
+    assert built == ["collect", "_train"]
+    assert len({policy.content_hash() for policy in policies}) == 1

@@ -1,0 +1,55 @@
+"""A task of a Slurm array. It is light to import, because its process stays beside the sweep."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+AGAIN = os.EX_TEMPFAIL
+"""Exit code of a task that is to be queued again."""
+
+
+@dataclass(frozen=True)
+class ArrayTask:
+    """Executes a sweep as a process of its own, which Slurm's warning reaches through this one.
+
+    Attributes:
+        words: of the sweep's command line.
+        checkpoints: of its runs.
+        base: the folder of demonstrations and base policies.
+    """
+
+    words: tuple[str, ...]
+    checkpoints: tuple[Path, ...]
+    base: Path
+
+    def __call__(self) -> None:
+        """Ends the process with the exit code of the sweep, or with :data:`AGAIN`."""
+        warned = False
+        saved = self._saved()
+        # Slurm signals every process of the task; the sweep inherits that it does not hear this.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR2})
+        sweep = subprocess.Popen([sys.executable, "-m", "symsteer", *self.words])
+
+        def stop(number: int, frame: object) -> None:
+            nonlocal warned
+            warned = True
+            sweep.terminate()
+
+        signal.signal(signal.SIGUSR2, stop)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGUSR2})
+        code = sweep.wait()
+        if warned and code == 128 + signal.SIGTERM:
+            if self._saved() == saved:
+                sys.exit("the task has saved nothing in its time; give it more `time`")
+            code = AGAIN
+        sys.exit(code)
+
+    def _saved(self) -> set[tuple[Path, int]]:
+        """What a task that was stopped continues with: files and their times."""
+        kept = [*filter(Path.is_file, self.checkpoints), *self.base.glob("[!.]*")]
+        return {(path, path.stat().st_mtime_ns) for path in kept}
