@@ -43,8 +43,10 @@ class ArrayTask:
         signal.signal(signal.SIGUSR2, stop)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGUSR2})
         code = sweep.wait()
-        if warned and code == 128 + signal.SIGTERM:
-            if self._saved() == saved:
+        # Slurm itself terminates the sweep of a task that is pre-empted, and does not queue that
+        # again unless it is asked; it ends the batch script of one that is cancelled.
+        if code == 128 + signal.SIGTERM:
+            if warned and self._saved() == saved:
                 sys.exit("the task has saved nothing in its time; give it more `time`")
             code = AGAIN
         sys.exit(code)

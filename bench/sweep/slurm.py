@@ -37,11 +37,7 @@ LAUNCHERS = Path(__file__).parent.parent / "launchers"
 NOTICE_SECONDS = 90
 """How long before the end of its time a task is warned."""
 
-AFTER_THE_WORK = (
-    "code=$?",
-    f'if [ "$code" = {AGAIN} ]; then scontrol requeue "$SLURM_JOB_ID"; fi',
-    'exit "$code"',
-)
+REQUEUE = f"code=$?; if [ $code = {AGAIN} ]; then scontrol requeue $SLURM_JOB_ID; fi; exit $code"
 
 
 class SlurmFile(BaseModel):
@@ -101,7 +97,8 @@ def launch(
     # Without one, nothing was launched.
     with contextlib.suppress(UserError):
         jobs = read_sweep(plan.path).jobs
-    jobs = still_queued(plan.name, jobs)
+    left = jobs_left(plan.out, plan.name, jobs)
+    jobs = {run_id: jobs[run_id] for run_id in left if left[run_id] is None}
     todo = {run for run in unfinished if run.run_id not in jobs}
     before, waiting = len(plan.runs) - len(unfinished), len(unfinished) - len(todo)
     text = f"{before} runs finished, {waiting} in the queue before, {len(todo)} queued now"
@@ -125,8 +122,8 @@ def launch(
     return f"{text}\nhow far they are: {to_paste('symsteer', 'status', plan.out)}"
 
 
-def still_queued(suite: str, jobs: Mapping[str, str]) -> dict[str, str]:
-    """Those of the jobs of runs, by run id, that wait, work or end at the moment.
+def jobs_left(out: Path, suite: str, jobs: Mapping[str, str]) -> dict[str, Path | None]:
+    """Of the jobs of runs, by run id: None if Slurm still has them, otherwise their output's file.
 
     Raises:
         UserError: if Slurm does not answer here.
@@ -141,19 +138,10 @@ def still_queued(suite: str, jobs: Mapping[str, str]) -> dict[str, str]:
     except (subprocess.SubprocessError, OSError) as error:
         reason = getattr(error, "stderr", "") or str(error)
         raise UserError(f"Slurm does not answer ({_line(reason)}); try again later") from error
-    there = set(done.stdout.split())
-    return {run_id: job for run_id, job in jobs.items() if job in there}
-
-
-def jobs_left(out: Path, suite: str, jobs: Mapping[str, str]) -> dict[str, Path | None]:
-    """Of jobs of runs, by run id: None if Slurm still has them, otherwise the file of their output.
-
-    Raises:
-        UserError: if Slurm does not answer here.
-    """
-    left = still_queued(suite, jobs)
-    files = {job: _folder(out, suite) / f"{job}_0_log.out" for job in jobs.values()}
-    return {run_id: None if run_id in left else files[job] for run_id, job in jobs.items()}
+    left, folder = set(done.stdout.split()), _folder(out, suite)
+    return {
+        run_id: None if job in left else folder / f"{job}_0_log.out" for run_id, job in jobs.items()
+    }
 
 
 def _submit(tasks: Sequence[ArrayTask], plan: Plan, file: SlurmFile) -> list[str]:
@@ -189,7 +177,7 @@ def _submit(tasks: Sequence[ArrayTask], plan: Plan, file: SlurmFile) -> list[str
         stderr_to_stdout=True,
         # Nothing is imported from the folder that the command was given in.
         setup=["export PYTHONSAFEPATH=1", *file.setup],
-        teardown=[*AFTER_THE_WORK],
+        teardown=[REQUEUE],
         additional_parameters={**file.sbatch, "requeue": True},
     )
     own = {key: os.environ[key] for key in os.environ if key.startswith(("SBATCH_", "SLURM_CONF"))}

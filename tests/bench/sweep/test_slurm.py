@@ -23,6 +23,7 @@ from symsteer.bench.sweep import array_task, slurm
 from symsteer.bench.sweep.array_task import AGAIN, ArrayTask
 from symsteer.bench.sweep.plan import make_plan, sweep_path
 from symsteer.bench.sweep.suite import load_suite
+from symsteer.files import read_model
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import execute, tiny_config, without_clock, write_suite
@@ -81,6 +82,14 @@ def launcher(tmp_path, text) -> str:
 
 def jobs_of(out, suite="tiny"):
     return json.loads(sweep_path(out, suite).read_text())["jobs"]
+
+
+def test_the_settings_that_come_with_symsteer_are_the_defaults_and_have_a_page():
+    file, path = read_model("slurm", "launcher", slurm.LAUNCHERS, slurm.SlurmFile)
+    assert file == slurm.SlurmFile()
+    page = Path(__file__).parents[3] / "docs" / "clusters.md"
+    for text in (path.read_text(), page.read_text()):
+        assert [key for key in slurm.SlurmFile.model_fields if key not in text] == []
 
 
 def test_one_array_has_all_runs_and_the_same_command_queues_what_is_lost(fake, command, tmp_path):
@@ -206,6 +215,8 @@ def test_a_container_gets_the_folder_and_the_gpu(fake, command, tmp_path):
         # It saves, ends as a sweep does when it is terminated, and is queued again.
         ("echo > '{out}/a/checkpoint.pt'; sleep 0.2; kill -USR2 $PPID; sleep 60", AGAIN),
         ("kill -USR2 $PPID; sleep 60", "the task has saved nothing in its time; give it more"),
+        # Pre-empted, it is terminated by Slurm.
+        ("kill -TERM $$; sleep 60", AGAIN),
         # It ended before the warning reached it, or without one.
         ("trap 'exit 0' TERM; kill -USR2 $PPID; sleep 1", 0),
         ("kill -USR2 $$; exit 1", 1),
@@ -253,6 +264,8 @@ def real_slurm(tmp_path_factory):
         "CredType": "cred/none",
         # A task that is queued again waits as long.
         "AuthInfo": "cred_expire=5",
+        "PreemptType": "preempt/partition_prio",
+        "PreemptMode": "REQUEUE",
         "SlurmUser": "root",
         "StateSaveLocation": folder / "state",
         "SlurmdSpoolDir": folder / "spool",
@@ -268,7 +281,8 @@ def real_slurm(tmp_path_factory):
     }
     lines = [f"{key}={value}" for key, value in settings.items()]
     lines += [f"NodeName={host} NodeAddr=127.0.0.1 CPUs=2 RealMemory=4000"]
-    lines += [f"PartitionName=main Nodes={host} Default=YES MaxTime=INFINITE State=UP"]
+    lines += [f"PartitionName=main Nodes={host} Default=YES PriorityTier=1 GraceTime=60"]
+    lines += [f"PartitionName=first Nodes={host} PriorityTier=2 PreemptMode=OFF"]
     (folder / "slurm.conf").write_text("\n".join(lines) + "\n")
     for name in ("state", "spool"):
         (folder / name).mkdir()
@@ -350,8 +364,8 @@ def test_a_task_is_cancelled_and_the_same_command_goes_on(
 
 
 @pytest.mark.slow
-def test_time_ends_and_a_node_goes_down(real_slurm, command, tmp_path):
-    """Slurm queues the task again by itself, and the record is that of an undisturbed run."""
+def test_time_ends_others_come_first_and_a_node_goes_down(real_slurm, command, tmp_path):
+    """Slurm queues the task again each time, and the record is that of an undisturbed run."""
     path = write_suite(tmp_path, LONGER, 'agent = ["equivariant"]')
     out = tmp_path / "runs"
     file = launcher(tmp_path, 'cpus = 1\nmemory = "1500M"\ntime = "60"')
@@ -359,26 +373,35 @@ def test_time_ends_and_a_node_goes_down(real_slurm, command, tmp_path):
     [run] = make_plan(load_suite(path), out).runs
     folder, job = out / run.run_id, jobs_of(out)[run.run_id]
 
-    def saved():
-        return (folder / CHECKPOINT).stat().st_mtime_ns if (folder / CHECKPOINT).is_file() else 0
-
     def restarts():
         return int(re.search(r"Restarts=(\d+)", told("scontrol", "show", "job", job))[1])
 
-    wait_long(saved)
-    # The warning comes between 150 and 120 seconds before the end.
-    minutes = int(told("squeue", "-h", "-j", job, "-o", "%M").split(":")[-2])
-    told("scontrol", "update", f"JobId={job}", f"TimeLimit={minutes + 3}")
-    wait_long(lambda: restarts() == 1)
-    told("scontrol", "update", f"JobId={job}", "TimeLimit=60")
-    wait_long(lambda: state_in(out, "tiny")["queued"] == 1)
-    before = saved()
-    wait_long(lambda: saved() > before)
-    told("scontrol", "update", f"NodeName={real_slurm}", "State=DOWN", "Reason=test")
-    wait_long(lambda: restarts() == 2)
-    wait_long(lambda: state_in(out, "tiny")["queued"] == 1)
+    def time_ends():
+        """The warning comes between 150 and 120 seconds before the end."""
+        minutes = int(told("squeue", "-h", "-j", job, "-o", "%M").split(":")[-2])
+        told("scontrol", "update", f"JobId={job}", f"TimeLimit={minutes + 3}")
+        wait_long(lambda: restarts() == 1)
+        told("scontrol", "update", f"JobId={job}", "TimeLimit=60")
+
+    def others_come_first():
+        told(
+            "sbatch", "--partition=first", "--cpus-per-task=2", "--wrap=true", "--output=/dev/null"
+        )
+        wait_long(lambda: restarts() == 2)
+
+    def node_goes_down():
+        told("scontrol", "update", f"NodeName={real_slurm}", "State=DOWN", "Reason=test")
+        wait_long(lambda: restarts() == 3)
+
+    saved = 0
+    for event in (time_ends, others_come_first, node_goes_down):
+        wait_long((folder / CHECKPOINT).is_file)
+        wait_long(lambda: (folder / CHECKPOINT).stat().st_mtime_ns > saved)  # noqa: B023
+        event()
+        wait_long(lambda: state_in(out, "tiny")["queued"] == 1)
+        saved = (folder / CHECKPOINT).stat().st_mtime_ns
     told("scontrol", "update", f"NodeName={real_slurm}", "State=RESUME")
     alone = execute(LONGER, tmp_path / "alone")
     wait_long(lambda: is_finished(folder))
-    assert read_record(folder / RECORD).wall_clock.resumed == 2
+    assert read_record(folder / RECORD).wall_clock.resumed == 3
     assert without_clock(folder) == without_clock(alone)
