@@ -29,6 +29,10 @@ Trust = Annotated[
 ]
 """The option with which a user consents to code that files name."""
 
+Track = tyro.conf.FlagCreatePairsOff[bool]
+
+RunFolder = Annotated[Path, tyro.conf.arg(metavar="RUN")]
+
 
 def run(arguments: list[str]) -> int:
     """Steer a base policy with one agent on one task.
@@ -46,10 +50,10 @@ def run(arguments: list[str]) -> int:
 
 
 def resume(
-    folder: Path,
+    folder: RunFolder,
     /,
-    workers: int = 1,
-    track: Literal["wandb"] | None = None,
+    sim_workers: int = 1,
+    track: Track = False,
     quiet: bool = False,
     trust: Trust = (),
 ) -> int:
@@ -59,7 +63,7 @@ def resume(
 
     Args:
         folder: The run's folder (it holds config.json).
-        workers: Processes that share the simulation; they change nothing in the record but times.
+        sim_workers: Processes that share the simulation; only times in the record change.
         track: Show the run in Weights & Biases, too; it continues there as well.
         quiet: No progress bars.
     """
@@ -69,7 +73,7 @@ def resume(
     from symsteer.bench.runs.tracking import check_tracking
 
     check_tracking(track)
-    _print_places(execute(folder, Execution(workers=workers, track=track, quiet=quiet)))
+    _print_places(execute(folder, Execution(sim_workers=sim_workers, track=track, quiet=quiet)))
     return 0
 
 
@@ -81,7 +85,7 @@ def reproduce(
     base_policy: Path | None = None,
     base_from: Path | None = None,
     into: Path | None = None,
-    workers: int = 1,
+    sim_workers: int = 1,
     trust: Trust = (),
 ) -> int:
     """Make a run again from its record, and say what agrees (docs/runner.md).
@@ -100,24 +104,24 @@ def reproduce(
             taken, because a policy that is trained on another kind of processor differs.
         into: Folder that gets, named after the record's hash, what the leaderboard reads: a copy of
             reproduction.json, the new record, and the line for the list of the study.
-        workers: Processes that share the simulation.
+        sim_workers: Processes that share the simulation.
     """
     allow(*trust)
     from symsteer.bench.runs.config import Execution
     from symsteer.bench.runs.reproduce import reproduce, text
 
-    how = Execution(demos=demos, base_policy=base_policy, workers=workers)
+    how = Execution(demos=demos, base_policy=base_policy, sim_workers=sim_workers)
     done = reproduce(record, out, how, into, base_from, _tell)
     print(printable(text(done)))
     return 0 if done.reproduction.verdict == "exact" else 1
 
 
 def evaluate(
-    folder: Path,
+    folder: RunFolder,
     /,
     variant: str | None = None,
     episodes: int | None = None,
-    workers: int = 1,
+    sim_workers: int = 1,
     json: bool = False,
     trust: Trust = (),
 ) -> int:
@@ -129,7 +133,7 @@ def evaluate(
         folder: The run's folder; nothing in it changes.
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none; default: as in the run.
         episodes: Number of held-out episodes; default: as many as the record's final ones.
-        workers: Processes that share the simulation.
+        sim_workers: Processes that share the simulation.
         json: Print only JSON, with every episode and diagnostic.
     """
     allow(variant, *trust)
@@ -139,7 +143,7 @@ def evaluate(
 
     from symsteer.bench.runs.run import evaluate
 
-    result = evaluate(folder, variant, episodes, workers)
+    result = evaluate(folder, variant, episodes, sim_workers)
     if json:
         print(dumps(result.to_json()))
         return 0
@@ -194,11 +198,11 @@ def film(
 def sweep(
     suite: Annotated[str, tyro.conf.arg(metavar="SUITE")],
     /,
-    out: Path = Path("runs"),
+    runs: Path = Path("runs"),
     workforce: Annotated[Workforce, tyro.conf.arg(name="")] = THIS_MACHINE,
     launcher: Annotated[str | None, tyro.conf.arg(metavar="slurm|FILE")] = None,
     shard: Annotated[str | None, tyro.conf.arg(metavar="I/N")] = None,
-    track: Literal["wandb"] | None = None,
+    track: Track = False,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
     trust: Trust = (),
 ) -> int:
@@ -209,7 +213,7 @@ def sweep(
 
     Args:
         suite: Name of a suite (see `symsteer list`) or path of a .toml file.
-        out: Folder of the runs; a sweep on a cluster needs one that all its machines share.
+        runs: Folder of the runs; a sweep on a cluster needs one that all its machines share.
         launcher: Queue the runs as one array of Slurm, and return: slurm, or a .toml file with
             partition, time, memory and set-up of its tasks (docs/clusters.md).
         shard: Only a share of the runs: 3/16 is the third of 16, for any other scheduler.
@@ -225,14 +229,14 @@ def sweep(
     from symsteer.bench.sweep.suite import load_suite
     from symsteer.bench.throughput import measure
 
-    plan = make_plan(load_suite(suite), out, bool(workforce.ray or launcher))
+    plan = make_plan(load_suite(suite), runs, bool(workforce.ray or launcher))
     if shard is not None:
         plan = share_of(plan, shard)
     if launcher is not None:
         from symsteer.bench.sweep.slurm import launch
 
         check_tracking(track)
-        more = (*(("--track", track) if track else ()), *(("--trust", *trust) if trust else ()))
+        more = (*("--track",) * track, *(("--trust", *trust) if trust else ()))
         print(printable(launch(plan, suite, launcher, workforce, more, dry_run)))
         return 0
     if workforce.workers == "auto" and workforce.ray is None:
@@ -251,7 +255,7 @@ def sweep(
     if elsewhere:
         print(
             f"another process works on {elsewhere} of the runs; this shows when they are finished: "
-            f"{to_paste('symsteer', 'status', out)}",
+            f"{to_paste('symsteer', 'status', runs)}",
             file=sys.stderr,
         )
     return 1 if failed or elsewhere else 0
@@ -260,7 +264,7 @@ def sweep(
 def tune(
     plan: Annotated[str, tyro.conf.arg(metavar="PLAN")],
     /,
-    out: Path = Path("runs"),
+    runs: Path = Path("runs"),
     workforce: Annotated[Workforce, tyro.conf.arg(name="")] = THIS_MACHINE,
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
     trust: Trust = (),
@@ -271,7 +275,7 @@ def tune(
 
     Args:
         plan: Name of a tuning plan (see `symsteer list`) or path of a .toml file.
-        out: Folder of the runs; trials and chosen settings are written to OUT/tuning.
+        runs: Folder of the runs; trials and chosen settings are written to RUNS/tuning.
         dry_run: Only show what would be tried.
     """
     allow(*trust)
@@ -285,7 +289,7 @@ def tune(
         return 0
     from symsteer.bench.tuning.trials import to_text
 
-    tuner = Tuner(found, out, workforce)
+    tuner = Tuner(found, runs, workforce)
     trials, chosen = tuner.play()
     print(f"\n{to_text(trials, chosen)}\n")
     for kind, path in tuner.places.items():
@@ -297,7 +301,7 @@ def tune(
 
 
 def status(
-    folder: Annotated[Path, tyro.conf.arg(metavar="[FOLDER]")] = Path("runs"),
+    folder: Annotated[Path, tyro.conf.arg(metavar="[RUNS]")] = Path("runs"),
     /,
     suite: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
 ) -> int:
@@ -344,7 +348,7 @@ def list_names() -> int:
 
 
 def demos(
-    path: Path,
+    path: Annotated[Path, tyro.conf.arg(metavar="FILE")],
     /,
     task: str = "PickCube-v1",
     embodiment: str = "floating",
@@ -373,9 +377,7 @@ def demos(
     return 0
 
 
-def export(
-    run: Annotated[Path, tyro.conf.arg(metavar="RUN")], /, *, out: Path, trust: Trust = ()
-) -> int:
+def export(run: RunFolder, /, *, out: Path, trust: Trust = ()) -> int:
     """Write the base policy of a run and its demonstrations to one file (docs/bundles.md).
 
     Args:
@@ -419,7 +421,7 @@ def export_lerobot(
 
 
 def fetch_bundle(
-    file: Annotated[Path, tyro.conf.arg(metavar="FILE")], /, out: Path = Path("runs/base")
+    file: Annotated[Path, tyro.conf.arg(metavar="FILE")], /, runs: Path = Path("runs")
 ) -> int:
     """Check a bundle and unpack it to where runs find its demonstrations and base policy.
 
@@ -427,15 +429,15 @@ def fetch_bundle(
 
     Args:
         file: The bundle, which `symsteer export` wrote.
-        out: Folder to unpack to: RUNS/base.
+        runs: Folder of runs; the files go to RUNS/base.
     """
     from symsteer.bench.bundles.fetch import fetch_bundle
 
-    manifest, places = fetch_bundle(file, out)
+    manifest, places = fetch_bundle(file, runs / "base")
     for kind in ("card", "policy", "demonstrations"):
         if path := manifest.path(kind, ".h5" if kind == "demonstrations" else ""):
             print(f"{kind + ':':16s}{places[path]}")
-    for command in manifest.commands(out):
+    for command in manifest.commands(runs / "base"):
         print(f"{'next:':16s}{command}")
     return 0
 
@@ -445,7 +447,7 @@ def audit(
     embodiment: str = "floating",
     variant: tuple[str, ...] = ("none",),
     group: str = "C8",
-    count: int = 32,
+    states: int = 32,
     base_policy: Path | None = None,
     out: Path | None = None,
     trust: Trust = (),
@@ -460,7 +462,7 @@ def audit(
         embodiment: floating or panda.
         variant: none, name:strength, several of these joined with +, or all:strength.
         group: Symmetry group, e.g. C8, D4 (with reflections).
-        count: Number of states of the expert and of the base policy with random noise, each.
+        states: Number of states of the expert and of the base policy with random noise, each.
         base_policy: Saved base policy, or none: only the expert; default: that of `symsteer run`.
         out: Folder for audit.json and map.png, or for a folder of each cell and the table.
     """
@@ -469,10 +471,10 @@ def audit(
     from symsteer.bench.audit.result import AuditResult, AuditSettings
     from symsteer.bench.audit.study import cells, run_audits
 
-    states: Literal["both", "expert"] = "both"
+    visitors: Literal["both", "expert"] = "both"
     if base_policy == Path("none"):
-        base_policy, states = None, "expert"
-    template = AuditSettings(embodiment=embodiment, group=group, states=states, count=count)
+        base_policy, visitors = None, "expert"
+    template = AuditSettings(embodiment=embodiment, group=group, states=visitors, count=states)
     wanted = cells(task, variant, template)
     several = len(wanted) > 1
 

@@ -34,7 +34,8 @@ def report(
         records: Record files, run folders or folders of runs; default: the committed records.
         out: Where to write; default: RECORDS/leaderboard, in the first folder that is named; of
             the committed records: the committed leaderboard.
-        audit: The summary.json of an audit, for the map; default: the committed one.
+        audit: What `symsteer audit --out` wrote: its folder or summary.json; default: the committed
+            audit.
         study: The claims to test: name of a study in leaderboard/studies or path of a .toml file;
             default: those of the paper, for the committed records those of their study.
         reproductions: The folder that `symsteer reproduce --into` wrote to: its runs are marked;
@@ -97,8 +98,8 @@ def site(
         out: Folder of the site: a new one, or that of an earlier site, which is replaced.
         study: The claims to test: name of a study in leaderboard/studies or path of a .toml file;
             default: those of the paper, for the committed records those of their study.
-        audit: The folder that `symsteer audit --out` wrote, for its numbers and maps, or its
-            summary.json; default: the committed numbers.
+        audit: What `symsteer audit --out` wrote: its folder (then with its maps) or summary.json;
+            default: the committed audit.
         reproductions: The folder that `symsteer reproduce --into` wrote to: its runs are marked;
             default: for committed records the committed one.
         docs: Build the documentation, too, in a checkout of the repository.

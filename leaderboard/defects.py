@@ -95,11 +95,12 @@ Audit = Mapping[Place, AuditedDefect]
 
 
 def read_audit(path: Path | None = None) -> Audit:
-    """Defects by place from the audit's summary, `AUDIT` by default.
+    """Defects by place from an audit's folder or summary, `AUDIT` by default.
 
     Raises UserError for a path that cannot be read or holds something else.
     """
     path = path or AUDIT
+    path = path / AUDIT.name if path.is_dir() else path
     try:
         return parse_audit(path.read_bytes(), path)
     except OSError as error:

@@ -27,8 +27,8 @@ def advise(
     variant: str = "none",
     group: str = "C8",
     audit: Path | None = None,
-    records: tuple[Path, ...] = (),
-    json: Path | None = None,
+    runs: tuple[Path, ...] = (),
+    json: bool = False,
     trust: Trust = (),
 ) -> int:
     """Say which agent to take in a world, and how sure that is (docs/advise.md).
@@ -39,11 +39,10 @@ def advise(
         task: Task; `symsteer list` names them.
         embodiment: floating or panda.
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none.
-        group: Group of the base policy.
-        audit: What `symsteer audit --out` wrote, the folder or its audit.json or summary.json.
-        records: Folders of runs or records, each a study of its own; default: the committed
-            records.
-        json: Write everything into this file, too.
+        group: Symmetry group, e.g. C8, D4 (with reflections).
+        audit: What `symsteer audit --out` wrote: its folder, audit.json or summary.json.
+        runs: Folders of runs or records, each a study of its own; default: the committed records.
+        json: Print only JSON, with every number.
     """
     allow(task, variant, *trust)
     if (task is None) == (audit is None):
@@ -56,7 +55,7 @@ def advise(
     from symsteer.leaderboard.study import FOLDER, read_list
     from symsteer.leaderboard.which_agent import advise
 
-    folders = chosen_records(records, "advise", "--records RUNS")
+    folders = chosen_records(runs, "advise", "--runs RUNS")
     defects = read_audit()
     # Mistakes first: to read the records takes seconds.
     if task is not None:
@@ -65,27 +64,25 @@ def advise(
         assert audit is not None
         worlds = [(world, f"measured, {audit}") for world in _audited(audit)]
     # Of the committed records, submitted ones that nobody has made again give no advice.
-    listed = None if records else read_list(FOLDER / f"{STUDY}.toml")
-    marks = None if records else REPRODUCTIONS
+    listed = None if runs else read_list(FOLDER / f"{STUDY}.toml")
+    marks = None if runs else REPRODUCTIONS
     summaries = [summarize(load_runs([folder], marks, listed)) for folder in folders]
     embodiments = dict.fromkeys(world.embodiment for world, _ in worlds)
     tests = [leave_tasks_out(summaries, defects, name) for name in embodiments]
     advices = [(advise(summaries, defects, world), source) for world, source in worlds]
     number = sum(len(summary.runs) for summary in summaries)
-    studies = f"{len(folders)} studies" if len(folders) > 1 else "one study"
-    blocks = [f"From {number} runs of {studies}."]
-    blocks += [_text(advice, source) for advice, source in advices] + list(map(_test_text, tests))
-    print(printable("\n\n".join(blocks)))
-    if json is not None:
-        from symsteer.files import write_atomically
-
+    if json:
         data = {
             "runs": number,
             "advice": [dataclasses.asdict(one) | {"audit": source} for one, source in advices],
             "left_out": [dataclasses.asdict(test) for test in tests],
         }
-        write_atomically(json, (encoding.dumps(data, indent=1, allow_nan=False) + "\n").encode())
-        print(printable(f"\nwrote {json}"))
+        print(encoding.dumps(data, indent=1, allow_nan=False))
+        return 0
+    studies = f"{len(folders)} studies" if len(folders) > 1 else "one study"
+    blocks = [f"From {number} runs of {studies}."]
+    blocks += [_text(advice, source) for advice, source in advices] + list(map(_test_text, tests))
+    print(printable("\n\n".join(blocks)))
     return 0
 
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 from symsteer.bench.sim.errors import WorkerLostError
 from symsteer.errors import UserError
+from symsteer.hints import check_options
 from symsteer.names import unknown
 from symsteer.registry import summary_of
 from symsteer.terminal import careful_output, complain, folded
@@ -144,6 +145,7 @@ def _run(arguments: Sequence[str]) -> int:
         raise UserError(f"the verb {name!r} was removed in version 0.3.0; {REMOVED[name]}")
     if name not in VERBS:
         raise unknown("verb", name, VERBS)
+    check_options(name, rest)
     verb = VERBS[name]
     module, _, attribute = verb.target.partition(":")
     function: Callable[..., int] = getattr(importlib.import_module(module), attribute)

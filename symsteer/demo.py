@@ -15,29 +15,29 @@ if TYPE_CHECKING:
     from symsteer.bench.runs.config import RunConfig
 
 
-def demo(out: Path = Path("runs/demo")) -> int:
+def demo(runs: Path = Path("runs/demo")) -> int:
     """See a plain and an equivariant agent in a world that breaks the symmetry: minutes on a CPU.
 
     They steer a base policy that comes with SymSteer.
 
     Args:
-        out: Folder of the runs and of their leaderboard.
+        runs: Folder of the runs and of their leaderboard.
     """
     from symsteer.bench.cli import Workforce, sweep
     from symsteer.bench.sweep.suite import load_suite
     from symsteer.leaderboard.command import report
     from symsteer.leaderboard.curves import curves_as_text
 
-    copy_base(load_suite("demo").runs[0], out)
-    exit_code = sweep("demo", out=out, workforce=Workforce(together=5))
-    report((out,), out=out / "leaderboard")
-    print(f"\n{curves_as_text((out,))}")
+    copy_base(load_suite("demo").runs[0], runs)
+    exit_code = sweep("demo", runs=runs, workforce=Workforce(together=5))
+    report((runs,), out=runs / "leaderboard")
+    print(f"\n{curves_as_text((runs,))}")
     print(
         "\nOne motor is weak. This breaks the symmetry, but a symmetric agent sees what it did and"
         "\ncan correct it. Other breaks cost symmetric agents success: in the repository the page"
         "\nleaderboard/LEADERBOARD.md compares many worlds, each with several base policies.\n"
-        f"\nOpen the leaderboard:  {out / 'leaderboard' / 'LEADERBOARD.md'}"
-        f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', out)}"
+        f"\nOpen the leaderboard:  {runs / 'leaderboard' / 'LEADERBOARD.md'}"
+        f"\nSee the runs:          {to_paste(_script('tensorboard'), '--logdir', runs)}"
         f"  then {BOARD}"
     )
     return exit_code

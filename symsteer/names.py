@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Iterable
 
 from symsteer.errors import UserError
+from symsteer.hints import name_hint
 
 LONGEST_NAME = 80
 """Characters of a wrong name that are quoted: its end, which tells paths apart."""
@@ -30,7 +31,7 @@ def unknown(kind: str, name: str, valid: Iterable[str], where: str = "") -> User
     """
     valid = list(valid)
     name = name if len(name) <= LONGEST_NAME else f"...{name[-LONGEST_NAME:]}"
-    close = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
-    hint = f"did you mean {close[0]!r}? " if close else ""
+    close = difflib.get_close_matches(name, valid, n=1)
+    hint = name_hint(kind, name) or (f"did you mean {close[0]!r}? " if close else "")
     start = f"{where}: " if where else ""
     return UserError(f"{start}there is no {kind} {name!r}; {hint}valid: {', '.join(valid)}")

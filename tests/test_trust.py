@@ -143,7 +143,7 @@ def ways(name: str, artefact: Path, intact: Path) -> Iterator[list[str]]:
     if name == "run":
         paths = [field.name for field in fields(Execution) if field.type in ("Path", "Path | None")]
         for option in (*paths, "agent.preset"):
-            place = [] if option == "out" else ["--out", "made"]
+            place = [] if option == "runs" else ["--runs", "made"]
             yield [name, *options_of(SHORT), f"--{option.replace('_', '-')}", str(artefact), *place]
         return
     verb = cli.VERBS[name]
@@ -159,7 +159,8 @@ def ways(name: str, artefact: Path, intact: Path) -> Iterator[list[str]]:
             value = str(SMALL[p.name]) if p.name in SMALL else None
             if p is chosen:
                 value = str(artefact)
-            elif p.name == "records":  # the committed ones are many
+            # The committed ones are many.
+            elif p.name == "records" or (name, p.name) == ("advise", "runs"):
                 value = str(intact)
             elif p.default is p.empty:
                 value = "made.zip" if p.name == "out" else "standard"
@@ -254,8 +255,8 @@ def test_processes_import_nothing_from_the_current_folder(strangers):
     """Those of a sweep, and those that share a simulation."""
     suite = write_suite(strangers.top, SHORT, "seed = [0, 1]")
     for arguments in (
-        ["sweep", suite, "--workers", "2", "--out", "made"],
-        ["run", *options_of(SHORT), "--workers", "2", "--out", "shards"],
+        ["sweep", suite, "--workers", "2", "--runs", "made"],
+        ["run", *options_of(SHORT), "--sim-workers", "2", "--runs", "shards"],
     ):
         child = start(*arguments, watch=WATCH, cwd=strangers.place)
         shown = "".join(child.communicate(timeout=300))

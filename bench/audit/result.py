@@ -96,7 +96,7 @@ class AuditSettings:
                 )
         check_group(self.group)
         if self.count < LEAST_STATES:
-            raise UserError(f"count is {self.count}; it must be at least {LEAST_STATES}")
+            raise UserError(f"--states is {self.count}; it must be at least {LEAST_STATES}")
         if not 1 <= self.chunk <= task.max_episode_steps:
             raise UserError(
                 f"a chunk of {self.chunk} steps does not fit into an episode of {self.task}, which "

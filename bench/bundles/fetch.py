@@ -142,15 +142,15 @@ class BundleManifest(_Strict):
         return commands
 
 
-def fetch_bundle(path: Path, out: Path) -> tuple[BundleManifest, dict[str, Path]]:
-    """Check a bundle as a whole, then write its files below ``out``, all or none.
+def fetch_bundle(path: Path, base: Path) -> tuple[BundleManifest, dict[str, Path]]:
+    """Check a bundle as a whole, then write its files below ``base``, all or none.
 
-    Card and manifest go to ``out/bundles/NAME``. Files that are there already with the same
+    Card and manifest go to ``base/bundles/NAME``. Files that are there already with the same
     content stay.
 
     Args:
         path: of the bundle.
-        out: folder for its files; RUNS/base, if runs shall find them.
+        base: folder for its files; RUNS/base, if runs shall find them.
 
     Returns:
         The manifest, and where each of its files is, by its path in the bundle.
@@ -160,23 +160,23 @@ def fetch_bundle(path: Path, out: Path) -> tuple[BundleManifest, dict[str, Path]
             the names of its files; nothing is written then.
     """
     manifest, contents = read_bundle(path)
-    about = out / "bundles" / manifest.name
+    about = base / "bundles" / manifest.name
     roles = {file.path: file.role for file in manifest.files}
-    places = {n: (about if roles.get(n, "card") == "card" else out) / n for n in contents}
+    places = {n: (about if roles.get(n, "card") == "card" else base) / n for n in contents}
     missing = {}
     for name, place in places.items():
-        inside = place.resolve().is_relative_to(out.resolve())
-        if not inside or any(p.is_symlink() for p in (place, *place.parents) if out in p.parents):
+        inside = place.resolve().is_relative_to(base.resolve())
+        if not inside or any(p.is_symlink() for p in (place, *place.parents) if base in p.parents):
             raise UserError(
                 f"{place} is a link, or in a folder that is one, so the file would go elsewhere; "
-                "remove the link, or choose another folder with --out"
+                "remove the link, or choose another folder with --runs"
             )
         if not place.exists():
             missing[place] = contents[name]
         elif not place.is_file() or place.read_bytes() != contents[name]:
             raise UserError(
                 f"{place} is there already, with other content than in {path}; choose another "
-                "folder with --out, or remove it"
+                "folder with --runs, or remove it"
             )
     write_together(missing)
     return manifest, {file.path: places[file.path] for file in manifest.files}

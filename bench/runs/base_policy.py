@@ -47,11 +47,11 @@ def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
     paths = {}
     for name in config.policy_tasks:
         given = how.demos if name == config.task else None
-        paths[name] = given or demonstration_file(_on(config, name), how.out, how.quiet)
+        paths[name] = given or demonstration_file(_on(config, name), how.runs, how.quiet)
     demos = _loaded(config, paths)
-    folder = _policy_folder(config, how.out, demos)
+    folder = _policy_folder(config, how.runs, demos)
     # The policies of several tasks are trained at once.
-    place = _policy_folder(_on(config, min(config.policy_tasks)), how.out, demos)
+    place = _policy_folder(_on(config, min(config.policy_tasks)), how.runs, demos)
     with contextlib.nullcontext() if policy_path(folder).is_file() else built_once(place):
         if not policy_path(folder).is_file():
             for name, policy in _train(config, demos, how.quiet).items():
@@ -61,7 +61,7 @@ def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
                     "demonstrations": dataclasses.asdict(config.demonstrations),
                     "policy_seed": config.policy_seed,
                 }
-                save_policy(policy, _policy_folder(_on(config, name), how.out, demos))
+                save_policy(policy, _policy_folder(_on(config, name), how.runs, demos))
         policy = load_policy(folder, *layouts)
         new = "steerability" not in policy.report
         policy = _measured(config, policy, how)
@@ -257,7 +257,7 @@ def _measured(config: RunConfig, policy: ChunkPolicy, how: Execution) -> ChunkPo
             num_envs=num_envs,
             embodiment=config.embodiment,
             sim=config.sim,
-            workers=min(how.workers, num_envs),
+            workers=min(how.sim_workers, num_envs),
         )
         latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
         with contextlib.closing(latent), torch.no_grad():

@@ -210,18 +210,18 @@ class RunConfig(_Checked):
 class Execution:
     """How runs are executed. These options do not change the results."""
 
-    out: Path = Path("runs")
-    """Folder of the runs; demonstrations and base policies are kept in OUT/base."""
+    runs: Path = Path("runs")
+    """Folder of the runs; demonstrations and base policies are kept in RUNS/base."""
     demos: Path | None = None
     """Trajectory file (.h5 with .json) to train the base policy on, instead of demonstrations of
     the scripted expert."""
     base_policy: Path | None = None
     """Saved base policy (policy.safetensors) to steer, instead of training one. The run uses its
     settings and those of its demonstrations."""
-    workers: int = 1
+    sim_workers: int = 1
     """Processes that share the simulation; they only change the times in the record."""
-    track: Literal["wandb"] | None = None
-    """Show the run in Weights & Biases, too; WANDB_MODE=offline needs no network and no login."""
+    track: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Show the run in Weights & Biases, too. WANDB_MODE=offline needs no network and no login."""
     quiet: bool = False
     """No progress bars."""
     trust: tuple[str, ...] = ()

@@ -55,7 +55,7 @@ def check_room(
     needed = held + most if workers == 1 else 2 * math.ceil(most / min(workers, most))
     if needed > MAX_SCENES and configs[0].sim == "cpu":
         processes = max(2, math.ceil(most / (MAX_SCENES // 2)))
-        divide = f"use --workers {processes}, or " if processes <= configs[0].num_envs else ""
+        divide = f"use --sim-workers {processes}, or " if processes <= configs[0].num_envs else ""
         cure = cure or f"{divide}make fewer (--num-envs, --evaluation.episodes)"
         raise UserError(
             f"one process holds at most {MAX_SCENES} PhysX scenes, but {needed} are needed while "

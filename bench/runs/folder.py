@@ -83,13 +83,13 @@ def claimed(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise UserError(
             f"cannot write to {folder.parent}: {error.strerror}; "
-            "choose a writable folder with --out"
+            "choose a writable folder with --runs"
         ) from error
     try:
         if is_finished(folder):
             raise UserError(
                 f"the run {folder.name} is finished already in {folder.parent}; "
-                "choose another --out or --seed, or delete its folder to run it again"
+                "choose another --runs or --seed, or delete its folder to run it again"
             )
         yield
     finally:

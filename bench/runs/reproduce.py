@@ -102,7 +102,7 @@ def reproduce(
     run = run_id(config, files)
     finished = out is not None and is_finished(out / name / run)
     if not finished:
-        check(config, how.workers, begun=f"the run of {path}")
+        check(config, how.sim_workers, begun=f"the run of {path}")
     place = out / name if out else Path(tempfile.mkdtemp(prefix="symsteer-reproduction-"))
     folder = place / run
     report(f"repeating {record.run_id} in {place}")
@@ -121,7 +121,7 @@ def reproduce(
     if finished:
         report("the run is there and finished: it is compared without making it again")
     else:
-        execute(config, replace(how, out=place))
+        execute(config, replace(how, runs=place))
     made = read_record(folder / RECORD).provenance
     compared = reproduction_of(path, folder / RECORD, taken + conditions(record, config, made))
     content = dump_reproduction(compared)

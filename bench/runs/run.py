@@ -82,11 +82,13 @@ def check(
         return
     if not 1 <= workers <= config.num_envs:
         raise UserError(
-            f"--workers is {workers}; it must lie between 1 and the number of environments, "
+            f"--sim-workers is {workers}; it must lie between 1 and the number of environments, "
             f"{config.num_envs}"
         )
     if workers > 1 and config.sim == "cuda":
-        raise UserError("--workers needs --sim cpu: on CUDA one process simulates all environments")
+        raise UserError(
+            "--sim-workers needs --sim cpu: on CUDA one process simulates all environments"
+        )
     check_room([config], workers, trains)
 
 
@@ -118,8 +120,8 @@ def opened(begun: RunConfig | Path, how: Execution, together: int = 1) -> Iterat
     """
     if isinstance(begun, Path):
         run = RunFolder.stored(begun)
-        how = replace(how, out=run.folder.parent)
-        check(run.config, how.workers, begun=f"the run {run.folder.name}")
+        how = replace(how, runs=run.folder.parent)
+        check(run.config, how.sim_workers, begun=f"the run {run.folder.name}")
     else:
         if how.base_policy is not None:
             if how.demos is not None:
@@ -127,10 +129,10 @@ def opened(begun: RunConfig | Path, how: Execution, together: int = 1) -> Iterat
                     "a base policy of yours needs no demonstrations; leave one of them out"
                 )
             begun = with_policy_of(begun, how.base_policy)
-        check(begun, how.workers)
+        check(begun, how.sim_workers)
         variant = variant_text(evaluation_variants(begun.variants))
         resolved = {**begun.to_json(), "evaluation_variant": variant, "files": how.files}
-        run = RunFolder(how.out / run_id_of(resolved), begun, resolved)
+        run = RunFolder(how.runs / run_id_of(resolved), begun, resolved)
     config, folder = run.config, run.folder
     with claimed(folder):
         try:
@@ -160,7 +162,7 @@ def opened(begun: RunConfig | Path, how: Execution, together: int = 1) -> Iterat
             trainer.stop(error)
             names = [config.agent, config.policy_name, config.task]
             typed = [n for n in (*names, *(v.name for v in config.variants)) if ":" in n]
-            words = ("--workers", how.workers) * (how.workers > 1)
+            words = ("--sim-workers", how.sim_workers) * (how.sim_workers > 1)
             words += ("--trust", *typed) * bool(typed)
             command = to_paste("symsteer", "resume", folder, *words)
             error.add_note(f"continue the run with: {command}")

@@ -36,7 +36,7 @@ class _Member(contextlib.ExitStack):
     def begin(self, config: RunConfig, how: Execution, together: int) -> None:
         """Open the run, unless it is finished, and let it go on."""
         try:
-            if is_finished(how.out / run_id(config, {})):
+            if is_finished(how.runs / run_id(config, {})):
                 return
             self.trainer = self.enter_context(opened(config, how, together))
         except Exception as error:

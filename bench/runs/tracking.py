@@ -1,4 +1,4 @@
-"""Weights & Biases as a view of runs (``--track wandb``).
+"""Weights & Biases as a view of runs (``--track``).
 
 Tracking is not part of a run's configuration, and the record is the same with and without it. What
 can be known at the start is checked there; later errors end the tracking, never the run.
@@ -34,20 +34,20 @@ FINISH_SECONDS = 60.0
 """How long the end of a run waits until W&B has everything; the rest can be uploaded later."""
 
 
-def check_tracking(service: str | None) -> None:
-    """Check that the service of ``--track`` can work.
+def check_tracking(wanted: bool) -> None:
+    """Check that ``--track`` can work, if it is wanted.
 
     Raises:
         UserError: if W&B is not installed, or nobody is logged in and it is not offline.
     """
-    if service is None:
+    if not wanted:
         return
     try:
         # A folder wandb, as W&B makes them, can be imported, too, but it is empty.
         from wandb import login, setup
     except ImportError as error:
         raise UserError(
-            '--track wandb needs Weights & Biases; install it with: pip install "symsteer[wandb]"'
+            '--track needs Weights & Biases; install it with: pip install "symsteer[wandb]"'
         ) from error
     try:
         with away():  # W&B takes settings, such as the host that gets the key, from ./wandb
@@ -58,7 +58,7 @@ def check_tracking(service: str | None) -> None:
         ready, reason = False, _one_line(error)
     if not ready:
         raise UserError(
-            f"--track wandb cannot log in to Weights & Biases ({reason}); run `wandb login`, set "
+            f"--track cannot log in to Weights & Biases ({reason}); run `wandb login`, set "
             "WANDB_MODE=offline to upload later, or leave --track out"
         )
 

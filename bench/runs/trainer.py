@@ -116,7 +116,7 @@ class Trainer(Steered):
             observer.began(self, checkpoint)
         try:
             variants = evaluation_variants(self.config.variants, self.share)
-            self.evaluator = Evaluator(self, variants, how.workers)
+            self.evaluator = Evaluator(self, variants, how.sim_workers)
         except BaseException as error:
             self.stop(error)
             raise
@@ -270,7 +270,7 @@ class Trainer(Steered):
             self._checkpoint()
 
     def _make_env(self, ignore_terminations: bool) -> LatentNoiseEnv:
-        how = (self.config.num_envs, ignore_terminations, self.how.workers)
+        how = (self.config.num_envs, ignore_terminations, self.how.sim_workers)
         env = self.make_env(self.world, *how)
         env.clock = self.clock
         return env

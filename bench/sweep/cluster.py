@@ -156,7 +156,7 @@ def _check_shared(ray: Any, out: Path) -> None:
             if not seen:
                 raise UserError(
                     f"the folder {out} is not shared: {address} of the Ray cluster does not see "
-                    "the same files there; choose one that all machines mount with --out"
+                    "the same files there; choose one that all machines mount with --runs"
                 )
     finally:
         token.unlink()

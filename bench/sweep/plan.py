@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -75,8 +75,8 @@ class Plan:
     description: str
     out: Path
     configs: dict[PlannedRun, RunConfig]
-    track: Literal["wandb"] | None = None
-    """A service that shows the runs."""
+    track: bool = False
+    """Whether Weights & Biases shows the runs."""
     part: str = ""
     """``-3-of-16`` if these are not all runs of the suite, but the third of 16 shares."""
 
@@ -93,7 +93,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class SweepFile:
-    """What is kept of a sweep in ``OUT/sweeps/SUITE.json``, or of a share in another file."""
+    """What is kept of a sweep in ``RUNS/sweeps/SUITE.json``, or of a share in another file."""
 
     suite: str
     description: str

@@ -115,7 +115,7 @@ def teams_of(plan: Plan, todo: list[PlannedRun], together: int) -> list[list[Pla
         if not can_join(AGENTS.get(config.agent)):
             del open_teams[key]
     for team in teams:
-        cures = "lower num_envs, or use `symsteer run` with --workers", "lower --together"
+        cures = "lower num_envs, or use `symsteer run` with --sim-workers", "lower --together"
         check_room([plan.configs[run] for run in team], cure=cures[len(team) > 1])
     return teams
 

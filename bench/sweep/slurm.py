@@ -108,7 +108,7 @@ def launch(
         if not todo.isdisjoint(share.runs)
     }
     if tasks:
-        words = ("sweep", _kept(suite, plan, bool(jobs)), "--out", str(plan.out), *more)
+        words = ("sweep", _kept(suite, plan, bool(jobs)), "--runs", str(plan.out), *more)
         words += ("--workers", str(workers), "--together", str(together), "--shard")
         array = []
         for shard, runs in tasks.items():

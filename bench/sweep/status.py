@@ -71,14 +71,14 @@ def read_status(folder: Path, suite: str | None = None) -> Overview:
         UserError: if there is no such folder or sweep, or the given sweep is damaged.
     """
     if not folder.is_dir():
-        raise UserError(f"there is no folder {folder}; name the --out of a sweep or a run")
+        raise UserError(f"there is no folder {folder}; name the --runs of a sweep or a run")
     if (folder / CONFIG).is_file():
         return Overview([Status("run", _unlisted(folder))])
     runs, files = _search(folder)
     if suite is not None:
         named = [key for key in files if key[1] == suite]
         if not files:
-            raise UserError(f"there is no sweep in {folder}; name the --out of a sweep")
+            raise UserError(f"there is no sweep in {folder}; name the --runs of a sweep")
         if not named:
             names = dict.fromkeys(name for _, name in files)
             raise unknown("sweep of a suite", suite, names, str(folder))
@@ -160,7 +160,7 @@ def _of_sweep(folder: Path, out: Path, suite: str, paths: Sequence[Path]) -> Sta
 def to_text(sweeps: list[Status], folder: Path) -> str:
     """:attr:`Overview.sweeps` as text."""
     if not sweeps:
-        start = to_paste("symsteer", "sweep", "SUITE", "--out", folder)
+        start = to_paste("symsteer", "sweep", "SUITE", "--runs", folder)
         return f"there are no runs in {folder} yet; start some: {start}"
     return "\n\n".join(_text(status) for status in sweeps)
 

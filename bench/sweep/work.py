@@ -64,11 +64,11 @@ def work(kind: Kind, configs: Sequence[RunConfig], how: Execution, patience: flo
             that it has trained, or the released lock of a run.
     """
     if kind == "demonstrations":
-        return [_guarded(lambda: demonstration_file(configs[0], how.out, quiet=True))]
+        return [_guarded(lambda: demonstration_file(configs[0], how.runs, quiet=True))]
     if kind == "base policy":
         return [_guarded(lambda: prepare_base(configs[0], how))]
     deadline = time.monotonic() + patience
-    while any(find_base(c, how.out) is None for c in configs) and time.monotonic() < deadline:
+    while any(find_base(c, how.runs) is None for c in configs) and time.monotonic() < deadline:
         time.sleep(POLL_SECONDS)
     if len(configs) == 1:
         return [_play(configs[0], how, deadline)]
@@ -83,7 +83,7 @@ def work(kind: Kind, configs: Sequence[RunConfig], how: Execution, patience: flo
 
 
 def _play(config: RunConfig, how: Execution, deadline: float) -> Result:
-    folder = how.out / run_id(config, {})
+    folder = how.runs / run_id(config, {})
     while not is_finished(folder):
         try:
             return _guarded(lambda: execute(config, how))

@@ -59,7 +59,7 @@ class Search:
         elif self.study.user_attrs.get("plan") != plan.digest:
             raise UserError(
                 f"{plan.name}.toml is not as it was when its trials began; restore it (only "
-                f"{', '.join(LATER)} may change), or name another folder with --out"
+                f"{', '.join(LATER)} may change), or name another folder with --runs"
             )
 
     @property

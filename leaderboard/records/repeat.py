@@ -18,7 +18,7 @@ KEYS = frozenset(
     }
 )
 """The keys of a run's configuration that are options of `symsteer run`. Others that this verb has,
-such as `--out`, are no part of a configuration, and a record must not bring them in."""
+such as `--runs`, are no part of a configuration, and a record must not bring them in."""
 
 FILES = {"demonstrations": ("--demos", "FILE.h5"), "policy": ("--base-policy", "FILE.safetensors")}
 """Options and placeholders of the files from which a run may have started."""

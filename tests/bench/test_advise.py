@@ -28,17 +28,17 @@ def records(tmp_path_factory):
 
 @pytest.fixture
 def advise(records, command):
-    return lambda *arguments: command("advise", *arguments, "--records", records)
+    return lambda *arguments: command("advise", *arguments, "--runs", records)
 
 
-def test_a_world_by_name(advise, tmp_path):
-    path = tmp_path / "advice.json"
-    variant = ("--variant", "action_gain:0.25")
-    code, shown = advise("--task", "PushT-v1", *variant, "--json", path)
+def test_a_world_by_name(advise):
+    world = ("--task", "PushT-v1", "--variant", "action_gain:0.25")
+    code, shown = advise(*world)
     assert code == 0
+    found = json.loads(advise(*world, "--json")[1].out)
     assert "PushT-v1, floating, action_gain:0.25, C8" in shown.out
     assert "committed audit" in shown.out
-    (data,) = json.loads(path.read_text())["advice"]
+    (data,) = found["advice"]
     (one,) = [
         e for e in data["expected"] if (e["agent"], e["measure"]) == ("equivariant", "success")
     ]
@@ -46,7 +46,7 @@ def test_a_world_by_name(advise, tmp_path):
     assert 0.1 < one["value"] < 0.5
     assert f"{one['value']:+.3f} [" in shown.out
     assert "success: take equivariant" in shown.out
-    (test,) = json.loads(path.read_text())["left_out"]
+    (test,) = found["left_out"]
     assert len(test["tasks"]) == 4
     assert "by success in 12/12 cells (the agent that is best" in shown.out
 
@@ -68,7 +68,7 @@ def test_worlds_of_an_audit(advise, tmp_path):
 
 @pytest.mark.long
 def test_the_file_of_one_audit(advise, tmp_path, command):
-    small = ("--base-policy", "none", "--count", 8, "--out", tmp_path)
+    small = ("--base-policy", "none", "--states", 8, "--out", tmp_path)
     code, _ = command("audit", "--task", "PushCube-v1", "--variant", "wind:0.3", *small)
     assert code == 0
     for path in (tmp_path, tmp_path / "audit.json"):
@@ -104,4 +104,4 @@ def test_an_installed_package_has_no_committed_records(tmp_path, monkeypatch, co
     monkeypatch.setattr(paths, "RECORDS", tmp_path / "nothing")
     code, shown = command("advise", "--task", "PushT-v1")
     assert code == 2
-    assert "name run folders: symsteer advise --records RUNS" in shown.err
+    assert "name run folders: symsteer advise --runs RUNS" in shown.err

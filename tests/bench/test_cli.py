@@ -2,6 +2,7 @@
 
 import ast
 import fcntl
+import importlib
 import itertools
 import os
 import pty
@@ -11,6 +12,9 @@ import struct
 import subprocess
 import sys
 import termios
+import typing
+from collections import defaultdict
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,9 +25,12 @@ import symsteer as symsteer_package
 from symsteer import bench
 from symsteer.bench import cli
 from symsteer.bench.demos import collect
+from symsteer.bench.runs.config import Execution
 from symsteer.bench.sweep.survey import look
+from symsteer.bench.sweep.workforce import Workforce
 from symsteer.bench.tasks import task_class
 from symsteer.cli import GROUPS, VERBS, _threads, main
+from symsteer.hints import _ELSEWHERE, _OPTIONS
 from symsteer.leaderboard.records import Episodes, write_record
 from symsteer.policies.files import save_policy
 from symsteer.policies.symmetry.lifted import EquivariantDiffusionPolicy, EquivariantOptions
@@ -61,7 +68,7 @@ RUN = ("run", "--quiet")
         (("demos", "a.h5", "--seed", "-1"), "seed"),
         (("demos", "a.txt"), ".h5"),
         (("demos", "a.h5", "--count", "0"), "at least 1"),
-        (("sweep", "smoke", "--out", "/proc/nowhere"), "/proc/nowhere"),
+        (("sweep", "smoke", "--runs", "/proc/nowhere"), "/proc/nowhere"),
         (("sweep", "dmeo"), "demo"),
     ],
 )
@@ -94,7 +101,7 @@ def test_demonstrations_that_do_not_fit(damage, task, words, demos, command, tmp
         bad.with_suffix(suffix).write_bytes(demos.with_suffix(suffix).read_bytes())
     damage(bad)
     arguments = ("--task", task, "--demos", bad, "--demonstrations.count", 2)
-    assert words in refused(command, *RUN, *arguments, "--out", tmp_path / "runs")
+    assert words in refused(command, *RUN, *arguments, "--runs", tmp_path / "runs")
     assert not (tmp_path / "runs").is_dir() or not any((tmp_path / "runs").iterdir())
 
 
@@ -103,7 +110,7 @@ def test_a_checkpoint_of_another_layout(command, tmp_path):
     options = EquivariantOptions(channels=8, width=16, depth=1)
     policy = EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
     path = save_policy(policy, tmp_path / "push.safetensors")
-    words = refused(command, *RUN, "--base-policy", path, "--out", tmp_path / "runs")
+    words = refused(command, *RUN, "--base-policy", path, "--runs", tmp_path / "runs")
     assert "observation layout" in words
 
 
@@ -160,7 +167,7 @@ def test_commands_can_be_pasted(command, capsys, tmp_path):
         "symsteer",
         "sweep",
         "SUITE",
-        "--out",
+        "--runs",
         str(out),
     ]
     write_record(make_record(), out / "run" / "record.json")
@@ -284,3 +291,57 @@ def test_the_end_of_a_run_and_status_say_what_was_not_finite(tmp_path, capsys):
         expected = f"warning: not finite: {words}; see {place}\n" if words else ""
         assert capsys.readouterr().err == expected
         assert look(tmp_path).success.endswith(f", not finite: {words}" if words else "of 5")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((*RUN, "--total-timesteps", "1000000"), "--env-steps"),
+        ((*RUN, "--env-id=PickCube-v1"), "--task"),
+        ((*RUN, "--n_envs", "16"), "--num-envs"),
+        ((*RUN, "--learning-rate", "3e-4"), "--agent.lr"),
+        ((*RUN, "--agent", "sac"), "there is no agent 'sac'; all learners here are soft actor"),
+        ((*RUN, "--agent", "ppo"), "`symsteer new agent`"),
+        ((*RUN, "--policy.name", "dp"), "'plain' is a diffusion policy"),
+        ((*RUN, "--agent.critics", "2"), "--agent.num-critics"),
+        ((*RUN, "--workers", "2"), "--sim-workers"),
+        (("sweep", "smoke", "--out", "runs"), "--runs"),
+        (("train",), "`symsteer run`"),
+    ],
+)
+def test_words_of_other_software_get_the_name_here(arguments, words, command):
+    line = refused(command, *arguments)
+    assert words in line
+    assert "did you mean" not in line
+
+
+def options_by_name():
+    """The kinds of value of every option, by its name, and the verbs that have it."""
+    kinds, verbs = defaultdict(set), defaultdict(set)
+    for verb, target in ((name, verb.target) for name, verb in VERBS.items()):
+        module, _, attribute = target.partition(":")
+        function = getattr(importlib.import_module(module), attribute)
+        hints = typing.get_type_hints(function)
+        if verb == "run":
+            hints = {field.name: field.type for field in fields(Execution)}
+        if "workforce" in hints:
+            hints |= typing.get_type_hints(Workforce)
+        for name, hint in hints.items():
+            parts = re.findall(r"\b(?:bool|int|float|str|Path)\b", str(hint))
+            option = "--" + name.replace("_", "-")
+            kinds[option].add(parts[0] if parts else str(hint))
+            verbs[option].add(verb)
+    return kinds, verbs
+
+
+def test_an_option_takes_the_same_kind_of_value_in_all_verbs():
+    kinds, _ = options_by_name()
+    assert {name: found for name, found in kinds.items() if len(found) > 1} == {}
+
+
+def test_no_hint_is_about_an_option_that_there_is():
+    _, verbs = options_by_name()
+    foreign = {option for words in _OPTIONS for option in words.split()}
+    assert not foreign & set(verbs)
+    for option, (refusing, _) in _ELSEWHERE.items():
+        assert not verbs[option] & set(refusing.split())

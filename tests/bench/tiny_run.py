@@ -55,7 +55,7 @@ def tiny_config(agent="equivariant", policy_name="edp", options=None, **changes)
 
 def execute(config, out, **options):
     """Execute a run without progress bars; further options of an `Execution` as keywords."""
-    return run.execute(config, quiet(out=out, **options))
+    return run.execute(config, quiet(runs=out, **options))
 
 
 def resume(folder, **options):

@@ -139,7 +139,7 @@ def require(condition: bool, complaint: str) -> None:
 
 
 def new_run(workshop: Workshop, *more: Any) -> list[Any]:
-    return ["run", "--quiet", *more, "--out", "runs", *options_of(workshop.config)]
+    return ["run", "--quiet", *more, "--runs", "runs", *options_of(workshop.config)]
 
 
 def in_run(name: str) -> Make:
@@ -444,7 +444,7 @@ KINDS: dict[str, Kind] = {
     "bundle": Kind(
         bundle,
         BYTES,
-        [lambda workshop, path: ["fetch-bundle", path, "--out", path.with_name("base")]],
+        [lambda workshop, path: ["fetch-bundle", path, "--runs", path.parent]],
         check=same_members,
     ),
 }

@@ -116,7 +116,7 @@ def test_a_run_outlives_a_full_disk(size, undisturbed, tmp_path):
             stack.enter_context(files_end_at(size))
 
         stack.enter_context(patch.object(Trainer, "_checkpoint", save))
-        ending = end_of(["run", "--quiet", *options_of(SHORT), "--out", tmp_path], notes=True)
+        ending = end_of(["run", "--quiet", *options_of(SHORT), "--runs", tmp_path], notes=True)
     assert str(folder) in ending.sentence
     assert os.strerror(errno.EFBIG) in ending.sentence
     assert ending.notes == [f"continue the run with: symsteer resume {folder}"]
@@ -146,7 +146,7 @@ def test_what_a_run_begins_with_appears_whole(kept, size, blamed, undisturbed, t
         shutil.copy(path, tmp_path / "base")
     before = files_in(tmp_path)
     with files_end_at(size):
-        sentence = complaint("run", "--quiet", *options_of(SHORT), "--out", tmp_path)
+        sentence = complaint("run", "--quiet", *options_of(SHORT), "--runs", tmp_path)
     assert blamed in sentence
     assert files_in(tmp_path) == before
 
@@ -154,7 +154,7 @@ def test_what_a_run_begins_with_appears_whole(kept, size, blamed, undisturbed, t
 def test_a_run_outlives_its_terminal(undisturbed, tmp_path):
     shutil.copytree(undisturbed.parent / "base", tmp_path / "base")
     ours, theirs = pty.openpty()
-    words = [sys.executable, "-m", "symsteer", "run", *options_of(SHORT), "--out", str(tmp_path)]
+    words = [sys.executable, "-m", "symsteer", "run", *options_of(SHORT), "--runs", str(tmp_path)]
     hangup = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         streams = {"stdin": theirs, "stdout": theirs, "stderr": theirs}
@@ -173,7 +173,7 @@ def test_a_run_outlives_its_terminal(undisturbed, tmp_path):
 
 def test_the_bookkeeping_of_a_sweep(tmp_path):
     with files_end_at(10):
-        sentence = complaint("sweep", "smoke", "--out", tmp_path, "--workers", 1)
+        sentence = complaint("sweep", "smoke", "--runs", tmp_path, "--workers", 1)
     assert str(tmp_path / "sweeps") in sentence
     assert not leftovers(tmp_path)
     assert not list(tmp_path.rglob("record.json"))
@@ -185,7 +185,7 @@ WRITERS = {
     "film": ("film", "RUN", "--episodes", 1, "--out", "OUT/a.mp4"),
     "bundle": ("export", "RUN", "--out", "OUT/a.zip"),
     "lerobot": ("export-lerobot", "DEMOS", "--videos", "off", "--out", "OUT/set"),
-    "audit": ("audit", "--base-policy", "none", "--count", 8, "--group", "C2", "--out", "OUT"),
+    "audit": ("audit", "--base-policy", "none", "--states", 8, "--group", "C2", "--out", "OUT"),
     "report": ("report", "RESULTS", "--out", "OUT"),
     "site": ("site", "RESULTS", "--no-docs", "--out", "OUT"),
     "compare": ("compare", *PAIR, "--runs", "RESULTS", "--picture", "OUT/a.png"),
@@ -236,9 +236,9 @@ def test_read_only_folders(undisturbed, workshop, line, read_only, tmp_path):
     stopped, finished = workshop.restore_run(runs), runs / undisturbed.name
     read_only(runs)
     for arguments in (
-        ("run", "--quiet", "--seed", 5, *options_of(SHORT), "--out", runs),
+        ("run", "--quiet", "--seed", 5, *options_of(SHORT), "--runs", runs),
         ("resume", stopped),
-        ("sweep", "smoke", "--out", runs),
+        ("sweep", "smoke", "--runs", runs),
         *(line(verb, runs / "new") for verb in WRITERS),
     ):
         sentence = complaint(*arguments)

@@ -19,7 +19,7 @@ run --num-envs 99999999
 run --policy.steps 0
 run --env-steps 100
 sweep nowhere.toml
-sweep smoke --out file
+sweep smoke --runs file
 sweep smoke --workers automatic
 resume loop
 resume
@@ -36,7 +36,7 @@ advise --task Nothing
 advise --task PickCube-v1 --variant wnid:1
 advise --task PickCube-v1 --audit x.json
 advise --audit x.json
-advise --task PickCube-v1 --records folder
+advise --task PickCube-v1 --runs folder
 audit --task Nothing
 audit --group E8
 audit-episodes --actions nobody
@@ -56,7 +56,7 @@ export-lerobot file --out file
 fetch-bundle x.json
 fetch-bundle https://example.org/a.zip
 doctor extra
-demo --out file
+demo --runs file
 """
 
 

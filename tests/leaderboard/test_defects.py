@@ -36,6 +36,7 @@ def test_a_cell_has_its_defect_its_part_and_its_resets(tmp_path: Path) -> None:
     differ = {"variant": "none", "part": "cost", "resets": [0.05, 0.04, 0.06], "resets_p": 0.001}
     audit = read_audit(write(tmp_path, [CELL, CELL | differ]))
     place = "PickCube-v1", "floating", "action_gain:0.5", "C8"
+    assert audit == read_audit(tmp_path)  # of the folder
     assert audit[place] == AuditedDefect(
         Interval(0.2, 0.15, 0.3), "object", Interval(-0.001, 0.0, 0.002), False
     )

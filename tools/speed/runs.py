@@ -131,7 +131,7 @@ def _time_in(checkout: Path, config: RunConfig, out: Path) -> dict[str, float]:
     options = _options(config, RunConfig(task=config.task, agent=config.agent))
     with _folder(out) as folder:
         done = subprocess.run(
-            [sys.executable, "-c", RUN, "run", "--quiet", "--out", str(folder), *options],
+            [sys.executable, "-c", RUN, "run", "--quiet", "--runs", str(folder), *options],
             env={**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"},
             cwd=checkout,
             capture_output=True,

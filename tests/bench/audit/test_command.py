@@ -42,7 +42,7 @@ def symsteer(monkeypatch, tmp_path):
         (["--group", "E8"], "C8"),
         (["--group", "C1"], "nothing to compare"),
         (["--group", "SO2"], "not finite"),
-        (["--count", "2"], "at least 8"),
+        (["--states", "2"], "at least 8"),
         (["--base-policy", "nowhere.safetensors"], "nowhere.safetensors"),
         (["--base-policy", "x.safetensors", "--task", "all"], "for one task"),
         (["-episodes", "--episodes", "-1"], "at least 1"),
@@ -68,7 +68,7 @@ def test_one_audit(symsteer, capsys, tmp_path):
     policy = EquivariantDiffusionPolicy(options, task.observation_layout, task.action_layout)
     path = save_policy(policy, tmp_path / "policy")
     arguments = ("--variant", "action_gain:1", "--group", "C4", "--base-policy", path)
-    assert symsteer("audit", *arguments, "--count", 8, "--out", "out") == 0
+    assert symsteer("audit", *arguments, "--states", 8, "--out", "out") == 0
     shown = capsys.readouterr().out
     data = json.loads((tmp_path / "out" / "audit.json").read_text())
     assert data["states"] == 16
@@ -83,7 +83,7 @@ def test_one_audit(symsteer, capsys, tmp_path):
 
 def test_a_table_of_audits(symsteer, capsys, tmp_path):
     variants = ("--variant", "none", "action_gain:0.5")
-    arguments = ("audit", *variants, "--base-policy", "none", "--group", "C2", "--count", 8)
+    arguments = ("audit", *variants, "--base-policy", "none", "--group", "C2", "--states", 8)
     assert symsteer(*arguments, "--out", tmp_path) == 0
     out = capsys.readouterr().out
     assert "unbroken" in out

@@ -130,7 +130,7 @@ def test_manifest_and_card_say_what_is_inside(run, bundle):
 
 def test_a_policy_without_symmetry_has_a_large_error(run):
     config = tiny_config(policy_name="plain")
-    policy = prepare_base(config, quiet(out=run.parent))
+    policy = prepare_base(config, quiet(runs=run.parent))
     plain = measure(config, policy)
     assert plain["group"] == "C8"
     assert plain["equivariance_error"] > 1e-2
@@ -301,7 +301,7 @@ def test_older_bundles_may_have_demonstrations_alone(bundle, tmp_path, command):
         del files[policy["path"]]
 
     path = rewritten(bundle, tmp_path / "old.zip", without_policy)
-    code, shown = command("fetch-bundle", path, "--out", tmp_path / "base")
+    code, shown = command("fetch-bundle", path, "--runs", tmp_path)
     assert code == 0
     assert "--demos" in shown.out
     assert "policy" not in shown.out
@@ -310,7 +310,7 @@ def test_older_bundles_may_have_demonstrations_alone(bundle, tmp_path, command):
 def test_fetching_needs_neither_torch_nor_maniskill(bundle, tmp_path):
     program = (
         "import sys; from symsteer.cli import main; "
-        f"sys.argv = ['symsteer', 'fetch-bundle', {str(bundle)!r}, '--out', {str(tmp_path)!r}]\n"
+        f"sys.argv = ['symsteer', 'fetch-bundle', {str(bundle)!r}, '--runs', {str(tmp_path)!r}]\n"
         "main()\n"
         "heavy = {'torch', 'mani_skill', 'sapien'} & set(sys.modules)\n"
         "sys.exit(f'imported: {heavy}' if heavy else 0)"

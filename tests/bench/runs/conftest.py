@@ -57,7 +57,7 @@ def lend(shared) -> Callable[[Path], Path]:
     bases = shared.with_name("bases")
     with FileLock(f"{bases}.lock"):
         for seed in (0, 1):
-            prepare_base(tiny_config(seed=seed), quiet(out=bases))
+            prepare_base(tiny_config(seed=seed), quiet(runs=bases))
     return lambda out: shutil.copytree(bases / "base", out / "base")
 
 

@@ -10,12 +10,12 @@ from symsteer.errors import UserError
 def test_without_arguments_the_defaults_are_those_of_a_run():
     config, execution = parse_run([])
     assert config == RunConfig()
-    assert (str(execution.out), execution.workers, execution.quiet) == ("runs", 1, False)
+    assert (str(execution.runs), execution.sim_workers, execution.quiet) == ("runs", 1, False)
 
 
 def test_options_of_the_named_agent_and_policy():
     words = "--policy.width 48 --agent=residual-pathway --agent.penalty 0.25 --policy.name plain"
-    words += " --agent.no-layer-norm --task PushCube-v1 --evaluation.every 77 --out a --quiet"
+    words += " --agent.no-layer-norm --task PushCube-v1 --evaluation.every 77 --runs a --quiet"
     words += " --agent=standard --agent residual-pathway"
     config, execution = parse_run(words.split())
     assert (config.agent, config.policy_name) == ("residual-pathway", "plain")
@@ -23,7 +23,7 @@ def test_options_of_the_named_agent_and_policy():
     assert not config.agent_options.layer_norm
     assert config.policy == type(config.policy)(width=48)
     assert (config.task, config.evaluation.every) == ("PushCube-v1", 77)
-    assert (str(execution.out), execution.quiet) == ("a", True)
+    assert (str(execution.runs), execution.quiet) == ("a", True)
 
 
 @pytest.mark.parametrize("preset", [[], ["--agent.preset", "first"]])

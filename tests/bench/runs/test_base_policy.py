@@ -48,12 +48,12 @@ def test_a_policy_from_another_package(tmp_path, monkeypatch):
     data = tiny_config().to_json() | {"policy": {"name": name, "horizon": 4, "execute": 2}}
     config = build_config(data, "test")
     assert find_base(config, tmp_path) is None
-    base = prepare_base(config, quiet(out=tmp_path))
+    base = prepare_base(config, quiet(runs=tmp_path))
     assert (base.name, base.horizon, base.execute) == ("echo", 4, 2)
     assert describe_base(base).episodes == 32
     # Found again instead of trained again.
     monkeypatch.setattr(POLICIES.get(name), "fit", None)
-    again = prepare_base(config, quiet(out=tmp_path))
+    again = prepare_base(config, quiet(runs=tmp_path))
     assert again.content_hash() == base.content_hash()
     # A run that names the file takes its settings; other settings are refused.
     path = policy_path(find_base(config, tmp_path))
@@ -103,7 +103,7 @@ def joint(task, tasks=TASKS, name="edp-joint", **changes):
 def test_it_is_trained_once_for_the_runs_on_all_tasks(name, tmp_path, monkeypatch):
     first = joint("PushCube-v1", name=name)
     assert find_base(first, tmp_path) is None
-    base = prepare_base(first, quiet(out=tmp_path))
+    base = prepare_base(first, quiet(runs=tmp_path))
     assert base.options.tasks == tuple(sorted(TASKS))
     monkeypatch.setattr(POLICIES.get(name), "fit_tasks", None)
     hashes = {base.content_hash()}
@@ -111,7 +111,7 @@ def test_it_is_trained_once_for_the_runs_on_all_tasks(name, tmp_path, monkeypatc
         other = joint(task, name=name)
         path = find_base(other, tmp_path)
         assert path is not None
-        policy = prepare_base(other, quiet(out=tmp_path))
+        policy = prepare_base(other, quiet(runs=tmp_path))
         assert policy.obs_layout == task_class(task).observation_layout
         assert policy.report["world"]["task"] == task
         assert "steerability" in policy.report
@@ -128,10 +128,10 @@ def test_it_is_trained_once_for_the_runs_on_all_tasks(name, tmp_path, monkeypatc
 def test_other_demonstrations_of_one_task_are_another_policy_of_all(tmp_path):
     pair = ("PickCube-v1", "PushCube-v1")
     demos = collect("PushCube-v1", "floating", 3, "diverse", 99, tmp_path / "own.h5")
-    prepare_base(joint("PushCube-v1", pair), quiet(out=tmp_path, demos=demos))
+    prepare_base(joint("PushCube-v1", pair), quiet(runs=tmp_path, demos=demos))
     # The runs that begin from the expert's demonstrations do not find it.
     for task in pair:
-        prepare_base(joint(task, ()), quiet(out=tmp_path))
+        prepare_base(joint(task, ()), quiet(runs=tmp_path))
     for task in pair:
         assert find_base(joint(task, pair), tmp_path) is None
         assert find_base(joint(task, ()), tmp_path) is not None
@@ -169,7 +169,7 @@ def test_processes_that_need_the_same_policy_at_the_same_time_build_it_once(tmp_
     for name in ("collect", "_train"):
         monkeypatch.setattr(base_policy, name, counted(getattr(base_policy, name)))
     with ThreadPoolExecutor(3) as machines:
-        how = quiet(out=tmp_path)
+        how = quiet(runs=tmp_path)
         policies = list(machines.map(lambda _: prepare_base(tiny_config(), how), range(3)))
     assert built == ["collect", "_train"]
     assert len({policy.content_hash() for policy in policies}) == 1

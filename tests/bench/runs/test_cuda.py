@@ -34,7 +34,7 @@ def bases(tmp_path_factory) -> Path:
     """A folder with the base policies of tiny runs with seeds 0 and 1, trained on the GPU."""
     out = tmp_path_factory.mktemp("bases")
     for seed in (0, 1):
-        prepare_base(tiny_config(seed=seed, device="cuda"), quiet(out=out))
+        prepare_base(tiny_config(seed=seed, device="cuda"), quiet(runs=out))
     return out / "base"
 
 
@@ -77,7 +77,7 @@ def test_every_policy_decodes_as_on_the_cpu(name, tmp_path):
     if name == "escnn":
         pytest.importorskip("escnn.nn")
     config = tiny_config(policy_name=name, device="cuda")
-    policy = prepare_base(config, quiet(out=tmp_path))
+    policy = prepare_base(config, quiet(runs=tmp_path))
     assert policy.device.type == "cuda"
     generator = torch.Generator().manual_seed(0)
     obs = 0.1 * torch.randn(16, policy.obs_layout.dim, generator=generator)
@@ -89,7 +89,7 @@ def test_every_policy_decodes_as_on_the_cpu(name, tmp_path):
 @pytest.mark.parametrize("name", TEAMS)
 def test_teams_train(name, out):
     configs = [tiny_config(name, seed=seed, device="cuda") for seed in (0, 1)]
-    assert execute_together(configs, quiet(out=out)) == [None, None]
+    assert execute_together(configs, quiet(runs=out)) == [None, None]
     for config in configs:
         record = read_record(out / run_id(config, {}) / "record.json")
         assert (record.status, record.provenance.together) == ("finished", 2)

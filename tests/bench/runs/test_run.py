@@ -66,7 +66,7 @@ def test_the_record_tells_the_whole_run(finished):
 @pytest.mark.parametrize("workers", slow_except((1, 2), 2))
 def test_the_same_configuration_gives_the_same_record(workers, finished, tmp_path):
     config, folder = finished
-    again = execute(config, tmp_path, workers=workers)
+    again = execute(config, tmp_path, sim_workers=workers)
     assert again.name == folder.name
     assert without_clock(again) == without_clock(folder)
 
@@ -193,15 +193,15 @@ def test_mistakes_are_refused_before_anything_is_built(change, words, tmp_path):
     [
         (False, {"sim": "cuda"}, "no CUDA device"),
         (False, {"device": "cuda"}, "no CUDA device"),
-        (True, {"workers": 0}, "--workers is"),
-        (True, {"workers": 2, "sim": "cuda"}, "--workers needs"),
+        (True, {"workers": 0}, "--sim-workers is"),
+        (True, {"workers": 2, "sim": "cuda"}, "--sim-workers needs"),
     ],
 )
 def test_what_this_machine_cannot_do_is_refused(cuda, change, words, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
     workers = change.pop("workers", 1)
     with pytest.raises(UserError, match=words):
-        execute(tiny_config(**change), tmp_path, workers=workers)
+        execute(tiny_config(**change), tmp_path, sim_workers=workers)
 
 
 ROOMY = {"num_envs": 500, "env_steps": 10**6}
@@ -210,8 +210,8 @@ ROOMY = {"num_envs": 500, "env_steps": 10**6}
 @pytest.mark.parametrize(
     ("change", "workers", "words"),
     [
-        (ROOMY, 1, "1005 are needed while those of 500 environments are replaced; use --workers 2"),
-        (ROOMY | {"num_envs": 3000}, 4, "but 1500 are needed .* use --workers 7"),
+        (ROOMY, 1, "1005 are needed while those of 500 .* replaced; use --sim-workers 2"),
+        (ROOMY | {"num_envs": 3000}, 4, "but 1500 are needed .* use --sim-workers 7"),
         (
             {"evaluation": EvaluationConfig(episodes=3000)},
             1,
@@ -226,7 +226,7 @@ def test_more_environments_than_processes_can_hold(change, workers, words, tmp_p
     if words is None:
         return check(config, workers)
     with pytest.raises(UserError, match=words):
-        execute(config, tmp_path, workers=workers)
+        execute(config, tmp_path, sim_workers=workers)
     assert not any(tmp_path.iterdir())
 
 

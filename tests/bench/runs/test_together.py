@@ -51,7 +51,7 @@ def assert_same(folder, other):
 
 def test_the_records_are_those_of_single_runs(alone, tmp_path):
     begin = time.perf_counter()
-    assert execute_together(configs(), quiet(out=tmp_path)) == [None] * len(SEEDS)
+    assert execute_together(configs(), quiet(runs=tmp_path)) == [None] * len(SEEDS)
     seconds, total = time.perf_counter() - begin, 0.0
     before = {}
     for config in configs():
@@ -68,7 +68,7 @@ def test_the_records_are_those_of_single_runs(alone, tmp_path):
         before[tmp_path / name] = (tmp_path / name / "record.json").read_bytes()
     assert total <= seconds
     # Finished runs are left alone.
-    assert execute_together(configs(), quiet(out=tmp_path)) == [None] * len(SEEDS)
+    assert execute_together(configs(), quiet(runs=tmp_path)) == [None] * len(SEEDS)
     assert {path: (path / "record.json").read_bytes() for path in before} == before
 
 
@@ -102,7 +102,7 @@ def test_a_killed_team_continues_and_an_error_of_one_run_does_not_stop_the_other
 
     monkeypatch.setattr(trainer, "save_checkpoint", save)
     with pytest.raises(KeyboardInterrupt):
-        execute_together(configs(), quiet(out=tmp_path))
+        execute_together(configs(), quiet(runs=tmp_path))
     folders = [tmp_path / run_id(config, {}) for config in configs()]
     assert {read_record(f / "record.json").status for f in folders} == {"interrupted"}
     monkeypatch.setattr(trainer, "save_checkpoint", stock)
@@ -114,7 +114,7 @@ def test_a_killed_team_continues_and_an_error_of_one_run_does_not_stop_the_other
         observe(self, transition)
 
     monkeypatch.setattr(StandardAgent, "observe", fail)
-    first, error = execute_together(configs(), quiet(out=tmp_path))
+    first, error = execute_together(configs(), quiet(runs=tmp_path))
     assert first is None
     assert_same(folders[0], alone / folders[0].name)
     record = read_record(folders[1] / "record.json")
@@ -122,7 +122,7 @@ def test_a_killed_team_continues_and_an_error_of_one_run_does_not_stop_the_other
     assert "not finite" in str(error)
     assert "not finite" in record.failure
     monkeypatch.setattr(StandardAgent, "observe", observe)
-    assert execute_together(configs(), quiet(out=tmp_path)) == [None] * len(SEEDS)
+    assert execute_together(configs(), quiet(runs=tmp_path)) == [None] * len(SEEDS)
     assert_same(folders[1], alone / folders[1].name)
 
 
@@ -135,7 +135,7 @@ def test_an_error_of_an_update_ends_its_team_alone(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Team, "update", update)
     mixed = [*configs(), *configs("equivariant", seeds=(0,)), *configs("zero", seeds=(0,))]
-    first, second, *others = execute_together(mixed, quiet(out=tmp_path))
+    first, second, *others = execute_together(mixed, quiet(runs=tmp_path))
     assert "out of memory" in str(first)
     assert "out of memory" in str(second)
     assert others == [None, None]

@@ -100,7 +100,7 @@ def test_a_tracked_run_has_the_same_record_and_wandb_has_its_points(finished, ou
     """Also beside another run in one process."""
     config, folder = finished
     other = tiny_config("zero")
-    how = quiet(out=out, track="wandb", group="suite")
+    how = quiet(runs=out, track=True, group="suite")
     assert execute_together([config, other], how) == [None, None]
     wandb.teardown()  # its service may still be writing when a run has finished
     tracked = out / folder.name
@@ -163,14 +163,14 @@ def test_mistakes_are_told_before_anything_is_built(monkeypatch, tmp_path):
 
     def refused():
         with pytest.raises(UserError) as error:
-            run(["--out", str(tmp_path / "runs"), "--track", "wandb"])
+            run(["--runs", str(tmp_path / "runs"), "--track"])
         assert not (tmp_path / "runs").exists()
         return str(error.value)
 
     monkeypatch.setenv("WANDB_MODE", "online")
     wandb.teardown()
     cure = "run `wandb login`, set WANDB_MODE=offline to upload later, or leave --track out"
-    wanted = "--track wandb cannot log in to Weights & Biases (no API key was found); "
+    wanted = "--track cannot log in to Weights & Biases (no API key was found); "
     assert refused() == wanted + cure
     monkeypatch.setenv("WANDB_API_KEY", "short")
     assert "API key must have 40+ characters" in refused()

@@ -85,7 +85,7 @@ def test_a_folder_that_is_not_shared_is_refused(cluster, tmp_path):
         pytest.skip("this machine allows no mount namespaces")
     out = tmp_path / "runs"
     out.mkdir()
-    sweep = f"{sys.executable} -m symsteer sweep smoke --out {out} --ray {cluster.address}"
+    sweep = f"{sys.executable} -m symsteer sweep smoke --runs {out} --ray {cluster.address}"
     done = subprocess.run(
         [*own, f"mount -t tmpfs tmpfs {out} && exec {sweep}"],
         capture_output=True,

@@ -60,7 +60,7 @@ def test_another_machine_agrees(plans):
 
 @pytest.mark.parametrize("shard", ["0/3", "4/3", "3", "1/0", "-1/3", "1/2/3", "a/b"])
 def test_what_is_no_share_is_refused(shard, command, tmp_path):
-    code, shown = command("sweep", "smoke", "--out", tmp_path / "runs", f"--shard={shard}")
+    code, shown = command("sweep", "smoke", "--runs", tmp_path / "runs", f"--shard={shard}")
     assert code == 2
     assert shown.err == f"error: --shard {shard} is no share; 3/16 is the third of 16\n"
     assert not (tmp_path / "runs").exists()
@@ -89,7 +89,7 @@ def test_status_puts_shares_together(tmp_path, command):
 
 
 def test_a_share_is_a_sweep(command, tmp_path):
-    words = ("sweep", "smoke", "--out", tmp_path, "--dry-run")
+    words = ("sweep", "smoke", "--runs", tmp_path, "--dry-run")
     counted = [command(*words, "--shard", f"{n}/3")[1].out for n in (1, 2, 3)]
     assert sum(int(text.split("\nall")[1].split()[0]) for text in counted) == 4
     assert not list(tmp_path.iterdir())

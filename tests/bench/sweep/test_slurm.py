@@ -95,7 +95,7 @@ def test_the_settings_that_come_with_symsteer_are_the_defaults_and_have_a_page()
 def test_one_array_has_all_runs_and_the_same_command_queues_what_is_lost(fake, command, tmp_path):
     suite, out = five(tmp_path)
     file = launcher(tmp_path, 'cpus = 2\ntime = "30"\nsetup = ["module load x"]')
-    words = ("sweep", suite, "--out", out, "--launcher", file)
+    words = ("sweep", suite, "--runs", out, "--launcher", file)
     code, shown = command(*words, "--dry-run")
     assert (code, out.exists()) == (0, False)
     assert shown.out.endswith("an array of up to 3 tasks, each with 2 runs at a time\n")
@@ -126,7 +126,7 @@ def test_a_task_is_a_sweep_of_its_share(fake, command, tmp_path, monkeypatch):
     handed = []
     monkeypatch.setattr(slurm, "_submit", lambda tasks, *_: handed.extend(tasks) or ["1_0", "1_1"])
     file = launcher(tmp_path, "cpus = 3")
-    command("sweep", suite, "--out", out, "--launcher", file, "--together", 1, "--trust", "a:B")
+    command("sweep", suite, "--runs", out, "--launcher", file, "--together", 1, "--trust", "a:B")
     plan = make_plan(load_suite(suite), out)
     kept = [path for task in handed for path in task.checkpoints]
     assert sorted(kept) == sorted(out / run.run_id / CHECKPOINT for run in plan.runs)
@@ -140,7 +140,7 @@ def test_a_task_is_a_sweep_of_its_share(fake, command, tmp_path, monkeypatch):
 
 def test_a_suite_that_changes_under_its_jobs_is_refused(fake, command, tmp_path):
     suite, out = five(tmp_path)
-    words = ("sweep", suite, "--out", out, "--launcher", launcher(tmp_path, "cpus = 2"))
+    words = ("sweep", suite, "--runs", out, "--launcher", launcher(tmp_path, "cpus = 2"))
     command(*words)
     (fake / "queue").write_text("1_0\n")
     Path(suite).write_text(Path(suite).read_text().replace("[0, 1, 2, 3, 4]", "[0, 1, 2, 3, 5]"))
@@ -167,7 +167,7 @@ def test_a_suite_that_changes_under_its_jobs_is_refused(fake, command, tmp_path)
 def test_what_is_wrong_is_one_sentence(text, words, says, fake, command, tmp_path):
     suite, out = five(tmp_path)
     file = launcher(tmp_path, text)
-    code, shown = command("sweep", suite, "--out", out, "--launcher", file, *words)
+    code, shown = command("sweep", suite, "--runs", out, "--launcher", file, *words)
     assert (code, shown.out) == (2, "")
     assert says in shown.err
     assert shown.err.count("\n") == 1
@@ -176,7 +176,7 @@ def test_what_is_wrong_is_one_sentence(text, words, says, fake, command, tmp_pat
 
 def test_without_slurm_or_submitit_it_is_said(no_slurm, command, tmp_path, monkeypatch):
     suite, out = five(tmp_path)
-    words = ("sweep", suite, "--out", out, "--launcher", "slurm")
+    words = ("sweep", suite, "--runs", out, "--launcher", "slurm")
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "submitit", None)
         assert 'pip install "symsteer[slurm]"' in command(*words)[1].err
@@ -188,7 +188,7 @@ def test_without_slurm_or_submitit_it_is_said(no_slurm, command, tmp_path, monke
 
 def test_where_slurm_is_silent_status_shows_what_it_knows(fake, command, tmp_path):
     suite, out = five(tmp_path)
-    command("sweep", suite, "--out", out, "--launcher", launcher(tmp_path, "cpus = 5"))
+    command("sweep", suite, "--runs", out, "--launcher", launcher(tmp_path, "cpus = 5"))
     (fake / "squeue").write_text("#!/bin/sh\necho 'squeue: error: no answer' >&2\nexit 1")
     code, shown = command("status", out)
     assert code == 0
@@ -202,7 +202,7 @@ def test_a_container_gets_the_folder_and_the_gpu(fake, command, tmp_path):
     image = tmp_path / "an image.sif"
     image.touch()
     file = launcher(tmp_path, f"image = {str(image)!r}\ngpus = 1\n[sbatch]\naccount = 'robots'")
-    assert command("sweep", suite, "--out", out, "--launcher", file)[0] == 0
+    assert command("sweep", suite, "--runs", out, "--launcher", file)[0] == 0
     script = (fake / "script").read_text()
     assert f" apptainer exec --nv --bind {out} '{image}' python -u -m submitit" in script
     assert "#SBATCH --account=robots\n" in script
@@ -336,7 +336,7 @@ def test_a_task_is_cancelled_and_the_same_command_goes_on(
     path = write_suite(tmp_path, LONG, 'agent = ["equivariant", "zero"]')
     out = tmp_path / "runs"
     file = launcher(tmp_path, 'cpus = 1\nmemory = "1500M"')
-    words = ("sweep", path, "--out", out, "--launcher", file)
+    words = ("sweep", path, "--runs", out, "--launcher", file)
     code, shown = command(*words)
     assert (code, shown.err) == (0, "")
     first, second = make_plan(load_suite(path), out).runs
@@ -369,7 +369,7 @@ def test_time_ends_others_come_first_and_a_node_goes_down(real_slurm, command, t
     path = write_suite(tmp_path, LONGER, 'agent = ["equivariant"]')
     out = tmp_path / "runs"
     file = launcher(tmp_path, 'cpus = 1\nmemory = "1500M"\ntime = "60"')
-    assert command("sweep", path, "--out", out, "--launcher", file)[0] == 0
+    assert command("sweep", path, "--runs", out, "--launcher", file)[0] == 0
     [run] = make_plan(load_suite(path), out).runs
     folder, job = out / run.run_id, jobs_of(out)[run.run_id]
 

@@ -147,7 +147,7 @@ def test_a_stopped_sweep_leaves_no_process_and_goes_on(end, undisturbed, tmp_pat
     program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "from symsteer.launch import main; "
-        f"sys.argv = ['symsteer', 'sweep', {path!r}, '--out', {str(out)!r}, '--workers', '1']; "
+        f"sys.argv = ['symsteer', 'sweep', {path!r}, '--runs', {str(out)!r}, '--workers', '1']; "
         "sys.exit(main())"
     )
     sweep = subprocess.Popen(
@@ -202,7 +202,7 @@ def test_the_command_line(undisturbed, command, tmp_path):
     # Whoever comes to this folder cannot make a run of it.
     (out / other.run_id).write_text("in the way")
     before = sorted(out.rglob("*"))
-    trial = ("sweep", path, "--out", out, "--dry-run")
+    trial = ("sweep", path, "--runs", out, "--dry-run")
     code, shown = command(*trial)
     assert code == 0
     assert re.search(r"env_steps +320 +1 +1 +0 +0 +0\n +321 +1 +0 +0 +0 +1\n", shown.out)
@@ -214,7 +214,7 @@ def test_the_command_line(undisturbed, command, tmp_path):
     assert sorted(out.rglob("*")) == before
     record = (out / undisturbed.name / "record.json").stat().st_mtime_ns
     shutil.copytree(undisturbed.parent / "base", out / "base")
-    code, shown = command("sweep", path, "--out", out, "--workers", 1)
+    code, shown = command("sweep", path, "--runs", out, "--workers", 1)
     assert code == 1
     skipped, failed = shown.out.splitlines()
     assert skipped == "skipped   1 of 2 runs are finished already"
@@ -251,7 +251,7 @@ def test_the_fastest_setting_reaches_the_pool(options, tried, used, command, mon
     monkeypatch.setattr("symsteer.bench.throughput.measure", measure)
     monkeypatch.setattr("symsteer.bench.sweep.command._cores", lambda: 2)
     monkeypatch.setattr("symsteer.bench.sweep.command.execute_plan", execute)
-    sweep = ("sweep", path, "--out", tmp_path / "runs", "--workers", "auto", *options)
+    sweep = ("sweep", path, "--runs", tmp_path / "runs", "--workers", "auto", *options)
     shown = command(*sweep, "--dry-run")[1]
     assert not measured
     assert f"tries [2, 1] at a time, {tried['together']} together" in shown.err
@@ -271,7 +271,7 @@ def test_nothing_is_measured_if_every_learner_has_a_core(command, monkeypatch, t
         "symsteer.bench.sweep.command.execute_plan",
         lambda plan, todo, pool, display, together: begun.append((pool.capacity, together)) or [],
     )
-    assert command("sweep", path, "--out", tmp_path / "runs", "--workers", "auto")[0] == 0
+    assert command("sweep", path, "--runs", tmp_path / "runs", "--workers", "auto")[0] == 0
     assert (begun, measured) == ([(2, 1)], [])
 
 
@@ -299,7 +299,7 @@ def test_nothing_is_measured_if_every_learner_has_a_core(command, monkeypatch, t
 def test_what_cannot_run_is_refused_before_anything_happens(run, options, words, command, tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text(f"[grid]\nseed = [0, 1]\n[run]\n{run}")
-    code, shown = command("sweep", path, "--out", tmp_path / "runs", *options)
+    code, shown = command("sweep", path, "--runs", tmp_path / "runs", *options)
     assert (code, shown.out) == (2, "")
     assert re.search(words, shown.err)
     assert shown.err.count("\n") == 1

@@ -257,7 +257,7 @@ def test_a_committed_search_can_be_gone_on_with(tmp_path):
 
 def test_the_command_says_what_it_does_and_where_the_results_are(tmp_path, monkeypatch, command):
     monkeypatch.setattr(tuning, "run_plan", KnownRuns())
-    words = ("tune", write_plan(tmp_path), "--out", tmp_path / "runs")
+    words = ("tune", write_plan(tmp_path), "--runs", tmp_path / "runs")
     code, shown = command(*words, "--dry-run")
     assert code == 0
     assert "standard: 12 trials of 2 options: lr, batch_size" in shown.out
