@@ -21,7 +21,7 @@ from torch import nn
 
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.episodes import Played
-from symsteer.agents.options import Critic, EitherOptions
+from symsteer.agents.options import CriticKind, EitherOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import Drawn
@@ -32,7 +32,7 @@ from symsteer.agents.standard import EitherAgent
 class BestOfNOptions(EitherOptions):
     """Options of best of n."""
 
-    critic: Critic = "sampler"
+    critic_kind: CriticKind = "sampler"
     """`sampler`: critics of the executed actions; this agent knows no other ones."""
     noise_bank: int = 8
     """n: chunks to choose from, in a decision and in the critics' target."""

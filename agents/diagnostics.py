@@ -52,7 +52,7 @@ def critic_diagnostics(agent: SacAgent, played: Played) -> Measures:
     group, layouts = Group.parse(options.group), (agent.obs_layout, agent.act_layout)
     variance = orbit_variance(agent, obs, noise, group)
     q_here, gap = agent.q_values(obs, noise), None
-    if options.critic == "aliased":
+    if options.critic_kind == "aliased":
         gap = (agent.noise_q_values(obs, noise) - q_here).abs().mean().item()
     # What the critics gain by the actor; if the returns do not, it exploits errors of theirs.
     steered, random = agent.act(obs, True), agent.gaussian_noise(len(obs), played.generator)

@@ -12,7 +12,7 @@ from symsteer.errors import UserError
 from symsteer.names import check
 from symsteer.policies.geometry import Group
 
-Critic = Literal["noise", "aliased", "sampler"]
+CriticKind = Literal["noise", "aliased", "sampler"]
 Reduce = Literal["min", "mean"]
 Distill = Literal["gaussian", "squashed", "actor", "mixture"]
 Layers = Literal["plain", "equivariant"]
@@ -26,7 +26,7 @@ class SacOptions(AgentOptions):
     :func:`~symsteer.agents.presets.tuned` gives each of those agents its own.
     """
 
-    critic: Critic = "aliased"
+    critic_kind: CriticKind = "aliased"
     """What the critics judge. `noise`: the noise (DSRL-SAC). `aliased`: the executed actions; noise
     critics are distilled from them for the actor (DSRL-NA). `sampler`: the executed actions; the
     actor's gradient passes through the sampler."""
@@ -88,7 +88,7 @@ class SacOptions(AgentOptions):
 
     agent: ClassVar[str] = "the agent"
     """The agent in messages."""
-    known_critics: ClassVar[tuple[Critic, ...]] = get_args(Critic)
+    known_critics: ClassVar[tuple[CriticKind, ...]] = get_args(CriticKind)
     """The kinds of critics that the agent can have."""
     least_bank: ClassVar[int] = 0
     """The smallest ``noise_bank`` that the agent can have."""
@@ -99,9 +99,9 @@ class SacOptions(AgentOptions):
         for name, kind in get_type_hints(type(self)).items():
             if get_origin(kind) is Literal:
                 check(name, [getattr(self, name)], get_args(kind))
-        if self.critic not in self.known_critics:
+        if self.critic_kind not in self.known_critics:
             known = " or ".join(self.known_critics)
-            raise UserError(f"{self.agent} judges executed actions: its critic is {known}")
+            raise UserError(f"{self.agent} judges executed actions: its critic_kind is {known}")
         if self.noise_bank < self.least_bank:
             raise UserError(
                 f"{self.agent} needs a noise_bank of at least {self.least_bank}, not "

@@ -102,10 +102,10 @@ class PartialAgent(StandardAgent):
 
     def __init__(self, context: AgentContext, options: PartialOptions | None = None):
         super().__init__(context, options)
-        if self.options.critic == "aliased" and context.horizon == context.execute:
+        if self.options.critic_kind == "aliased" and context.horizon == context.execute:
             raise UserError(
                 "the partial agent cannot tell noise from actions if a whole chunk is executed; "
-                "set critic to sampler, or execute less than the horizon"
+                "set critic_kind to sampler, or execute less than the horizon"
             )
         following = self.following
         self.blocks = following.block_means.to(self.device, self.dtype)

@@ -20,7 +20,7 @@ import torch
 
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.distributions import SquashedGaussian
-from symsteer.agents.options import Critic, EitherOptions
+from symsteer.agents.options import CriticKind, EitherOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import Drawn
@@ -33,7 +33,7 @@ from symsteer.policies.normalizer import clip_blocks
 class ResidualOptions(EitherOptions):
     """Options of the residual agent."""
 
-    critic: Critic = "sampler"
+    critic_kind: CriticKind = "sampler"
     """`sampler`: critics of the executed actions; this agent knows no other ones."""
     residual_bound: float = 0.2
     """Largest norm of an irrep block of the correction; the actions of the policy have norm 1 at

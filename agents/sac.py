@@ -3,7 +3,7 @@
 After Haarnoja et al., arXiv 1812.05905, used for steering as in DSRL, arXiv 2506.15799. An action
 is the whole noise chunk ``w [Tp, Da]``. A step is one decision of the latent-noise environment.
 
-The critics judge the noise or what it is decoded to (option ``critic``):
+The critics judge the noise or what it is decoded to (option ``critic_kind``):
 
 - ``noise`` (DSRL-SAC): Q(s, w).
 - ``aliased`` (DSRL-NA): Q(s, a) of the executed actions a. The noise critics Q_W(s, w) are trained
@@ -281,7 +281,7 @@ class SacAgent(Agent):
     @torch.no_grad()
     def noise_q_values(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """The same by the critics that the actor climbs (with ``aliased``: the distilled ones)."""
-        if self.options.critic != "aliased":
+        if self.options.critic_kind != "aliased":
             return self.q_values(obs, noise)
         weights = self.networks["noise_critic"].weights()
         q = self._q(weights, self._features(obs), noise.to(self.dtype).flatten(1))
@@ -294,7 +294,7 @@ class SacAgent(Agent):
             obs: in environment units.
             noise: actions are differentiable with respect to it.
         """
-        if self.options.critic == "noise":
+        if self.options.critic_kind == "noise":
             return noise
         return self.executed(obs, self.chunk(noise)).flatten(-2)
 
@@ -381,7 +381,7 @@ class SacAgent(Agent):
     def count_update(self) -> int:
         """Count an update; returns how many distillations it makes."""
         self.updates += 1
-        if self.options.critic != "aliased":
+        if self.options.critic_kind != "aliased":
             return 0
         owed = self.distillation_owed + self.options.distill_steps
         self.distillation_owed = owed - int(owed)
@@ -426,7 +426,7 @@ class SacAgent(Agent):
     def _improve(self, batch: Batch, judge: Weights) -> dict[str, torch.Tensor]:
         """One step of the actor and the temperature; returns scalars."""
         drawn, alpha = self.drawn_to_improve(batch), self.alpha
-        if self.options.critic == "aliased":
+        if self.options.critic_kind == "aliased":
             climbed = detached(self.networks["noise_critic"].weights())
             values = self._q(climbed, drawn.obs, drawn.noise)
         else:
@@ -491,7 +491,7 @@ class SacAgent(Agent):
     @property
     def _bank_size(self) -> int:
         """Random noises that are decoded when a decision is stored."""
-        banks = self.always_banks or self.options.critic == "aliased"
+        banks = self.always_banks or self.options.critic_kind == "aliased"
         return self.options.noise_bank if banks else 0
 
     @torch.no_grad()
@@ -512,9 +512,10 @@ class SacAgent(Agent):
 
     def description(self) -> dict[str, Any]:
         """Agent, geometry and sizes; a checkpoint must have the same."""
-        keys = ("critic", "group", "width", "depth", "critics", "layer_norm", "activation")
+        keys = ("group", "width", "depth", "critics", "layer_norm", "activation")
         sizes = {key: getattr(self.options, key) for key in keys}
-        return {**super().description(), **sizes, "noise_bound": self.options.noise_bound}
+        named = {"critic": self.options.critic_kind, "noise_bound": self.options.noise_bound}
+        return {**super().description(), **sizes, **named}
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimisers, multipliers, generators; loads with ``weights_only=True``."""
@@ -555,9 +556,9 @@ class SacAgent(Agent):
 
     def _members(self) -> dict[str, list[list[nn.Module]]]:
         """The layers of each member of each network, new ones."""
-        judged = self.noise_inputs if self.options.critic == "noise" else self.action_inputs
+        judged = self.noise_inputs if self.options.critic_kind == "noise" else self.action_inputs
         members = {"actor": self._actors(), "critic": self._critics(judged)}
-        if self.options.critic == "aliased":
+        if self.options.critic_kind == "aliased":
             members["noise_critic"] = self._critics(self.noise_inputs)
         return members
 
@@ -591,7 +592,7 @@ class SacAgent(Agent):
 
     def _stored(self, batch: Batch) -> torch.Tensor:
         """What the critics see of a stored decision, flat."""
-        return (batch.noise if self.options.critic == "noise" else batch.actions).flatten(-2)
+        return (batch.noise if self.options.critic_kind == "noise" else batch.actions).flatten(-2)
 
     def _features(self, obs: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():

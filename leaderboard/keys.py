@@ -9,7 +9,13 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
-from symsteer.leaderboard.records import RunRecord, config_hash, flat, with_retired
+from symsteer.leaderboard.records import (
+    RunRecord,
+    config_hash,
+    flat,
+    with_first_names,
+    with_retired,
+)
 from symsteer.variant import UNBROKEN
 
 SYMMETRIC_EMBODIMENT = "floating"
@@ -99,7 +105,7 @@ def recipe_of(config: Mapping[str, Any]) -> str:
             }
         return [strip(item) for item in value] if isinstance(value, list) else value
 
-    return config_hash(strip(with_retired(config)))
+    return config_hash(strip(with_first_names(with_retired(config))))
 
 
 def seeds_of(config: Mapping[str, Any]) -> str:

@@ -57,8 +57,8 @@ _OPTIONS = {
     "--learning-starts": "use --agent.warmup, in decisions",
     "--utd --utd-ratio --gradient-steps": "use --agent.utd, updates per decision",
     "--alpha --ent-coef": "use --agent.initial-alpha; alpha is then tuned",
-    "--n-critics --num-critics --agent.critics --agent.n-critics": (
-        "use --agent.num-critics for their number, and --agent.critic for what they judge"
+    "--critic --agent.critic --n-critics --num-critics": (
+        "use --agent.critics for their number, and --agent.critic-kind for what they judge"
     ),
     "--eval-freq --eval-every": "use --evaluation.every, in control steps",
     "--n-eval-episodes --eval-episodes --num-eval-episodes": "use --evaluation.episodes",

@@ -25,7 +25,11 @@ from symsteer.leaderboard.records.reproductions import (
     read_reproductions,
     reproduction_of,
 )
-from symsteer.leaderboard.records.retired import with_retired, without_retired
+from symsteer.leaderboard.records.retired import (
+    with_first_names,
+    with_retired,
+    without_retired,
+)
 from symsteer.leaderboard.records.schema import (
     HELD_OUT_SEED,
     MAX_GROWTH,
@@ -89,6 +93,7 @@ __all__ = [
     "repeat_command",
     "reproduction_of",
     "run_id_of",
+    "with_first_names",
     "with_retired",
     "without_retired",
     "write_record",

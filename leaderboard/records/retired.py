@@ -1,4 +1,4 @@
-"""Options that agents once had and have no more.
+"""Options that agents once had and have no more, or have by another name.
 
 A record keeps the configuration that it was made with, and its hash. Today's code does what it did
 with the value in `RETIRED`. So a configuration without such an option means the same as one with
@@ -36,6 +36,9 @@ RETIRED_OF_AUGMENTED: dict[str, JsonValue] = {"augmentation": "C8"}
 RETIRED_OF_RUNS: dict[str, JsonValue] = {"keep_replay": False}
 """Options of runs of any agent."""
 
+RENAMED = {"critic": "critic_kind"}
+"""Options of the SAC agents by their first name, and their name today."""
+
 POLICY_OPTION = "process"
 """An option of policies that came with those of runs: older configurations have neither."""
 
@@ -44,17 +47,27 @@ SAC_OPTION = "target_entropy"
 
 
 def with_retired(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration in which no retired option is missing, to compare old and new ones."""
+    """A configuration with all retired options and today's names, to compare old and new ones."""
     policy, options = config.get("policy"), config.get("agent_options")
     is_old = not isinstance(policy, Mapping) or POLICY_OPTION not in policy
     whole = dict(config) if is_old else {**RETIRED_OF_RUNS, **config}
     if isinstance(options, Mapping):
-        whole["agent_options"] = {**_retired_of(config), **options}
+        whole["agent_options"] = {**_retired_of(config), **_named_as_today(options)}
     return whole
 
 
+def with_first_names(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration with the first name of every option: its hash outlives new names."""
+    first = {new: old for old, new in RENAMED.items()}
+    options = config.get("agent_options")
+    if not isinstance(options, Mapping) or SAC_OPTION not in options:
+        return dict(config)
+    named = {first.get(name, name): value for name, value in options.items()}
+    return {**config, "agent_options": named}
+
+
 def without_retired(config: Mapping[str, Any], known: Collection[str]) -> dict[str, Any]:
-    """A configuration without the retired options whose value still means the same.
+    """A configuration with today's names, without retired options that still mean the same.
 
     Args:
         config: as a record has it.
@@ -63,8 +76,14 @@ def without_retired(config: Mapping[str, Any], known: Collection[str]) -> dict[s
     kept = _without(config, RETIRED_OF_RUNS, ())
     options = kept.get("agent_options")
     if isinstance(options, Mapping):
-        kept["agent_options"] = _without(options, _retired_of(config), known)
+        named = options if RENAMED.keys() & set(known) else _named_as_today(options)
+        kept["agent_options"] = _without(named, _retired_of(config), known)
     return kept
+
+
+def _named_as_today(options: Mapping[str, Any]) -> dict[str, Any]:
+    renamed = RENAMED if SAC_OPTION in options else {}
+    return {renamed.get(name, name): value for name, value in options.items()}
 
 
 def _retired_of(config: Mapping[str, Any]) -> dict[str, JsonValue]:

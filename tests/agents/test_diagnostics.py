@@ -104,7 +104,7 @@ def diagnosed(problem, agent):
 
 @pytest.mark.parametrize("critic", ["noise", "aliased", "sampler"])
 def test_a_learner_is_diagnosed_as_by_hand(problem, critic):
-    agent = trained("standard", critic=critic, soft_backup=True)
+    agent = trained("standard", critic_kind=critic, soft_backup=True)
     found, obs, noise = diagnosed(problem, agent)
     q = agent.q_values(obs, noise)
     assert found["q_mean"] == pytest.approx(q.amin(0).mean().item())

@@ -19,7 +19,7 @@ OPTIONS = [
     *({"depth": depth, "layer_norm": norm} for depth in (1, 3) for norm in (True, False)),
     {"activation": "tanh"},
     {"critics": 5, "reduce": "mean"},
-    *({"critic": critic} for critic in ("noise", "sampler")),
+    *({"critic_kind": critic} for critic in ("noise", "sampler")),
 ]
 PENALTIES = [
     (name, {"penalty": penalty}, limit)
@@ -29,7 +29,7 @@ PENALTIES = [
 EXACT = [
     *(("equivariant", {"group": group}, 1e-10) for group in GROUPS),
     *(("equivariant", options, 1e-10) for options in OPTIONS),
-    *(("ensemble", {"group": g, "critic": c}, 1e-10) for g in GROUPS for c in CRITICS),
+    *(("ensemble", {"group": g, "critic_kind": c}, 1e-10) for g in GROUPS for c in CRITICS),
     ("displaced", {"layers": "equivariant"}, 1e-10),
     *PENALTIES,
 ]
@@ -93,12 +93,12 @@ def test_others_are_not_equivariant_under_the_group(problem, name, options):
 
 @pytest.mark.parametrize("critic", CRITICS)
 def test_the_control_is_exact_under_its_mirrored_action(problem, critic):
-    agent = trained("wrong-group", 10, critic=critic)
+    agent = trained("wrong-group", 10, critic_kind=critic)
     assert AGENTS.get("wrong-group").role == "control"
     assert max(errors(agent, problem, sense=-1).values()) < 1e-10
     shapes = [
         [p.shape for net in one.networks.values() for p in net.parameters()]
-        for one in (agent, trained("equivariant", 0, critic=critic))
+        for one in (agent, trained("equivariant", 0, critic_kind=critic))
     ]
     assert shapes[0] == shapes[1]
 

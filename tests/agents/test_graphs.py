@@ -170,8 +170,8 @@ def test_only_classes_that_say_so_are_in_graphs(problem):
     class Own(type(agent)):
         pass
 
-    ramp = problem.agent("residual", critic="sampler", ramp=10)
-    steady = problem.agent("residual", critic="sampler")
+    ramp = problem.agent("residual", critic_kind="sampler", ramp=10)
+    steady = problem.agent("residual", critic_kind="sampler")
     own = Own(problem.context(), agent.options)
     for one in (agent, own, ramp, steady):
         one.device = torch.device("cuda")

@@ -30,7 +30,9 @@ LEARNERS = [
 MARKS = {"standard": (), "equivariant": (), "residual-pathway": pytest.mark.long}
 KINDS = [
     # Those of the others need some minutes of one core.
-    pytest.param(name, AGENTS.get(name).Options().critic, marks=MARKS.get(name, pytest.mark.slow))
+    pytest.param(
+        name, AGENTS.get(name).Options().critic_kind, marks=MARKS.get(name, pytest.mark.slow)
+    )
     for name in LEARNERS
 ]
 KINDS += [
@@ -104,7 +106,7 @@ def null_problem(name, **options):
 
 @pytest.mark.parametrize(("name", "critic"), [("wrong-group", "aliased"), *KINDS])
 def test_nothing_to_gain(name, critic):
-    norms, shares = null_problem(name, critic=critic)
+    norms, shares = null_problem(name, critic_kind=critic)
     if name != "best-of-n":  # it has no actor that could drift
         assert max(norms) < DRIFT, norms
     for key, share in shares.items():
@@ -201,7 +203,7 @@ RANDOM = ("displaced", "best-of-n")
 
 @pytest.mark.parametrize(("name", "critic"), [kind for kind in KINDS if kind[0] not in RANDOM])
 def test_values_and_steps_are_almost_the_best(name, critic):
-    agent = reach(name, critic=critic)
+    agent = reach(name, critic_kind=critic)
     generator = torch.Generator().manual_seed(2)
     obs, noise = states(1024, generator), agent.gaussian_noise(1024, generator)
     truth = best_q(obs, agent.executed(obs, noise))

@@ -25,7 +25,7 @@ TRAINED = [name for name in AGENTS.builtin if issubclass(AGENTS.get(name), SacAg
 
 REFUSED = {
     **{
-        (name, preset): "its critic is sampler"
+        (name, preset): "its critic_kind is sampler"
         for name in ("residual", "best-of-n")
         for preset in ("dsrl", "dsrl-na", "first")
     },
@@ -84,12 +84,17 @@ EXECUTED = 4
     [
         (
             "dsrl",  # Transport
-            {"critic": "noise", "width": 128, "noise_bound": 1.0, "warmup": 640_000 // EXECUTED},
+            {
+                "critic_kind": "noise",
+                "width": 128,
+                "noise_bound": 1.0,
+                "warmup": 640_000 // EXECUTED,
+            },
         ),
         (
             "dsrl-na",  # Can
             {
-                "critic": "aliased",
+                "critic_kind": "aliased",
                 "width": 2048,
                 "noise_bound": 1.5,
                 "warmup": 24_000 // EXECUTED,
@@ -181,14 +186,14 @@ BAD = [
     ("displaced", {"displacement": 0.0}, "displacement must be positive"),
     ("displaced", {"soft_backup": True}, "the displaced agent has no entropy bonus"),
     ("displaced", {"layers": "convolutional"}, "no layers 'convolutional'"),
-    ("residual", {"critic": "noise"}, "the residual agent .* its critic is sampler"),
+    ("residual", {"critic_kind": "noise"}, "the residual agent .* its critic_kind is sampler"),
     ("residual", {"residual_bound": 0.0}, "residual_bound must lie"),
     ("residual", {"residual_bound": 3.0}, "residual_bound must lie"),
     ("residual", {"ramp": -1}, "ramp must not be negative"),
-    ("best-of-n", {"critic": "aliased"}, "best-of-n .* its critic is sampler"),
+    ("best-of-n", {"critic_kind": "aliased"}, "best-of-n .* its critic_kind is sampler"),
     ("best-of-n", {"noise_bank": 0}, "best-of-n needs a noise_bank of at least 1, not 0"),
     ("best-of-n", {"soft_backup": True}, "best-of-n has no entropy bonus"),
-    ("partial", {"critic": "noise"}, "its critic is aliased or sampler"),
+    ("partial", {"critic_kind": "noise"}, "its critic_kind is aliased or sampler"),
     ("partial", {"gate": "open"}, "no gate 'open'"),
     ("partial", {"fence": -1.0}, "fence must not be negative"),
     ("partial", {"noise_bank": 0}, "noise_bank of at least 1"),

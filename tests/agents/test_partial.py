@@ -25,7 +25,7 @@ def set_gates(agent, logit):
 
 @pytest.mark.parametrize("critic", ["aliased", "sampler"])
 def test_it_starts_equivariant(problem, critic):
-    agent = problem.agent("partial", critic=critic, **DOUBLE)
+    agent = problem.agent("partial", critic_kind=critic, **DOUBLE)
     assert max(errors(agent, problem).values()) < 1e-10
     set_gates(agent, 10.0)
     assert min(errors(agent, problem).values()) > 1e-2
@@ -33,7 +33,7 @@ def test_it_starts_equivariant(problem, critic):
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_mixtures_by_hand(problem, share):
-    agent = problem.agent("partial", gate="soft", critic="sampler", **DOUBLE)
+    agent = problem.agent("partial", gate="soft", critic_kind="sampler", **DOUBLE)
     set_gates(agent, torch.logit(torch.tensor(share), eps=1e-12).item())
     batch = problem.batch(8, dtype=torch.float64)
     outputs = agent.actor(batch.obs)
@@ -168,4 +168,4 @@ def test_noise_and_actions_must_differ():
     context = AgentContext(OBS, ACT, 1, 1, lambda obs, noise: noise, lambda obs: obs)
     with pytest.raises(UserError, match="whole chunk is executed"):
         PartialAgent(context, PartialOptions(width=16))
-    PartialAgent(context, PartialOptions(width=16, critic="sampler"))
+    PartialAgent(context, PartialOptions(width=16, critic_kind="sampler"))

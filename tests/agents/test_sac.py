@@ -29,7 +29,7 @@ def tensors(part):
 @pytest.mark.parametrize("critic", CRITICS)
 @pytest.mark.parametrize("name", LEARNERS)
 def test_update_moves_every_parameter_and_stays_finite(problem, name, critic):
-    agent = problem.agent(name, critic=critic)
+    agent = problem.agent(name, critic_kind=critic)
     trained = {**agent.networks, "target": agent.target}
     before = {key: [p.clone() for p in tensors(part)] for key, part in trained.items()}
     for seed in range(3):
@@ -46,7 +46,7 @@ def test_update_moves_every_parameter_and_stays_finite(problem, name, critic):
 @pytest.mark.parametrize("terminal", [0.0, 1.0])
 def test_critic_target_is_the_hand_computed_one(problem, terminal, soft, critic):
     agent = problem.agent(
-        "standard", dtype=torch.float64, soft_backup=soft, initial_alpha=0.3, critic=critic
+        "standard", dtype=torch.float64, soft_backup=soft, initial_alpha=0.3, critic_kind=critic
     )
     batch = problem.batch(dtype=torch.float64, terminal=terminal)
     for seed in range(3):  # so that target and online critics differ
@@ -103,7 +103,7 @@ def test_target_critics_follow_by_tau(problem):
 
 @pytest.mark.parametrize("critic", CRITICS)
 def test_actor_step_leaves_the_critics_alone_and_climbs_q(problem, critic):
-    agent = problem.agent("standard", initial_alpha=1e-6, critic=critic)
+    agent = problem.agent("standard", initial_alpha=1e-6, critic_kind=critic)
     obs = problem.batch(256).obs
 
     def value():
@@ -120,7 +120,7 @@ def test_actor_step_leaves_the_critics_alone_and_climbs_q(problem, critic):
 
 @pytest.mark.parametrize("critic", CRITICS)
 def test_actor_loss_is_the_hand_computed_one(problem, critic):
-    agent = problem.agent("equivariant", dtype=torch.float64, initial_alpha=0.3, critic=critic)
+    agent = problem.agent("equivariant", dtype=torch.float64, initial_alpha=0.3, critic_kind=critic)
     for seed in range(3):  # so that target and online critics differ
         agent.update(problem.batch(seed=10 + seed, dtype=torch.float64))
     for name in ("critic", "noise_critic"):
@@ -189,7 +189,7 @@ def test_same_seed_same_agent(problem, name):
     ("name", "options"),
     [
         *((name, {}) for name in AGENTS.builtin if issubclass(AGENTS.get(name), SacAgent)),
-        *(("equivariant", {"critic": critic}) for critic in ("noise", "sampler")),
+        *(("equivariant", {"critic_kind": critic}) for critic in ("noise", "sampler")),
         ("standard", {"distill_steps": 0.5, "noise_bank": 0, "distill": "actor"}),
     ],
     ids=str,
@@ -237,7 +237,7 @@ def test_a_saved_agent_continues_bit_equal(problem, name, options):
         ({"name": "standard"}, "agent"),
         ({"width": 64}, "width"),
         ({"group": "C4"}, "group"),
-        ({"critic": "noise"}, "critic"),
+        ({"critic_kind": "noise"}, "critic"),
         ({"noise_bound": 2.0}, "noise_bound"),
         ({"problem": {"horizon": 4}}, "horizon"),
         ({"problem": {"obs_layout": Layout([Field("xy", 1)])}}, "obs_layout"),

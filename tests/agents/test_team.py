@@ -72,13 +72,13 @@ def assert_same_state(agents, others):
         assert agent.updates == other.updates
 
 
-KINDS = [(name, AGENTS.get(name).Options().critic) for name in LEARNERS]
+KINDS = [(name, AGENTS.get(name).Options().critic_kind) for name in LEARNERS]
 KINDS += [("ensemble", critic) for critic in ("noise", "sampler")]
 
 
 @pytest.mark.parametrize(("name", "critic"), KINDS)
 def test_members_learn_what_they_learn_alone(problem, name, critic):
-    single, team = (members(problem, name, critic=critic) for _ in range(2))
+    single, team = (members(problem, name, critic_kind=critic) for _ in range(2))
     expected, (_, scalars_of) = alone(single, 5), together(team, 5)
     assert_same_state(team, single)
     for mine, theirs in zip(scalars_of, expected, strict=True):

@@ -303,7 +303,7 @@ def test_the_end_of_a_run_and_status_say_what_was_not_finite(tmp_path, capsys):
         ((*RUN, "--agent", "sac"), "there is no agent 'sac'; all learners here are soft actor"),
         ((*RUN, "--agent", "ppo"), "`symsteer new agent`"),
         ((*RUN, "--policy.name", "dp"), "'plain' is a diffusion policy"),
-        ((*RUN, "--agent.critics", "2"), "--agent.num-critics"),
+        ((*RUN, "--agent.critic", "2"), "--agent.critic-kind"),
         ((*RUN, "--workers", "2"), "--sim-workers"),
         (("sweep", "smoke", "--out", "runs"), "--runs"),
         (("train",), "`symsteer run`"),

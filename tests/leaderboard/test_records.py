@@ -13,6 +13,7 @@ import pytest
 from pydantic import ValidationError
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.keys import recipe_of
 from symsteer.leaderboard.records import (
     Episodes,
     Evaluation,
@@ -366,6 +367,12 @@ def test_of_an_option_that_is_no_more_one_value_means_the_same() -> None:
     old = make_config(agent_options={"target_entropy": 0.5, **RETIRED})
     new = make_config(agent_options={"target_entropy": 0.5})
     assert with_retired(new) == with_retired(old) == old
+    older, newer = ({**new["agent_options"], name: "noise"} for name in ("critic", "critic_kind"))
+    both = [make_config(agent_options=options) for options in (older, newer)]
+    assert with_retired(both[0]) == with_retired(both[1])
+    assert recipe_of(both[0]) == recipe_of(both[1])
+    assert without_retired(both[0], newer)["agent_options"] == newer
+    assert without_retired(both[0], older)["agent_options"] == older  # of another package
     policy = {"name": "edp", "process": "diffusion"}
     later = [make_config(policy=policy), make_config(policy=policy, keep_replay=False)]
     assert with_retired(later[0]) == with_retired(later[1]) == later[1]

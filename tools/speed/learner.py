@@ -173,7 +173,7 @@ def _contenders(task: str, agents: Sequence[str], device: str) -> list[Contender
 
 def _learner(task: str, name: str, critic: str, seed: int, device: str) -> SacAgent:
     agent_class = AGENTS.get(name)
-    options = agent_class.Options(critic=critic, warmup=1)
+    options = agent_class.Options(critic_kind=critic, warmup=1)
     agent = agent_class(AgentContext.of(new_policy(task).to(device), device, seed), options)
     assert isinstance(agent, SacAgent)
     agent.observe(_decisions(agent.context, agent.rows, DECISIONS))
