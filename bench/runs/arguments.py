@@ -61,7 +61,8 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunConfig, Execution]:
         _Arguments,
         prog="symsteer run",
         description=ABOUT,
-        args=arguments,
+        # `all` of `--help all`, see `brief`.
+        args=arguments[: 1 + arguments.index("--help")] if "--help" in arguments else arguments,
         default=_Arguments(Execution(), defaults),
     )
     return parsed.config, parsed.execution

@@ -109,16 +109,17 @@ class RunConfig(_Checked):
     task: str = "PickCube-v1"
     """Task; `symsteer list` names them."""
     embodiment: str = "floating"
-    """`floating` (gripper without an arm: near-exact symmetry) or `panda` (arm)."""
+    """`floating`: a gripper without an arm, almost exactly symmetric. `panda`: an arm."""
     variant: str = "none"
-    """How the symmetry is broken: `none`, `action_gain:0.5`, or several joined with `+`."""
+    """How the symmetry is broken: `none`, NAME:STRENGTH such as `action_gain:0.5`, or several of
+    them joined with `+`."""
     agent: str = "equivariant"
     """Agent; `symsteer list` names them. Your own class: `package.module:Class`."""
     seed: Seed = 0
-    """Seed of the run: networks, exploration, training episodes, and the base policy with its
-    demonstrations."""
+    """Seed of the run: networks, exploration and training episodes. The base policy and its
+    demonstrations change with it, too."""
     env_steps: Count = 50_000
-    """Budget in control steps, summed over the parallel environments."""
+    """Budget: control steps, summed over the parallel environments."""
     num_envs: Annotated[int, Field(ge=1, le=100_000)] = 64
     """Parallel training environments."""
     checkpoint_every: Count = 250
@@ -126,9 +127,9 @@ class RunConfig(_Checked):
     environments begin new episodes in fresh scenes, because a checkpoint cannot contain the
     contacts that PhysX remembers."""
     sim: Literal["cpu", "cuda"] = "cpu"
-    """Device of the simulation."""
+    """Device of the simulation: `cpu` or `cuda`."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the networks."""
+    """Device of the networks: `cpu` or `cuda`."""
     demonstrations: DemonstrationConfig = field(default_factory=DemonstrationConfig)
     policy_name: Annotated[str, tyro.conf.arg(name="policy.name")] = "edp"
     """Base policy; `symsteer list` names them. Your own class: `package.module:Class`."""
@@ -211,21 +212,21 @@ class Execution:
     """How runs are executed. These options do not change the results."""
 
     runs: Path = Path("runs")
-    """Folder of the runs; demonstrations and base policies are kept in RUNS/base."""
+    """Folder of the runs. Demonstrations and base policies are in RUNS/base."""
     demos: Path | None = None
     """Trajectory file (.h5 with .json) to train the base policy on, instead of demonstrations of
     the scripted expert."""
     base_policy: Path | None = None
-    """Saved base policy (policy.safetensors) to steer, instead of training one. The run uses its
-    settings and those of its demonstrations."""
+    """Saved base policy (policy.safetensors) to steer, instead of training one. Its settings and
+    those of its demonstrations become those of the run."""
     sim_workers: int = 1
-    """Processes that share the simulation; they only change the times in the record."""
+    """Processes that share the simulation. Only times in the record depend on it."""
     track: tyro.conf.FlagCreatePairsOff[bool] = False
     """Show the run in Weights & Biases, too. WANDB_MODE=offline needs no network and no login."""
     quiet: bool = False
     """No progress bars."""
     trust: tuple[str, ...] = ()
-    """Code of other authors that files name, as module:Class; it is executed."""
+    """Code of other authors that files name, as module:Class. It is executed."""
     group: Annotated[str | None, tyro.conf.Suppress] = None
     """Name of what tracked runs belong to: the suite of a sweep."""
 

@@ -25,6 +25,7 @@ import symsteer as symsteer_package
 from symsteer import bench
 from symsteer.bench import cli
 from symsteer.bench.demos import collect
+from symsteer.bench.runs.brief import COMMON
 from symsteer.bench.runs.config import Execution
 from symsteer.bench.sweep.survey import look
 from symsteer.bench.sweep.workforce import Workforce
@@ -76,6 +77,17 @@ def test_mistakes(arguments, words, command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert words in refused(command, *arguments)
     assert not any(tmp_path.rglob("record.json"))
+
+
+def test_the_brief_help_of_run_has_options_of_the_whole_one(command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    briefly, whole = (command("run", *words)[1].out for words in (["--help"], ["--help", "all"]))
+    assert len(briefly.splitlines()) <= 50
+    assert max(map(len, briefly.splitlines())) <= 100
+    listed = re.findall(r"^  (--\S+) .*\S", briefly, re.MULTILINE)
+    assert listed == [f"--{name}" for name in COMMON]
+    assert [name for name in listed if not re.search(rf"{name}[ ,]", whole)] == []
+    assert "--agent.gamma" in whole
 
 
 def cut_off(path):
@@ -143,7 +155,7 @@ def test_every_verb_has_help(verb, command):
     assert f"usage: symsteer {verb} " in shown.out
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["list"], ["sweep", "--help"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["list"], ["sweep", "--help"], ["run", "-h"]])
 def test_names_and_help_cost_no_import_of_torch_or_maniskill(arguments):
     program = (
         "import sys; from symsteer.cli import main; "
@@ -215,7 +227,7 @@ def test_a_class_in_the_present_folder_can_be_tried(tmp_path):
         "class Mine(ZeroAgent):\n    name = 'mine'\n"
     )
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "symsteer", "run", "--agent", "mine:Mine", "--help"],
+        [sys.executable, "-P", "-m", "symsteer", "run", "--agent", "mine:Mine", "--help", "all"],
         cwd=tmp_path,
         capture_output=True,
         text=True,
