@@ -10,7 +10,7 @@ export MKL_NUM_THREADS := 1
 
 help:
 	@echo "make setup         create .venv with the pinned packages"
-	@echo "make demo          a plain and an equivariant agent in a broken world -> leaderboard, in minutes"
+	@echo "make demo          the agents standard and equivariant in a broken world -> leaderboard, in minutes"
 	@echo "make test          the default tests, minutes (the others: make test-long, make test-slow)"
 	@echo "make lint          ruff, format check, types, import contracts"
 	@echo "make requirements  compile requirements.txt from pyproject.toml"

@@ -2,7 +2,7 @@
 
 If the world is symmetric, a transition (s, w, a, r, s') that is rotated as a whole is another true
 one with the same reward. The equivariant agent has this built in. This agent is plain and learns it
-from batches in which every transition is rotated at random. It costs as much as the plain agent and
+from batches in which every transition is rotated at random. It costs as much as `standard` and
 can leave the symmetry. Where the world breaks the symmetry, some rotated transitions are false.
 """
 

@@ -9,7 +9,7 @@ need not agree. Two regularisers of the paper make them agree more:
 
     actor:   mean_g KL(pi_g || pi) + KL(pi || pi_g),     critics:   mean_g (q_g - Q)^2,
 
-without gradient in pi and Q. An update costs |G| times the products of the plain agent.
+without gradient in pi and Q. An update costs |G| times the products of `standard`.
 :func:`symsteer.policies.geometry.group_average` does the same to any function.
 """
 

@@ -18,7 +18,7 @@ TEMPLATES = Path(__file__).resolve().parent / "templates"
 
 ORIGINS = {
     "equivariant": ("EquivariantAgent", "the equivariant agent"),
-    "standard": ("StandardAgent", "the plain agent"),
+    "standard": ("StandardAgent", "the standard agent"),
 }
 """Class and description of the agents that a new one can begin as."""
 

@@ -31,7 +31,7 @@ class SacOptions(AgentOptions):
     critics are distilled from them for the actor (DSRL-NA). `sampler`: the executed actions; the
     actor's gradient passes through the sampler."""
     gamma: float = 0.95
-    """Discount per decision (not per environment step)."""
+    """Discount per decision (not per control step)."""
     lr: float = 2.4e-3
     """Adam's learning rate of actor and critics."""
     alpha_lr: float = 3e-4
@@ -55,18 +55,18 @@ class SacOptions(AgentOptions):
     noise_bound: float = 1.0
     """Largest norm of an irrep block of the noise."""
     distill: Distill = "squashed"
-    """Noise at which `aliased` distils: N(0, I), N(0, I) squashed into the bound, the actor's, or a
-    mixture of squashed and actor's in equal parts."""
+    """Noise at which `aliased` distils. `gaussian`: N(0, I). `squashed`: N(0, I) inside the bound.
+    `actor`: the actor's. `mixture`: half squashed, half the actor's."""
     distill_steps: float = 0.5
     """Gradient steps of the noise critics per update."""
     noise_bank: int = 4
     """Random noises that `aliased` decodes once per stored decision and distils from; 0: decode new
     ones in every step."""
     utd: float = 0.5
-    """Updates per collected decision, for any number of environments."""
+    """Updates per decision (not per control step), for any number of environments."""
     warmup: int = 1280
-    """Decisions at the start with noise from N(0, I), that is of the base policy, before the first
-    update."""
+    """Decisions (not control steps) before the first update. Their noise is N(0, I), as that of the
+    base policy alone."""
     replay_capacity: int = 200_000
     """Capacity of the replay buffer, in decisions."""
     reward_scale: float = 0.25
@@ -81,7 +81,7 @@ class SacOptions(AgentOptions):
     layer_norm: bool = True
     """Normalise hidden features; without it Q often diverges."""
     group: str = "C8"
-    """Symmetry group, C_n or D_n, of equivariant layers, of turned batches and of the measured
+    """Symmetry group, C_n or D_n. Equivariant layers use it, and turned batches, and the measured
     equivariance errors."""
     initial_output: float = 0.01
     """Factor on the actor's output layer at initialisation; small means w starts around 0."""

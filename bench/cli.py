@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Trust = Annotated[
     tuple[str, ...],
-    tyro.conf.arg(help="Code of other authors that files name, as module:Class; it is executed."),
+    tyro.conf.arg(help="Code of other authors that files name, as module:Class. It is executed."),
 ]
 """The option with which a user consents to code that files name."""
 
@@ -363,7 +363,7 @@ def demos(
         task: Task; `symsteer list` names them.
         embodiment: floating or panda.
         count: Number of successful demonstrations.
-        mode: clean, or diverse (correlated noise and offsets: what steering needs).
+        mode: clean: as the expert acts. diverse: with correlated noise and offsets, for steering.
         seed: Seed of the collection.
     """
     allow(task)
@@ -510,7 +510,7 @@ def audit_episodes(
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none.
         group: Symmetry group, e.g. C8, D4 (with reflections).
         episodes: Number of episodes.
-        actions: Who acts: expert or random, whose actions are turned, or policy: its noise is.
+        actions: Who acts. Actions of expert and random are turned; of policy, the noise is.
         base_policy: Saved base policy; default: that of `symsteer run`, kept in runs/base.
     """
     allow(task, variant, *trust)

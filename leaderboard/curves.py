@@ -143,17 +143,17 @@ def _cell(table: Table) -> str:
 
 
 def _certainties(table: Table) -> list[str]:
-    """How sure it is that a learner ends above or below the plain one: a sentence for each."""
-    sentences, plain = [], table.row_of(STANDARD)
+    """How sure it is that a learner ends above or below `standard`: a sentence for each."""
+    sentences, standard = [], table.row_of(STANDARD)
     for row in table.learners:
-        pairs = success_pairs(row, plain) if plain and row is not plain else {}
-        if not plain or not pairs:
+        pairs = success_pairs(row, standard) if standard and row is not standard else {}
+        if not standard or not pairs:
             continue
         success, policies = crossed_bootstrap([*pairs.values()]), {p.policy for p in pairs.values()}
         sure = "is clearly" if success.sign else "is not clearly"
         sentence = (
             f"{row.label} {sure if len(pairs) >= MIN_SEEDS else 'may be'} "
-            f"{'above' if success.value > 0 else 'below'} {plain.label}: "
+            f"{'above' if success.value > 0 else 'below'} {standard.label}: "
             f"{interval(success, sign=True)} of success in the last fifth of the steps (95 % "
             f"interval; base policies: {len(policies)}; pairs of runs: {len(pairs)}, and a verdict "
             f"needs {MIN_SEEDS})."

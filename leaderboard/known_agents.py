@@ -12,11 +12,11 @@ STANDARD = "standard"
 """Without symmetry, with the channels of the equivariant agent."""
 
 WITHOUT_SYMMETRY = (STANDARD, "standard-matched", "augmented")
-"""Rivals without symmetry in their networks: the plain agent, the same with the parameters of the
-equivariant agent, and the fair one, which learns from rotated data."""
+"""Rivals without symmetry in their networks: `standard`, the same with as many parameters as
+`equivariant`, and the fair one, which learns from rotated data."""
 
 WITH_SYMMETRY = ("equivariant", "residual-pathway", "approximate")
-"""Strict and approximate. The last one is that of the first leaderboard, which `residual-pathway`
+"""All of it, and nearly all. The last is that of the first leaderboard, which `residual-pathway`
 has replaced."""
 
 USING_SYMMETRY = ("augmented", *WITH_SYMMETRY)

@@ -56,7 +56,8 @@ def render_page(view: View) -> str:
     """The whole page as markdown."""
     parts = [
         "# Leaderboard",
-        "This page is generated from run records by `symsteer report`; do not edit it.",
+        "This page is generated from run records by `symsteer report`; do not edit it. Version: "
+        f"`{view.summary.version}`.",
         *notices(view.findings.study),
     ]
     if notice := seed_notice(view.summary):

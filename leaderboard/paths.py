@@ -66,12 +66,16 @@ def reproductions_for(records: Iterable[Path], folder: Path | None) -> Path | No
     return folder
 
 
-def record_files(paths: Iterable[Path]) -> list[Path]:
+def record_files(paths: Iterable[Path], mixed: bool = False) -> list[Path]:
     """The files that `paths` name (files, run folders, folders of either), resolved, each once.
 
     In a folder every `record.json` at any depth counts, and beside these every `*.json` that begins
     like a record; run folders hold other JSON as well. A folder without any `record.json` must hold
     nothing but records as `*.json`. Links to files are followed, links to folders are not.
+
+    Args:
+        paths: of files and folders.
+        mixed: in any folder, other `*.json` are left out.
 
     Raises:
         UserError: for a path that does not exist or is neither a file nor a folder, a folder
@@ -80,7 +84,7 @@ def record_files(paths: Iterable[Path]) -> list[Path]:
     paths = list(paths)
     files: dict[Path, None] = {}
     for path in paths:
-        for file in _in_folder(path) if stat.S_ISDIR(_mode(path)) else [path]:
+        for file in _in_folder(path, mixed) if stat.S_ISDIR(_mode(path)) else [path]:
             if not stat.S_ISREG(_mode(file)):
                 raise UserError(f"{file} is no ordinary file: name a record or a folder")
             resolved = file.resolve()
@@ -111,7 +115,7 @@ def _refuse(error: OSError) -> NoReturn:
     ) from error
 
 
-def _in_folder(folder: Path) -> list[Path]:
+def _in_folder(folder: Path, mixed: bool) -> list[Path]:
     files = sorted(
         Path(parent, name)
         for parent, _, names in os.walk(folder, onerror=_refuse)
@@ -119,7 +123,7 @@ def _in_folder(folder: Path) -> list[Path]:
         if name.endswith(".json") and not name.endswith(REPEATED)
     )
     named = [file for file in files if file.name == RECORD]
-    if not named:
+    if not named and not mixed:
         return files
     # A run folder laid among committed records must not hide them.
     return named + [file for file in files if file.name != RECORD and _begins_like_a_record(file)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -164,6 +165,14 @@ class Summary:
     @property
     def runs(self) -> list[Run]:
         return [run for table in self.tables for run in table.runs]
+
+    @cached_property
+    def version(self) -> str:
+        """The day of the newest run, and the beginning of a hash of all records' files."""
+        runs = [*self.runs, *self.set_aside]
+        newest = max(run.record.ended or run.record.started for run in runs)
+        digests = "\n".join(sorted(run.digest for run in runs))
+        return f"{newest:%Y-%m-%d}.{hashlib.sha256(digests.encode()).hexdigest()[:8]}"
 
     @cached_property
     def usual_budget(self) -> int:

@@ -48,6 +48,8 @@ class Run:
     """What the same run said when it was made again."""
     trusted: bool = True
     """Whether it counts: all do but submitted ones that no maintainer has reproduced."""
+    digest: str = ""
+    """sha256 of the record's file."""
 
     @property
     def seed(self) -> int:
@@ -239,7 +241,8 @@ def load_runs(
     runs = []
     for file in record_files(paths):
         record, digest = read_record(file), file_hash(file)
-        runs.append(Run(file, record, known.get(digest), listed is None or digest in listed))
+        trusted = listed is None or digest in listed
+        runs.append(Run(file, record, known.get(digest), trusted, digest))
         if reproductions and digest in known:
             path = reproductions / f"{digest}.json"
             counts = file_hash(path) in vouched, listed is None

@@ -16,15 +16,17 @@ if TYPE_CHECKING:
     from symsteer.bench.runs.trained import load
     from symsteer.bench.tasks import make
     from symsteer.errors import UserError
+    from symsteer.leaderboard.run_table import read_records
 
     __version__: str
 
-__all__ = ["UserError", "__version__", "load", "make"]
+__all__ = ["UserError", "__version__", "load", "make", "read_records"]
 
 _HOME = {
     "UserError": "symsteer.errors",
     "load": "symsteer.bench.runs.trained",
     "make": "symsteer.bench.tasks",
+    "read_records": "symsteer.leaderboard.run_table",
 }
 
 

@@ -41,7 +41,8 @@ def advise(
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none.
         group: Symmetry group, e.g. C8, D4 (with reflections).
         audit: What `symsteer audit --out` wrote: its folder, audit.json or summary.json.
-        runs: Folders of runs or records, each a study of its own; default: the committed records.
+        runs: Folders of runs or records. Runs of different folders are not compared. Default: the
+            committed records.
         json: Print only JSON, with every number.
     """
     allow(task, variant, *trust)
@@ -153,7 +154,10 @@ def _text(advice: Advice, source: str) -> str:
     if defect.resets_differ:
         lines.append("its initial states are broken, too, which is no part of a decision")
     if advice.expected:
-        lines += ["", "Expected advantage over standard, 95 % interval; ? decides nothing:"]
+        lines += [
+            "",
+            "Expected advantage over standard, with 95 % intervals (?: too little to decide):",
+        ]
         header = ["agent", "measure", "from", "line of", "advantage", "cells", "policies", "tasks"]
         lines.append(aligned(header, [_expected(one) for one in advice.expected], left=4))
     lines += ["", *(_choice(choice) for choice in advice.choices)]
@@ -189,7 +193,7 @@ def _test_text(test: LeaveOut) -> str:
     from symsteer.leaderboard.rows import MIN_SEEDS
     from symsteer.leaderboard.sections.unknown_task import best_agents, scores
 
-    title = f"Tested by leaving out one task after the other ({test.embodiment})"
+    title = f"Test: each task from the runs of the other tasks ({test.embodiment})"
     if not test.agents:
         return (
             f"{title}: not possible; tasks with audited cells of at least {MIN_SEEDS} base "

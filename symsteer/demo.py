@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def demo(runs: Path = Path("runs/demo")) -> int:
-    """See a plain and an equivariant agent in a world that breaks the symmetry: minutes on a CPU.
+    """See `standard` and `equivariant` in a world that breaks the symmetry: minutes on a CPU.
 
     They steer a base policy that comes with SymSteer.
 

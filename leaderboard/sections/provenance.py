@@ -8,6 +8,7 @@ from symsteer.files import csv_text
 from symsteer.leaderboard.defects import fingerprint
 from symsteer.leaderboard.records import Provenance
 from symsteer.leaderboard.rows import Summary
+from symsteer.leaderboard.run_table import run_line
 from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.sections import Findings, Links, Section, View
 from symsteer.leaderboard.text import NOTHING, code, number
@@ -20,6 +21,9 @@ def render(findings: Findings, view: View) -> list[str]:
         "Regenerate with `symsteer report`, or `symsteer report RECORDS --out FOLDER`: the same "
         "records and audit give the same bytes. Each record holds the whole configuration and "
         "every evaluation episode with its seed.",
+        f"To cite these results, name their version, `{summary.version}`: the day of the newest "
+        "run and the beginning of a hash of all records. In the repository, "
+        f"`git log -S {summary.version} --format=%h --reverse` names the commit that has it first.",
         facts(summary, fingerprint(findings.audit)),
         "[records.csv](records.csv) names all records, with seed, status, commit and hash.",
     ]
@@ -78,22 +82,10 @@ def _link(run: Run, links: Links) -> str:
 def render_records(summary: Summary, links: Links) -> str:
     """The records of all tables; `record` is the file's place relative to the page."""
     lines = [
-        {
-            "task": table.key.task,
-            "embodiment": table.key.embodiment,
-            "variant": table.key.variant,
-            "demonstrations": table.key.demonstrations,
-            "env_steps": table.key.env_steps,
-            "agent": run.agent,
+        run_line(run)
+        | {
             "row": row.label,
-            "seed": run.seed,
-            "status": run.record.status,
             "reproduced": run.reproduction and run.reproduction.verdict,
-            "success": run.success if run.finished else None,
-            "commit": " ".join(dict.fromkeys(p.commit or p.version or "" for p in run.provenances)),
-            "local_changes": int(any(p.dirty for p in run.provenances)),
-            "config_sha256": run.record.config_hash,
-            "run": run.record.run_id,
             "record": links.get(run.path),
         }
         for table in summary.tables

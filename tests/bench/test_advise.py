@@ -63,7 +63,7 @@ def test_worlds_of_an_audit(advise, tmp_path):
     # The task and its dial are unknown here, and one dial is not enough for a part.
     assert "kind of break         shelf or else part tool" in shown.out
     assert "success: undecided, because" in shown.out
-    assert shown.out.count("Tested by leaving out") == 1
+    assert shown.out.count("Test: each task from") == 1
 
 
 @pytest.mark.long

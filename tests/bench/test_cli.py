@@ -2,6 +2,7 @@
 
 import ast
 import fcntl
+import functools
 import importlib
 import itertools
 import os
@@ -26,7 +27,7 @@ from symsteer import bench
 from symsteer.bench import cli
 from symsteer.bench.demos import collect
 from symsteer.bench.runs.brief import COMMON
-from symsteer.bench.runs.config import Execution
+from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.sweep.survey import look
 from symsteer.bench.sweep.workforce import Workforce
 from symsteer.bench.tasks import task_class
@@ -327,6 +328,10 @@ def test_words_of_other_software_get_the_name_here(arguments, words, command):
     assert "did you mean" not in line
 
 
+ROOT = Path(symsteer_package.__file__).parents[1]
+
+
+@functools.cache
 def options_by_name():
     """The kinds of value of every option, by its name, and the verbs that have it."""
     kinds, verbs = defaultdict(set), defaultdict(set)
@@ -357,3 +362,28 @@ def test_no_hint_is_about_an_option_that_there_is():
     assert not foreign & set(verbs)
     for option, (refusing, _) in _ELSEWHERE.items():
         assert not verbs[option] & set(refusing.split())
+
+
+PAGES = [
+    *(page for page in (ROOT / "docs").rglob("*.md") if page.name != "detect.md"),  # of 0.2.0
+    *(ROOT / "examples").rglob("*.md"),
+    *(ROOT / "agents" / "templates").glob("*.txt"),
+    ROOT / "README.md",
+    ROOT / ".ci" / "end-to-end",
+]
+
+TYPED = re.compile(r"symsteer ([a-z][a-z-]+)((?: [^\s`#|>]+)*)")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_documentation_types_options_that_the_verb_has(page):
+    _, verbs = options_by_name()
+    config = {field.name.replace("_", "-") for field in fields(RunConfig)}
+    unknown = []
+    for verb, words in TYPED.findall(page.read_text().replace("\\\n", " ")):
+        for option in re.findall(r"--[\w.-]+", words):
+            known = verb in verbs[option.replace("--no-", "--")] or option == "--help"
+            known |= verb == "run" and ("." in option or option[2:] in config)
+            if verb in VERBS and not known:
+                unknown.append(f"{verb} {option}")
+    assert unknown == []

@@ -25,7 +25,7 @@ from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from mani_skill.vector.wrappers.sb3 import ManiSkillSB3VectorEnv
-from stable_baselines3 import SAC
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 
 from symsteer.bench.sim.headless import rendering_works
@@ -369,6 +369,7 @@ def test_stable_baselines3_takes_both():
         ends += dones.sum()
     assert (rewards.shape, obs.shape, len(infos)) == ((3,), first.shape, 3)
     assert ends == 3
+    PPO("MlpPolicy", env, n_steps=6, batch_size=18, n_epochs=1, seed=0).learn(18)
 
 
 def test_cleanrls_ppo_wraps_the_documented_id():

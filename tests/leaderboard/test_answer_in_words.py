@@ -17,14 +17,14 @@ INTERVAL = re.compile(r"[+\u2212]?\d\.\d+ \[[+\u2212]?\d\.\d+, [+\u2212]?\d\.\d+
 SHARE = re.compile(r"\b\d+/\d+\b")
 
 ROWS = {
-    "learns faster than plain (`standard`), {}": "Symmetric agents learn faster in unbroken worlds",
-    "at equal size, {}": "Symmetric agents learn faster, at equal size",
+    "learns faster than `standard`, {}": "Symmetric agents learn faster in unbroken worlds",
+    "at equal size (`standard-matched`), too, {}": "Symmetric agents learn faster, at equal size",
     "rotated data (`augmented`), {}": "Symmetric networks learn faster than symmetry from data",
     "no difference is seen, {}": "unbroken, 120 k steps",
-    "strict ends {}": "Strictness loses to the plain agent there",
+    "that of `equivariant` is {}": "Strictness loses to the plain agent there",
     "(two tasks) {}": "With five times the budget the strict agent loses, broken",
-    "approximate (`residual-pathway`) {}": "Approximate equivariance beats the plain agent there",
-    "and {}. As tuned": "`perception_bias`, 120 k steps",
+    "that of `residual-pathway` is {}": "Approximate equivariance beats the plain agent there",
+    "and then {}. As tuned": "`perception_bias`, 120 k steps",
     "at a defect of {}": "`equivariant` | success | all",
     "at {} with `actuator_offset`": "`equivariant` | success | `actuator_offset`",
     "at {} with `perception_bias`": "`equivariant` | success | `perception_bias`",
