@@ -23,7 +23,7 @@ ROWS = {
     "no difference is seen, {}": "unbroken, 120 k steps",
     "that of `equivariant` is {}": "Strictness loses to the plain agent there",
     "(two tasks) {}": "With five times the budget the strict agent loses, broken",
-    "that of `residual-pathway` is {}": "Approximate equivariance beats the plain agent there",
+    "That of `residual-pathway` is {}": "Approximate equivariance beats the plain agent there",
     "and then {}. As tuned": "`perception_bias`, 120 k steps",
     "at a defect of {}": "`equivariant` | success | all",
     "at {} with `actuator_offset`": "`equivariant` | success | `actuator_offset`",
