@@ -73,7 +73,7 @@ class SacOptions(AgentOptions):
     """Factor on rewards in training (0.25: one decision of four steps costs 1). Reported Q-values
     are in unscaled reward units."""
     width: int = 128
-    """Hidden features per layer; with a group of order n they are width/n regular fields."""
+    """Hidden features per layer. With a group of order n they form width/n regular fields."""
     depth: int = 2
     """Hidden layers."""
     activation: Activation = "relu"
@@ -81,8 +81,8 @@ class SacOptions(AgentOptions):
     layer_norm: bool = True
     """Normalise hidden features; without it Q often diverges."""
     group: str = "C8"
-    """Symmetry group, C_n or D_n, of equivariant layers, of turned batches and of the measured
-    equivariance errors."""
+    """Symmetry group, C_n or D_n. Equivariant layers, turned batches and measured equivariance
+    errors use it."""
     initial_output: float = 0.01
     """Factor on the actor's output layer at initialisation; small means w starts around 0."""
 
