@@ -19,6 +19,7 @@ import pytest
 import yaml
 from packaging.specifiers import SpecifierSet
 
+from symsteer.bench.sweep.slurm import SlurmFile
 from symsteer.bench.sweep.suite import load_suite
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -99,10 +100,11 @@ def test_the_data_card_counts_the_records():
     assert len(list((results / "base").glob("*/policy.safetensors"))) == 10
 
 
-def test_the_suite_of_the_first_result(tmp_path):
+def test_the_files_of_the_first_result(tmp_path):
     page = (ROOT / "docs" / "first-result.md").read_text()
-    (text, *_) = re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S)
-    (tmp_path / "mine.toml").write_text(text)
+    suite, cluster = re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S)
+    assert SlurmFile.model_validate(tomllib.loads(cluster)).cpus == 4
+    (tmp_path / "mine.toml").write_text(suite)
     runs = load_suite(str(tmp_path / "mine.toml")).runs
     assert len(runs) == 20
     assert {run.policy_seed for run in runs} == {0}
