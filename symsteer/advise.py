@@ -154,10 +154,7 @@ def _text(advice: Advice, source: str) -> str:
     if defect.resets_differ:
         lines.append("its initial states are broken, too, which is no part of a decision")
     if advice.expected:
-        lines += [
-            "",
-            "Expected advantage over standard, with 95 % intervals (?: too little to decide):",
-        ]
+        lines += ["", "Expected advantage over standard, 95 % interval (?: not enough to decide):"]
         header = ["agent", "measure", "from", "line of", "advantage", "cells", "policies", "tasks"]
         lines.append(aligned(header, [_expected(one) for one in advice.expected], left=4))
     lines += ["", *(_choice(choice) for choice in advice.choices)]
@@ -200,5 +197,6 @@ def _test_text(test: LeaveOut) -> str:
             f"policies: {len(test.tasks)}."
         )
     rows = scores(test)
-    table = aligned(list(rows[0]), [list(row.values()) for row in rows], left=3)
+    shown = [[value.replace("`", "") for value in row.values()] for row in rows]
+    table = aligned(list(rows[0]), shown, left=3)
     return f"{title}:\n{table}\n{best_agents(test)}".replace("`", "")
