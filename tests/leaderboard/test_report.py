@@ -157,7 +157,7 @@ HOSTILE = [
 
 def test_hostile_text_stays_text_in_every_section(tmp_path: Path) -> None:
     """In names and failures of every kind, and of finished runs in a hostile, audited cell."""
-    markdown = pytest.importorskip("markdown_it")
+    markdown = pytest.importorskip("markdown_it", exc_type=ImportError)
     text = HOSTILE[1]
     rates = {"base": 0.3, "standard": 0.5, "equivariant": 0.6, text: 0.7, f"{text}2": 0.4}
     place = {"task": text, "embodiment": text}

@@ -202,7 +202,7 @@ def files_of(runs: Sequence[Run], folder: Path, study: str = "paper") -> dict[st
 
 
 def test_the_site_marks_rows_and_runs(two_of_five: Path, tmp_path: Path) -> None:
-    pytest.importorskip("jinja2")
+    pytest.importorskip("jinja2", exc_type=ImportError)
     marks = two_of_five / "marks"
     generate_site([two_of_five / "records"], tmp_path, "paper", docs=False, reproductions=marks)
     assert "1\u00a0reproduced" in (tmp_path / "index.html").read_text()

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import pytest
 
+pytest.importorskip("optuna", exc_type=ImportError)
+
 from symsteer.bench.tuning import command
 from symsteer.bench.tuning.command import Tuner
 from symsteer.bench.tuning.plan import read_plan
