@@ -1,8 +1,8 @@
 # Everything runs in .venv. `make setup` makes it once; later it does nothing.
 PYTHON ?= python3.11
 UV_VERSION := 0.9.30
-# What the committed records were made with; pyarrow 26 needs NumPy 2.
-PINNED := 'torch==2.13.0' 'mani-skill==3.0.1' 'sapien==3.0.3' 'numpy==1.26.4' 'pyarrow<26'
+# What the committed records were made with.
+PINNED := 'torch==2.13.0' 'mani-skill==3.0.1' 'sapien==3.0.3' 'numpy==1.26.4'
 BIN := .venv/bin
 # One thread per process: runs and tests use the cores by running several processes.
 export OMP_NUM_THREADS := 1
