@@ -21,6 +21,7 @@ from symsteer.bench.sim.headless import RENDERING_CURE, silence_import_noise
 from symsteer.bench.sim.versions import TESTED, installed, untested
 from symsteer.errors import UserError
 from symsteer.extras import EXTRAS, command
+from symsteer.names import check
 
 REQUIRED = {
     "filelock": "filelock",
@@ -79,16 +80,17 @@ def doctor(arguments: list[str]) -> int:
     parser.add_argument(
         "--quiet", action="store_true", help="Show only what is required and missing."
     )
-    quiet = parser.parse_args(arguments).quiet
+    options, others = parser.parse_known_args(arguments)
+    check("option of doctor", others, ["--quiet"])
     checks = probe()
-    for check in checks:
-        if quiet and (check.ok or not check.required):
+    for one in checks:
+        if options.quiet and (one.ok or not one.required):
             continue
-        mark = "ok     " if check.ok else "MISSING" if check.required else "absent "
-        print(f"{mark} {check.name:18s} {check.detail}")
-        if not check.ok and check.cure:
-            print(f"{'':26s} -> {check.cure}")
-    return 0 if all(check.ok or not check.required for check in checks) else 1
+        mark = "ok     " if one.ok else "MISSING" if one.required else "absent "
+        print(f"{mark} {one.name:18s} {one.detail}")
+        if not one.ok and one.cure:
+            print(f"{'':26s} -> {one.cure}")
+    return 0 if all(one.ok or not one.required for one in checks) else 1
 
 
 def probe() -> list[Check]:
