@@ -43,8 +43,8 @@ SMALL = {
 
 def controller(obs: torch.Tensor) -> torch.Tensor:
     """Actions [..., 7] that commute with every rotation and reflection of the plane."""
-    tcp, goal = (torch.view_as_complex(obs[..., OBS.slice(n)].clone()) for n in ("tcp", "goal"))
-    rod = torch.view_as_complex(obs[..., OBS.slice("rod")].clone())
+    tcp, goal = (torch.complex(*obs[..., OBS.slice(n)].unbind(-1)) for n in ("tcp", "goal"))
+    rod = torch.complex(*obs[..., OBS.slice("rod")].unbind(-1))
     reach = goal - tcp
     xy = reach / reach.abs().clamp_min(0.25)
     tilt = 0.5j * rod * xy.conj()
