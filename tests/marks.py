@@ -6,8 +6,15 @@ from typing import Any
 import pytest
 
 from symsteer.errors import UserError
+from symsteer.extras import EXTRAS
 from symsteer.policies import POLICIES
 from symsteer.policies.geometry import escnn_package
+
+
+def need(extra: str) -> None:
+    """Without the packages of an extra, what calls this is skipped."""
+    for module in EXTRAS[extra]:
+        pytest.importorskip(module, exc_type=ImportError)
 
 
 def need_escnn() -> Any:

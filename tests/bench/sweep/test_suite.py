@@ -24,6 +24,7 @@ from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.study import read_study
 from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy
+from tests.marks import need
 
 
 def write(tmp_path, text: str) -> str:
@@ -287,7 +288,7 @@ def test_how_a_toml_file_is_read(tmp_path):
     path.mkdir()
     with pytest.raises(UserError, match=f"the suite {path} cannot be read: Is a dir.*name another"):
         read_suite(str(path))
-    pytest.importorskip("optuna", exc_type=ImportError)
+    need("tune")
     from symsteer.bench.tuning.plan import read_plan
 
     for read, kind in ((load_suite, "suite"), (read_plan, "tuning plan"), (read_study, "study")):

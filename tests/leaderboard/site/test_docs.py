@@ -13,7 +13,10 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.site import docs
 from symsteer.leaderboard.site.docs import CONFIG, Documentation, build_documentation
 from tests.leaderboard.site.pages import dead_links, read_pages
+from tests.marks import need
 from tools.mkdocs_hook import PAGES, relinked
+
+need("site")
 
 markdown_it = pytest.importorskip("markdown_it", exc_type=ImportError)
 
