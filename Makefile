@@ -1,6 +1,8 @@
 # Everything runs in .venv. `make setup` makes it once; later it does nothing.
 PYTHON ?= python3.11
 UV_VERSION := 0.9.30
+# What the committed records were made with.
+PINNED := 'torch==2.13.0' 'mani-skill==3.0.1' 'sapien==3.0.3' 'numpy==1.26.4'
 BIN := .venv/bin
 # One thread per process: runs and tests use the cores by running several processes.
 export OMP_NUM_THREADS := 1
@@ -19,7 +21,7 @@ setup: .venv/.complete
 
 .venv/.complete: requirements.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || \
-	  { echo "SymSteer needs Python 3.11; name it with: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)" >&2; exit 2; }
+	  { echo "the pinned packages need Python 3.11 (for others see docs/install.md): make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)" >&2; exit 2; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
 	$(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --no-deps -r requirements.txt
@@ -46,8 +48,8 @@ lint: setup
 	$(BIN)/lint-imports
 
 requirements:
-	$(BIN)/uv pip compile pyproject.toml --extra dev --python-version 3.11 --no-header \
-	  --no-emit-index-url --no-annotate --upgrade --output-file requirements.txt
+	printf '%s\n' $(PINNED) | $(BIN)/uv pip compile pyproject.toml - --extra dev --no-header \
+	  --python-version 3.11 --no-emit-index-url --no-annotate --upgrade --output-file requirements.txt
 
 clean:
 	rm -rf .venv build *.egg-info

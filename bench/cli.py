@@ -6,9 +6,8 @@ imported inside the functions, so that help, ``list`` and ``doctor`` do not wait
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,6 +15,7 @@ import tyro
 
 from symsteer.bench.sweep.workforce import THIS_MACHINE, Workforce
 from symsteer.errors import UserError
+from symsteer.extras import extra
 from symsteer.files import prepare_folder
 from symsteer.registry import allow
 from symsteer.terminal import BOARD, complain, folded, printable, to_paste
@@ -279,7 +279,7 @@ def tune(
         dry_run: Only show what would be tried.
     """
     allow(*trust)
-    with _extra("tune", "optuna", "tuning needs Optuna"):
+    with extra("tune", "symsteer tune"):
         from symsteer.bench.tuning.command import Tuner, preview
     from symsteer.bench.tuning.plan import read_plan
 
@@ -412,7 +412,7 @@ def export_lerobot(
         videos: Whether the dataset has a video; auto: where a Vulkan driver works.
     """
     allow(*trust)
-    with _extra("lerobot", "pyarrow", "a LeRobot dataset needs pyarrow"):
+    with extra("lerobot", "symsteer export-lerobot"):
         from symsteer.bench.bundles.lerobot import write_dataset
 
     prepare_folder(out.parent)
@@ -563,37 +563,6 @@ def throughput(
         rates |= measure(run, choices("cuda", num_envs), LocalPool, _tell)
     print(to_text(run, rates))
     return 0
-
-
-def doctor(quiet: bool = False) -> int:
-    """Show what this machine can do, and what to install for more.
-
-    Args:
-        quiet: Show only what is required and missing.
-    """
-    from symsteer.bench.sim.capabilities import probe
-
-    checks = probe()
-    for check in checks:
-        if quiet and (check.ok or not check.required):
-            continue
-        mark = "ok     " if check.ok else "MISSING" if check.required else "absent "
-        print(f"{mark} {check.name:18s} {check.detail}")
-        if not check.ok and check.cure:
-            print(f"{'':26s} -> {check.cure}")
-    return 0 if all(check.ok or not check.required for check in checks) else 1
-
-
-@contextlib.contextmanager
-def _extra(extra: str, package: str, problem: str) -> Iterator[None]:
-    """Name the extra to install if a package that is imported inside is missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name != package:
-            raise
-        cure = f'install it with: pip install "symsteer[{extra}]"'
-        raise UserError(f"{problem}; {cure}") from error
 
 
 def _tell(line: str) -> None:

@@ -13,9 +13,12 @@ reflections (yaw, axial vectors, mirrored rotation columns).
 from __future__ import annotations
 
 import functools
+import importlib.util
 import itertools
 import math
 import re
+import sys
+import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -23,6 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import torch
 
 from symsteer.errors import UserError
+from symsteer.extras import extra
 
 if TYPE_CHECKING:
     import escnn.group
@@ -486,18 +490,26 @@ def group_average(
 def escnn_package() -> Any:
     """The package ``escnn``, with ``escnn.nn``.
 
+    escnn imports lie-learn for rotations in space alone. That package needs NumPy 1 and has no
+    wheels for Python 3.13, so where it is missing a stand-in takes its place.
+
     Raises:
-        UserError: if it is not installed.
+        UserError: if it cannot be imported.
     """
-    try:
+    if importlib.util.find_spec("lie_learn") is None:
+        wigner = types.ModuleType("lie_learn.representations.SO3.wigner_d")
+        vars(wigner)["wigner_D_matrix"] = _no_lie_learn
+        sys.modules.setdefault(wigner.__name__, wigner)
+    with extra("escnn", "this use of escnn"):
         import escnn.gspaces
         import escnn.nn
-    except ImportError as error:
-        raise UserError(
-            f"escnn is needed here and cannot be imported ({error}); "
-            'install it with: pip install "symsteer[escnn]"'
-        ) from error
     return escnn
+
+
+def _no_lie_learn(*args: Any, **options: Any) -> Any:
+    raise UserError(
+        "representations of SO(3) need lie-learn; install it with: pip install lie-learn"
+    )
 
 
 def _cos_sin(angle: float) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from symsteer.bench.sim.errors import WorkerLostError
+from symsteer.bench.sim.versions import first_warning
 from symsteer.errors import UserError
 from symsteer.hints import check_options
 from symsteer.names import unknown
@@ -79,7 +80,7 @@ GROUPS = {
     },
     "what there is": {
         "list": Verb(f"{BENCH}:list_names", computes=False),
-        "doctor": Verb(f"{BENCH}:doctor", computes=False),
+        "doctor": Verb("symsteer.bench.sim.capabilities:doctor", computes=False, parses=True),
         "throughput": Verb(f"{BENCH}:throughput"),
     },
 }
@@ -110,6 +111,12 @@ def main() -> int:
         return complain(error, f"error: {error}", 2)
     except WorkerLostError as error:
         return complain(error, f"error: {error}", 1)
+    except ImportError as error:
+        # A package of others, or a library that it needs. One of our own is a bug.
+        if (error.name or "").partition(".")[0] == "symsteer":
+            raise
+        cure = "`symsteer doctor` says what to install"
+        return complain(error, f"error: a package cannot be imported: {error}; {cure}", 1)
     except BrokenPipeError:
         # The reader closed the pipe.
         return 128 + signal.SIGPIPE
@@ -156,6 +163,8 @@ def _run(arguments: Sequence[str]) -> int:
             # A run goes on when its terminal is closed.
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
             _limit_threads()
+            if warning := first_warning():
+                print(f"warning: {warning}", file=sys.stderr)
         return function(*args, **options)
 
     if verb.parses:

@@ -57,11 +57,9 @@ def tuned(agent: type[T]) -> type[T]:
         ],
         bases=(base,),
         frozen=True,
-        # The name by which options that are sent to another process find their class.
-        namespace={
-            "__doc__": base.__doc__,
-            "__module__": agent.__module__,
-            "__qualname__": f"{agent.__qualname__}.Options",
-        },
+        namespace={"__doc__": base.__doc__, "__qualname__": f"{agent.__qualname__}.Options"},
     )
+    # Options that are sent to another process find their class by this and the qualified name.
+    # Python 3.12 and later overwrite what a namespace says of it.
+    agent.Options.__module__ = agent.__module__
     return agent

@@ -52,11 +52,12 @@ DIGITS = 12
 
 @dataclass(frozen=True)
 class Reproduced:
-    """A run made again: its folder, the files with the comparison, and their content."""
+    """A run made again: its folder, the files with the comparison, their content, and its cause."""
 
     run: Path
     results: tuple[Path, ...]
     reproduction: Reproduction
+    cause: str
 
 
 def reproduce(
@@ -135,7 +136,8 @@ def reproduce(
             stem.with_suffix(".sha256"): line.encode(),
         }
     write_together(written)
-    return Reproduced(folder, tuple(written), compared)
+    cause = "" if compared.verdict == "exact" else _cause(record.provenance, made, compared)
+    return Reproduced(folder, tuple(written), compared, cause)
 
 
 def conditions(record: RunRecord, config: RunConfig, now: Provenance) -> list[str]:
@@ -152,10 +154,8 @@ def conditions(record: RunRecord, config: RunConfig, now: Provenance) -> list[st
         lines.append("the recorded run was continued with other code or on another machine")
     if then.extensions != now.extensions:
         lines.append("code from outside SymSteer has changed since the record")
-    for name in sorted(then.packages.keys() | now.packages.keys()):
-        versions = [where.packages.get(name, "missing") for where in (then, now)]
-        if versions[0] != versions[1]:
-            lines.append(f"{name} was {versions[0]}, and is {versions[1]} here")
+    for name, (was, here) in _versions(then, now).items():
+        lines.append(f"{name} was {was or 'missing'}, and is {here or 'missing'} here")
     for what, was, here in (
         ("Python", then.python, now.python),
         ("the platform", then.platform, now.platform),
@@ -212,10 +212,34 @@ def text(done: Reproduced) -> str:
         f"area           {area.recorded:.3f} in the record, {area.repeated:.3f} here "
         f"({area.repeated - area.recorded:+.3f})",
         "",
-        SENTENCES[shown.verdict],
+        " ".join(filter(None, (SENTENCES[shown.verdict], done.cause))),
         *(f"wrote {path}" for path in done.results),
     ]
     return "\n".join(lines)
+
+
+def _versions(then: Provenance, now: Provenance) -> dict[str, tuple[str | None, str | None]]:
+    """The packages whose versions differ, each with both; None where it is missing."""
+    names = sorted(then.packages.keys() | now.packages.keys())
+    both = {name: (then.packages.get(name), now.packages.get(name)) for name in names}
+    return {name: versions for name, versions in both.items() if versions[0] != versions[1]}
+
+
+def _cause(then: Provenance, now: Provenance, shown: Reproduction) -> str:
+    """What may explain that a run does not agree, in words: versions first, they can be changed."""
+    if fixed := [one.part for one in shown.differences if one.part in ("seeds", "parameters")]:
+        return f"No version of a package explains that {' and '.join(fixed)} differ: the code does."
+    versions = _versions(then, now)
+    if versions:
+        names = ", ".join(f"{name} {was} -> {here}" for name, (was, here) in versions.items())
+        # "2.13.0+cpu" is a build of 2.13.0.
+        pins = (f"{name}=={was.partition('+')[0]}" for name, (was, _) in versions.items() if was)
+        return (
+            f"Versions may explain it: {names}. Those of the record: pip install {' '.join(pins)}"
+        )
+    if shown.conditions:
+        return "All versions are those of the record; what the notes name may explain it."
+    return "Nothing that a record knows explains it: code, versions and machine are the same."
 
 
 def _configuration(path: Path, record: RunRecord) -> tuple[RunConfig, dict[str, str]]:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from symsteer.errors import UserError
+from symsteer.extras import extra
 from symsteer.files import away, write_atomically
 from symsteer.leaderboard.records import RunRecord
 from symsteer.terminal import tell
@@ -42,13 +43,9 @@ def check_tracking(wanted: bool) -> None:
     """
     if not wanted:
         return
-    try:
+    with extra("wandb", "--track"):
         # A folder wandb, as W&B makes them, can be imported, too, but it is empty.
         from wandb import login, setup
-    except ImportError as error:
-        raise UserError(
-            '--track needs Weights & Biases; install it with: pip install "symsteer[wandb]"'
-        ) from error
     try:
         with away():  # W&B takes settings, such as the host that gets the key, from ./wandb
             mode = setup().settings.mode

@@ -1,23 +1,48 @@
 """What this machine can do, and what to install for more.
 
-Runs without ManiSkill, torch or a driver: a failed import is a finding, not a crash.
+Only the standard library is imported here: any package may be missing, and that is a finding.
 """
 
 from __future__ import annotations
 
+import argparse
 import ctypes
+import functools
 import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+import textwrap
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 from symsteer.bench.sim.headless import RENDERING_CURE, silence_import_noise
-from symsteer.bench.sim.versions import PINNED, check_versions
+from symsteer.bench.sim.versions import TESTED, installed, untested
 from symsteer.errors import UserError
+from symsteer.extras import EXTRAS, command
+from symsteer.names import check
+
+REQUIRED = {
+    "filelock": "filelock",
+    "gymnasium": "gymnasium",
+    "h5py": "h5py",
+    "matplotlib": "matplotlib",
+    "numpy": "numpy",
+    "packaging": "packaging",
+    "pebble": "pebble",
+    "PIL": "pillow",
+    "pydantic": "pydantic",
+    "pytorch_kinematics": "pytorch-kinematics",
+    "safetensors": "safetensors",
+    "sapien": "sapien",
+    "scipy": "scipy",
+    "tensorboard": "tensorboard",
+    "torch": "torch",
+    "tqdm": "tqdm",
+    "tyro": "tyro",
+}
+"""What every run imports besides ManiSkill, and the distribution that has it."""
 
 _RENDER_PROBE = (
     "import warnings; warnings.simplefilter('ignore'); import sapien; "
@@ -49,8 +74,27 @@ class _AbsentError(Exception):
     """Something is not there; its arguments are the detail and the cure of a `Check`."""
 
 
+def doctor(arguments: list[str]) -> int:
+    """Show what this machine can do, and what to install for more."""
+    parser = argparse.ArgumentParser("symsteer doctor", description=doctor.__doc__)
+    parser.add_argument(
+        "--quiet", action="store_true", help="Show only what is required and missing."
+    )
+    options, others = parser.parse_known_args(arguments)
+    check("option of doctor", others, ["--quiet"])
+    checks = probe()
+    for one in checks:
+        if options.quiet and (one.ok or not one.required):
+            continue
+        mark = "ok     " if one.ok else "MISSING" if one.required else "absent "
+        print(f"{mark} {one.name:18s} {one.detail}")
+        if not one.ok and one.cure:
+            print(f"{'':26s} -> {one.cure}")
+    return 0 if all(one.ok or not one.required for one in checks) else 1
+
+
 def probe() -> list[Check]:
-    """Check memory, packages, system libraries, CUDA, PhysX on GPU and rendering.
+    """Check memory, packages, system libraries, CUDA, PhysX on GPU, rendering and extras.
 
     Never raises: an unexpected error of a check is its finding.
     """
@@ -78,12 +122,45 @@ def _memory() -> str:
     return f"{usable:.1f} GiB"
 
 
-def _versions() -> str:
-    try:
-        check_versions()
-    except UserError as error:
-        raise _AbsentError(*str(error).split(": ", 1)) from error
-    return ", ".join(f"{name} {version(name)}" for name in (*PINNED, "torch", "numpy"))
+def _packages() -> str:
+    errors = _errors(REQUIRED)
+    if errors:
+        missing = " ".join(REQUIRED[name] for name in errors)
+        raise _AbsentError("; ".join(errors.values()), f"pip install {missing}")
+    names = ("torch", "numpy")
+    versions = (f"{name} {importlib.import_module(name).__version__}" for name in names)
+    return f"{', '.join(versions)}, and {len(REQUIRED) - len(names)} others"
+
+
+def _errors(modules: Iterable[str]) -> dict[str, str]:
+    """What went wrong with the modules that cannot be imported; packages raise all sorts."""
+    silence_import_noise()
+    errors = {}
+    for name in modules:
+        try:
+            importlib.import_module(name)
+        except Exception as error:
+            kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
+            errors[name] = textwrap.shorten(f"{kind}{error}", 200)
+    return errors
+
+
+def _simulator() -> str:
+    if sentence := untested():
+        pins = " ".join(f"{name}=={version}" for name, version in TESTED.items())
+        raise _AbsentError(sentence, f"optional: pip install {pins}")
+    return ", ".join(f"{name} {version}" for name, version in installed().items())
+
+
+def _extra(name: str) -> str:
+    if name == "escnn":
+        try:
+            importlib.import_module("symsteer.policies.geometry").escnn_package()
+        except UserError as error:
+            raise _AbsentError(f"{error.__cause__}", f"optional: {command(name)}") from error
+    if errors := _errors(EXTRAS[name]):
+        raise _AbsentError("; ".join(errors.values()), f"optional: {command(name)}")
+    return "imports"
 
 
 def _maniskill() -> str:
@@ -94,7 +171,8 @@ def _maniskill() -> str:
         # The usual reason is a missing shared library; the message begins with its name.
         library = str(error).split(":")[0]
         packages = {"libX11.so.6": "libx11-6", "libGL.so.1": "libgl1", "libEGL.so.1": "libegl1"}
-        cure = "pip install --force-reinstall symsteer"
+        pins = " ".join(f"{name}=={version}" for name, version in TESTED.items())
+        cure = f"pip install {pins}"
         if library in packages:
             cure = f"apt install {packages[library]}"
         raise _AbsentError(f"cannot be imported: {error}", cure) from error
@@ -151,10 +229,12 @@ def _rendering() -> str:
 
 _CHECKS: dict[str, tuple[bool, Callable[[], str]]] = {
     "memory": (False, _memory),
-    "package versions": (True, _versions),
+    "packages": (True, _packages),
     "ManiSkill": (True, _maniskill),
+    "tested simulator": (False, _simulator),
     "CUDA": (False, _cuda),
     "PhysX on GPU": (False, _physx_gpu),
     "rendering": (False, _rendering),
+    **{f"extra {name}": (False, functools.partial(_extra, name)) for name in EXTRAS},
 }
 """Whether SymSteer needs it, and how it is found."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import warnings
 import weakref
 from collections.abc import Iterable
 from functools import cache
@@ -23,7 +24,7 @@ from symsteer.bench.sim.errors import Unique
 from symsteer.bench.sim.headless import prepare_headless
 from symsteer.bench.sim.scene import BatchedScene
 from symsteer.bench.sim.trees import merge
-from symsteer.bench.sim.versions import check_versions
+from symsteer.bench.sim.versions import first_warning
 from symsteer.errors import UserError
 
 Simulator = Literal["cpu", "cuda"]
@@ -84,7 +85,8 @@ class _OnSimulator(Unique, BaseEnv):
     ) -> None:
         visual = obs_mode not in (None, "state", "state_dict", "none")
         cameras = visual or render_mode is not None or getattr(self, "needs_cameras", False)
-        check_versions()
+        if warning := first_warning():
+            warnings.warn(warning, stacklevel=2)
         prepare_headless()
         backends = self._prepare(cameras, render_backend)
         super().__init__(*args, obs_mode=obs_mode, render_mode=render_mode, **backends, **kwargs)
@@ -146,8 +148,7 @@ class BatchedCpuMixin(_OnSimulator):
     arguments of that class.
 
     Raises:
-        UserError: ManiSkill or SAPIEN does not have the pinned version, or cameras are asked for
-            without a Vulkan driver.
+        UserError: cameras are asked for without a Vulkan driver.
     """
 
     def _prepare(self, cameras: bool, render_backend: str | None) -> dict[str, str]:

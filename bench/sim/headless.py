@@ -17,12 +17,13 @@ RENDERING_CURE = (
 )
 """How to get pictures and videos."""
 
-# Warnings of SAPIEN and escnn at import on a machine without Vulkan or Fortran.
+# Warnings of SAPIEN and escnn at import.
 _NOISE = (
     "Failed to find system libvulkan.*",
     "Failed to find Vulkan ICD file.*",
     "Failed to find glvnd ICD file.*",
     ".*py3nj.*",
+    "invalid escape sequence.*",
 )
 
 # ManiSkill logs this about objects of its own tasks, which get their pose at the first reset.

@@ -2,7 +2,7 @@
 
 Each patch looks at the scene: objects of a batched CPU scene use our code, all others use
 ManiSkill's own, so stock environments can run in the same process. The patches depend on the
-versions in `versions.PINNED`.
+versions in `versions.TESTED`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _dispatch_property(cls: type, name: str, ours: Any) -> None:
 
 @lru_cache(maxsize=1)
 def install() -> None:
-    """Install the patches, once per process. Call `versions.check_versions` first."""
+    """Install the patches, once per process."""
     from mani_skill.agents.controllers.utils.kinematics import Kinematics
     from mani_skill.agents.robots import Panda
     from mani_skill.envs.tasks.tabletop.push_t import WhiteTableSceneBuilder

@@ -11,12 +11,11 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-import grpc
-
 from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.sweep.pool import SHARED_PATIENCE
 from symsteer.bench.sweep.work import Kind, Result, work
 from symsteer.errors import UserError
+from symsteer.extras import extra
 from symsteer.files import away
 from symsteer.registry import ALLOWED
 
@@ -98,10 +97,8 @@ def _connect(address: str) -> Any:
     check_address(address)
     # Ray reads it when it is imported.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    try:
+    with extra("ray", "--ray"):
         import ray
-    except ImportError as error:
-        raise UserError('--ray needs Ray; install it with: pip install "symsteer[ray]"') from error
     if address != "auto" and not os.environ.get("RAY_USE_TLS"):
         _wait_for_answer(address)
     # What was consented to on this machine holds on the others.
@@ -120,6 +117,8 @@ def _connect(address: str) -> Any:
 
 def _wait_for_answer(address: str) -> None:
     """Fail after a few seconds if no Ray head answers; Ray itself would wait for minutes."""
+    import grpc
+
     with grpc.insecure_channel(address) as channel:
         try:
             grpc.channel_ready_future(channel).result(timeout=CONNECT_SECONDS)

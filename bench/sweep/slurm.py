@@ -29,6 +29,7 @@ from symsteer.bench.sweep.grid import read_suite
 from symsteer.bench.sweep.plan import Plan, read_sweep, shares, sweep_path, write_sweep
 from symsteer.bench.sweep.workforce import Workforce
 from symsteer.errors import UserError
+from symsteer.extras import extra
 from symsteer.files import prepare_folder, read_model, write_atomically
 from symsteer.terminal import to_paste
 
@@ -146,11 +147,8 @@ def jobs_left(out: Path, suite: str, jobs: Mapping[str, str]) -> dict[str, Path 
 
 def _submit(tasks: Sequence[ArrayTask], plan: Plan, file: SlurmFile) -> list[str]:
     """The names of the jobs of an array."""
-    try:
+    with extra("slurm", "--launcher"):
         import submitit
-    except ImportError as error:
-        cure = 'install it with: pip install "symsteer[slurm]"'
-        raise UserError(f"--launcher needs submitit; {cure}") from error
     python = None
     if file.image is not None:
         if not Path(file.image).is_file():

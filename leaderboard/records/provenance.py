@@ -22,7 +22,7 @@ from symsteer.leaderboard.records.values import Count, Name, RecordBlock, Sha256
 CODE = ("agents", "bench", "leaderboard", "policies", "symsteer")
 """Folders of a checkout that hold code; those in `symsteer/` are links to the others."""
 
-PACKAGES = ("torch", "mani-skill", "sapien", "escnn", "gymnasium", "numpy")
+PACKAGES = ("torch", "mani-skill", "mani-skill-nightly", "sapien", "escnn", "gymnasium", "numpy")
 """Packages whose versions a record names, where they are installed."""
 
 NUMBERED = {"family": "cpu family", "model": "model"}

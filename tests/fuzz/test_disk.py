@@ -19,12 +19,14 @@ import pytest
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.folder import state_of
 from symsteer.bench.runs.trainer import Trainer
+from symsteer.extras import EXTRAS
 from symsteer.leaderboard.records import dump_record, read_record
 from tests.bench.tiny_run import execute, resume, without_clock
 from tests.fuzz.conftest import CONFIG
 from tests.fuzz.judge import end_of
 from tests.fuzz.kinds import options_of
 from tests.leaderboard.record_factory import make_record
+from tests.marks import need
 
 pytestmark = pytest.mark.long
 
@@ -213,6 +215,8 @@ def line(undisturbed, tmp_path):
 @pytest.mark.parametrize("verb", WRITERS)
 def test_what_a_verb_writes_is_whole_or_not_there(verb, line, tmp_path):
     """A full disk, and a file in the place of the folder; what was written before stays."""
+    if verb in EXTRAS:
+        need(verb)
     out, before = tmp_path / "out", files_in(tmp_path)
     with files_end_at(200):
         assert str(out) in complaint(*line(verb, out))

@@ -14,6 +14,7 @@ import pytest
 
 from tests.fuzz.judge import BadEndingError
 from tests.fuzz.kinds import KINDS
+from tests.marks import need
 
 COUNT = 100
 """Inputs of a kind in the whole test."""
@@ -63,6 +64,8 @@ def tried(workshop, run, numbers, folder):
 @pytest.mark.parametrize("kind", KINDS)
 def test_some_damaged_inputs(kind, workshop, tmp_path):
     """Each way to damage a file once; the intact one is accepted."""
+    if kind == "plan":
+        need("tune")
     assert tried(workshop, KINDS[kind], [None], tmp_path).keys() < {"accepted", "done"}
     numbers = range(max(2, len(KINDS[kind].ways)))
     assert tried(workshop, KINDS[kind], numbers, tmp_path)["refused"] > 0
@@ -71,6 +74,8 @@ def test_some_damaged_inputs(kind, workshop, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_all_damaged_inputs(kind, workshop, tmp_path, capsys):
+    if kind == "plan":
+        need("tune")
     endings = tried(workshop, KINDS[kind], range(COUNT), tmp_path)
     with capsys.disabled():
         print(f"\n{kind}: {COUNT} inputs, " + ", ".join(f"{n} {k}" for k, n in endings.items()))

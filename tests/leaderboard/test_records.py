@@ -135,7 +135,7 @@ def test_what_is_no_number_of_a_measurement_is_not_divided(tmp_path: Path, value
 
 
 def test_arrays_and_tensors_are_stored_as_numbers() -> None:
-    torch = pytest.importorskip("torch")
+    torch = pytest.importorskip("torch", exc_type=ImportError)
     evaluation = make_evaluation([1, 0], q_mean=np.float32(0.5), alpha=torch.tensor(0.25))
     assert evaluation.diagnostics == {"q_mean": 0.5, "alpha": 0.25}
     columns = {

@@ -47,6 +47,7 @@ from tests.leaderboard.record_factory import (
     make_record,
     put,
 )
+from tests.marks import need
 
 STEPS = (0, 25_000, 50_000)
 
@@ -202,7 +203,7 @@ def files_of(runs: Sequence[Run], folder: Path, study: str = "paper") -> dict[st
 
 
 def test_the_site_marks_rows_and_runs(two_of_five: Path, tmp_path: Path) -> None:
-    pytest.importorskip("jinja2")
+    need("site")
     marks = two_of_five / "marks"
     generate_site([two_of_five / "records"], tmp_path, "paper", docs=False, reproductions=marks)
     assert "1\u00a0reproduced" in (tmp_path / "index.html").read_text()

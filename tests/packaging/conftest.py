@@ -15,8 +15,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 FOLDERS = ("symsteer", "agents", "bench", "leaderboard", "policies")
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", *FOLDERS)
-"""What a build reads."""
+"""Those with code."""
 
 
 class Installed:
@@ -64,15 +63,13 @@ def build_wheel(source: Path, out: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def source(tmp_path_factory) -> Path:
-    """A copy of the source tree without the leftovers of earlier builds."""
+    """A copy of the files that belong to the repository."""
     folder = tmp_path_factory.mktemp("source") / "symsteer"
-    folder.mkdir()
-    for name in SOURCES:
-        if (ROOT / name).is_dir():
-            ignored = shutil.ignore_patterns("__pycache__")
-            shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=ignored)
-        else:
-            shutil.copy(ROOT / name, folder / name)
+    which = ("--cached", "--others", "--exclude-standard")
+    for name in call("git", "ls-files", "-z", *which, cwd=ROOT).split("\0"):
+        if name and os.path.lexists(ROOT / name):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / name, follow_symlinks=False)
     return folder
 
 

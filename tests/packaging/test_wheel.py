@@ -1,10 +1,15 @@
 """What the wheel holds."""
 
+import email
+import re
 import tomllib
 import zipfile
 from pathlib import PurePosixPath
 
+from packaging.specifiers import SpecifierSet
+
 from symsteer.bench.sweep.suite import load_suite
+from symsteer.cli import VERBS
 from symsteer.demo import copy_base
 from tests.packaging.conftest import FOLDERS, ROOT, build_wheel, python
 
@@ -53,10 +58,29 @@ def test_the_version_is_that_of_the_newest_entry_in_the_changelog(wheel):
     assert PurePosixPath(wheel.name).name.startswith(f"symsteer-{version}-")
 
 
-def test_a_source_distribution_gives_the_same_wheel(wheel, source, tmp_path):
+def test_the_description_stands_alone(wheel):
+    """It is read without the repository: there are no links and pictures to follow."""
+    (name,) = (name for name in contents(wheel) if name.endswith("/METADATA"))
+    metadata = email.message_from_bytes(contents(wheel)[name])
+    text = metadata.get_payload()
+    assert text == (ROOT / "PACKAGE.md").read_text()
+    assert not re.search(r"\]\(|<\w+|https?:", text)
+    verbs = set(re.findall(r"^symsteer (\w+)", text, re.MULTILINE))
+    assert {"doctor", "run", "report"} <= verbs <= VERBS.keys()
+    versions = SpecifierSet(metadata["Requires-Python"])
+    for minor in range(9, 20):
+        classifier = f"Programming Language :: Python :: 3.{minor}"
+        assert (f"3.{minor}.1" in versions) == (classifier in metadata.get_all("Classifier"))
+
+
+def test_a_source_distribution_is_complete_and_gives_the_same_wheel(wheel, source, tmp_path):
     build = "import sys; from setuptools import build_meta; build_meta.build_sdist(sys.argv[1])"
     python("-c", build, str(tmp_path), cwd=source)
     (archive,) = tmp_path.glob("*.tar.gz")
     python("-m", "tarfile", "-e", str(archive), str(tmp_path), cwd=tmp_path)
     unpacked = tmp_path / archive.name.removesuffix(".tar.gz")
+    for file in source.rglob("*"):
+        name = file.relative_to(source)
+        own = {"build", "symsteer.egg-info", "symsteer"}  # of a build; links become folders
+        assert name.parts[0] in own or (unpacked / name).exists(), name
     assert contents(build_wheel(unpacked, tmp_path)) == contents(wheel)

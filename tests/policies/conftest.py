@@ -7,6 +7,7 @@ import torch
 
 from symsteer.policies import POLICIES
 from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
+from tests.marks import policy_class
 
 OBS = Layout(
     [
@@ -42,8 +43,8 @@ SMALL = {
 
 def controller(obs: torch.Tensor) -> torch.Tensor:
     """Actions [..., 7] that commute with every rotation and reflection of the plane."""
-    tcp, goal = (torch.view_as_complex(obs[..., OBS.slice(n)].clone()) for n in ("tcp", "goal"))
-    rod = torch.view_as_complex(obs[..., OBS.slice("rod")].clone())
+    tcp, goal = (torch.complex(*obs[..., OBS.slice(n)].unbind(-1)) for n in ("tcp", "goal"))
+    rod = torch.complex(*obs[..., OBS.slice("rod")].unbind(-1))
     reach = goal - tcp
     xy = reach / reach.abs().clamp_min(0.25)
     tilt = 0.5j * rod * xy.conj()
@@ -104,7 +105,7 @@ def small_options(name: str = "edp", **fields):
 
 def fit(name: str = "edp", seed: int = 0, progress=None, episodes=None, **fields):
     """A policy trained for a few steps."""
-    kind = POLICIES.get(name)
+    kind = policy_class(name)
     few = {"steps": 30, "batch_size": 32, "match_compute": False}
     few = {key: value for key, value in few.items() if hasattr(kind.Options, key)}
     episodes = make_episodes(6, noise=0.2) if episodes is None else episodes
@@ -114,7 +115,7 @@ def fit(name: str = "edp", seed: int = 0, progress=None, episodes=None, **fields
 def untrained(name: str = "edp", layouts=(OBS, ACT), **fields):
     """A policy with random weights."""
     torch.manual_seed(0)
-    return POLICIES.get(name)(small_options(name, **fields), *layouts)
+    return policy_class(name)(small_options(name, **fields), *layouts)
 
 
 @pytest.fixture(scope="session")

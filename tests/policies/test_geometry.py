@@ -1,6 +1,7 @@
 """Layouts and groups: representations, agreement with escnn, serialisation, user mistakes."""
 
 import math
+import subprocess
 import sys
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Group, Layout, equivariance_error
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
+from tests.marks import need_escnn
 
 LAYOUT = Layout(
     [
@@ -36,7 +38,7 @@ def test_representation_is_a_homomorphism(name):
 
 @pytest.mark.parametrize("name", [*GROUPS, "SO2"])
 def test_field_type_is_escnns_in_the_same_basis(name):
-    pytest.importorskip("escnn")
+    need_escnn()
     group = Group.parse(name)
     field_type = LAYOUT.field_type(group)
     assert field_type.size == LAYOUT.dim
@@ -89,8 +91,29 @@ def test_equivariance_error_is_the_largest_relative_one():
 
 def test_escnn_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "escnn", None)
-    with pytest.raises(UserError, match=r"symsteer\[escnn\]"):
+    with pytest.raises(UserError, match=r"pip install --no-deps escnn"):
         LAYOUT.field_type(Group.parse("C4"))
+
+
+def test_escnn_without_lie_learn():
+    """It imports lie-learn, which has no wheels for Python 3.13, and uses it for SO(3) alone."""
+    need_escnn()
+    code = """
+import importlib.util, sys
+find = importlib.util.find_spec
+importlib.util.find_spec = lambda name: None if name == "lie_learn" else find(name)
+sys.modules["lie_learn"] = None
+from symsteer.errors import UserError
+from symsteer.policies.geometry import escnn_package
+group = escnn_package().group
+print(group.cyclic_group(8).irrep(1).size)
+try:
+    group.so3_group(1).irrep(1)(group.so3_group(1).sample())
+except UserError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("2\nrepresentations of SO(3) need lie-learn")
 
 
 def test_blocks_cover_the_vector_once():

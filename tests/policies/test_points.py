@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from symsteer.errors import UserError
-from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Field, Group, Layout
 from symsteer.policies.networks.points import PointEncoder
 from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.symmetry.joint import merged_layout
+from tests.marks import policy_class
 from tests.policies.conftest import ACT, SMALL, assert_exact, noises
 
 POINTS = 12
@@ -41,7 +41,7 @@ def episodes(count: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
 
 
 def fit(name: str, steps: int = 2, count: int = 2, **options):
-    policy = POLICIES.get(name)
+    policy = policy_class(name)
     options = {**SMALL, "steps": steps, "horizon": 2, "execute": 1, **options}
     return policy.fit(policy.Options(**options), episodes(count), SEEN, ACT)
 

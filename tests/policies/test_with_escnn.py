@@ -6,6 +6,7 @@ import torch
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Group
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
+from tests.marks import need_escnn
 from tests.policies.conftest import (
     ACT,
     OBS,
@@ -17,7 +18,7 @@ from tests.policies.conftest import (
     untrained,
 )
 
-nn = pytest.importorskip("escnn.nn")
+nn = need_escnn().nn
 
 from symsteer.policies.symmetry.with_escnn import EscnnDiffusionPolicy, EscnnLayer  # noqa: E402
 

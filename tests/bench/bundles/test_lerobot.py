@@ -10,17 +10,19 @@ from pathlib import Path
 import h5py
 import imageio.v2 as imageio
 import numpy as np
-import pandas as pd
 import pytest
-from pyarrow import parquet
 
 from symsteer.bench.bundles.film import PIXELS, RENDERING
-from symsteer.bench.bundles.lerobot import write_dataset
 from symsteer.bench.demos import load
 from symsteer.bench.demos.files import checksum
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import make, task_class
 from symsteer.errors import UserError
+
+pd = pytest.importorskip("pandas", exc_type=ImportError)
+parquet = pytest.importorskip("pyarrow.parquet", exc_type=ImportError)
+
+from symsteer.bench.bundles.lerobot import write_dataset  # noqa: E402
 
 ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "examples" / "lerobot"

@@ -21,6 +21,7 @@ from symsteer.bench.runs.together import execute_together
 from symsteer.leaderboard.records import read_record
 from symsteer.policies import POLICIES
 from tests.bench.tiny_run import execute, quiet, resume, stop, tiny_config
+from tests.marks import policy_class
 
 pytestmark = [
     pytest.mark.gpu,
@@ -74,8 +75,7 @@ def test_every_agent_runs_and_is_restored(name, out):
 
 @pytest.mark.parametrize("name", POLICIES.builtin)
 def test_every_policy_decodes_as_on_the_cpu(name, tmp_path):
-    if name == "escnn":
-        pytest.importorskip("escnn.nn")
+    policy_class(name)
     config = tiny_config(policy_name=name, device="cuda")
     policy = prepare_base(config, quiet(runs=tmp_path))
     assert policy.device.type == "cuda"

@@ -85,6 +85,11 @@ def flip(data):
     episodes["success_at_end"][2] = 0
 
 
+def flip_in_an_older_torch(data):
+    flip(data)
+    data["provenance"]["packages"] |= {"torch": "1.0+cpu", "sapien": "2.0"}
+
+
 def succeed(data):
     episodes = data["evaluations"][-1]["episodes"]
     before, count = sum(episodes["success_once"]), len(episodes["success_once"])
@@ -102,6 +107,17 @@ def succeed(data):
                 "exactly  seeds, parameters, base policy, feasible Q, budget, diagnostics$",
                 "does not differ clearly",
             ),
+        ),
+        (
+            flip_in_an_older_torch,
+            (
+                r"Versions may explain it: sapien 2\.0 -> .*, torch 1\.0\+cpu -> \d",
+                r"the record: pip install sapien==2\.0 torch==1\.0$",
+            ),
+        ),
+        (
+            lambda data: data["seeds"].update(agent=12345),
+            ("No version of a package explains that seeds differ",),
         ),
         (succeed, ("the final success differs", r", 0\.000 here \(-1\.000 \[")),
     ],

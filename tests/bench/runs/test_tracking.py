@@ -26,7 +26,7 @@ from tests.bench.tiny_run import (
 
 pytestmark = pytest.mark.long
 
-wandb = pytest.importorskip("wandb")
+wandb = pytest.importorskip("wandb", exc_type=ImportError)
 
 
 @pytest.fixture(autouse=True)

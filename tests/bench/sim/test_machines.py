@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import subprocess
 import sys
+import tomllib
+import warnings
+from importlib import metadata
+from pathlib import Path
 
 import pytest
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
+from symsteer.bench.sim import capabilities, versions
 from symsteer.bench.sim import environment as batched
-from symsteer.bench.sim import versions
 from symsteer.bench.sim.capabilities import probe
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.sim.parallel import create
 from symsteer.errors import UserError
+from symsteer.extras import EXTRAS
 
+ROOT = Path(__file__).parents[3]
 NO_VULKAN = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
 
 
@@ -82,14 +89,61 @@ def test_cameras_with_vulkan():
     assert (env.render()[0] != first).any()
 
 
-def test_other_release_is_refused(monkeypatch):
-    """Another version of ManiSkill or SAPIEN gives one sentence with the cure."""
-    monkeypatch.setitem(versions.PINNED, "sapien", "9.9")
-    with pytest.raises(UserError, match=r"sapien 9\.9, but 3.*pip install sapien==9\.9"):
-        create(PickCubeEnv, 1)
-    (check,) = [check for check in probe() if check.name == "package versions"]
-    assert (check.ok, check.required) == (False, True)
-    assert check.cure == 'run "pip install sapien==9.9".'
+def test_another_release_gives_one_warning(monkeypatch):
+    """Whatever its distribution is called, and however many environments are made."""
+    monkeypatch.setitem(versions.TESTED, "sapien", "9.9")
+    monkeypatch.delenv("SYMSTEER_VERSIONS_SAID", raising=False)
+    version = metadata.version
+
+    def nightly(name):
+        if name == "mani-skill":
+            raise metadata.PackageNotFoundError(name)
+        return "2030.1.1" if name == "mani-skill-nightly" else version(name)
+
+    monkeypatch.setattr(metadata, "version", nightly)
+    owners = {"mani_skill": ["mani-skill-nightly"]}
+    monkeypatch.setattr(metadata, "packages_distributions", lambda: owners)
+    words = r"tested with mani-skill 3\.0\.1 and sapien 9\.9; mani-skill-nightly 2030\.1\.1 and sap"
+    with pytest.warns(UserWarning, match=words):
+        create(PickCubeEnv, 1).close()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        create(PickCubeEnv, 1).close()
+    (check,) = [check for check in probe() if check.name == "tested simulator"]
+    assert (check.ok, check.required) == (False, False)
+    assert "sapien==9.9" in check.cure
+
+
+def test_doctor_knows_what_the_package_asks_for():
+    """Names of distributions, but for ManiSkill, which it checks by itself."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = {re.split(r"[<>=]", text)[0] for text in project["dependencies"]}
+    assert asked == {*capabilities.REQUIRED.values(), "mani-skill"}
+    assert {*project["optional-dependencies"]} == {*EXTRAS, "dev", "test"}
+
+
+def test_doctor_and_other_verbs_without_a_package():
+    """`doctor` names what is missing; other verbs name `doctor`."""
+    code = """
+import sys
+sys.modules |= {"escnn": None, "h5py": None, "tyro": None}
+sys.argv = ["symsteer", "WORD"]
+from symsteer.cli import main
+sys.exit(main())
+"""
+    shown = run_python(code.replace("WORD", "doctor"))
+    assert (shown.returncode, shown.stderr) == (1, "")
+    lines = shown.stdout.splitlines()
+    (place,) = [i for i, line in enumerate(lines) if line.startswith("MISSING packages")]
+    assert lines[place + 1].endswith("-> pip install h5py tyro")
+    (place,) = [i for i, line in enumerate(lines) if line.startswith("absent  extra escnn")]
+    assert lines[place + 1].endswith("-> optional: pip install --no-deps escnn==1.0.11 joblib")
+    shown = run_python(code.replace("WORD", "status"))
+    assert shown.returncode == 1
+    assert re.fullmatch(
+        "error: a package cannot be imported: .*tyro.*; `symsteer doctor` says what to install\n",
+        shown.stderr,
+    )
 
 
 @pytest.mark.parametrize(
@@ -168,7 +222,7 @@ def test_cuda():
 def test_probe_of_this_machine():
     """Every finding is one line, and nothing required is missing."""
     checks = probe()
-    assert len({check.name for check in checks}) == len(checks) == 6
+    assert len({check.name for check in checks}) == len(checks) == 7 + len(EXTRAS)
     for check in checks:
         assert "\n" not in check.detail + check.cure
         assert check.ok or not check.required, check

@@ -21,6 +21,7 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import execute, tiny_config, without_clock
+from tests.marks import need
 
 MACHINE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
 
@@ -32,6 +33,7 @@ def test_without_ray_the_extra_is_named(monkeypatch, tmp_path):
 
 
 def test_an_address_that_does_not_answer(monkeypatch, tmp_path):
+    need("ray")
     monkeypatch.setattr(cluster_module, "CONNECT_SECONDS", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"127.0.0.1:{silent.getsockname()[1]}"
@@ -42,6 +44,7 @@ def test_an_address_that_does_not_answer(monkeypatch, tmp_path):
 @pytest.fixture(scope="module")
 def cluster():
     """A head without processors and two machines with one each, all on this one."""
+    need("ray")
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     # Ray's workers give way to all other processes, so that beside other tests they stand still.
     os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112 (the name that Ray reads)

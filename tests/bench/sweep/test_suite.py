@@ -17,7 +17,6 @@ from symsteer.bench.sweep.schedule import tasks_of
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.bench.sweep.workforce import THIS_MACHINE
 from symsteer.bench.tasks import task_class
-from symsteer.bench.tuning.plan import read_plan
 from symsteer.errors import UserError
 from symsteer.leaderboard.keys import Key
 from symsteer.leaderboard.paths import RECORDS, RESULTS
@@ -25,6 +24,7 @@ from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.study import read_study
 from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy
+from tests.marks import need
 
 
 def write(tmp_path, text: str) -> str:
@@ -288,6 +288,9 @@ def test_how_a_toml_file_is_read(tmp_path):
     path.mkdir()
     with pytest.raises(UserError, match=f"the suite {path} cannot be read: Is a dir.*name another"):
         read_suite(str(path))
+    need("tune")
+    from symsteer.bench.tuning.plan import read_plan
+
     for read, kind in ((load_suite, "suite"), (read_plan, "tuning plan"), (read_study, "study")):
         with pytest.raises(UserError, match=f"there is no {kind} 'dmeo'"):
             read("dmeo")

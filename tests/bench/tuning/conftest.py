@@ -9,9 +9,6 @@ from typing import NamedTuple
 
 import pytest
 
-from symsteer.bench.tuning import command
-from symsteer.bench.tuning.command import Tuner
-from symsteer.bench.tuning.plan import read_plan
 from symsteer.bench.tuning.trials import Chosen, TrialResult
 from tests.bench.tuning.tiny_plan import TEXT, KnownRuns, write_plan
 
@@ -32,10 +29,13 @@ class Played(NamedTuple):
 
 def play_plan(folder: Path, text: str = TEXT, **kwargs: float | int) -> Played:
     """Play a plan in a folder; ``kwargs`` are those of `KnownRuns`."""
+    from symsteer.bench.tuning import command
+    from symsteer.bench.tuning.plan import read_plan
+
     runs = KnownRuns(**kwargs)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "run_plan", runs)
-        tuner = Tuner(read_plan(write_plan(folder, text)), folder / "runs")
+        tuner = command.Tuner(read_plan(write_plan(folder, text)), folder / "runs")
         return Played(*tuner.play(), runs, folder / "runs" / "tuning")
 
 

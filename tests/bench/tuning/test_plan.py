@@ -1,10 +1,15 @@
 """Reading tuning plans: what they mean, and mistakes."""
 
+# ruff: noqa: E402
 from __future__ import annotations
 
 import itertools
 
 import pytest
+
+from tests.marks import need
+
+need("tune")
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from symsteer.agents import AGENTS

@@ -1,5 +1,6 @@
 """The search, on runs whose success is a known function of the options; and one real one."""
 
+# ruff: noqa: E402
 from __future__ import annotations
 
 import dataclasses
@@ -8,6 +9,10 @@ import math
 import shutil
 
 import pytest
+
+from tests.marks import need
+
+need("tune")
 
 from symsteer.agents.equivariant import EquivariantAgent
 from symsteer.agents.presets import preset_options

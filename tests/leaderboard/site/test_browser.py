@@ -10,6 +10,9 @@ from typing import Any
 import pytest
 
 from tests.leaderboard.site.conftest import EVIL
+from tests.marks import need
+
+need("site")
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CHROMIUM = next((path for name in NAMES if (path := shutil.which(name))), None)

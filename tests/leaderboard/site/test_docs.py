@@ -8,13 +8,17 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from markdown_it import MarkdownIt
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.site import docs
 from symsteer.leaderboard.site.docs import CONFIG, Documentation, build_documentation
 from tests.leaderboard.site.pages import dead_links, read_pages
+from tests.marks import need
 from tools.mkdocs_hook import PAGES, relinked
+
+need("site")
+
+markdown_it = pytest.importorskip("markdown_it", exc_type=ImportError)
 
 ROOT = CONFIG.parent
 
@@ -47,7 +51,7 @@ def test_links_of_the_documentation_lead_to_pages(whole: Path) -> None:
 
 def test_pages_are_as_github_shows_them(whole: Path) -> None:
     """Lists, tables and blocks of code are the same; Python-Markdown has rules of its own."""
-    github = MarkdownIt("commonmark").enable("table")
+    github = markdown_it.MarkdownIt("commonmark").enable("table")
     sources = {path: path.relative_to(ROOT / "docs") for path in (ROOT / "docs").rglob("*.md")}
     sources |= {ROOT / name: Path(page) for name, page in PAGES.items()}
     for path, page in sources.items():

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from symsteer.leaderboard.site.markup import environment, html
+from tests.marks import need
+
+need("site")
 
 
 def test_html_in_markdown_is_text() -> None:

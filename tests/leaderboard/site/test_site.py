@@ -25,6 +25,9 @@ from symsteer.leaderboard.text import SPACE, compact, interval, number
 from tests.leaderboard.record_factory import make_evaluation, make_record
 from tests.leaderboard.site.conftest import EVIL, SIDE_BY_SIDE, picture, write_all
 from tests.leaderboard.site.pages import Page, dead_links, read_pages
+from tests.marks import need
+
+need("site")
 
 TAGS = frozenset(
     {
