@@ -48,9 +48,10 @@ The *slope* is that of least squares with an intercept for each base policy: it 
 alone, never from a comparison of policies, tasks or embodiments. Its interval draws base policies
 (runs, where a task has one policy) and episodes, and the defects within their intervals; it is
 about these cells. With fewer than {MIN_SEEDS} base policies it decides nothing. Lines in the figure
-have this slope and go through the mean of their task; the fan has the slopes of the interval. An
-advantage *ends* where the line crosses 0; between the numbers in brackets 0 is not excluded (95 %,
-Fieller's method), and a dash there means: up to the end of the measured range."""
+have this slope and go through the mean of their task; the fan has the slopes of the interval. They
+are bent, because the axis of the defect is logarithmic. An advantage *ends* where the line crosses
+0; between the numbers in brackets 0 is not excluded (95 %, Fieller's method), and a dash there
+means: up to the end of the measured range."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +257,10 @@ def figure(advantages: DefectMap, embodiment: str) -> Figure:
     tasks = sorted({point.table.key.task for point in points})
     markers = {task: MARKERS[i % len(MARKERS)] for i, task in enumerate(tasks)}
     right = 1.04 * max(point.defect.interval.high for point in points)
-    x = Axis(f"audited defect of a decision, {cut(embodiment, 26)}", (-0.02 * right, right))
+    smallest = min(point.defect.value for point in points)
+    # Most worlds have small defects, which a linear axis would draw upon each other.
+    scale, left = ("log", 0.7 * smallest) if smallest > 0 else ("linear", -0.02 * right)
+    x = Axis(f"audited defect of a decision, {cut(embodiment, 26)}", (left, right), scale=scale)
     y, zero = Axis(f"advantage over {STANDARD}"), [Rule(0)]
     plots = []
     for panel in panels:
@@ -297,7 +301,8 @@ def _lines(fit: Fit) -> list[Trace]:
     slope, traces = fit.slope.interval(), []
     for line in fit.lines:
         x, y = line.centre
-        grid = np.array([line.span[0], x, line.span[1]])
+        # With places between, because a straight line is bent on a logarithmic axis.
+        grid = np.unique([*np.linspace(*line.span, 25), x])
         middle, *fan = (y + s * (grid - x) for s in (slope.value, slope.low, slope.high))
         low, high = np.minimum(*fan), np.maximum(*fan)
         traces.append(Trace(WITHIN, grid, middle, Look(FIT, width=1.4), low, high, band=0.1))
