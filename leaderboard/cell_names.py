@@ -40,7 +40,9 @@ def cell_name(table: Table, summary: Summary) -> str:
     same = [other for other in keys if (other.task, other.embodiment, other.variant) == world]
     if len({(other.base, other.group, other.mode) for other in same}) > 1:
         words.append(code(" ".join(filter(None, (key.base, key.group, key.mode)))))
-    return ", ".join([*words, *beside_variant(key, keys), *([code(key.settings)] * bool(key.settings))])
+    return ", ".join(
+        [*words, *beside_variant(key, keys), *([code(key.settings)] * bool(key.settings))]
+    )
 
 
 def _variant(text: str) -> list[str]:

@@ -318,7 +318,7 @@
   const figures = new Map();
   const seen = new IntersectionObserver((entries) => {
     for (const entry of entries) {
-      if (!entry.isIntersecting) continue;
+      if (!entry.isIntersecting || !figures.has(entry.target)) continue;
       seen.unobserve(entry.target);
       const figure = figures.get(entry.target);
       figure.drawn = true;
