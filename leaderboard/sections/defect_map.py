@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -257,10 +257,10 @@ def figure(advantages: DefectMap, embodiment: str) -> Figure:
     tasks = sorted({point.table.key.task for point in points})
     markers = {task: MARKERS[i % len(MARKERS)] for i, task in enumerate(tasks)}
     right = 1.04 * max(point.defect.interval.high for point in points)
-    smallest = min(point.defect.value for point in points)
-    # Most worlds have small defects, which a linear axis would draw upon each other.
-    scale, left = ("log", 0.7 * smallest) if smallest > 0 else ("linear", -0.02 * right)
-    x = Axis(f"audited defect of a decision, {cut(embodiment, 26)}", (left, right), scale=scale)
+    x = Axis(f"audited defect of a decision, {cut(embodiment, 26)}", (-0.02 * right, right))
+    if (smallest := min(point.defect.value for point in points)) > 0:
+        # A linear axis would draw small defects, which most worlds have, upon each other.
+        x = replace(x, ends=(0.7 * smallest, right), scale="log")
     y, zero = Axis(f"advantage over {STANDARD}"), [Rule(0)]
     plots = []
     for panel in panels:
