@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
-from symsteer.leaderboard.keys import ARM, Key
+from symsteer.leaderboard.defects import parts_of
+from symsteer.leaderboard.keys import ARM, SYMMETRIC_EMBODIMENT, Key
 from symsteer.leaderboard.rows import Summary, Table
 from symsteer.leaderboard.text import code, count
 
@@ -29,12 +31,37 @@ def told_apart(key: Key, keys: Sequence[Key]) -> dict[str, str]:
 
 
 def cell_name(table: Table, summary: Summary) -> str:
-    """Task, embodiment and variant, and of the rest of the key what tells the tables apart."""
-    key = table.key
-    words = [code(key.task), code(key.embodiment), broken_by(key) or "unbroken"]
-    apart = told_apart(key, [other.key for other in summary.tables])
-    words += [text if name == "steps" else code(text) for name, text in apart.items()]
-    return " ".join([*words, *([code(key.settings)] if key.settings else [])])
+    """In words: the task, what breaks its symmetry, and what else tells the table from others."""
+    key, keys = table.key, [other.key for other in summary.tables]
+    arm = [] if key.embodiment == SYMMETRIC_EMBODIMENT else [f"{_plain(key.embodiment)} arm"]
+    broken = _variant(key.variant) if key.breaking[0] else []
+    words = [_plain(key.task.removesuffix("-v1")), *((arm + broken) or ["unbroken"])]
+    world = (key.task, key.embodiment, key.variant)
+    same = [other for other in keys if (other.task, other.embodiment, other.variant) == world]
+    if len({(other.base, other.group, other.mode) for other in same}) > 1:
+        words.append(code(" ".join(filter(None, (key.base, key.group, key.mode)))))
+    return ", ".join(
+        [*words, *beside_variant(key, keys), *([code(key.settings)] * bool(key.settings))]
+    )
+
+
+def _variant(text: str) -> list[str]:
+    """`wind:0.2..0.8` as `wind 0.2 to 0.8`; a text that is no variant as it is."""
+    parts = parts_of(text)
+    if parts is None:
+        return [code(text)]
+    words = []
+    for part in parts:
+        strength, _, begins = part.text.removeprefix(f"{part.name}:").partition("@")
+        begun = f" from {begins} of the budget" if begins else ""
+        words.append(f"{_plain(part.name)} {strength}{begun}".replace("..", " to "))
+    return words
+
+
+def _plain(name: str) -> str:
+    """A name without underscores; as code if it is none that markdown could be given."""
+    safe = re.fullmatch(r"[A-Za-z][\w-]{,40}", name, re.ASCII)
+    return name.replace("_", " ") if safe else code(name)
 
 
 def beside_variant(key: Key, others: Sequence[Key]) -> list[str]:

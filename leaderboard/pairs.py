@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-
-import numpy as np
+from statistics import fmean
 
 from symsteer.leaderboard.rows import AgentRow, Table
 from symsteer.leaderboard.runs import Pair, Run, aligned, episode_success
@@ -81,7 +80,7 @@ def reference_success(run: Run, references: Sequence[Run]) -> dict[int, float]:
     for reference in same:
         for seed, success in reference.final_success.items():
             values[seed].append(success)
-    return {seed: float(np.mean(successes)) for seed, successes in values.items()}
+    return {seed: fmean(successes) for seed, successes in values.items()}
 
 
 def area_pairs(first: AgentRow, second: AgentRow, budget: int) -> dict[Pair, Sample]:

@@ -32,14 +32,12 @@ def regrets(values: Values, splits: int = SPLITS, seed: int = 0) -> Values:
     """
     generator = np.random.default_rng(seed)
     policies = values.shape[1]
+    ordered = values[:, [generator.permutation(policies) for _ in range(splits)]]
+    first, second = ordered[..., : policies // 2].mean(-1), ordered[..., policies // 2 :].mean(-1)
     total = np.zeros(len(values))
-    for _ in range(splits):
-        order = generator.permutation(policies)
-        halves = order[: policies // 2], order[policies // 2 :]
-        for chosen, measured in (halves, halves[::-1]):
-            best = values[:, chosen].mean(1).argmax()
-            means = values[:, measured].mean(1)
-            total += means[best] - means
+    for chosen, measured in ((first, second), (second, first)):
+        best = measured[chosen.argmax(0), np.arange(splits)]
+        total += (best - measured).sum(1)
     return total / (2 * splits)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 
@@ -170,7 +171,7 @@ class Run:
             if min(inside, FINAL_WINDOW) == number:
                 for seed, success in episode_success(evaluation).items():
                     values[seed].append(success)
-        return {seed: float(np.mean(successes)) for seed, successes in values.items()}
+        return {seed: fmean(successes) for seed, successes in values.items()}
 
     def measured(self, measure: str) -> float | None:
         """Final success, divergence, largest |Q| over the feasible, |Q bias|; None if unknown.

@@ -67,7 +67,7 @@ class EpisodeBlock:
     def draw(self, resamples: int) -> Array:
         """The value under each resample's weights of episodes: [resamples]."""
         totals = _weighted_sum(self.seeds, tuple(self.totals), resamples)
-        return totals / _weighted_counts(self.seeds, tuple(self.counts), resamples)
+        return totals / _weighted_sum(self.seeds, tuple(self.counts), resamples)
 
 
 @dataclass(frozen=True)
@@ -155,13 +155,11 @@ def _stacked_weights(seeds: tuple[int, ...], resamples: int) -> Array:
     return np.stack([episode_weights(seed, resamples) for seed in seeds])
 
 
+@lru_cache(maxsize=1024)
 def _weighted_sum(seeds: tuple[int, ...], values: tuple[float, ...], resamples: int) -> Array:
+    # Kept, because the sections of a leaderboard draw the same samples, and most have equal counts.
     # Not `@`: matrix products would start threads for these small sums.
     return (_stacked_weights(seeds, resamples) * np.array(values)[:, None]).sum(axis=0)
-
-
-_weighted_counts = lru_cache(maxsize=64)(_weighted_sum)
-"""The same, kept: most blocks of a leaderboard have equal episodes and counts."""
 
 
 def iqm(values: Sequence[float] | Array, weights: Array | None = None) -> Array:

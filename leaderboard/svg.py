@@ -16,7 +16,7 @@ from matplotlib import style as mpl_style
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from symsteer.leaderboard.plots import FEASIBLE, GREY, Dot, Figure, Look, Plot, Trace
 from symsteer.leaderboard.statistics import Interval
@@ -125,6 +125,11 @@ def _draw_plot(ax: Axes, plot: Plot) -> None:
         ax.set_yscale("symlog", linthresh=plot.y.linear_to)
     elif plot.y.scale == "log":
         ax.set_yscale("log")
+    if plot.x.scale == "log":
+        ax.set_xscale("log")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_locator(NullLocator())
     if plot.x.ends:
         ax.set_xlim(plot.x.ends)
     if plot.y.ends:

@@ -57,9 +57,9 @@ def cell_tables(table: Table, links: Links) -> list[str]:
     # Where all runs have ended as they should, their status is no news.
     all_finished = all(status(row) == f"{len(row.runs)}{SPACE}finished" for row in rows)
     results = [
-        ({"Rank": _rank(row, table)} if table.is_ranked else {})
+        {"Agent": _name(row)}
+        | ({"Rank": _rank(row, table)} if table.is_ranked else {})
         | {
-            "Agent": _name(row),
             "Success (final window)": stacked(row.success),
             "Last": number(row.last.value if row.last else None),
             "Against base": stacked(row.difference, sign=True, marks=mark_of(row.difference)),
@@ -70,7 +70,7 @@ def cell_tables(table: Table, links: Links) -> list[str]:
         | ({} if all_finished else {"Status": status(row)})
         for row in rows
     ]
-    parts = [_base_line(table), table_text(results, left=2 if table.is_ranked else 1)]
+    parts = [_base_line(table), table_text(results)]
     if absent := [code(row.agent) for row in table.rows if not row.runs]:
         parts.append(f"Not run here: {', '.join(absent)}.")
     if (best := table.best_reference) and best.success:

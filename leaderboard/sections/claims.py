@@ -328,17 +328,17 @@ def render(outcomes: list[ClaimOutcome], view: View) -> list[str]:
         rows.append(
             {
                 "Claim (family)": f"{title(claim)} ({claim.family})",
+                "Verdict": verdict_text(outcome),
                 "Effect": test_text(claim),
                 "Size, 95 % interval": size,
                 "Smallest of interest": f"{claim.smallest:g}",
                 "p: none; at least that": NOTHING if outcome.reason else p_values,
                 "Cells, pairs, policies": f"{outcome.cells}, {outcome.pairs}, {outcome.policies}",
-                "Verdict": verdict_text(outcome),
             }
         )
     parts = [EXPLAINED, origin]
     if rows:
-        parts.append(table_text(rows, left=2))
+        parts.append(table_text(rows, left=3))
     if untested:
         lines = [f"- {reason}: {'; '.join(names)}" for reason, names in untested.items()]
         parts.append("Not tested:\n\n" + "\n".join(lines))

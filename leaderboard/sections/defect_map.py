@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -48,9 +48,10 @@ The *slope* is that of least squares with an intercept for each base policy: it 
 alone, never from a comparison of policies, tasks or embodiments. Its interval draws base policies
 (runs, where a task has one policy) and episodes, and the defects within their intervals; it is
 about these cells. With fewer than {MIN_SEEDS} base policies it decides nothing. Lines in the figure
-have this slope and go through the mean of their task; the fan has the slopes of the interval. An
-advantage *ends* where the line crosses 0; between the numbers in brackets 0 is not excluded (95 %,
-Fieller's method), and a dash there means: up to the end of the measured range."""
+have this slope and go through the mean of their task; the fan has the slopes of the interval. They
+are bent, because the axis of the defect is logarithmic. An advantage *ends* where the line crosses
+0; between the numbers in brackets 0 is not excluded (95 %, Fieller's method), and a dash there
+means: up to the end of the measured range."""
 
 
 @dataclass(frozen=True)
@@ -257,6 +258,9 @@ def figure(advantages: DefectMap, embodiment: str) -> Figure:
     markers = {task: MARKERS[i % len(MARKERS)] for i, task in enumerate(tasks)}
     right = 1.04 * max(point.defect.interval.high for point in points)
     x = Axis(f"audited defect of a decision, {cut(embodiment, 26)}", (-0.02 * right, right))
+    if (smallest := min(point.defect.value for point in points)) > 0:
+        # A linear axis would draw small defects, which most worlds have, upon each other.
+        x = replace(x, ends=(0.7 * smallest, right), scale="log")
     y, zero = Axis(f"advantage over {STANDARD}"), [Rule(0)]
     plots = []
     for panel in panels:
@@ -297,7 +301,8 @@ def _lines(fit: Fit) -> list[Trace]:
     slope, traces = fit.slope.interval(), []
     for line in fit.lines:
         x, y = line.centre
-        grid = np.array([line.span[0], x, line.span[1]])
+        # With places between, because a straight line is bent on a logarithmic axis.
+        grid = np.unique([*np.linspace(*line.span, 25), x])
         middle, *fan = (y + s * (grid - x) for s in (slope.value, slope.low, slope.high))
         low, high = np.minimum(*fan), np.maximum(*fan)
         traces.append(Trace(WITHIN, grid, middle, Look(FIT, width=1.4), low, high, band=0.1))

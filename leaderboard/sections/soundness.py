@@ -111,7 +111,7 @@ def render(learners: Sequence[tuple[Table, AgentRow, Soundness]], view: View) ->
     """Whether each learner is sound in each cell; empty where no success was measured twice."""
     rows = [
         {
-            "Task": cell_name(table, view.summary),
+            "Cell": cell_name(table, view.summary),
             "Agent": code(row.label),
             "Runs": str(len(row.finished)),
             "Fall": f"{number(sound.fall)} (worst {number(sound.worst_fall)})",

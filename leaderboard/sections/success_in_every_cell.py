@@ -12,7 +12,7 @@ from symsteer.leaderboard.text import NOTHING, SPACE, code, mark_of, number, tab
 def render(summary: Summary, view: View) -> list[str]:
     """A row for each cell, a column for each agent."""
     rows = [
-        {"Task": cell_name(table, summary)}
+        {"Cell": cell_name(table, summary)}
         | {
             code(agent): "<br>".join(map(_shown, table.shown(agent))) or NOTHING
             for agent in summary.agents

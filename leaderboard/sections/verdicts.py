@@ -91,15 +91,15 @@ def render_tests(said: dict[str, list[ClaimOutcome]], view: View) -> list[str]:
         rows = [
             {
                 "Claim": title(outcome.claim),
+                "Verdict": verdict_text(outcome),
                 "Effect": test_text(outcome.claim),
                 "Size, 95 % interval": size_text(outcome),
                 "p": NOTHING if outcome.reason else p_text(outcome.p),
-                "Verdict": verdict_text(outcome),
                 "What it would take": _needed(outcome, tests[outcome.claim.family]),
             }
             for outcome in tested
         ]
-        parts += [f"### {text}", table_text(rows, left=2)]
+        parts += [f"### {text}", table_text(rows, left=3)]
     return parts
 
 

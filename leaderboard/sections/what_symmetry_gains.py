@@ -135,13 +135,15 @@ def render(measured: list[Gain], view: View) -> list[str]:
     rows: dict[str, dict[str, str]] = {}
     for (kind, agent), both in groupby(measured, key=lambda gain: (gain.kind, gain.agent)):
         by_measure = list(both)
-        defects = ends(by_measure[0].defects).replace(" ", SPACE)
-        row = rows.setdefault(kind, {"World": kind, "Defect": defects, "Cells": "0"})
-        row["Cells"] = str(max(int(row["Cells"]), *(gain.cells for gain in by_measure)))
+        row = rows.setdefault(kind, {"World": kind})
         row[f"{code(agent)}: AUC,<br>success"] = "<br>".join(
             difference(gain.effect) if gain.enough else interval(gain.effect, sign=True)
             for gain in by_measure
         )
+    for kind, of_kind in groupby(measured, key=lambda gain: gain.kind):
+        every = list(of_kind)
+        rows[kind]["Defect"] = ends(every[0].defects).replace(" ", SPACE)
+        rows[kind]["Cells"] = str(max(gain.cells for gain in every))
     numbers = folded("The picture's numbers", [NUMBERS, table_text(list(rows.values()))])
     return [EXPLAINED, *view.drawn(kind="answer"), *numbers]
 

@@ -22,7 +22,7 @@ from symsteer.leaderboard.site.libraries import assets, needs
 from symsteer.leaderboard.site.media import DIGITS, films_of, films_of_cell, maps_of
 from symsteer.leaderboard.site.pages import pages
 from symsteer.leaderboard.site.results import Results
-from symsteer.leaderboard.site.run_page import run_values
+from symsteer.leaderboard.site.run_page import run_pages
 from symsteer.leaderboard.study import read_study
 
 GENERATOR = '<meta name="generator" content="symsteer site'
@@ -94,10 +94,9 @@ def render(results: Results) -> dict[str, bytes]:
         "study": results.study,
         "docs": results.docs.is_built,
         "version": metadata.version("symsteer"),
+        "address_of": results.run,
     }
-    runs = results.runs.values()
-    of_runs = ((results.run(run), "run.html", run_values(results, run)) for run in runs)
-    for address, template, values in (*pages(results), *of_runs):
+    for address, template, values in (*pages(results), *run_pages(results)):
         values |= {"root": "../" * address.count("/"), "address": address, **common}
         page = markup.environment().get_template(template).render(values)
         files[address] = page.encode()

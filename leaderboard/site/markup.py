@@ -39,7 +39,7 @@ def shown(value: Any) -> Any:
     """A value for a page: control characters of texts become spaces, None is nothing."""
     if value is None:
         return ""
-    if isinstance(value, str) and not hasattr(value, "__html__"):
+    if isinstance(value, str) and not value.isprintable() and not hasattr(value, "__html__"):
         return "".join(c if c.isprintable() or c in SPACES else " " for c in value)
     return value
 

@@ -37,6 +37,8 @@ from symsteer.leaderboard.text import NOTHING, compact, count, difference, inter
 
 Values = dict[str, Any]
 
+JSON = json.JSONEncoder(ensure_ascii=False)
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -91,11 +93,10 @@ def overview(results: Results) -> Values:
     records = [run.record for run in summary.runs]
     newest = max(record.ended or record.started for record in records)
     view, drawn = _view(results)
-    answer = [
-        block
-        for title, blocks in by_title(view, [s for s in SECTIONS if s.where == "first"])
-        for block in (f"## {title}", *blocks)
-    ]
+    first = by_title(view, [s for s in SECTIONS if s.where == "first"])
+    link = {"PAPER.md": "findings.html#the-paper-s-claims"}.get
+    # What was learned stands before what it was compared with.
+    agents = sorted(summary.agents, key=lambda name: summary.roles[name] == "reference")
     return {
         "facts": {
             "runs": len(records),
@@ -105,9 +106,9 @@ def overview(results: Results) -> Values:
             "newest run": f"{newest:%Y-%m-%d}",
         },
         "notice": _notice(results),
-        "answer": markup.html(answer, {"PAPER.md": "findings.html#the-paper-s-claims"}.get, drawn),
-        "agents": [(name, results.agent(name)) for name in summary.agents],
-        "matrix": [_matrix_row(results, table) for table in summary.tables],
+        "answer": [(anchor(t), t, markup.html(blocks, link, drawn)) for t, blocks in first],
+        "agents": [(name, results.agent(name)) for name in agents],
+        "matrix": [_matrix_row(results, table, agents) for table in summary.tables],
         "rows": [_result(results, table, row) for table, row in results.rows],
     }
 
@@ -128,11 +129,11 @@ def _notice(results: Results) -> str:
     return markup.html([text for text in texts if text], link) if any(texts) else ""
 
 
-def _matrix_row(results: Results, table: Table) -> Values:
+def _matrix_row(results: Results, table: Table, agents: Sequence[str]) -> Values:
     cells = []
-    for name in results.summary.agents:
+    for name in agents:
         shown = []
-        for row in table.shown(name):
+        for row in (row for row in table.shown(name) if row.runs):
             value, _, ends = interval(row.success).partition("\u00a0")
             level = round(10 * row.success.value) if row.success else ""
             text = value + marks(row) if row.success else status(row)
@@ -141,10 +142,10 @@ def _matrix_row(results: Results, table: Table) -> Values:
     return {"name": results.names[table.key], "href": results.cell(table.key), "cells": cells}
 
 
-def _place(task: Entry, embodiment: str, broken_by: Sequence[str], variant: str) -> Line:
-    """Columns that say where something is measured."""
+def _place(task: str, embodiment: str, broken_by: Sequence[str], variant: str) -> Line:
+    """Columns that say where something is measured; they come last, and are filtered by."""
     return {
-        "Task": task,
+        "Task": Entry(task),
         "Embodiment": Entry(embodiment),
         "Broken by": Entry(", ".join(broken_by)),
         "Strength": Entry(", ".join(strengths(variant)) or NOTHING),
@@ -157,12 +158,11 @@ def _result(results: Results, table: Table, row: AgentRow) -> Line:
     diverged = sum(row.diverged) / len(row.diverged) if row.diverged else None
     errors = [row.over_runs(f"equivariance_{part}") for part in ("actor", "critic")]
     error = max((value for value in errors if value is not None), default=None)
-    place = _place(Entry(key.task, results.cell(key)), key.embodiment, breaks(key), key.variant)
     return {
-        **place,
+        "Cell": Entry(results.names[key], results.cell(key)),
         "Agent": Entry(row.label, results.agent(row.agent), facet=row.agent),
-        "Rank": measured(row.rank, count),
         "Success": measured(row.success, interval),
+        "Rank": measured(row.rank, count),
         "Against base": measured(row.difference, difference),
         "Against best reference": measured(row.against_best, difference),
         "AUC": measured(row.area),
@@ -171,6 +171,7 @@ def _result(results: Results, table: Table, row: AgentRow) -> Line:
         "Equivariance error": measured(error, compact),
         "Defect": measured(defect and defect.interval, _percents),
         "Status": Entry(status(row)),
+        **_place(key.task, key.embodiment, breaks(key), key.variant),
     }
 
 
@@ -216,11 +217,7 @@ def cell(results: Results, table: Table) -> Values:
             zip(("success", "q", "errors", "directions"), map(charts, shown), strict=True)
         ),
         "films": films_of_cell(table),
-        "runs": [
-            (row.label, [(run, results.run(run)) for run in row.runs])
-            for row in table.rows
-            if row.runs
-        ],
+        "runs": results.runs_of(table),
         "picture": results.docs.picture("tasks", key.task),
     }
 
@@ -280,7 +277,7 @@ def standing(rows: Mapping[str, tuple[AgentRow, AgentRow | None]]) -> Figure:
 def options_of(table: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Nested settings as names with dots and texts."""
     return [
-        (key, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
+        (key, value if isinstance(value, str) else JSON.encode(value))
         for key, value in flat(table).items()
     ]
 
@@ -340,20 +337,19 @@ def runs(results: Results) -> Values:
 
 def _run(results: Results, run: Run) -> Line:
     record, settings, commit = run.record, run.record.settings, run.record.provenance.commit
-    name = record.run_id
     table, row = results.row_of.get(run.path) or (None, None)
     broken_by = breaks(table.key) if table else dials(settings.variant)
     page_of_agent = results.agent(run.agent) if run.agent in results.summary.roles else None
     return {
-        "Run": Entry(name if len(name) < 15 else f"…{name[-12:]}", results.run(run)),
-        **_place(Entry(settings.task), settings.embodiment, broken_by, settings.variant),
+        "Run": Entry(results.names[table.key] if table else run.record.run_id, results.run(run)),
         "Agent": Entry(row.label if row else run.agent, page_of_agent, facet=run.agent),
-        "Seed": measured(run.seed, str),
         "Success": measured(run.success if run.finished else None),
+        "Seed": measured(run.seed, str),
         "Last checkpoint": measured(record.final.success_once if record.final else None),
+        "Status": Entry(record.status if row else "set aside"),
         "Steps": measured(record.budget.env_steps, count),
         "Minutes": measured(record.wall_clock.total / 60, "{:.1f}".format),
-        "Status": Entry(record.status if row else "set aside"),
         "Started (UTC)": Entry(f"{record.started:%Y-%m-%d %H:%M}"),
         "Code": Entry(commit[:12] if commit else (record.provenance.version or NOTHING)),
+        **_place(settings.task, settings.embodiment, broken_by, settings.variant),
     }

@@ -102,16 +102,34 @@ class Results:
         return f"variants/{slug(name, digits=DIGITS)}.html"
 
     def run(self, run: Run) -> str:
-        """Address of a run's page; records with the same bytes share one."""
-        return f"runs/{self._run_names[run.path]}.html"
+        """Address of a run on the page of its cell; records with the same bytes share one."""
+        return f"{self._page_of_run[run.path]}#{self.run_names[run.path]}"
 
     @cached_property
-    def _run_names(self) -> dict[Path, str]:
+    def run_pages(self) -> dict[str, list[Run]]:
+        """Runs by the address of their page: one a cell, and one of all that are set aside."""
+        pages: dict[str, list[Run]] = {}
+        for table, row in self.rows:
+            pages.setdefault(self.cell(table.key).replace("cells", "runs", 1), []).extend(row.runs)
+        aside = f"runs/{slug('set aside', digits=DIGITS)}.html"
+        return pages | ({aside: list(self.summary.set_aside)} if self.summary.set_aside else {})
+
+    @cached_property
+    def _page_of_run(self) -> dict[Path, str]:
+        return {run.path: page for page, runs in self.run_pages.items() for run in runs}
+
+    @cached_property
+    def run_names(self) -> dict[Path, str]:
+        """What names a run within its page, by the path of its record."""
         names = {}
         for path, run in self.runs.items():
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             names[path] = slug(run.record.run_id, digits=DIGITS)[:-DIGITS] + digest[:DIGITS]
         return names
+
+    def runs_of(self, table: Table) -> list[tuple[str, list[Run]]]:
+        """The runs of a cell by the label of their row."""
+        return [(row.label, row.runs) for row in table.rows if row.runs]
 
     def audited(self, dial: str) -> list[tuple[str, str, str, float, AuditedDefect]]:
         """Task, embodiment, group, strength and defect where a variant acts alone, in this order.

@@ -1,29 +1,61 @@
-"""What the page of a run shows."""
+"""The pages of runs: one a cell, whose data a script shows as the run that the address names."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from statistics import mean
+from collections.abc import Iterator, Mapping, Sequence
+from statistics import fmean
 from typing import Any
 
 from symsteer.leaderboard.curve_figures import run_curves
 from symsteer.leaderboard.records import REPRODUCED, Evaluation, repeat_command
 from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.site.charts import charts, episodes, grouped
+from symsteer.leaderboard.site.markup import shown
 from symsteer.leaderboard.site.media import films_of
-from symsteer.leaderboard.site.pages import options_of
+from symsteer.leaderboard.site.pages import Values, options_of
 from symsteer.leaderboard.site.results import Results
 from symsteer.leaderboard.text import compact, count, number
 
 
-def run_values(results: Results, run: Run) -> dict[str, Any]:
-    """The values of the template."""
+def run_pages(results: Results) -> Iterator[tuple[str, str, Values]]:
+    """Address, template and values of the pages of runs."""
+    for address, runs in results.run_pages.items():
+        table, _ = results.row_of.get(runs[0].path) or (None, None)
+        agents = dict.fromkeys(run.agent for run in runs)
+        aside = [(name, [run for run in runs if run.agent == name]) for name in agents]
+        named = {results.run_names[run.path]: run for run in runs}
+        data = {name: run_values(results, run) for name, run in named.items()}
+        entries = [_entries(run) for run in named.values()]
+        # Most of them are those of all runs of the cell.
+        shared = set.intersection(*(set(one.items()) for one in entries))
+        for one, values in zip(entries, data.values(), strict=True):
+            values["record"] = _printable(dict(pair for pair in one.items() if pair not in shared))
+        yield (
+            address,
+            "run.html",
+            {
+                "cell": table and (results.names[table.key], results.cell(table.key)),
+                "runs": results.runs_of(table) if table else aside,
+                "data": {"shared": _printable(dict(sorted(shared))), "runs": data},
+            },
+        )
+
+
+def _entries(run: Run) -> dict[str, str]:
+    """All of a record but its evaluations."""
+    every = run.record.model_dump(mode="json", by_alias=True, exclude={"evaluations"})
+    return {key: text for key, text in options_of(every) if text != "null"}
+
+
+def run_values(results: Results, run: Run) -> Values:
+    """What the script shows of a run; its texts without control characters."""
     record, again = run.record, run.reproduction
-    table, row = results.row_of.get(run.path) or (None, None)
+    _, row = results.row_of.get(run.path) or (None, None)
     budget = record.settings.env_steps
     facts = {
         "status": record.status,
+        "role": record.role,
         "failure": record.failure,
         "seed": str(run.seed),
         "success, final window": number(run.success) if run.finished else None,
@@ -38,24 +70,31 @@ def run_values(results: Results, run: Run) -> dict[str, Any]:
     command = repeat_command(record.config)
     measured = sorted({name for e in run.curve.values() for name in e.diagnostics})
     header = ["Steps", "Episodes", "Success once", "Success at end", "Return", "Length", *measured]
-    every = record.model_dump(mode="json", by_alias=True, exclude={"evaluations"})
-    return {
+    texts = {
         "name": record.run_id,
-        "agent_page": results.agent(run.agent) if run.agent in results.summary.roles else None,
-        "label": row.label if row else run.agent,
-        "role": record.role,
-        "cell": table and (results.names[table.key], results.cell(table.key)),
+        "agent": row.label if row else run.agent,
+        "page": results.agent(run.agent) if run.agent in results.summary.roles else None,
         "facts": {key: text for key, text in facts.items() if text},
         "commit": record.provenance.commit,
         "version": record.provenance.version,
-        "command": command and re.split(" (?=--)", command),
-        "record": [(key, text) for key, text in options_of(every) if text != "null"],
-        "charts": charts(run_curves(run)) if run.curve else [],
-        "episodes": [episodes(run)] if run.curve else [],
-        "evaluations": (header, [_evaluation(e, measured) for e in run.curve.values()]),
-        "last": _episodes(record.evaluations[-1]) if record.evaluations else [],
-        "films": films_of(run),
+        "command": re.split(" (?=--)", command) if command else [],
+        "films": [(one.address, one.text, one.is_film) for one in films_of(run)],
     }
+    return _printable(texts) | {
+        "charts": charts(run_curves(run)) if run.curve else [],
+        "episodes": run.curve and episodes(run),
+        "evaluations": [
+            [*map(shown, header)],
+            *(_evaluation(e, measured) for e in run.curve.values()),
+        ],
+    }
+
+
+def _printable(value: Any) -> Any:
+    """The same data with texts that pages show (`shown`)."""
+    if isinstance(value, Mapping):
+        return {shown(key): _printable(one) for key, one in value.items()}
+    return [*map(_printable, value)] if isinstance(value, list | tuple) else shown(value)
 
 
 def _evaluation(evaluation: Evaluation, measured: Sequence[str]) -> list[str]:
@@ -74,13 +113,4 @@ def _evaluation(evaluation: Evaluation, measured: Sequence[str]) -> list[str]:
 
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
-    return mean(known) if known else None
-
-
-def _episodes(evaluation: Evaluation) -> list[list[str]]:
-    """Rows of the table of the last evaluation's episodes."""
-    columns = evaluation.episodes
-    flags = zip(columns.success_once, columns.success_at_end, strict=True)
-    successes = [["yes" if flag else "no" for flag in both] for both in flags]
-    numbers = zip(columns.seed, successes, columns.return_, columns.episode_len, strict=True)
-    return [[str(seed), *both, number(ret, 1), str(length)] for seed, both, ret, length in numbers]
+    return fmean(known) if known else None

@@ -46,7 +46,8 @@
       return [element("label", {}, head.textContent, select)];
     });
     const all = element("button", { type: "button", className: "plain" }, "Show all");
-    return selects.length ? element("div", { className: "filters" }, ...selects, all) : null;
+    const bar = element("div", { className: "filters" }, ...selects, all);
+    return selects.length ? element("details", { open: innerWidth > 620 }, element("summary", {}, "Filters"), bar) : null;
   };
 
   const readAddress = (bar) => {
@@ -147,10 +148,11 @@
     }
   };
 
+  const PLACES = [0.001, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10];
   const isLog = (axis) => axis.scale === "log";
   const axisOf = (spec, narrow = innerWidth < 620) => ({
     title: { text: safe(spec.title || ""), standoff: 8, font: { size: 13, color: css("--muted") } },
-    range: spec.ends,
+    range: isLog(spec) && spec.ends ? spec.ends.map(Math.log10) : spec.ends,
     type: isLog(spec) ? "log" : "linear",
     zeroline: false,
     gridcolor: css("--line"),
@@ -159,13 +161,14 @@
     tickformat: spec.in_steps ? "~s" : undefined,
     exponentformat: isLog(spec) ? "power" : "e",
     dtick: isLog(spec) ? 1 : spec.every || undefined,
-    nticks: 7,
+    ...(isLog(spec) && spec.ends ? { tickvals: PLACES, ticktext: PLACES.map(String) } : {}),
+    nticks: narrow ? 5 : 7,
     automargin: true,
     fixedrange: false,
     // Places from top to bottom that have names.
     ...(spec.labels ? {
       tickvals: spec.labels.map((_, k) => k), range: [spec.labels.length - 0.4, -0.6],
-      ticktext: spec.labels.map((text) => safe(narrow && text.length > 22 ? text.replace(/^(\S+ \S+) /, "$1\n") : text).replace("\n", "<br>")),
+      ticktext: spec.labels.map((text) => safe(narrow ? text.replace(/(.{8,18})\s/g, "$1\n") : text).replaceAll("\n", "<br>")),
     } : {}),
   });
 
@@ -246,7 +249,7 @@
       type: "heatmap", z, text, x: spec.seeds.map((_, k) => k), y: spec.rows.map((row) => safe(row.name)),
       zmin: -0.5, zmax: 2.5, colorscale, showscale: false, xgap: 1, ygap: 2, hovertemplate: "%{text}<extra></extra>", hoverongaps: false,
     }];
-    const yaxis = { ...axisOf({ title: "environment steps" }), type: "category", autorange: "reversed", nticks: undefined, showgrid: false };
+    const yaxis = { ...axisOf({ title: spec.rows.length > 4 ? "environment steps" : "steps" }), type: "category", autorange: "reversed", nticks: undefined, showgrid: false };
     return { traces, layout: { xaxis: { ...axisOf({ title: "held-out episodes" }), showgrid: false }, yaxis, height: 110 + 24 * spec.rows.length } };
   };
 
@@ -315,7 +318,7 @@
   const figures = new Map();
   const seen = new IntersectionObserver((entries) => {
     for (const entry of entries) {
-      if (!entry.isIntersecting) continue;
+      if (!entry.isIntersecting || !figures.has(entry.target)) continue;
       seen.unobserve(entry.target);
       const figure = figures.get(entry.target);
       figure.drawn = true;
@@ -324,38 +327,99 @@
     }
   }, { rootMargin: "400px" });
 
+  const addFigure = (made, spec) => {
+    if (spec.legend) twins(spec.legend);
+    figures.set(made, {
+      spec, drawn: false,
+      // Beside the bands of many agents, single runs hide more than they show.
+      state: { hidden: new Set(), runs: !spec.traces || spec.traces.filter((one) => one.band).length < 3 },
+      plot: made.querySelector(".plot"), box: made.querySelector(".legend"),
+    });
+    seen.observe(made);
+    return made;
+  };
+
+  // ---------------------------------------------------------------- runs
+
+  const chart = (spec, caption) => addFigure(element("figure", { className: "chart" },
+    element("p", { className: "title" }, spec.title), element("div", { className: "legend" }),
+    element("div", { className: "plot", role: "img", ariaLabel: spec.text }), element("figcaption", {}, caption || spec.note || "")), spec);
+
+  const grid = (rows, name, kind = "") => {
+    const lines = rows.map((cells, row) => element("tr", {}, ...cells.map((text, k) => element(row ? "td" : "th", { className: k ? "n" : "" }, text))));
+    const table = element("table", { className: kind }, element("thead", {}, lines[0]), element("tbody", {}, ...lines.slice(1)));
+    return element("div", { className: "scroll tall", tabIndex: 0, role: "region", ariaLabel: name }, table);
+  };
+
+  const lastEpisodes = ({ seeds, rows }) => rows.at(-1).cells.flatMap((cell, k) => (cell ? [[
+    String(seeds[k]), cell[0] ? "yes" : "no", cell[0] > 1 ? "yes" : "no", cell[1] === null ? "\u2013" : shown(cell[1]), String(cell[2])]] : []));
+
+  // The run that the address names, of those that the page holds; the first one without a name.
+  const showRun = (box, { runs, shared }) => {
+    const name = runs[location.hash.slice(1)] ? location.hash.slice(1) : Object.keys(runs)[0];
+    const run = runs[name];
+    for (const link of document.querySelectorAll(".runs-of a")) link.toggleAttribute("aria-current", link.id === name);
+    for (const made of figures.keys()) figures.delete(made);
+    const code = element("code", {}, run.commit ? `commit ${run.commit}` : `SymSteer ${run.version}`);
+    const part = (title, ...children) => [element("h3", {}, title), ...children];
+    box.replaceChildren(
+      element("h2", {}, run.name),
+      element("p", { className: "lede" }, run.page ? element("a", { href: `../${run.page}` }, run.agent) : run.agent),
+      element("dl", { className: "pairs" }, ...Object.entries(run.facts).map(([key, text]) => element("div", {}, element("dt", {}, key), element("dd", {}, text)))),
+      ...part("Repeat it"),
+      ...(run.command.length ? [element("p", {}, "With the code of ", code, ":"), element("div", { className: "command" },
+        element("pre", { tabIndex: 0 }, element("code", { id: "command" }, ...run.command.flatMap((text) => [element("span", {}, text), " "]))),
+        element("button", { type: "button", className: "plain" }, "Copy"))]
+        : [element("p", {}, "No command of this version of SymSteer gives this configuration, which is listed below. Its code: ", code, ".")]),
+      ...(run.films.length ? part("Films and paths", element("div", { className: "columns" }, ...run.films.map(([address, text, isFilm]) => element("figure", {},
+        isFilm ? element("video", { controls: true, preload: "metadata", src: `../${address}` }) : element("img", { className: "picture", src: `../${address}`, alt: text }),
+        element("figcaption", {}, text))))) : []),
+      ...(run.charts.length ? [
+        ...part("Curves", element("div", { className: "columns" }, ...run.charts.map((spec) => chart(spec)))),
+        ...part("Episodes", chart(run.episodes, "Columns are the held-out initial states, the same for every agent. Dark: success at the end; light: success once, but not at the end; grey: no success.")),
+        ...part("Evaluations", grid(run.evaluations, "Evaluations")),
+        element("details", {}, element("summary", {}, "Episodes of the last evaluation"),
+          grid([["Seed", "Success once", "Success at end", "Return", "Length"], ...lastEpisodes(run.episodes)], "Episodes of the last evaluation")),
+      ] : []),
+      ...part("Record", element("p", {}, "All of it but the evaluations: configuration, provenance, the base policy, what it cost."),
+        grid([["Entry", "Value"], ...Object.entries({ ...shared, ...run.record }).sort()], "Record", "settings")),
+    );
+  };
+
+  const copy = async (button) => {
+    const source = button.parentElement.querySelector("code");
+    try {
+      await navigator.clipboard.writeText(source.textContent.trim());
+      button.textContent = "Copied";
+    } catch {
+      getSelection().selectAllChildren(source);
+      button.textContent = "Selected";
+    }
+  };
+
   const start = () => {
     if (globalThis.SymSteerTables) {
       // Errors of a table go to the console; a reader is not stopped by a dialogue.
       SymSteerTables.default.ext.errMode = "throw";
       document.querySelectorAll("table.data, .sortable table").forEach(makeTable);
     }
-    for (const element of document.querySelectorAll("figure.chart")) {
-      const spec = JSON.parse(element.querySelector("script[type='application/json']").textContent);
-      if (spec.legend) twins(spec.legend);
-      figures.set(element, {
-        spec, drawn: false,
-        // Beside the bands of many agents, single runs hide more than they show.
-        state: { hidden: new Set(), runs: !spec.traces || spec.traces.filter((one) => one.band).length < 3 },
-        plot: element.querySelector(".plot"), box: element.querySelector(".legend"),
-      });
-      seen.observe(element);
+    for (const made of document.querySelectorAll("figure.chart")) {
+      addFigure(made, JSON.parse(made.querySelector("script[type='application/json']").textContent));
+    }
+    const box = document.getElementById("run");
+    if (box) {
+      const data = JSON.parse(document.getElementById("runs").textContent);
+      const show = () => { showRun(box, data); if (location.hash) box.scrollIntoView(); };
+      addEventListener("hashchange", show);
+      show();
     }
     document.addEventListener("themechange", () => {
       for (const figure of figures.values()) if (figure.drawn) { legend(figure); draw(figure); }
     });
-    for (const button of document.querySelectorAll("[data-copy]")) {
-      button.addEventListener("click", async () => {
-        const text = document.getElementById(button.dataset.copy).textContent;
-        try {
-          await navigator.clipboard.writeText(text);
-          button.textContent = "Copied";
-        } catch {
-          getSelection().selectAllChildren(document.getElementById(button.dataset.copy));
-          button.textContent = "Selected";
-        }
-      });
-    }
+    document.addEventListener("click", (event) => {
+      const button = event.target.closest?.(".command button");
+      if (button) copy(button);
+    });
     root.classList.add("ready");
   };
   start();

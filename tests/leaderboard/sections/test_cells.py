@@ -59,8 +59,8 @@ def tallies(*groups: list[RunRecord]) -> dict[str, list[str]]:
 
 def test_the_main_table_ranks_with_ties_and_never_references(page: str) -> None:
     _, _, *rows = table_after(page, "### Unbroken symmetry")
-    shown = {row[1]: row for row in rows}
-    assert [(agent, row[0]) for agent, row in shown.items()] == [
+    shown = {row[0]: row for row in rows}
+    assert [(agent, row[1]) for agent, row in shown.items()] == [
         ("`base`", "\u2013"),
         ("`zero`", "\u2013"),
         ("`golden-ticket`<br>search 12.8 k", "\u2013"),

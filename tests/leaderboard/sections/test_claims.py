@@ -350,8 +350,8 @@ def test_the_page_has_every_claim_of_the_paper_tested_or_not() -> None:
     _, _, *rows = table_after(text, "|")
     few = "**not tested**: base policies at several defects: 1, 5 are needed"
     supported = "**supported**, for one base policy alone"
-    assert [row[-1] for row in rows] == [supported, few, few, supported]
-    _, effect, size, smallest, p_values, counts, _ = rows[-1]
+    assert [row[1] for row in rows] == [supported, few, few, supported]
+    _, _, effect, size, smallest, p_values, counts = rows[-1]
     assert effect == (
         "success, `residual-pathway` minus `equivariant`, broken cells of `floating` minus the "
         "same in unbroken cells"

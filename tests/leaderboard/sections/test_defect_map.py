@@ -74,7 +74,7 @@ def test_the_page_names_slopes_parts_and_what_is_missing() -> None:
     sizes = [cell[1].split("<br>") for cell in cells]
     assert [size[0] for size in sizes] == ["0.002", "0.100", "0.200", "0.400"]
     assert {size[2] for size in sizes} == {"tool"}
-    assert "Not audited, so not in the map: `PickCube-v1` `floating` `wind:0.75`." in text
+    assert "Not audited, so not in the map: PickCube, wind 0.75." in text
     assert (
         "`symsteer audit --task PickCube-v1 --embodiment floating --group C8 "
         "--variant wind:0.75 --out runs/audit`" in text

@@ -103,4 +103,4 @@ def test_the_papers_statements_have_their_tests() -> None:
         rows = table_after(text, f"### {statement}")[2:]
         for row, outcome in zip(rows, tested, strict=True):
             assert row[0] == outcome.claim.name
-            assert row[4].startswith(f"**{outcome.verdict}**")
+            assert row[1].startswith(f"**{outcome.verdict}**")

@@ -100,7 +100,7 @@ def test_columns_sort_by_their_numbers(site: Path, visit: Visit) -> None:
     table = page.locator("table.data")
 
     def values() -> list[float]:
-        return [float(text.split()[0]) for text in column(page, 7) if text[0].isdigit()]
+        return [float(text.split()[0]) for text in column(page, 3) if text[0].isdigit()]
 
     before = values()
     sort(table, "Success", "desc")
@@ -113,7 +113,7 @@ def test_columns_sort_by_their_numbers(site: Path, visit: Visit) -> None:
     assert values() == sorted(before)
     # What is not known stands last, or first, never between numbers.
     sort(table, "Against base", "desc")
-    known = [text != "\u2013" for text in column(page, 8)]
+    known = [text != "\u2013" for text in column(page, 5)]
     assert known == sorted(known, reverse=True)
     assert set(known) == {True, False}
 
@@ -143,7 +143,7 @@ def test_tables_of_the_leaderboard_sort_and_lines_can_be_left_out(site: Path, vi
 def test_rows_are_filtered_and_the_address_keeps_it(site: Path, visit: Visit) -> None:
     page = visit(site / "runs.html")
     every = page.inner_text(".dt-info")
-    for name, value, number in (("Agent", "equivariant", 6), ("Broken by", "action_gain", 4)):
+    for name, value, number in (("Agent", "equivariant", 2), ("Broken by", "action_gain", 13)):
         page.select_option(f"select[name='{name}']", value)
         assert set(column(page, number)) == {value}
     assert len(column(page, 1)) == 5
@@ -154,10 +154,10 @@ def test_rows_are_filtered_and_the_address_keeps_it(site: Path, visit: Visit) ->
     assert again.inner_text(".dt-info") == every
     # A cell with several values.
     again.select_option("select[name='Broken by']", "arm kinematics")
-    assert set(column(again, 3)) == {"panda"}
+    assert set(column(again, 12)) == {"panda"}
     again.get_by_role("button", name="Show all").click()
     again.fill("input[type=search]", "wind")
-    assert set(column(again, 4)) == {"wind"}
+    assert set(column(again, 13)) == {"wind"}
 
 
 def hover_text(page: Any, figure: Any, marker: int = 0) -> str:
@@ -232,11 +232,50 @@ def test_no_page_is_wider_than_a_phone_or_has_errors(
         draw_charts(page)
         width = page.evaluate("document.documentElement.scrollWidth")
         assert width <= 390, (path, width)
+        # Nor is the menu cut.
+        boxes = [link.bounding_box() for link in page.locator(".site-header a").all()]
+        assert max(box["x"] + box["width"] for box in boxes) <= 390
         assert page.evaluate("window.evil") is None
         # Plotly reads markup in texts.
         evil = "a[href^='javascript'], a[href*='evil.example'], img[src=x]"
         assert page.locator(evil).count() == 0
         page.close()
+
+
+@pytest.mark.parametrize("visit", [390], indirect=True)
+def test_first_columns_stay_and_results_are_beside_them(site: Path, visit: Visit) -> None:
+    page = visit(site / "index.html")
+    table = page.locator("table.data")
+    first, success = (table.locator(f"tbody tr:first-child td:nth-child({n})") for n in (1, 3))
+    assert success.bounding_box()["x"] < 300
+    left = first.bounding_box()["x"]
+    page.evaluate(
+        "document.querySelector('table.data').closest('.dt-layout-cell').scrollLeft = 200"
+    )
+    assert first.bounding_box()["x"] == left
+    assert success.bounding_box()["x"] < 150
+
+
+def test_the_address_chooses_a_run(site: Path, visit: Visit) -> None:
+    page = visit(site / "runs.html")
+    link = page.locator("table.data tbody a[href*='wind']").last
+    name = link.get_attribute("href").split("#")[1]
+    link.click()
+    page.wait_for_selector("#run h2")
+    draw_charts(page)
+    shown = page.inner_text("#run")
+    assert "Repeat it" in shown
+    assert name.startswith(page.inner_text("#run h2").lower())
+    assert page.locator("#run figure.chart").count() == 3
+    # Another run of the same cell, without a new page.
+    other = page.locator(".runs-of a:not([aria-current])").first
+    other.click()
+    page.wait_for_selector(f"a[id='{other.get_attribute('id')}'][aria-current]")
+    assert page.inner_text("#run") != shown
+    draw_charts(page)
+    page.go_back()
+    page.wait_for_selector(f"a[id='{name}'][aria-current]")
+    assert page.inner_text("#run").split("\n")[0] == shown.split("\n")[0]
 
 
 def test_the_documentation_is_searched_offline(whole: Path, visit: Visit) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,6 +20,7 @@ from symsteer.leaderboard.site import build, libraries
 from symsteer.leaderboard.site.build import generate
 from symsteer.leaderboard.site.docs import Documentation
 from symsteer.leaderboard.site.libraries import as_script
+from symsteer.leaderboard.site.pages import options_of
 from symsteer.leaderboard.site.results import Results
 from symsteer.leaderboard.study import PAPER, read_study
 from symsteer.leaderboard.text import SPACE, compact, interval, number
@@ -50,6 +52,17 @@ def page_of(folder: Path, kind: str, text: str) -> Page:
     raise AssertionError(f"no page of {text!r}")
 
 
+def runs_of(folder: Path) -> list[dict[str, Any]]:
+    """What the script can show of every run."""
+    found = []
+    for page in read_pages(folder / "runs").values():
+        (data,) = page.data
+        for address, run in data["runs"].items():
+            assert address in page.anchors
+            found.append(run | {"record": data["shared"] | run["record"], "page": page})
+    return found
+
+
 @pytest.mark.parametrize("kind", ["site", "hostile"])
 def test_nothing_of_a_record_becomes_markup(kind: str, request: pytest.FixtureRequest) -> None:
     pages = read_pages(request.getfixturevalue(kind))
@@ -60,7 +73,7 @@ def test_nothing_of_a_record_becomes_markup(kind: str, request: pytest.FixtureRe
             assert not [name for name in attrs if name.startswith("on")], (path, tag, attrs)
             assert STYLES.fullmatch(attrs.get("style", "text-align:left")), (path, tag, attrs)
             # Scripts are files or data; nothing runs that stands in a page.
-            assert tag != "script" or attrs.get("src") or attrs == {"type": "application/json"}
+            assert tag != "script" or attrs.get("src") or attrs["type"] == "application/json"
         policy = next(a for t, a in page.elements if "http-equiv" in a)["content"]
         assert "default-src 'none'" in policy
         assert "unsafe" not in re.search(r"script-src ([^;]*)", policy)[1]  # type: ignore[index]
@@ -71,11 +84,12 @@ def test_hostile_texts_are_shown_as_they_are(hostile: Path) -> None:
     index = Page(hostile / "index.html")
     for text in (EVIL, "../../../../etc/passwd", "x" * 120, "{{ 7 * 7 }}%{y}&lt;b&gt;", "a-b"):
         assert text in index.text
-    run = page_of(hostile, "runs", EVIL.replace("<", "&lt;")[:20])
-    assert run.text.count(EVIL) >= 12
-    assert "No command" in run.text
-    failed = page_of(hostile, "runs", "standard-99")
-    assert failed.text.count('<img src=x onerror="window.evil=1">') == 6
+    run = next(run for run in runs_of(hostile) if run["agent"] == EVIL)
+    assert sum(EVIL in text for text in run["record"].values()) >= 12
+    assert not run["command"]
+    (failed,) = [run for run in runs_of(hostile) if run["name"].endswith("standard-99")]
+    for part in ("facts", "record"):
+        assert failed[part]["failure"].count('<img src=x onerror="window.evil=1">') == 3
 
 
 def test_names_stay_in_their_folders_and_do_not_collide(hostile: Path) -> None:
@@ -135,27 +149,34 @@ def test_the_findings_are_those_of_the_page(site: Path) -> None:
 def test_a_run_page_has_all_of_its_record(site: Path) -> None:
     run = next(r for r in load_runs([site.parent / "runs"]) if r.record.status == "failed")
     record = run.record
-    page = page_of(site, "runs", record.run_id)
-    for text in (record.failure, record.config_hash, "0.0003", "demonstrations.count"):
-        assert text in page.text
-    episodes = next(data for data in page.data if "seeds" in data)
+    (shown,) = [one for one in runs_of(site) if one["facts"]["status"] == "failed"]
+    every = record.model_dump(mode="json", by_alias=True, exclude={"evaluations"})
+    texts = {key: value for key, value in options_of(every) if value != "null"}
+    assert shown["record"] == texts
+    assert texts.keys() >= {"failure", "config_hash", "config.demonstrations.count"}
+    episodes = shown["episodes"]
     seeds = record.evaluations[0].episodes.seed
     assert episodes["seeds"] == seeds
     assert len(episodes["rows"]) == len(record.evaluations) == 3
     for row, evaluation in zip(episodes["rows"], record.evaluations, strict=True):
         assert [bool(cell[0]) for cell in row["cells"]] == evaluation.episodes.success_once
         assert [cell[1] for cell in row["cells"]] == evaluation.episodes.return_
-    for name, value in record.evaluations[-1].diagnostics.items():
-        assert name in page.text
-        assert compact(value) in page.text
+    header, *_, last = shown["evaluations"]
+    measured = record.evaluations[-1].diagnostics
+    assert {name: compact(measured[name]) for name in measured}.items() <= {
+        *zip(header, last, strict=True)
+    }
 
 
 def test_a_record_that_is_set_aside_says_so(site: Path) -> None:
     aside = summarize(load_runs([site.parent / "runs"])).set_aside
     assert len(aside) == 1
-    texts = [page.text for page in read_pages(site / "runs").values()]
-    assert len(texts) == len(load_runs([site.parent / "runs"]))
-    assert sum("This record is set aside" in text for text in texts) == 1
+    pages = {run["page"].path for run in runs_of(site)}
+    assert len(pages) == len(summarize(load_runs([site.parent / "runs"])).tables) + 1
+    (page,) = [path for path in pages if path.name.startswith("set-aside")]
+    (shown,) = [run for run in runs_of(site) if run["page"].path == page]
+    assert shown["name"] == aside[0].record.run_id
+    assert "These records are set aside" in Page(page).text
     assert "set aside" in Page(site / "runs.html").text
     assert aside[0].record.run_id in Page(site / "findings.html").text
 
@@ -163,13 +184,18 @@ def test_a_record_that_is_set_aside_says_so(site: Path) -> None:
 def test_films_and_paths_are_copied_to_their_run_or_cell(site: Path) -> None:
     # Neither what only is called a film, nor a link, which may lead anywhere.
     assert sorted(path.suffix for path in (site / "media").iterdir()) == [".mp4", ".png"]
-    for kind, tags in (("runs", ["video", "img"]), ("cells", ["video"])):
-        pages = read_pages(site / kind).values()
-        shown = [
-            (page, tag) for page in pages for tag, _ in page.elements if tag in ("img", "video")
-        ]
-        assert [tag for _, tag in shown] == tags
-    assert f"film-{SIDE_BY_SIDE[0]}" in shown[0][0].text
+    films = [film for run in runs_of(site) for film in run["films"]]
+    assert [(Path(address).suffix, is_film) for address, _, is_film in films] == [
+        (".mp4", True),
+        (".png", False),
+    ]
+    assert all((site / address).is_file() for address, *_ in films)
+    (cell,) = [
+        page
+        for page in read_pages(site / "cells").values()
+        if any(tag == "video" for tag, _ in page.elements)
+    ]
+    assert f"film-{SIDE_BY_SIDE[0]}" in cell.text
 
 
 def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
@@ -186,7 +212,8 @@ def test_the_same_records_give_the_same_bytes_and_stale_pages_go(
     (out / "docs").mkdir()
     (out / "docs" / "index.html").write_text("of an earlier site")
     generate([site.parent / "runs" / str(index) for index in range(3)], out, PAPER, docs=False)
-    assert len(list((out / "runs").glob("*.html"))) == 3
+    assert len(runs_of(out)) == 3
+    assert len(list((out / "runs").glob("*.html"))) == 1
     assert (out / "runs" / "mine.txt").read_text() == "kept"
     assert not (out / "docs").exists()
     assert not dead_links(read_pages(out))
@@ -204,9 +231,9 @@ def test_runs_that_have_not_ended_have_pages(
     said = f"wrote {tmp_path / 'site' / 'index.html'}: the pages of 2 records"
     assert said in capsys.readouterr().out
     assert not dead_links(read_pages(tmp_path / "site"))
-    text = page_of(tmp_path / "site", "runs", "standard-0").text
-    assert "running" in text
-    assert "Every held-out episode" not in text
+    (running,) = [run for run in runs_of(tmp_path / "site") if run["facts"]["status"] == "running"]
+    assert not running["charts"]
+    assert not running["episodes"]
     assert "1\u00a0running" in Page(tmp_path / "site" / "index.html").text
 
 
