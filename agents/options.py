@@ -12,7 +12,7 @@ from symsteer.errors import UserError
 from symsteer.names import check
 from symsteer.policies.geometry import Group
 
-Critic = Literal["noise", "aliased", "sampler"]
+CriticKind = Literal["noise", "aliased", "sampler"]
 Reduce = Literal["min", "mean"]
 Distill = Literal["gaussian", "squashed", "actor", "mixture"]
 Layers = Literal["plain", "equivariant"]
@@ -26,12 +26,12 @@ class SacOptions(AgentOptions):
     :func:`~symsteer.agents.presets.tuned` gives each of those agents its own.
     """
 
-    critic: Critic = "aliased"
+    critic_kind: CriticKind = "aliased"
     """What the critics judge. `noise`: the noise (DSRL-SAC). `aliased`: the executed actions; noise
     critics are distilled from them for the actor (DSRL-NA). `sampler`: the executed actions; the
     actor's gradient passes through the sampler."""
     gamma: float = 0.95
-    """Discount per decision (not per environment step)."""
+    """Discount per decision (not per control step)."""
     lr: float = 2.4e-3
     """Adam's learning rate of actor and critics."""
     alpha_lr: float = 3e-4
@@ -55,25 +55,25 @@ class SacOptions(AgentOptions):
     noise_bound: float = 1.0
     """Largest norm of an irrep block of the noise."""
     distill: Distill = "squashed"
-    """Noise at which `aliased` distils: N(0, I), N(0, I) squashed into the bound, the actor's, or a
-    mixture of squashed and actor's in equal parts."""
+    """Noise at which `aliased` distils. `gaussian`: N(0, I). `squashed`: N(0, I) inside the bound.
+    `actor`: the actor's. `mixture`: half squashed, half the actor's."""
     distill_steps: float = 0.5
     """Gradient steps of the noise critics per update."""
     noise_bank: int = 4
     """Random noises that `aliased` decodes once per stored decision and distils from; 0: decode new
     ones in every step."""
     utd: float = 0.5
-    """Updates per collected decision, for any number of environments."""
+    """Updates per decision (not per control step), for any number of environments."""
     warmup: int = 1280
-    """Decisions at the start with noise from N(0, I), that is of the base policy, before the first
-    update."""
+    """Decisions (not control steps) before the first update. Their noise is N(0, I), as that of the
+    base policy alone."""
     replay_capacity: int = 200_000
     """Capacity of the replay buffer, in decisions."""
     reward_scale: float = 0.25
     """Factor on rewards in training (0.25: one decision of four steps costs 1). Reported Q-values
     are in unscaled reward units."""
     width: int = 128
-    """Hidden features per layer. With a group of order n they form width/n regular fields."""
+    """Hidden features per layer; with a group of order n they are width/n regular fields."""
     depth: int = 2
     """Hidden layers."""
     activation: Activation = "relu"
@@ -88,7 +88,7 @@ class SacOptions(AgentOptions):
 
     agent: ClassVar[str] = "the agent"
     """The agent in messages."""
-    known_critics: ClassVar[tuple[Critic, ...]] = get_args(Critic)
+    known_critics: ClassVar[tuple[CriticKind, ...]] = get_args(CriticKind)
     """The kinds of critics that the agent can have."""
     least_bank: ClassVar[int] = 0
     """The smallest ``noise_bank`` that the agent can have."""
@@ -99,9 +99,9 @@ class SacOptions(AgentOptions):
         for name, kind in get_type_hints(type(self)).items():
             if get_origin(kind) is Literal:
                 check(name, [getattr(self, name)], get_args(kind))
-        if self.critic not in self.known_critics:
+        if self.critic_kind not in self.known_critics:
             known = " or ".join(self.known_critics)
-            raise UserError(f"{self.agent} judges executed actions: its critic is {known}")
+            raise UserError(f"{self.agent} judges executed actions: its critic_kind is {known}")
         if self.noise_bank < self.least_bank:
             raise UserError(
                 f"{self.agent} needs a noise_bank of at least {self.least_bank}, not "

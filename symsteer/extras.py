@@ -12,6 +12,7 @@ EXTRAS = {
     "lerobot": ("pandas", "pyarrow.parquet"),
     "ray": ("grpc", "ray"),
     "site": ("itables", "jinja2", "markdown_it", "mkdocs", "material", "plotly"),
+    "slurm": ("submitit",),
     "tune": ("optuna",),
     "wandb": ("wandb",),
 }
