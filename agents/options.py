@@ -73,7 +73,7 @@ class SacOptions(AgentOptions):
     """Factor on rewards in training (0.25: one decision of four steps costs 1). Reported Q-values
     are in unscaled reward units."""
     width: int = 128
-    """Hidden features per layer; with a group of order n they are width/n regular fields."""
+    """Hidden features per layer. With a group of order n they form width/n regular fields."""
     depth: int = 2
     """Hidden layers."""
     activation: Activation = "relu"

@@ -154,7 +154,10 @@ def _text(advice: Advice, source: str) -> str:
     if defect.resets_differ:
         lines.append("its initial states are broken, too, which is no part of a decision")
     if advice.expected:
-        lines += ["", "Expected advantage over standard, 95 % interval (?: not enough to decide):"]
+        lines += [
+            "",
+            "Expected advantage over standard, with 95 % intervals (?: too little to decide):",
+        ]
         header = ["agent", "measure", "from", "line of", "advantage", "cells", "policies", "tasks"]
         lines.append(aligned(header, [_expected(one) for one in advice.expected], left=4))
     lines += ["", *(_choice(choice) for choice in advice.choices)]

@@ -51,7 +51,8 @@ def parse(name: str, *words: str) -> None:
     Raises:
         SystemExit: if they cannot be read.
     """
-    verb, words = VERBS[name], tuple(OURS.get(word, word) for word in words if word != "--help")
+    end = words.index("--help") if "--help" in words else None
+    verb, words = VERBS[name], tuple(OURS.get(word, word) for word in words[:end])
     if verb.parses:
         parse_run(words)
         return
