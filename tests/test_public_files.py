@@ -30,6 +30,9 @@ RECORDS = Path("leaderboard") / "results" / "records"
 RUN_HERE = {
     "make setup": "`make lint`, with which .ci/run begins, does it first",
     ".ci/run": "is CI here",
+    "pip install uv": "`make setup` does it",
+    'python -m tools.matrix "$CELL"': "its table in docs/install.md has a date",
+    "tail -n 200 build/matrix/*.log": "only shows",
     '.ci/submission "origin/$BASE"': "test_a_submission_is_checked_and_made_again",
 }
 """The lines of the workflows, and where they are run without GitHub."""
