@@ -126,7 +126,8 @@ def test_doctor_and_other_verbs_without_a_package():
     """`doctor` names what is missing; other verbs name `doctor`."""
     code = """
 import sys
-sys.modules |= {"escnn": None, "h5py": None, "tyro": None}
+for name in ("escnn", "h5py", "mani_skill", "optuna", "plotly", "ray", "tyro", "wandb"):
+    sys.modules[name] = None
 sys.argv = ["symsteer", "WORD"]
 from symsteer.cli import main
 sys.exit(main())
@@ -134,6 +135,7 @@ sys.exit(main())
     shown = run_python(code.replace("WORD", "doctor"))
     assert (shown.returncode, shown.stderr) == (1, "")
     lines = shown.stdout.splitlines()
+    assert [line for line in lines if line.startswith("MISSING ManiSkill")]
     (place,) = [i for i, line in enumerate(lines) if line.startswith("MISSING packages")]
     assert lines[place + 1].endswith("-> pip install h5py tyro")
     (place,) = [i for i, line in enumerate(lines) if line.startswith("absent  extra escnn")]
