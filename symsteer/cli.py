@@ -168,11 +168,12 @@ def _run(arguments: Sequence[str]) -> int:
         return function(*args, **options)
 
     if verb.parses:
-        from symsteer.bench.runs.brief import brief, wants_brief
+        if name == "run":
+            from symsteer.bench.runs.brief import brief, wants_brief
 
-        if wants_brief(rest):
-            print(brief())
-            return 0
+            if wants_brief(rest):
+                print(brief())
+                return 0
         return work(rest)
     import tyro
 

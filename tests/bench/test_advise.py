@@ -49,7 +49,7 @@ def test_a_world_by_name(advise):
     (test,) = found["left_out"]
     assert len(test["tasks"]) == 4
     assert "by success in 12/12 cells (the agent that is best" in shown.out
-    header, row = shown.out.partition("Tested by")[2].splitlines()[1:3]
+    header, row = shown.out.partition("Test: each task")[2].splitlines()[1:3]
     assert row.index("equivariant") == header.index("Agent")
 
 

@@ -229,7 +229,7 @@ def test_a_limit_of_the_users_holds_for_each_environment(limit):
         ({"sim": "cpu", "sim_backend": "gpu"}, ["sim='cpu'", "sim_backend='gpu'"]),
         ({"obs_mode": "stat"}, ["'stat'", "'state'"]),
         ({"reward_mode": "denes"}, ["'denes'", "'dense'", "sparse"]),
-        ({"render_mode": "rgb"}, ["'rgb'", "'rgb_array'"]),
+        ({"render_mode": "rgb"}, ["'rgb'", "rgb_array"]),
         ({"robot_uids": "panda"}, ["robot_uids='panda'", "embodiment", "floating, panda"]),
         ({"control_mode": "pd_joint_delta_pos", **BROKEN}, ["pd_ee_delta_pose", "leave"]),
         ({"id": SINGLE, "num_envs": 2}, ["leave num_envs out"]),

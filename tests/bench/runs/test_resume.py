@@ -102,7 +102,7 @@ def test_evaluating_again_gives_the_recorded_episodes(undisturbed):
     [
         ({"variant": "action_gian:1"}, "action_gain"),
         ({"episodes": 0}, "--episodes is 0"),
-        ({"sim_workers": 0}, "--sim-workers is 0"),
+        ({"workers": 0}, "--sim-workers is 0"),
     ],
 )
 def test_mistakes_in_evaluating_again(arguments, words, undisturbed):

@@ -118,7 +118,7 @@ def test_mistakes_in_loading(finished, tmp_path):
 
 
 def test_the_public_names_are_those_of_the_page():
-    assert symsteer.__all__ == ["UserError", "__version__", "load", "make"]
+    assert symsteer.__all__ == ["UserError", "__version__", "load", "make", "read_records"]
     assert all(hasattr(symsteer, name) for name in symsteer.__all__)
     with pytest.raises(AttributeError, match="no attribute 'mkae'"):
         _ = symsteer.mkae
