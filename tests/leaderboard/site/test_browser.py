@@ -265,12 +265,15 @@ def test_the_address_chooses_a_run(site: Path, visit: Visit) -> None:
     draw_charts(page)
     shown = page.inner_text("#run")
     assert "Repeat it" in shown
-    assert name.startswith(page.inner_text("#run h2").lower())
+    chosen = page.locator(".runs-of a[aria-current]")
+    assert chosen.get_attribute("id") == name
+    assert chosen.get_attribute("title") == page.inner_text("#run h2")
     assert page.locator("#run figure.chart").count() == 3
     # Another run of the same cell, without a new page.
     other = page.locator(".runs-of a:not([aria-current])").first
+    other_name = other.get_attribute("id")
     other.click()
-    page.wait_for_selector(f"a[id='{other.get_attribute('id')}'][aria-current]")
+    page.wait_for_selector(f"a[id='{other_name}'][aria-current]")
     assert page.inner_text("#run") != shown
     draw_charts(page)
     page.go_back()
