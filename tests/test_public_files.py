@@ -21,6 +21,7 @@ from packaging.specifiers import SpecifierSet
 
 from symsteer.bench.sweep.slurm import SlurmFile
 from symsteer.bench.sweep.suite import load_suite
+from tools.matrix import CELLS
 
 ROOT = Path(__file__).resolve().parents[1]
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
@@ -52,6 +53,11 @@ def test_every_line_of_a_workflow_is_run_here_and_sees_the_whole_history(path):
         assert {step["run"] for step in job["steps"] if "run" in step} <= RUN_HERE.keys()
         # Texts of a pull request reach the shell in variables only.
         assert "${{" not in " ".join(step.get("run", "") for step in job["steps"])
+
+
+def test_the_workflow_tries_the_other_cells_of_the_matrix():
+    jobs = read(ROOT / ".github" / "workflows" / "ci.yml")["jobs"]
+    assert {"pinned", *jobs["versions"]["strategy"]["matrix"]["cell"]} == set(CELLS)
 
 
 @pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)
