@@ -91,7 +91,9 @@ def complaint(*arguments):
 
 
 def files_in(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    """Paths and contents; locks are empty, and stay for the next who builds."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.suffix != ".lock")
+    return {path: path.read_bytes() for path in files}
 
 
 def leftovers(folder):
