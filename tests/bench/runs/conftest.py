@@ -78,7 +78,8 @@ def every(shared) -> dict[str, Path]:
 def in_broken_world(shared: Path, agents: Iterable[str]) -> dict[str, Path]:
     """A finished run of each agent in a broken world, beside an unbroken one: folders by agent."""
     # Long enough for a training episode to end.
-    evaluation = dataclasses.replace(tiny_config().evaluation, every=240)
+    usual = tiny_config().evaluation
+    evaluation = dataclasses.replace(usual, every=240, stochastic_episodes=2)
     change = {"variant": "action_gain:0.5", "env_steps": 240, "evaluation": evaluation}
     configs = {name: tiny_config(agent=name, **change) for name in agents}
     ensure(tiny_config(), shared)  # with the base policy of all

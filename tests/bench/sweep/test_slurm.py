@@ -29,7 +29,7 @@ from tests.bench.sweep.long_run import LONG, wait_for
 from tests.bench.tiny_run import execute, tiny_config, without_clock, write_suite
 
 LONGER = dataclasses.replace(
-    LONG, env_steps=10_000, evaluation=dataclasses.replace(LONG.evaluation, every=10_000)
+    LONG, env_steps=30_000, evaluation=dataclasses.replace(LONG.evaluation, every=30_000)
 )
 """Long enough for Slurm, which looks for jobs that are over their time every 30 seconds."""
 
