@@ -32,14 +32,7 @@ def run_line(run: Run) -> dict[str, Any]:
     """The numbers of one run that need no other run."""
     key, record, sizes = Key.of(run.record), run.record, run.record.parameters
     return {
-        "task": key.task,
-        "embodiment": key.embodiment,
-        "variant": key.variant,
-        "base_policy": key.base,
-        "group": key.group,
-        "demonstration_mode": key.mode,
-        "demonstrations": key.demonstrations,
-        "env_steps": key.env_steps,
+        **cell_columns(key),
         "agent": run.agent,
         "seed": run.seed,
         "base_policy_sha256": run.policy,
@@ -57,4 +50,18 @@ def run_line(run: Run) -> dict[str, Any]:
         "local_changes": int(any(place.dirty for place in run.provenances)),
         "config_sha256": record.config_hash,
         "run": record.run_id,
+    }
+
+
+def cell_columns(key: Key) -> dict[str, str | int]:
+    """The columns that name a cell; leaderboard.csv begins with them, too."""
+    return {
+        "task": key.task,
+        "embodiment": key.embodiment,
+        "variant": key.variant,
+        "base_policy": key.base,
+        "group": key.group,
+        "demonstration_mode": key.mode,
+        "demonstrations": key.demonstrations,
+        "env_steps": key.env_steps,
     }

@@ -12,6 +12,7 @@ from symsteer.leaderboard.records import REPRODUCED, VERDICTS
 from symsteer.leaderboard.records.reproductions import Verdict
 from symsteer.leaderboard.row_numbers import THRESHOLD
 from symsteer.leaderboard.rows import AgentRow, Summary, Table
+from symsteer.leaderboard.run_table import cell_columns
 from symsteer.leaderboard.sections import Links, Section, View
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.text import (
@@ -288,14 +289,7 @@ def _csv_row(table: Table, row: AgentRow) -> dict[str, object]:
     sizes = row.runs[0].record.parameters if row.runs else None
     wall = [run.record.wall_clock.total for run in row.finished]
     return {
-        "task": key.task,
-        "embodiment": key.embodiment,
-        "variant": key.variant,
-        "base_policy": key.base,
-        "group": key.group,
-        "demonstration_mode": key.mode,
-        "demonstrations": key.demonstrations,
-        "env_steps": key.env_steps,
+        **cell_columns(key),
         "settings": key.settings,
         "agent": row.agent,
         "recipe": row.recipe[:12],
