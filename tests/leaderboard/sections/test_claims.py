@@ -13,7 +13,7 @@ from symsteer.leaderboard.defects import Audit
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.sections.claims import SECTION, ClaimOutcome, claims
 from symsteer.leaderboard.statistics import ShareDifference
-from symsteer.leaderboard.study import PAPER, Claim, Study, read_study
+from symsteer.leaderboard.study import PAPER, Claim, Safe, Study, read_study
 from tests.leaderboard.record_factory import (
     audit_of,
     diverging,
@@ -375,3 +375,10 @@ def test_a_claim_of_no_effect_says_so_wherever_it_is_named() -> None:
     assert f"- **Contradicted** (1): {name}." in text
     assert f"| {name} (divergence under stress) |" in text
     assert "Symmetry prevents value divergence (predicted" not in text
+
+
+def test_the_agent_that_is_declared_safe_must_exist() -> None:
+    study = Study("", "", "", (), (), "study.toml", "", safe=Safe(agent="standrd", success=1, area=1))
+    summary = summary_of(cells({"none": {"standard": 0.5, "equivariant": 0.6}}))
+    with pytest.raises(UserError, match=r"study.toml, safe: there is no agent 'standrd'; did you mean 'standard'"):
+        claims(study, summary, {})
