@@ -378,7 +378,9 @@ def test_a_claim_of_no_effect_says_so_wherever_it_is_named() -> None:
 
 
 def test_the_agent_that_is_declared_safe_must_exist() -> None:
-    study = Study("", "", "", (), (), "study.toml", "", safe=Safe(agent="standrd", success=1, area=1))
+    safe = Safe(agent="standrd", success=1, area=1)
+    study = Study("", "", "", (), (), "study.toml", "", safe=safe)
     summary = summary_of(cells({"none": {"standard": 0.5, "equivariant": 0.6}}))
-    with pytest.raises(UserError, match=r"study.toml, safe: there is no agent 'standrd'; did you mean 'standard'"):
+    words = "study.toml, safe: there is no agent 'standrd'; did you mean 'standard'"
+    with pytest.raises(UserError, match=words):
         claims(study, summary, {})
