@@ -192,7 +192,7 @@ def percentile(value: float, draws: Array, confidence: float = CONFIDENCE) -> In
     return Interval(float(value), float(low), float(high))
 
 
-def tails(confidence: float, freedom: int) -> float:
+def tails(confidence: float, freedom: float) -> float:
     """By how much Student's tails are longer than those of a normal distribution; 1.42 for five."""
     if freedom == 0:
         return 1.0
@@ -217,16 +217,29 @@ class BootstrapEstimate:
         episodes: under each resample's weights of episodes, with every unit as it is [resamples].
         units: what drawing units changes, with the variance of a mean over them [resamples].
         freedom: degrees of freedom of the units.
+        residual: the variance that both have: that of single episodes of single units.
     """
 
     value: float
     episodes: Array
     units: Array
     freedom: int
+    residual: float = 0.0
 
     def draws(self, confidence: float = CONFIDENCE) -> Array:
-        """Draws whose quantiles are the ends of the interval: [resamples]."""
-        return self.episodes + tails(confidence, self.freedom) * self.units
+        """Draws whose quantiles are the ends of the interval: [resamples].
+
+        The residual counts once. What is known of a variance is that of the units, whose degrees of
+        freedom are few (Satterthwaite 1946).
+        """
+        of_episodes, of_units = float(self.episodes.var()), float(self.units.var())
+        if of_units == 0:
+            return self.episodes
+        both = of_episodes + of_units
+        once = both - min(self.residual, of_episodes, of_units)
+        longer = tails(confidence, self.freedom * (once / of_units) ** 2)
+        drawn = self.episodes - self.value + self.units
+        return self.value + longer * math.sqrt(once / both) * drawn
 
     def interval(self, confidence: float = CONFIDENCE) -> Interval:
         return percentile(self.value, self.draws(confidence), confidence)
@@ -318,9 +331,9 @@ def cell_estimates(
 
     Units and episodes are crossed factors: every run is scored on the same initial states. Each
     resample weighs the episodes (`episode_weights`) and the units (`unit_weights`), each the same
-    wherever it occurs (Owen and Eckles 2012). The weights of n units give a mean (n - 1) / (n + 1)
-    of the variance that it has; what they change is scaled by the root of that. With one unit only
-    episodes vary.
+    wherever it occurs (Owen and Eckles 2012), one at a time. The weights of n units give a mean
+    (n - 1) / (n + 1) of the variance that it has; what they change is scaled by the root of that.
+    With one unit only episodes vary.
 
     Raises ValueError without cells, or for a run without episodes.
     """
@@ -334,13 +347,16 @@ def cell_estimates(
     for units in named:
         number = len(units)
         values = np.stack([unit.draw(resamples) for unit in units.values()], axis=1)
-        of_all, change = statistic(values), np.zeros(resamples)
+        actual = np.array([unit.value for unit in units.values()])
+        value, change, residual = float(statistic(actual)), np.zeros(resamples), 0.0
         if number > 1:
             weights = np.stack([unit_weights(unit, resamples) for unit in units], axis=1)
-            change = statistic(values, weights) - of_all
+            change = statistic(np.broadcast_to(actual, weights.shape), weights) - value
             change *= np.sqrt((number + 1) / (number - 1))
-        value = float(statistic([unit.value for unit in units.values()]))
-        estimates.append(BootstrapEstimate(value, of_all, change, freedom))
+            # Of the variance that episodes give to a unit, the part that no other unit shares.
+            apart = values.var(axis=0).mean() - values.mean(axis=1).var()
+            residual = max(0.0, float(apart) / (number - 1))
+        estimates.append(BootstrapEstimate(value, statistic(values), change, freedom, residual))
     return estimates
 
 
@@ -367,6 +383,7 @@ def combined(
         np.sum([f * cell.episodes for f, cell in zip(factors, cells, strict=True)], axis=0),
         np.sum([f * cell.units for f, cell in zip(factors, cells, strict=True)], axis=0),
         cells[0].freedom,
+        float(sum(f**2 * cell.residual for f, cell in zip(factors, cells, strict=True))),
     )
 
 
