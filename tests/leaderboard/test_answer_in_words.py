@@ -25,6 +25,8 @@ ROWS = {
     "(two tasks) {}": "With five times the budget the strict agent loses, broken",
     "That of `residual-pathway` is {}": "Approximate equivariance beats the plain agent there",
     "and then {}. As tuned": "`perception_bias`, 120 k steps",
+    "`standard` {}. With more": "Symmetry helps with the fewest demonstrations",
+    "gain is the same, {}": "Symmetry helps most with the fewest demonstrations",
     "at a defect of {}": "`equivariant` | success | all",
     "at {} with `actuator_offset`": "`equivariant` | success | `actuator_offset`",
     "at {} with `perception_bias`": "`equivariant` | success | `perception_bias`",
