@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -29,7 +29,10 @@ from symsteer.leaderboard.sections import (
     wins_and_losses,
 )
 from symsteer.leaderboard.study import Study
-from symsteer.leaderboard.text import folded
+from symsteer.leaderboard.text import folded, slug
+
+LARGEST = 60_000
+"""Bytes of the largest page that stays one; of a larger one, sections have pages of their own."""
 
 SECTIONS: tuple[Section[Any], ...] = (
     what_symmetry_gains.SECTION,
@@ -52,8 +55,31 @@ SECTIONS: tuple[Section[Any], ...] = (
 """In the order of the page: first what a reader sees, then what a reader opens."""
 
 
-def render_page(view: View) -> str:
-    """The whole page as markdown."""
+def render_pages(view: View) -> dict[str, str]:
+    """LEADERBOARD.md and, if it would be too large, the pages beside it, by their files' names."""
+    whole = render_page(view)
+    if len(whole.encode()) <= LARGEST:
+        return {"LEADERBOARD.md": whole}
+    there = view.below()
+    pages = {
+        f"pages/{slug(*page.words)}.md": page
+        for section in SECTIONS
+        if section.apart
+        for page in section.apart(view.findings.of(section), there)
+    }
+    links = [f"- [{page.title}]({name})" for name, page in pages.items()]
+    first = f"Part of [the leaderboard](../LEADERBOARD.md), version `{view.summary.version}`."
+    return {
+        "LEADERBOARD.md": render_page(view, links),
+        **{
+            name: "\n\n".join([f"# {page.title}", first, *page.blocks]) + "\n"
+            for name, page in pages.items()
+        },
+    }
+
+
+def render_page(view: View, links: Sequence[str] = ()) -> str:
+    """LEADERBOARD.md as markdown; with links to pages, their sections are left out."""
     parts = [
         "# Leaderboard",
         "This page is generated from run records by `symsteer report`; do not edit it. Version: "
@@ -65,7 +91,10 @@ def render_page(view: View) -> str:
     for title, blocks in by_title(view, [s for s in SECTIONS if s.where == "first"]):
         parts += [f"## {title}", *blocks]
     parts.append("## Details")
-    for title, blocks in by_title(view, [s for s in SECTIONS if s.where in ("folded", "page")]):
+    if links:
+        parts += ["Pages of their own:", "\n".join(links)]
+    shown = [s for s in SECTIONS if s.where in ("folded", "page") and not (links and s.apart)]
+    for title, blocks in by_title(view, shown):
         parts += folded(title, blocks) if title else blocks
     return "\n\n".join(parts) + "\n"
 

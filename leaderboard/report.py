@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import stat
@@ -14,7 +13,7 @@ from pathlib import Path
 from symsteer.errors import UserError
 from symsteer.files import write_together
 from symsteer.leaderboard.defects import Audit, read_audit
-from symsteer.leaderboard.page import figures_of, other_files, render_page
+from symsteer.leaderboard.page import figures_of, other_files, render_pages
 from symsteer.leaderboard.paths import reproductions_for
 from symsteer.leaderboard.plots import Figure
 from symsteer.leaderboard.row_numbers import summarize
@@ -23,7 +22,7 @@ from symsteer.leaderboard.sections import Findings, View
 from symsteer.leaderboard.sections.verdicts import PAPER_TITLE
 from symsteer.leaderboard.study import PAPER, Study, read_study
 from symsteer.leaderboard.svg import to_image
-from symsteer.leaderboard.text import relative_link
+from symsteer.leaderboard.text import relative_link, slug
 
 DRAWN_WITH = ("matplotlib", "numpy", "pandas", "scipy")
 """Packages whose version may change a file's bytes."""
@@ -33,6 +32,7 @@ REQUIREMENTS = Path(__file__).resolve().parents[1] / "requirements.txt"
 FIGURE_NAME = re.compile(
     r"(map|answer|profiles|improvement|regret|(map|success|q)-[a-z0-9-]+-[0-9a-f]{6})\.svg"
 )
+PAGE_NAME = re.compile(r"[a-z0-9-]+-[0-9a-f]{6}\.md")
 
 
 def generate(
@@ -42,10 +42,10 @@ def generate(
     study: str = PAPER,
     reproductions: Path | None = None,
 ) -> list[Path]:
-    """Write LEADERBOARD.md, PAPER.md, leaderboard.csv, records.csv and figures/ into `out`.
+    """Write LEADERBOARD.md, PAPER.md, leaderboard.csv, records.csv, figures/ and pages/ into `out`.
 
-    Figures of an earlier call that no longer belong to a table are removed; so is PAPER.md if the
-    study names no statements of the paper.
+    Figures and pages of an earlier call that no longer belong to a table are removed; so is
+    PAPER.md if the study names no statements of the paper.
 
     Args:
         records: record files, run folders, or folders of these.
@@ -62,8 +62,9 @@ def generate(
             as it was (`write_together`).
     """
     out, files, _ = contents(records, out, audit, study, reproductions)
-    if (out / "figures").is_symlink():
-        raise UserError(f"{out / 'figures'} is a link: make it a folder, or remove it")
+    for name in ("figures", "pages"):
+        if (out / name).is_symlink():
+            raise UserError(f"{out / name} is a link: make it a folder, or remove it")
     stale = [out / name for name in _stale(out, files)]
     write_together({out / name: data for name, data in files.items()}, stale)
     return [out / name for name in files]
@@ -131,20 +132,13 @@ def render(runs: Sequence[Run], out: Path, audit: Audit, study: Study) -> dict[s
     figures = [(figure, f"figures/{_stem(figure)}.svg") for figure in figures_of(findings)]
     links = {run.path: relative_link(run.path, out.resolve()) for run in runs}
     view = View(findings, links, figures)
-    texts = {"LEADERBOARD.md": render_page(view), **other_files(view)}
+    texts = {**render_pages(view), **other_files(view)}
     files = {name: to_image(figure) for figure, name in figures}
     return files | {name: text.encode() for name, text in texts.items()}
 
 
 def _stem(figure: Figure) -> str:
     return "-".join([figure.kind, *([slug(*figure.place)] if figure.place else [])])
-
-
-def slug(*texts: str, digits: int = 6) -> str:
-    """A file name of lower-case letters, digits and dashes; it ends with a hash of the texts."""
-    words = "-".join(re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") for text in texts)
-    digest = hashlib.sha256("\0".join(texts).encode()).hexdigest()
-    return f"{words[:60].strip('-') or 'run'}-{digest[:digits]}"
 
 
 def _folder(out: Path) -> Path:
@@ -163,6 +157,8 @@ def _stale(out: Path, files: Mapping[str, bytes]) -> list[str]:
     """Files in `out` that carry a name of ours and are not of `files`."""
     names = [path.name for path in (out / "figures").glob("*.svg")]
     ours = [f"figures/{name}" for name in names if FIGURE_NAME.fullmatch(name)]
+    names = [path.name for path in (out / "pages").glob("*.md")]
+    ours += [f"pages/{name}" for name in names if PAGE_NAME.fullmatch(name)]
     paper = out / "PAPER.md"
     if paper.is_file() and paper.read_bytes().startswith(PAPER_TITLE.encode()):
         ours.append(paper.name)

@@ -6,7 +6,9 @@ Text from a record is shown only inside code spans, without the characters that 
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
@@ -136,3 +138,10 @@ def table_text(rows: Sequence[Mapping[str, str]], left: int = 1, sparse: bool = 
 def folded(title: str, blocks: Sequence[str]) -> list[str]:
     """Blocks of markdown that a reader opens; the title is our own."""
     return [f"<details>\n<summary>{title}</summary>", *blocks, "</details>"]
+
+
+def slug(*texts: str, digits: int = 6) -> str:
+    """A file name of lower-case letters, digits and dashes; it ends with a hash of the texts."""
+    words = "-".join(re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") for text in texts)
+    digest = hashlib.sha256("\0".join(texts).encode()).hexdigest()
+    return f"{words[:60].strip('-') or 'run'}-{digest[:digits]}"

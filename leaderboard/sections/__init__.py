@@ -10,9 +10,9 @@ records with known success.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 from symsteer.leaderboard.defects import Audit
 from symsteer.leaderboard.plots import Figure
@@ -21,6 +21,14 @@ from symsteer.leaderboard.study import Study
 from symsteer.leaderboard.text import image
 
 Result = TypeVar("Result")
+
+
+class Page(NamedTuple):
+    """A page of its own: what its file's name is made of, its title, and its blocks of markdown."""
+
+    words: Sequence[str]
+    title: str
+    blocks: list[str]
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,7 @@ class Section(Generic[Result]):
             the site has other pages; "site" is the site alone, where the page has another file.
         files: further files of the leaderboard by name, such as a CSV; an empty text is no file.
         figures: of the result; `render` places them by `View.drawn`.
+        apart: the same as pages of its own, for a leaderboard that is too large for one page.
     """
 
     title: str
@@ -46,6 +55,7 @@ class Section(Generic[Result]):
     where: Literal["first", "folded", "page", "site"] = "folded"
     files: Mapping[str, Callable[[Result, View], str]] = field(default_factory=dict, hash=False)
     figures: Callable[[Result, Summary], Sequence[Figure]] = lambda result, summary: ()
+    apart: Callable[[Result, View], Sequence[Page]] | None = None
 
 
 @dataclass(frozen=True)
@@ -95,3 +105,8 @@ class View:
     def blocks(self, section: Section[Any]) -> list[str]:
         """A section as blocks of markdown."""
         return section.render(self.findings.of(section), self)
+
+    def below(self) -> View:
+        """The same for a page in a folder beside the figures."""
+        links = {path: link and f"../{link}" for path, link in self.links.items()}
+        return replace(self, links=links, figures=[(one, f"../{a}") for one, a in self.figures])

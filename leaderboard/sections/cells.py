@@ -13,7 +13,7 @@ from symsteer.leaderboard.records.reproductions import Verdict
 from symsteer.leaderboard.row_numbers import THRESHOLD
 from symsteer.leaderboard.rows import AgentRow, Summary, Table
 from symsteer.leaderboard.run_table import cell_columns
-from symsteer.leaderboard.sections import Links, Section, View
+from symsteer.leaderboard.sections import Links, Page, Section, View
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.text import (
     NOTHING,
@@ -34,10 +34,15 @@ from symsteer.leaderboard.text import (
 
 def render(summary: Summary, view: View) -> list[str]:
     """By task and embodiment, each folded: the figures, then the tables of every cell."""
+    return [part for page in pages(summary, view) for part in folded(page.title, page.blocks)]
+
+
+def pages(summary: Summary, view: View) -> list[Page]:
+    """The same, a page for each task and embodiment."""
     places: dict[tuple[str, str], list[Table]] = {}
     for table in summary.tables:
         places.setdefault((table.key.task, table.key.embodiment), []).append(table)
-    parts = []
+    found = []
     for place, tables in places.items():
         keys = [table.key for table in tables]
         blocks = view.drawn(*place)
@@ -48,8 +53,8 @@ def render(summary: Summary, view: View) -> list[str]:
             # A name that a record may have, and no task, is shown as code below the title.
             title = "Other cells"
             blocks.insert(0, f"### {', '.join(map(code, place))}")
-        parts += folded(title, blocks)
-    return parts
+        found.append(Page(place, title, blocks))
+    return found
 
 
 def cell_tables(table: Table, links: Links) -> list[str]:
@@ -341,4 +346,5 @@ SECTION = Section(
     where="page",
     files={"leaderboard.csv": lambda summary, view: render_csv(summary)},
     figures=lambda summary, _: figures_of_cells(summary),
+    apart=pages,
 )

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from symsteer.errors import UserError
 from symsteer.leaderboard.paths import RECORD
-from symsteer.leaderboard.report import slug
 from symsteer.leaderboard.rows import Table
 from symsteer.leaderboard.runs import Run
+from symsteer.leaderboard.text import slug
 from symsteer.variant import file_name
 
 DIGITS = 10

@@ -11,12 +11,12 @@ from pathlib import Path
 from symsteer.leaderboard.cell_names import cell_name
 from symsteer.leaderboard.defects import Audit, AuditedDefect, parts_of
 from symsteer.leaderboard.keys import ARM, SYMMETRIC_EMBODIMENT, Key
-from symsteer.leaderboard.report import slug
 from symsteer.leaderboard.rows import AgentRow, Summary, Table
 from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.sections import Findings
 from symsteer.leaderboard.site.docs import Documentation
 from symsteer.leaderboard.site.media import DIGITS, Medium
+from symsteer.leaderboard.text import slug
 from symsteer.variant import UNBROKEN
 
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,13 +19,14 @@ import pytest
 
 from symsteer.files import csv_text
 from symsteer.leaderboard import command, paths
+from symsteer.leaderboard import page as page_module
 from symsteer.leaderboard.defects import AuditedDefect
 from symsteer.leaderboard.page import figures_of, other_files, render_page
 from symsteer.leaderboard.records import write_record
-from symsteer.leaderboard.report import differences, generate, other_versions, render, slug
+from symsteer.leaderboard.report import differences, generate, other_versions, render
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.study import PAPER, read_study
-from symsteer.leaderboard.text import code, compact, count, number, relative_link
+from symsteer.leaderboard.text import code, compact, count, number, relative_link, slug
 from tests.leaderboard.command_line import main
 from tests.leaderboard.record_factory import (
     LEARNING,
@@ -130,6 +132,39 @@ def test_stale_files_go_and_foreign_ones_stay(tmp_path: Path) -> None:
     paper.write_text("# The paper")
     generate([tmp_path / "record.json"], out, study="first")
     assert paper.read_text() == "# The paper"
+
+
+def test_a_large_leaderboard_has_pages_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They have what the one page has, their links lead to files, and old ones go."""
+    records = make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.7})
+    for index, record in enumerate(records):
+        write_record(record, tmp_path / f"{index}.json")
+    out = tmp_path / "board"
+    generate([tmp_path], out)
+    whole = (out / "LEADERBOARD.md").read_text()
+    assert not (out / "pages").exists()
+    monkeypatch.setattr(page_module, "LARGEST", 0)
+    generate([tmp_path], out)
+    pages = sorted((out / "pages").glob("*.md"))
+    texts = [path.read_text() for path in (out / "LEADERBOARD.md", *pages)]
+    tables = [line for line in whole.splitlines() if line.startswith("|")]
+    assert sorted(tables) == sorted(
+        line.replace("](../", "](")
+        for text in texts
+        for line in text.splitlines()
+        if line.startswith("|")
+    )
+    assert len(pages) == 2
+    for path in (out / "LEADERBOARD.md", *pages):
+        for link in re.findall(r"\]\(([^)#:]+)\)", path.read_text()):
+            assert (path.parent / unquote(link)).exists() or link.startswith("../docs"), link
+    old, foreign = out / "pages" / f"{slug('OldTask-v1')}.md", out / "pages" / "mine.md"
+    for path in (old, foreign):
+        path.write_text("")
+    generate([tmp_path], out)
+    assert (old.exists(), foreign.exists()) == (False, True)
 
 
 # Hostile records
