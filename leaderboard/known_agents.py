@@ -23,7 +23,16 @@ USING_SYMMETRY = ("augmented", *WITH_SYMMETRY)
 """The agents whose advantage over `STANDARD` is shown by kind of break and on the map: the fair
 rival has the symmetry from data, the others have it in their networks."""
 
-ROW_ORDER = (BASE, "zero", "golden-ticket", *WITHOUT_SYMMETRY, *WITH_SYMMETRY, "wrong-group")
+BETWEEN = ("slow", "free-bias", "resilient", "chooser", "balanced")
+"""Agents that may leave the symmetry, or choose how much of it to keep."""
+
+ROW_ORDER = (
+    *(BASE, "zero", "golden-ticket"),
+    *WITHOUT_SYMMETRY,
+    *WITH_SYMMETRY,
+    *BETWEEN,
+    "wrong-group",
+)
 """Other agents follow in alphabetical order; references come before learners, then controls. The
 last one here is the control: equivariant under a group that is not the world's."""
 
