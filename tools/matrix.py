@@ -81,7 +81,7 @@ def try_cell(name: str, wheel: Path, quick: bool) -> list[str]:
         empty.mkdir()
         steps = [arg.replace("WHEEL", f"file://{wheel}") for arg in cell.install]
         for made in (
-            ["venv", "--python", cell.python, f"{place / 'env'}"],
+            ["venv", "--seed", "--python", cell.python, f"{place / 'env'}"],
             ["pip", "install", "--python", f"{python}", *steps],
         ):
             if call(log, _uv(), *made, cwd=CHECKOUT):
