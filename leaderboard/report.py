@@ -24,7 +24,7 @@ from symsteer.leaderboard.study import PAPER, Study, read_study
 from symsteer.leaderboard.svg import to_image
 from symsteer.leaderboard.text import relative_link, slug
 
-DRAWN_WITH = ("matplotlib", "numpy", "pandas", "scipy")
+DRAWN_WITH = ("matplotlib", "numpy", "scipy")
 """Packages whose version may change a file's bytes."""
 
 REQUIREMENTS = Path(__file__).resolve().parents[1] / "requirements.txt"

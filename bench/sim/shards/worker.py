@@ -52,7 +52,7 @@ class _Pickler(pickle.Pickler):
     )
 
 
-def dumps(message: Any) -> memoryview:
+def dumps(message: Any) -> bytes:
     """A message as bytes; `pickle.loads` reads them.
 
     Raises:
@@ -66,7 +66,7 @@ def dumps(message: Any) -> memoryview:
             f"an argument of the environment cannot be sent to a worker process ({error}): "
             "pass plain data, or use workers=1"
         ) from error
-    return buffer.getbuffer()
+    return buffer.getvalue()
 
 
 def serve(connection: Connection) -> None:

@@ -22,9 +22,8 @@ from symsteer.leaderboard.keys import Key
 from symsteer.leaderboard.paths import RECORDS, RESULTS
 from symsteer.leaderboard.records import read_record
 from symsteer.leaderboard.study import read_study
-from symsteer.policies import POLICIES
 from symsteer.policies.files import load_policy
-from tests.marks import need
+from tests.marks import need, policy_class
 
 
 def write(tmp_path, text: str) -> str:
@@ -77,7 +76,7 @@ def test_every_suite_that_ships_can_be_read_and_its_policies_made(name):
     # A base policy that cannot be made would be found hours later.
     for task_name, policy_name, options in {(c.task, c.policy_name, c.policy) for c in suite.runs}:
         task = task_class(task_name)
-        POLICIES.get(policy_name)(options, task.observation_layout, task.action_layout)
+        policy_class(policy_name)(options, task.observation_layout, task.action_layout)
 
 
 def test_the_suite_first_describes_its_records():
