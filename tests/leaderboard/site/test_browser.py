@@ -48,7 +48,7 @@ def visit(browser: Any, request: pytest.FixtureRequest) -> Iterator[Visit]:
     """Fails for errors and warnings of the console, exceptions and requests to other hosts."""
     width = getattr(request, "param", 1280)
     context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme="light")
-    context.set_default_timeout(120_000)  # a busy machine needs more than its 30 s
+    context.set_default_timeout(120_000)  # Playwright's 30 s are short on a busy machine
     troubles: list[str] = []
 
     def said(message: Any) -> None:
