@@ -350,7 +350,7 @@ def test_submitted_rows_are_marked_last_and_change_nothing(submitted: Path) -> N
     assert table.rows[5].difference is not None
     page = files["LEADERBOARD.md"].replace("\u00a0", " ")
     assert "submitted runs that no maintainer has made again" in page
-    assert "| 0.40 | 0.50 | 0.80 \u25b2 | 1.00 \u25b2 not reproduced |" in page
+    assert "| 0.40 | 0.50 \u25b2 | 0.80 \u25b2 | 1.00 \u25b2 not reproduced |" in page
     ranks = re.findall(r"^\| `[^`]+` \| (\S+) \| [\d.]+<br>", page, re.M)
     assert ranks[:6] == ["\u2013", "1", "2", "\u2013", "\u2013", "\u2013"]
     rows = list(csv.DictReader(io.StringIO(files["leaderboard.csv"])))
