@@ -131,7 +131,7 @@ def test_tables():
         for high in (2.0, 4.0)
     ]
     # Nothing above the line, and 2 of a mean loss of 2.
-    assert page.barriers(rows).splitlines()[-1].count("0.50 [0.00, 1.00]") == 3
+    assert page.barriers(rows).splitlines()[-1].count("0.50 [0.00, 1.00]") == 4
     rows = [
         {"agent": "standard", "moved": moved, "alone": 0.5, "own_actor": 0.8, "aligned": moved}
         for moved in (0.5, 0.7, 0.6, 0.6, 0.9, 0.9)

@@ -59,6 +59,9 @@ NAMES = ("edp", "plain", "plain-augmented")
 APART = ("batches", "start", "demonstrations")
 """In what the two policies of a comparison differ."""
 
+WAYS = ("trained", "permuted", "aligned", "balanced")
+"""As they are; permuted; with shifts and turns, too; this after both were balanced."""
+
 POINTS = 11
 EPISODES = 50
 OTHER = 100
@@ -77,7 +80,7 @@ def train(
 
     Args:
         name: of a diffusion policy.
-        steps: of the gradient.
+        steps: option of the policy.
         demos: what it is trained on.
         normalised_by: what the normalisers are fitted to.
         start: seed of the first weights.
@@ -87,7 +90,7 @@ def train(
     layouts = (demos.observation_layout, demos.action_layout)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(start)
-        policy: DiffusionPolicy = kind(_options(kind, steps), *layouts)
+        policy: DiffusionPolicy = kind(kind.Options(steps=steps), *layouts)
     obs, chunks = (
         torch.cat(x) for x in zip(*(pairs(policy, d) for d in normalised_by), strict=True)
     )
@@ -103,12 +106,6 @@ def train(
 
     optimize(policy, batch_loss, policy.options)
     return policy.freeze()
-
-
-def _options(kind: Any, steps: int) -> Any:
-    """The default, but for the steps: plain networks take as many as equivariant ones."""
-    equal = {"match_compute": False} if hasattr(kind.Options, "match_compute") else {}
-    return kind.Options(steps=steps, **equal)
 
 
 def pairs(policy: DiffusionPolicy, demos: Demonstrations) -> tuple[torch.Tensor, torch.Tensor]:
@@ -138,7 +135,7 @@ class Study:
         config: of the task and the first demonstrations.
         count: number of policies that are compared with others; the demonstrations of the seed
             after theirs are held out.
-        steps: of the gradient, of every policy.
+        steps: option of the policies.
     """
 
     def __init__(self, folder: Path, config: RunConfig, count: int, steps: int):
@@ -178,7 +175,7 @@ class Study:
 def compare(
     first: DiffusionPolicy, second: DiffusionPolicy, held_out: Demonstrations, env: Any
 ) -> dict[str, Any]:
-    """Two policies, joined by straight lines in three ways.
+    """Two policies, joined by straight lines after each way of aligning them.
 
     Args:
         first, second: policies with the same normalisers.
@@ -186,28 +183,26 @@ def compare(
         env: parallel environments, in which the middle of a line is played.
 
     Returns:
-        ``losses`` at the points and ``distance`` of the ends as a share of the first one's norm, of
-        the line as ``trained``, ``aligned``, and aligned after both were ``balanced``; ``success``
-        in the middle of the first two.
+        For each of :data:`WAYS`: ``losses`` at the points, ``distance`` of the ends as a share of
+        the first one's norm, and ``success`` in the middle.
     """
     geometry = Geometry.of(first)
-    trained = parts_of(first, geometry), parts_of(second, geometry)
-    even = [balanced(parts, geometry) for parts in trained]
     found: dict[str, dict[str, Any]] = {"losses": {}, "distance": {}, "success": {}}
     between = copy.deepcopy(first)
-    for way, ends in (("trained", trained), ("aligned", trained), ("balanced", even)):
-        start, end = ends
+    for way in WAYS:
+        start, end = (parts_of(policy, geometry) for policy in (first, second))
+        if way == "balanced":
+            start, end = balanced(start, geometry), balanced(end, geometry)
         if way != "trained":
-            end = moved(end, align(start, end, geometry), geometry)
+            end = moved(end, align(start, end, geometry, way != "permuted"), geometry)
         found["losses"][way] = []
         for point in range(POINTS):
             put(between, blend(start, end, point / (POINTS - 1)), geometry)
-            found["losses"][way].append(loss(between, held_out))
-        if way != "balanced":
-            put(between, blend(start, end, 0.5), geometry)
-            found["success"][way] = success(env, between)
+            found["losses"][way].append(round(loss(between, held_out), 7))
+        put(between, blend(start, end, 0.5), geometry)
+        found["success"][way] = success(env, between)
         gap = {part: start[part] - end[part] for part in start}
-        found["distance"][way] = (product(gap, gap) / product(start, start)) ** 0.5
+        found["distance"][way] = round((product(gap, gap) / product(start, start)) ** 0.5, 5)
     return found
 
 
@@ -216,7 +211,7 @@ def success(env: Any, policy: DiffusionPolicy) -> float:
     latent = LatentNoiseEnv(env, policy, ignore_terminations=True)
     with torch.no_grad():
         played = held_out_episodes(latent, policy, 0, EPISODES)
-    return float(played.episodes["success_once"].float().mean())
+    return float(played.episodes["success_once"].double().mean())
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -231,7 +226,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--count", type=int, default=5, help="comparisons of each kind")
     parser.add_argument("--first", type=int, default=60, help="seed of the first demonstrations")
     parser.add_argument("--demonstrations", type=int, default=50, help="number for each policy")
-    parser.add_argument("--steps", type=int, default=1500, help="of the gradient, of every policy")
+    parser.add_argument("--steps", type=int, default=1500, help="option of the policies")
     given = parser.parse_args(arguments)
     rows = []
     try:

@@ -29,7 +29,7 @@ of the stream does not matter. :func:`balanced` chooses one point of each such o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -42,6 +42,9 @@ from symsteer.policies.training.denoising import DiffusionPolicy
 
 Parts = dict[str, torch.Tensor]
 """Parameters by name; those of FiLM are split by block, ``condition.weight.0 [2, width, C]``."""
+
+RESTARTS = 5
+"""Starts of a search, the first from the identity."""
 
 FILM = ("condition.weight", "condition.bias", "time_out.weight")
 
@@ -217,24 +220,30 @@ def product(first: Parts, second: Parts) -> float:
     return sum(float((first[name] * second[name]).sum()) for name in first)
 
 
-def align(fixed: Parts, other: Parts, geometry: Geometry, seed: int = 0, restarts: int = 5) -> Move:
+def align(fixed: Parts, other: Parts, geometry: Geometry, group: bool = True) -> Move:
     """The move that brings ``other`` near ``fixed`` (weight matching, arXiv 2209.04836).
 
     One kind of features is matched at a time, all others as they are: the permutation with the
     largest scalar product, by linear assignment. A shift belongs to a pair of channels, so its best
     value is known before they are assigned. Kinds take turns in a random order until nothing is
     gained. All turns are tried, each from the identity and from random permutations.
+
+    Args:
+        fixed, other: parameters of two networks.
+        geometry: of both.
+        group: whether shifts and turns are allowed; else permutations alone.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     sizes = geometry.sizes(other)
     best, most = None, -float("inf")
-    for turn in range(geometry.group.order):
+    elements = range(geometry.group.order if group else 1)
+    for turn in elements:
         turned = _turned(other, turn, geometry)
-        for restart in range(restarts):
+        for restart in range(RESTARTS):
             start = {kind: torch.arange(size) for kind, size in sizes.items()}
             if restart:
                 start = dict(random_move(other, geometry, generator).permutations)
-            found, value = _climb(fixed, turned, start, geometry, generator)
+            found, value = _climb(fixed, turned, start, elements, geometry, generator)
             if value > most:
                 best, most = Move(turn, *found), value
     assert best is not None
@@ -245,13 +254,14 @@ def _climb(
     fixed: Parts,
     other: Parts,
     permutations: dict[str, torch.Tensor],
+    elements: Sequence[int],
     geometry: Geometry,
     generator: torch.Generator,
 ) -> tuple[tuple[torch.Tensor, dict[str, torch.Tensor]], float]:
     """Shifts and permutations at which no single kind can be improved, and their product."""
-    kinds, order = list(permutations), geometry.group.order
+    kinds = list(permutations)
     shifts = torch.zeros_like(permutations["seen"])
-    under = [_shifted(other, shifts + u, geometry) for u in range(order)]
+    under = [_shifted(other, shifts + u, geometry) for u in elements]
     now, value = other, -float("inf")
     while True:
         for number in torch.randperm(len(kinds), generator=generator).tolist():

@@ -45,7 +45,7 @@ from symsteer.terminal import complain
 STATES = 64
 """Episodes of the other policy whose states are used to compare and to align the noise."""
 
-FIT_STEPS, FIT_BATCH, FIT_RATE = 200, 64, 1e-2
+FIT_STEPS, FIT_BATCH, FIT_RATE = 300, 64, 3e-3
 MOST_ENVS = 100
 COMPARED = 512
 """States at which actions are compared; four noise sequences each."""
@@ -71,7 +71,7 @@ def agreement(own: ChunkPolicy, other: ChunkPolicy, obs: torch.Tensor, change: N
     for policy, drawn in ((own, noise), (other, change(noise))):
         actions = policy.decode(seen, drawn).unflatten(0, (-1, draws))
         moved.append((actions - actions.mean(1, keepdim=True)).flatten())
-    return float(torch.corrcoef(torch.stack(moved))[0, 1])
+    return round(float(torch.corrcoef(torch.stack(moved))[0, 1]), 4)
 
 
 def align_noise(own: ChunkPolicy, other: ChunkPolicy, obs: torch.Tensor) -> torch.Tensor:
@@ -85,7 +85,8 @@ def align_noise(own: ChunkPolicy, other: ChunkPolicy, obs: torch.Tensor) -> torc
     matrix = torch.eye(size, device=obs.device).requires_grad_(True)
     optimizer = torch.optim.Adam([matrix], lr=FIT_RATE)
     generator = torch.Generator().manual_seed(0)
-    for _ in range(FIT_STEPS):
+    for step in range(FIT_STEPS):
+        optimizer.param_groups[0]["lr"] = FIT_RATE * (1 - step / FIT_STEPS)
         seen = obs[torch.randint(len(obs), (FIT_BATCH,), generator=generator)]
         noise = _noise(own, FIT_BATCH, generator)
         with torch.no_grad():
@@ -146,7 +147,7 @@ def measure(own: Steered, other: Steered, env: Any, episodes: int) -> list[dict[
 
     def success(act: Any) -> float:
         played = play(env, policy, act, held_out_seeds(episodes))
-        return float(played.episodes["success_once"].float().mean())
+        return float(played.episodes["success_once"].double().mean())
 
     policies = {
         "alone": success(random_noise(policy, 0)),
@@ -237,7 +238,7 @@ def main(arguments: Sequence[str]) -> int:
                 rows += measure(second, first, env, given.episodes)
     except UserError as error:
         return complain(error, f"error: {error}", 2)
-    print(json.dumps({**world, "episodes": given.episodes, "rows": rows}, indent=1))
+    print(json.dumps({**world, "episodes": given.episodes, "rows": rows}))
     return 0
 
 

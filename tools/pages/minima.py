@@ -31,7 +31,8 @@ RESULTS = CHECKOUT / "leaderboard" / "results" / "minima"
 Row = Mapping[str, Any]
 
 
-WAYS = {"as trained": "trained", "aligned": "aligned", "balanced and aligned": "balanced"}
+WAYS = {"as trained": "trained", "permuted": "permuted", "aligned": "aligned"}
+WAYS["balanced and aligned"] = "balanced"
 
 
 def barriers(rows: Sequence[Row]) -> str:
@@ -51,8 +52,7 @@ def distances(rows: Sequence[Row]) -> str:
 
 def middles(rows: Sequence[Row]) -> str:
     """Success of the policy at one end of the line, and in its middle."""
-    ways = {"one end": "own", "as trained": "trained", "aligned": "aligned"}
-    return _of_ways(rows, ways, lambda row, way: row["success"][way])
+    return _of_ways(rows, {"one end": "own", **WAYS}, lambda row, way: row["success"][way])
 
 
 def _of_ways(
@@ -104,12 +104,10 @@ def gains(rows: Sequence[Row]) -> str:
 
 def agreements(rows: Sequence[Row]) -> str:
     """Correlation of the actions of both policies over the noise: mean [lowest, highest]."""
-    keys = ("agreement", "agreement_aligned")
-    lines = [
-        [f"`{agent}`", *(spread([r[key] for r in found]) for key in keys)]
-        for (agent,), found in _grouped(rows, "agent").items()
-    ]
-    return markdown(["pairs of", "the same noise", "aligned noise"], lines)
+    # It is one of policies: the rows of each agent repeat it.
+    once = [row for row in rows if row["agent"] == rows[0]["agent"]]
+    shown = {"the same noise": "agreement", "aligned noise": "agreement_aligned"}
+    return markdown(list(shown), [[spread([r[key] for r in once]) for key in shown.values()]], 0)
 
 
 def _grouped(rows: Sequence[Row], *keys: str) -> dict[tuple[str, ...], list[Row]]:
