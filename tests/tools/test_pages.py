@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from symsteer.files import write_together
-from tools.pages import audit, base_policies, tuning
+from tools.pages import audit, base_policies, minima, tuning
 from tools.pages.marks import BEGIN, END, with_tables
 
-TOOLS = (audit, base_policies, tuning)
+TOOLS = (audit, base_policies, minima, tuning)
 
 
 @pytest.fixture
