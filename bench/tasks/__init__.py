@@ -46,6 +46,7 @@ TASKS: Registry[type[SymmetricTask]] = Registry(
         "PullCube-v1": "symsteer.bench.tasks.move_cube:PullCube",
         "PickCube-v1": "symsteer.bench.tasks.pick_cube:PickCube",
         "StackCube-v1": "symsteer.bench.tasks.stack_cube:StackCube",
+        "ClutterPick-v1": "symsteer.bench.tasks.clutter_pick:ClutterPick",
         "PlaceSphere-v1": "symsteer.bench.tasks.place_sphere:PlaceSphere",
         "LiftPegUpright-v1": "symsteer.bench.tasks.lift_peg_upright:LiftPegUpright",
         "PokeCube-v1": "symsteer.bench.tasks.poke_cube:PokeCube",
