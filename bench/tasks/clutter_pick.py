@@ -61,7 +61,7 @@ class ClutterPick(PickCube):
     """
 
     task_id = "ClutterPick-v1"
-    max_episode_steps = 60
+    max_episode_steps = 80
     task_fields: ClassVar[tuple[Field, ...]] = (
         *PickCube.task_fields,
         *(
@@ -78,7 +78,11 @@ class ClutterPick(PickCube):
     bearing_jitter = math.radians(10)
     lifts = (0.08, 0.14)
     """From and to, metres from the cube's first place to the goal above it."""
-    noise_scale = 0.5
+    noise_scale = 0.3
+    finger = (0.00875, 0.0152)
+    """Half the width and the thickness of a finger's tip, metres."""
+    clearance = 0.005
+    """What the expert leaves between a finger and a neighbour, metres."""
 
     neighbours: list[Actor]
 
@@ -130,10 +134,6 @@ class ClutterPick(PickCube):
         return {**super()._observe_task(), **around}
 
     # --------------------------------------------------------------------- expert
-
-    finger = (0.00875, 0.0152)
-    """Half the width and the thickness of a finger's tip, metres."""
-    clearance = 0.005
 
     def blocked(self) -> tuple[torch.Tensor, torch.Tensor]:
         """How far neighbours stand in the way of the fingers at the cube's two pairs of faces.
