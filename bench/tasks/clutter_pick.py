@@ -81,8 +81,10 @@ class ClutterPick(PickCube):
     noise_scale = 0.3
     finger = (0.00875, 0.0152)
     """Half the width and the thickness of a finger's tip, metres."""
-    clearance = 0.005
+    clearance = 0.003
     """What the expert leaves between a finger and a neighbour, metres."""
+    push_aside = 0.01
+    """How much further from the cube than a neighbour's centre the expert pushes, metres."""
 
     neighbours: list[Actor]
 
@@ -168,13 +170,20 @@ class ClutterPick(PickCube):
         axis, missing = axes[rows, pair], missing[rows, pair]
         side = left_of(axis)
         # Of those in the way, the one whose far side is nearest to the tool.
-        places = torch.stack([b.pose.p for b in self.neighbours], dim=1)
         ahead = missing.sign()[..., None] * side[:, None]
-        behind = places[..., :2] - 0.05 * ahead - tcp[:, None, :2]
-        far = torch.where(missing == 0, torch.inf, behind.norm(dim=2))
-        which = far.argmin(dim=1)
+        places = torch.stack([b.pose.p for b in self.neighbours], dim=1)
+        level = places[..., :2] - tcp[:, None, :2]
+        far = (level - 0.05 * ahead).norm(dim=2)
+        which = torch.where(missing == 0, torch.inf, far).argmin(dim=1)
         blocked = (missing != 0).any(dim=1)
-        clearing = push(self, places[rows, which] + 0.3 * offset, ahead[rows, which], 0.05)
+        place, ahead, level = places[rows, which], ahead[rows, which], level[rows, which]
+        # Not further than it has to go, and on its outer half, so that it turns away from the cube:
+        # else a finger or the neighbour drags the cube along.
+        gap = (level * ahead).sum(dim=1) - self.finger[0] - self.cube_half_size
+        step = (gap.clamp_min(0.0) + missing[rows, which].abs() + 0.003).clamp(max=0.03)
+        out = ((place - cube)[:, :2] * axis).sum(dim=1, keepdim=True).sign() * axis
+        place = torch.cat([place[:, :2] + self.push_aside * out, place[:, 2:]], dim=1)
+        clearing = push(self, place + 0.3 * offset, ahead, 0.05, step[:, None])
 
         yaw = yaw_along(self, side)
         approach, held = grasp_at(self, cube + 0.3 * offset, cube, yaw, 2 * self.cube_half_size)

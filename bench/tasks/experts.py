@@ -166,7 +166,11 @@ def grasp_at(
 
 
 def push(
-    env: SymmetricTask, cube: torch.Tensor, ahead: torch.Tensor, behind: float = 0.055
+    env: SymmetricTask,
+    cube: torch.Tensor,
+    ahead: torch.Tensor,
+    behind: float = 0.055,
+    step: float | torch.Tensor = 0.03,
 ) -> Intent:
     """Close the fingers, come down behind a cube and push it, steering back to its line.
 
@@ -175,6 +179,7 @@ def push(
         cube: the centre of a cube of 4 cm on the table, ``[N, 3]``.
         ahead: unit vectors into the direction of the push, ``[N, 2]``.
         behind: where the tool comes down, metres behind the centre.
+        step: how far to push in this control step, metres, or ``[N, 1]``.
     """
     tcp, side = env.agent.tcp_pose.p, left_of(ahead)
     relative = tcp[:, :2] - cube[:, :2]
@@ -186,7 +191,7 @@ def push(
     height = cube[:, 2] - tcp[:, 2]
     low = tcp[:, 2] < cube[:, 2] + 0.015
     pushing = placed & low
-    level = torch.where(pushing[:, None], 0.03 * ahead - 1.0 * across[:, None] * side, start)
+    level = torch.where(pushing[:, None], step * ahead - 1.0 * across[:, None] * side, start)
     rise = torch.where(pushing, height, height + lift)
     return Intent.to(torch.cat([level, rise[:, None]], dim=1), CLOSED)
 
