@@ -13,7 +13,15 @@ from mani_skill.utils.building import actors
 from mani_skill.utils.structs import Actor, Pose
 
 from symsteer.bench.sim.rotations import wrap
-from symsteer.bench.tasks.experts import CLOSED, Intent, choose, grasp_at, push, yaw_along
+from symsteer.bench.tasks.experts import (
+    CLOSED,
+    Intent,
+    choose,
+    finger_width,
+    grasp_at,
+    push,
+    yaw_along,
+)
 from symsteer.bench.tasks.features import ahead_of, disc, flat_pose, left_of, yaw_up_to
 from symsteer.bench.tasks.pick_cube import PickCube
 from symsteer.policies.geometry import Field
@@ -189,7 +197,10 @@ class ClutterPick(PickCube):
         approach, held = grasp_at(self, cube + 0.3 * offset, cube, yaw, 2 * self.cube_half_size)
         lift = Intent.to(self.goal_site.pose.p - cube, CLOSED)
         wanted = choose(held, lift, choose(blocked, replace(clearing, yaw=yaw), approach))
-        # Between cubes the tool goes up before it goes aside or opens.
-        rising = ~held & (tcp[:, 2] < 0.055) & (wanted.move[:, 2] > 0.02)
-        up = wanted.move * wanted.move.new_tensor([0.0, 0.0, 1.0])
-        return choose(rising, Intent.to(up, CLOSED, 0 * yaw), wanted)
+        # Between cubes the tool goes up before it goes aside or opens, and comes down open.
+        height, opening = tcp[:, 2] - cube[:, 2], finger_width(self) < 0.068
+        rising = ~held & (height < 0.035) & (wanted.move[:, 2] > 0.02)
+        waiting = ~blocked & opening & (height > 0.04) & (wanted.move[:, 2] < 0)
+        vertical = wanted.move * wanted.move.new_tensor([0.0, 0.0, 1.0])
+        wanted = choose(rising, Intent.to(vertical, CLOSED), wanted)
+        return choose(waiting & ~held, replace(wanted, move=wanted.move - vertical), wanted)
