@@ -84,8 +84,8 @@ class ClutterPick(PickCube):
     gaps = (0.003, 0.008)
     """From and to, metres between a neighbour and the cube."""
     bearing_jitter = math.radians(10)
-    lifts = (0.08, 0.14)
-    """From and to, metres from the cube's first place to the goal above it."""
+    goal_heights = (0.1, 0.16)
+    """From and to, metres from the table: above the neighbours."""
     noise_scale = 0.3
     finger = (0.00875, 0.0152)
     """Half the width and the thickness of a finger's tip, metres."""
@@ -111,22 +111,20 @@ class ClutterPick(PickCube):
 
     def _place_objects(self, rng: Any, count: int) -> None:
         n, half = self.neighbours_count, self.cube_half_size
-        u = rng.uniform(size=5 + 2 * n)
+        u = rng.uniform(size=7 + 2 * n)
         at, yaw = disc(u[:, :2], self.spawn_radius), 2 * np.pi * u[:, 2]
         self.cube.set_pose(flat_pose(at, half, yaw, self.device))
-        low, high = self.lifts
-        height = half + low + (high - low) * u[:, 3:4]
-        goal = torch.as_tensor(
-            np.concatenate([at, height], axis=1), dtype=torch.float32, device=self.device
-        )
-        self.goal_site.set_pose(Pose.create_from_pq(goal))
+        low, high = self.goal_heights
+        above = disc(u[:, 3:5], self.spawn_radius), low + (high - low) * u[:, 5:6]
+        goal = torch.as_tensor(np.concatenate(above, axis=1), dtype=torch.float32)
+        self.goal_site.set_pose(Pose.create_from_pq(goal.to(self.device)))
         for i, neighbour in enumerate(self.neighbours):
-            jitter = self.bearing_jitter * (2 * u[:, 5 + i] - 1)
-            bearing = 2 * np.pi * (u[:, 4] + i / n) + jitter
+            jitter = self.bearing_jitter * (2 * u[:, 7 + i] - 1)
+            bearing = 2 * np.pi * (u[:, 6] + i / n) + jitter
             # It faces the cube, which reaches that far into its direction.
             reach = half * (np.abs(np.cos(bearing - yaw)) + np.abs(np.sin(bearing - yaw)))
             low, high = self.gaps
-            gap = low + (high - low) * u[:, 5 + n + i]
+            gap = low + (high - low) * u[:, 7 + n + i]
             place = at + (reach + gap + half)[:, None] * ahead_of(bearing)
             neighbour.set_pose(flat_pose(place, half, bearing, self.device))
 
@@ -195,8 +193,11 @@ class ClutterPick(PickCube):
 
         yaw = yaw_along(self, side)
         approach, held = grasp_at(self, cube + 0.3 * offset, cube, yaw, 2 * self.cube_half_size)
-        lift = Intent.to(self.goal_site.pose.p - cube, CLOSED)
-        wanted = choose(held, lift, choose(blocked, replace(clearing, yaw=yaw), approach))
+        carry = self.goal_site.pose.p - cube
+        carry[:, :2] *= cube[:, 2:] > 0.06
+        wanted = choose(
+            held, Intent.to(carry, CLOSED), choose(blocked, replace(clearing, yaw=yaw), approach)
+        )
         # Between cubes the tool goes up before it goes aside or opens, and comes down open.
         height, opening = tcp[:, 2] - cube[:, 2], finger_width(self) < 0.068
         rising = ~held & (height < 0.035) & (wanted.move[:, 2] > 0.02)
