@@ -40,6 +40,19 @@ def test_the_cube_cannot_be_grasped_before_neighbours_are_pushed(env):
     assert solved(env, env.intent) >= 0.9
 
 
+def test_the_expert_pushes_neighbours_and_leaves_the_cube_alone(env):
+    places = torch.stack([b.pose.p for b in [env.cube, *env.neighbours]]).clone()
+    expert = Expert(env)
+    pushed = torch.zeros(COUNT)
+    for _ in range(env.max_episode_steps):
+        env.step(expert.act())
+        moved = (torch.stack([b.pose.p for b in [env.cube, *env.neighbours]]) - places).norm(dim=2)
+        down = env.cube.pose.p[:, 2] < 0.021
+        assert (moved[0, down] < 0.03).all()
+        pushed = torch.where(down, moved[1:].amax(dim=0), pushed)
+    assert (pushed > 0.005).all()
+
+
 def test_cubes_do_not_overlap_at_a_reset(env):
     """Of two squares that are apart, a side of one of them separates them."""
     bodies = [env.cube, *env.neighbours]
