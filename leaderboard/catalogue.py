@@ -10,7 +10,7 @@ TASKS = {
     **dict.fromkeys(("PushCube-v1", "PullCube-v1", "PickCube-v1", "PlaceSphere-v1"), 50),
     **dict.fromkeys(("LiftPegUpright-v1", "TiltedPushCube-v1", "TiltedPickCube-v1"), 50),
     **dict.fromkeys(("SeenPushCube-v1", "SeenPickCube-v1"), 50),
-    **{"StackCube-v1": 60, "PokeCube-v1": 60, "PushT-v1": 100},
+    **{"StackCube-v1": 60, "PokeCube-v1": 60, "ClutterPick-v1": 80, "PushT-v1": 100},
 }
 """The time limit of each task, in control steps."""
 

@@ -49,6 +49,7 @@ TASKS: Registry[type[SymmetricTask]] = Registry(
         "PlaceSphere-v1": "symsteer.bench.tasks.place_sphere:PlaceSphere",
         "LiftPegUpright-v1": "symsteer.bench.tasks.lift_peg_upright:LiftPegUpright",
         "PokeCube-v1": "symsteer.bench.tasks.poke_cube:PokeCube",
+        "ClutterPick-v1": "symsteer.bench.tasks.clutter_pick:ClutterPick",
         "PushT-v1": "symsteer.bench.tasks.push_t:PushT",
         "TiltedPushCube-v1": "symsteer.bench.tasks.tilted:TiltedPushCube",
         "TiltedPickCube-v1": "symsteer.bench.tasks.tilted:TiltedPickCube",

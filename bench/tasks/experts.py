@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from symsteer.bench.sim.rotations import quaternion_to_matrix, wrap
-from symsteer.bench.tasks.features import yaw_up_to
+from symsteer.bench.tasks.features import left_of, yaw_up_to
 
 if TYPE_CHECKING:
     from symsteer.bench.tasks.base import SymmetricTask
@@ -163,6 +163,37 @@ def grasp_at(
         ),
         held,
     )
+
+
+def push(
+    env: SymmetricTask,
+    cube: torch.Tensor,
+    ahead: torch.Tensor,
+    behind: float = 0.055,
+    step: float | torch.Tensor = 0.03,
+) -> Intent:
+    """Close the fingers, come down behind a cube and push it, steering back to its line.
+
+    Args:
+        env: the task.
+        cube: the centre of a cube of 4 cm on the table, ``[N, 3]``.
+        ahead: unit vectors into the direction of the push, ``[N, 2]``.
+        behind: where the tool comes down, metres behind the centre.
+        step: how far to push in this control step, metres, or ``[N, 1]``.
+    """
+    tcp, side = env.agent.tcp_pose.p, left_of(ahead)
+    relative = tcp[:, :2] - cube[:, :2]
+    along, across = (relative * ahead).sum(dim=1), (relative * side).sum(dim=1)
+    # Behind the cube, near its line: go down and push.
+    placed = (along < -0.025) & (across.abs() < 0.02)
+    start = cube[:, :2] - behind * ahead - tcp[:, :2]
+    lift = funnel(start.norm(dim=1), 0.015, 3.0, HOVER)
+    height = cube[:, 2] - tcp[:, 2]
+    low = tcp[:, 2] < cube[:, 2] + 0.015
+    pushing = placed & low
+    level = torch.where(pushing[:, None], step * ahead - 1.0 * across[:, None] * side, start)
+    rise = torch.where(pushing, height, height + lift)
+    return Intent.to(torch.cat([level, rise[:, None]], dim=1), CLOSED)
 
 
 def choose(mask: torch.Tensor, a: Intent, b: Intent) -> Intent:

@@ -12,14 +12,13 @@ from mani_skill.utils.structs import Actor
 
 from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
-from symsteer.bench.tasks.experts import CLOSED, HOVER, Intent, funnel
+from symsteer.bench.tasks.experts import Intent, push
 from symsteer.bench.tasks.features import (
     Thing,
     ahead_of,
     disc,
     flat_pose,
     goal_disc_pose,
-    left_of,
     vector_fields,
 )
 from symsteer.policies.geometry import Field
@@ -92,23 +91,9 @@ class MoveCube(SymmetricTask):
 
     def intent(self, offset: torch.Tensor) -> Intent:
         """Close the fingers, come down behind the cube, push it towards the goal."""
-        tcp, cube = self.agent.tcp_pose.p, self.obj.pose.p + offset
         to_goal = self.goal_region.pose.p[:, :2] - self.obj.pose.p[:, :2]
         ahead = to_goal / to_goal.norm(dim=1, keepdim=True).clamp_min(1e-6)
-        side = left_of(ahead)
-        relative = tcp[:, :2] - cube[:, :2]
-        along, across = (relative * ahead).sum(dim=1), (relative * side).sum(dim=1)
-        # Behind the cube, near its line to the goal: go down and push, steering back to the line.
-        behind = (along < -0.025) & (across.abs() < 0.02)
-        start = cube[:, :2] - 0.055 * ahead - tcp[:, :2]
-        lift = funnel(start.norm(dim=1), 0.015, 3.0, HOVER)
-        height = cube[:, 2] - tcp[:, 2]
-        low = tcp[:, 2] < cube[:, 2] + 0.015
-        pushing = behind & low
-        push = 0.03 * ahead - 1.0 * across[:, None] * side
-        level = torch.where(pushing[:, None], push, start)
-        rise = torch.where(pushing, height, height + lift)
-        return Intent.to(torch.cat([level, rise[:, None]], dim=1), CLOSED)
+        return push(self, self.obj.pose.p + offset, ahead)
 
 
 class PushCube(MoveCube, PushCubeEnv):

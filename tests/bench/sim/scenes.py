@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from symsteer.bench.sim.headless import prepare_headless
@@ -14,7 +15,9 @@ from symsteer.bench.sim.parallel import create
 from tests.bench.shared import FLAT_TASKS
 from tools.speed.simulation import stock_class
 
-TASKS = {name.removesuffix("-v1"): stock_class(name) for name in FLAT_TASKS}
+TASKS = {
+    name.removesuffix("-v1"): stock_class(name) for name in FLAT_TASKS if name in REGISTERED_ENVS
+}
 
 
 def _settings(task: str, settings: dict[str, Any]) -> dict[str, Any]:
