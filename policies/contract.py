@@ -178,6 +178,14 @@ class ChunkPolicy(nn.Module, abc.ABC):
         """
 
     @classmethod
+    def check(cls, options: Any, obs_layout: Layout) -> None:
+        """Check that it can be trained on such observations, before anything is built.
+
+        Raises:
+            UserError: if not; the message says what to change.
+        """
+
+    @classmethod
     def bounded_layout(cls, layout: Layout) -> Layout:
         """Says what has one norm and one scale in a vector of this layout: its irrep blocks."""
         return layout

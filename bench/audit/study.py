@@ -40,12 +40,7 @@ def cells(
     Raises:
         UserError: a variant is unknown or badly written.
     """
-    kinds = {name: task_class(name) for name in TASKS.names()}
-    known = [
-        name
-        for name, kind in kinds.items()
-        if not (kind.needs_cameras or kind.observation_layout.picture)
-    ]
+    known = [name for name in TASKS.names() if not task_class(name).is_seen()]
     tasks = [name for task in tasks for name in (known if task == ALL else [task])]
     texts = []
     for text in variants:

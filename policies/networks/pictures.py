@@ -28,14 +28,14 @@ from symsteer.errors import UserError
 from symsteer.policies.geometry import PIXEL, Field, Group, Layout, Picture, escnn_package
 from symsteer.policies.normalizer import MINIMUM_RANGE, Normalizer
 
-KERNELS = ((6, 2, 2), (4, 2, 1), (3, 1, 1))
+KERNELS = ((10, 4, 3), (5, 1, 2))
 """Size, stride and padding of each convolution; on an even number of pixels quarter turns keep all
 of them."""
 
 SHRINK = 4
 """Pixels of the picture to a place of the last convolution."""
 
-SIZES = {True: (4, 4), False: (7, 24)}
+SIZES = {True: (4, 4), False: (6, 24)}
 """Channels and keypoints for each element of a group, and those of the trivial group: as many
 parameters, about as many numbers (tests/policies/test_pictures.py)."""
 
@@ -128,15 +128,14 @@ class PictureEncoder(nn.Module):
         scale: the largest value of each channel of the picture, ``[channels]``.
 
     Raises:
-        UserError: if the group has reflections, or the picture a side that quarter turns do not
-            keep.
+        UserError: if quarter turns do not keep the pixels that the last convolution has.
     """
 
     scale: torch.Tensor
 
     def __init__(self, picture: Picture, group: Group):
         super().__init__()
-        self.picture, self.group = picture, Group.parse_rotations(str(group))
+        self.picture, self.group = picture, group
         if picture.side % SHRINK:
             raise UserError(
                 f"a picture of {picture.side} x {picture.side} pixels has no quarter turns after "

@@ -135,7 +135,7 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
     @classmethod
     def picture_group(cls, options: Any) -> Group:
         """That of the options."""
-        return Group.parse(options.group)
+        return Group.parse_rotations(options.group)
 
     def make_denoiser(self) -> LiftedDenoiser:
         """The lifted network over the options' group."""

@@ -145,7 +145,7 @@ class EscnnDiffusionPolicy(DiffusionPolicy):
     @classmethod
     def picture_group(cls, options: Any) -> Group:
         """That of the options."""
-        return Group.parse(options.group)
+        return Group.parse_rotations(options.group)
 
     def make_denoiser(self) -> LiftedDenoiser:
         """The lifted network over the options' group, with :meth:`make_encoder`."""

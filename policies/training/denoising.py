@@ -157,6 +157,12 @@ class DiffusionPolicy(GradientPolicy):
         """The network, untrained; it may read ``self.options`` and the layouts."""
 
     @classmethod
+    def check(cls, options: Any, obs_layout: Layout) -> None:
+        """Pictures need an encoder; see :meth:`ChunkPolicy.check`."""
+        if obs_layout.picture:
+            cls.picture_group(options)
+
+    @classmethod
     def picture_group(cls, options: Any) -> Group:
         """Group of the encoder of pictures.
 
