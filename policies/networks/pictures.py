@@ -35,6 +35,10 @@ of them."""
 SHRINK = 4
 """Pixels of the picture to a place of the last convolution."""
 
+REACH = 0.1
+"""Metres that have unit size for the networks. Most of a keypoint's weights lie elsewhere, so that
+it moves less than what it follows."""
+
 SIZES = {True: (4, 4), False: (6, 24)}
 """Channels and keypoints for each element of a group, and those of the trivial group: as many
 parameters, about as many numbers (tests/policies/test_pictures.py)."""
@@ -123,7 +127,7 @@ class PictureEncoder(nn.Module):
 
     Attributes:
         told: geometry of what the picture tells: for each keypoint its mean place in metres and,
-            there, the mean of each channel of the picture; then the shapes, of size 1.
+            there, the mean of each channel of the picture; then the shapes, in half sides.
         layout: the same in its place in the observation.
         scale: the largest value of each channel of the picture, ``[channels]``.
 
@@ -191,14 +195,14 @@ class PictureEncoder(nn.Module):
             rest: normaliser of the other fields.
         """
         self.scale.copy_(self.picture.of(obs).abs().amax(dim=(0, 2, 3)).clamp_min(MINIMUM_RANGE))
-        sizes = torch.ones(self.told.dim)
+        sizes = torch.full((self.told.dim,), REACH / (self.picture.side * PIXEL / 2))
         for field in self.told.fields:
             _, _, part = field.name.partition("_")
             if part in self.picture.channels:
                 size = float(self.scale[self.picture.channels.index(part)])
                 sizes[self.told.slice(field.name)] = size
             elif part:
-                sizes[self.told.slice(field.name)] = self.picture.side * PIXEL / 2
+                sizes[self.told.slice(field.name)] = REACH
 
         def around(values: torch.Tensor, told: torch.Tensor) -> torch.Tensor:
             return torch.cat([values[: self.start], told.to(values), values[self.start :]])
