@@ -10,6 +10,7 @@ TASKS = {
     **dict.fromkeys(("PushCube-v1", "PullCube-v1", "PickCube-v1", "PlaceSphere-v1"), 50),
     **dict.fromkeys(("LiftPegUpright-v1", "TiltedPushCube-v1", "TiltedPickCube-v1"), 50),
     **dict.fromkeys(("SeenPushCube-v1", "SeenPickCube-v1"), 50),
+    **dict.fromkeys(("HeightPushCube-v1", "HeightPickCube-v1"), 50),
     **{"StackCube-v1": 60, "PokeCube-v1": 60, "ClutterPick-v1": 80, "PushT-v1": 100},
 }
 """The time limit of each task, in control steps."""
@@ -17,6 +18,7 @@ TASKS = {
 VARIANTS = {
     **dict.fromkeys(("gravity_tilt", "wind", "action_gain", "actuator_offset", "obstacle"), 0.0),
     **dict.fromkeys(("friction_patch", "perception_bias", "frame_offset", "frame_rotation"), 0.0),
+    "camera_rotation": 0.0,
     **{"directional_reward": 1.0, "spawn_sector": 0.0, "observation_noise": 0.0},
 }
 """What a step before success may cost besides 1, at full strength."""

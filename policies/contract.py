@@ -100,6 +100,9 @@ class ChunkPolicy(nn.Module, abc.ABC):
         act_layout: geometry of one action.
 
     Attributes:
+        task_layout: geometry of one observation of the task.
+        obs_layout: the same as :meth:`see` makes it, which is what all other methods and agents
+            take.
         group: the finite group that the policy keeps exactly; C1, unless a subclass sets another.
         obs_normalizer, act_normalizer: statistics of the demonstrations; at first identities.
         training_record: what training reports (losses, seconds, ...), JSON-ready.
@@ -114,7 +117,8 @@ class ChunkPolicy(nn.Module, abc.ABC):
     def __init__(self, options: PolicyOptions, obs_layout: Layout, act_layout: Layout):
         super().__init__()
         self.options = options
-        self.obs_layout, self.act_layout = obs_layout, act_layout
+        self.task_layout = self.obs_layout = obs_layout
+        self.act_layout = act_layout
         self.group = Group.parse("C1")
         self.obs_normalizer, self.act_normalizer = Normalizer(obs_layout), Normalizer(act_layout)
         self.training_record: dict[str, Any] = {}
@@ -153,6 +157,14 @@ class ChunkPolicy(nn.Module, abc.ABC):
             UserError: if there are no episodes or their shapes do not fit the layouts.
         """
 
+    def see(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations ``[B, task_layout.dim]`` of the task as ``[B, obs_layout.dim]``.
+
+        A policy with an encoder of pictures puts what it tells in their place. Once for each
+        decision; agents and replay know the result alone.
+        """
+        return obs
+
     @abc.abstractmethod
     def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Turn noise into actions.
@@ -163,6 +175,14 @@ class ChunkPolicy(nn.Module, abc.ABC):
 
         Returns:
             ``[B, Tp, act_dim]``, environment actions: every irrep block of norm at most 1.
+        """
+
+    @classmethod
+    def check(cls, options: Any, obs_layout: Layout) -> None:
+        """Check that it can be trained on such observations, before anything is built.
+
+        Raises:
+            UserError: if not; the message says what to change.
         """
 
     @classmethod

@@ -101,7 +101,7 @@ def save_policy(
             "name": name,
             "extension": extension and extension.to_json(),
             "options": policy.options.to_json(),
-            "obs_layout": policy.obs_layout.to_json(),
+            "obs_layout": policy.task_layout.to_json(),
             "act_layout": policy.act_layout.to_json(),
             "training_record": policy.training_record,
             "report": {**policy.report, **(extra or {})},
@@ -174,7 +174,8 @@ def load_policy(
         obs_layout = Layout.from_json(description["obs_layout"])
         act_layout = Layout.from_json(description["act_layout"])
         for side, layout in (("obs", obs_layout), ("act", act_layout)):
-            if layout.dim != len(tensors[f"{side}_normalizer.scale"]):
+            # The encoder of a picture decides how many numbers it becomes.
+            if not layout.picture and layout.dim != len(tensors[f"{side}_normalizer.scale"]):
                 raise ValueError(f"{side}_layout does not fit the normaliser")
         if description["extension"]:
             cure += f", or let the constructor of {kind.__name__} build all tensors that fit fills"

@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
+from torch.nn import functional
 
 from symsteer.errors import UserError
 from symsteer.extras import extra
@@ -90,6 +91,46 @@ class Cloud:
     columns: torch.Tensor
     rest: Layout
     rest_columns: torch.Tensor
+
+
+PICTURE = "picture_"
+"""Fields with this prefix are the channels of a picture from above, one scalar for each pixel."""
+
+PIXEL = 0.01
+"""Side of a pixel, metres."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Where a picture from above lies in a vector.
+
+    Its centre is the origin. Rows go from +y to -y, columns from -x to +x.
+
+    Attributes:
+        channels: their names.
+        side: pixels in a row and in a column.
+        columns: ``[channels * side * side]`` int64.
+        rest: geometry of the other fields.
+        rest_columns: ``[rest.dim]`` int64.
+    """
+
+    channels: tuple[str, ...]
+    side: int
+    columns: torch.Tensor
+    rest: Layout
+    rest_columns: torch.Tensor
+
+    def of(self, x: torch.Tensor) -> torch.Tensor:
+        """The pictures ``[..., channels, side, side]`` in vectors ``[..., dim]``."""
+        shape = (len(self.channels), self.side, self.side)
+        return x[..., self.columns.to(x.device)].unflatten(-1, shape)
+
+    def changed(self, x: torch.Tensor, rest: torch.Tensor, pictures: torch.Tensor) -> torch.Tensor:
+        """``x [..., dim]`` with other pictures, and another ``rest [..., rest.dim]``."""
+        changed = torch.empty_like(x)
+        changed[..., self.rest_columns.to(x.device)] = rest
+        changed[..., self.columns.to(x.device)] = pictures.flatten(-3)
+        return changed
 
 
 class Layout:
@@ -175,6 +216,37 @@ class Layout:
             torch.cat([index[self.slice(field.name)] for field in rest]),
         )
 
+    @functools.cached_property
+    def picture(self) -> Picture | None:
+        """The picture from above, if there is one: the fields ``picture_...``.
+
+        Raises:
+            UserError: if these fields are no scalars of the pixels of one square.
+        """
+        seen = [field for field in self.fields if field.name.startswith(PICTURE)]
+        if not seen:
+            return None
+        side = math.isqrt(seen[0].multiplicity)
+        rest = [field for field in self.fields if field not in seen]
+        if not rest or any((f.frequency, f.odd, f.multiplicity) != (0, 0, side**2) for f in seen):
+            raise UserError(
+                "the fields picture_... of a layout need one scalar for each pixel of the same "
+                "square, and other fields beside them"
+            )
+        index = torch.arange(self.dim)
+        return Picture(
+            tuple(field.name.removeprefix(PICTURE) for field in seen),
+            side,
+            torch.cat([index[self.slice(field.name)] for field in seen]),
+            Layout(rest),
+            torch.cat([index[self.slice(field.name)] for field in rest]),
+        )
+
+    def split(self, at: int) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
+        """The fields of the first ``at`` numbers, and the others."""
+        first = sum(self._slices[field.name].stop <= at for field in self.fields)
+        return self.fields[:first], self.fields[first:]
+
     def spatial_vectors(self) -> list[tuple[str, str]]:
         """The pairs of fields that are vectors in space: horizontal part, then vertical part.
 
@@ -241,11 +313,32 @@ class Layout:
         return torch.block_diag(*blocks).to(dtype)
 
     def transform(self, x: torch.Tensor, angle: float, reflect: bool = False) -> torch.Tensor:
-        """Act with (angle, reflect) on the last axis of ``x [..., dim]``."""
+        """Act with (angle, reflect) on the last axis of ``x [..., dim]``.
+
+        Pictures are interpolated, but for quarter turns.
+        """
+        if picture := self.picture:
+            rest = x[..., picture.rest_columns.to(x.device)]
+            pixels = picture.of(x)
+            pixels = pixels.flip(-2) if reflect else pixels
+            quarters = round(angle / (math.pi / 2))
+            pixels = torch.rot90(pixels, quarters, (-2, -1))
+            left = angle - quarters * (math.pi / 2)
+            if abs(left) > 1e-9:
+                flat = pixels.reshape(-1, *pixels.shape[-3:])
+                turned = turn_pictures(flat, flat.new_full((len(flat),), left))
+                pixels = turned.view_as(pixels)
+            return picture.changed(x, picture.rest.transform(rest, angle, reflect), pixels)
         return x @ self.matrix(angle, reflect, x.dtype).to(x.device).T
 
     def rotate(self, x: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-        """Rotate every row of ``x [N, ..., dim]`` by its own ``angle [N]`` (radians)."""
+        """Rotate every row of ``x [N, ..., dim]`` by its own ``angle [N]`` (radians).
+
+        Pictures, of ``x [N, dim]`` alone, are interpolated.
+        """
+        if picture := self.picture:
+            rest = picture.rest.rotate(x[:, picture.rest_columns.to(x.device)], angle)
+            return picture.changed(x, rest, turn_pictures(picture.of(x), angle))
         frequency, partner, sign = _quarter_turn(self, x.dtype, x.device)
         turn = angle.to(x).view(-1, *(1,) * (x.dim() - 1)) * frequency
         # x cos(k a) + J x sin(k a), where J rotates each vector by 90 degrees.
@@ -434,6 +527,19 @@ def _representation(
 ) -> torch.Tensor:
     matrices = [layout.matrix(angle, reflect) for angle, reflect in group.elements]
     return torch.stack(matrices).to(dtype=dtype, device=device)
+
+
+def turn_pictures(pictures: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """Turn ``pictures [N, channels, side, side]``, each by its ``angle [N]``, radians.
+
+    Bilinear interpolation; what comes in from outside is 0.
+    """
+    c, s = angle.to(pictures).cos(), angle.to(pictures).sin()
+    # A pixel shows what was at the place turned back. In grids y goes down.
+    back = torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
+    matrix = functional.pad(back, (0, 1))
+    grid = functional.affine_grid(matrix, list(pictures.shape), align_corners=False)
+    return functional.grid_sample(pictures, grid, align_corners=False)
 
 
 def equivariance_error(

@@ -50,7 +50,7 @@ LEAST_DISPLACEMENT = 5e-4
 LEAST_SPREAD = 1e-3
 """A field whose spread over the resets is smaller does not enter their distance."""
 
-LENGTHS = ("_xy", "_z", "_width", "_height")
+LENGTHS = ("_xy", "_z", "_width", "_height", "_place")
 """Ends of the names of observed lengths."""
 
 
@@ -93,13 +93,14 @@ def audit(
     settings.check()
     begin, seed = time.perf_counter(), settings.seed
     group = check_group(settings.group)
-    with Experiment(reference, settings.variant, group, visited, seed) as experiment:
+    # What a picture shows is compared as agents see it, after the encoder of the base policy.
+    eyes = policy if reference.observation_layout.picture else None
+    with Experiment(reference, settings.variant, group, visited, seed, eyes) as experiment:
         copies, resets = experiment.copies(), experiment.resets(settings.resets)
-        centre, corners = experiment.centre, experiment.corners
+        centre, corners, layout = experiment.centre, experiment.corners, experiment.layout
     lengths = {body: copies.lengths(body, corners) for body in BODIES}
     rewards = {name: (value - value[:, :1]).abs() for name, value in copies.rewards.items()}
     apart = {name: copies.mean(value)[copies.compared] for name, value in rewards.items()}
-    layout = reference.observation_layout
     original, turned = _features(*resets, layout)
     distance, p_value = energy_distance(original, turned, seed)
     return AuditResult(

@@ -22,6 +22,7 @@ from symsteer.bench.sim.trees import join_trees, map_trees, rows_of
 from symsteer.bench.tasks import make
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.variants.base import overriding
+from symsteer.policies.contract import ChunkPolicy
 from symsteer.policies.geometry import Group
 
 SCENES = 320
@@ -113,6 +114,7 @@ class Experiment:
         group: a finite group.
         visited: the states; their number determines the number of scenes.
         seed: of resets and draws.
+        policy: makes of an observation what agents see; None: they see all of it.
     """
 
     def __init__(
@@ -122,8 +124,11 @@ class Experiment:
         group: Group,
         visited: Visited,
         seed: int,
+        policy: ChunkPolicy | None = None,
     ) -> None:
         self.reference, self.visited, self.seed = reference, visited, seed
+        self.see = policy.see if policy else lambda obs: obs
+        self.layout = policy.obs_layout if policy else reference.observation_layout
         self.elements: tuple[Element, ...] = group.elements
         # Batches of equal size leave few scenes of the last batch unused.
         batches = math.ceil(len(visited) * (group.order + 1) / SCENES)
@@ -296,7 +301,7 @@ class Experiment:
         """Observations of states in scenes that were reset with seeds of their own."""
         self.env.reset(seed=seeds)
         self._put(state)
-        return self.env.get_obs().cpu().clone()
+        return self.see(self.env.get_obs().cpu()).clone()
 
     def _observation_is_random(self) -> bool:
         """Whether the observation of the same state depends on the seed of the reset."""
@@ -312,12 +317,12 @@ class Experiment:
 
         Every scene and every draw of random observations has its own seed.
         """
-        layout = self.env.observation_layout
+        layout = self.layout
         if random:
             rng = np.random.default_rng([self.seed, 5])
             draws = [self._draw(self._seeds(rng), states) for _ in range(DRAWS)]
         else:
-            draws = [self.env.get_obs().cpu().clone()]
+            draws = [self.see(self.env.get_obs().cpu()).clone()]
         seen = self._split(torch.stack(draws, dim=1)).double()
         back = [layout.transform(seen[:, g], *_inverse(e)) for g, e in enumerate(self.elements)]
         return torch.stack(back, dim=1), seen[:, -1]
@@ -340,7 +345,7 @@ class Experiment:
         choice = rng.integers(1, len(self.elements), size=count)
         for g, element in enumerate(self.elements):
             rows = torch.as_tensor(choice == g)
-            turned[rows] = self.env.observation_layout.transform(turned[rows], *element)
+            turned[rows] = self.layout.transform(turned[rows], *element)
         return original, turned
 
     def _features(self, rng: np.random.Generator, count: int) -> torch.Tensor:
@@ -361,7 +366,7 @@ class Experiment:
         for start in range(0, total, env.num_envs):
             rows = torch.arange(start, start + env.num_envs).clamp(max=total - 1)
             env.set_state_dict(rows_of(state, rows))
-            seen.append(env.get_obs().cpu().clone())
+            seen.append(self.see(env.get_obs().cpu()).clone())
         # Move the robot's base back.
         env.reset(seed=0)
         return torch.cat(seen)[:total]

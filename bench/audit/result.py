@@ -87,6 +87,11 @@ class AuditSettings:
                 f"what cameras see of {self.task} cannot be compared point by point; audit the "
                 "task that tells the poses of its bodies: its physics are the same"
             )
+        if task.observation_layout.picture and self.states == "expert":
+            raise UserError(
+                f"the pictures of {self.task} are compared after the encoder of a base policy; "
+                "leave --states out, so that one is trained, or name it with --base-policy"
+            )
         check_embodiment(self.embodiment)
         for spec in read(self.variant):
             if not spec.is_constant:

@@ -208,7 +208,7 @@ def _actions(
             if step % actor.execute == 0:
                 draws = [stream.standard_normal((actor.horizon, layout.dim)) for stream in streams]
                 noise = torch.as_tensor(np.stack(draws), dtype=torch.float32)
-                chunk = actor.decode(env.get_obs(), turned(noise))
+                chunk = actor.decode(actor.see(env.get_obs()), turned(noise))
             yield chunk[:, step % actor.execute]
     elif actor == "expert":
         expert = Expert(env)

@@ -90,7 +90,8 @@ def _visit_batch(
                     env.num_envs, policy.horizon, policy.act_layout.dim, generator=generator
                 )
                 device = policy.device
-                chunk = policy.decode(obs.to(device), noise.to(device)).to(env.device)
+                seen = policy.see(obs.to(device))
+                chunk = policy.decode(seen, noise.to(device)).to(env.device)
             action = chunk[:, step % policy.execute]
         obs, _, _, _, info = env.step(action)
         trail.append(task_state(env))

@@ -33,14 +33,14 @@ def cells(
     """Settings for tasks x variants; the strengths of a variant stand together.
 
     Args:
-        tasks: names, or ``all``: every task without cameras, which cannot be audited.
+        tasks: names, or ``all``: every task that tells the poses of its bodies.
         variants: texts of variants; ``all:0.5`` stands for every variant at this strength.
         template: the other settings.
 
     Raises:
         UserError: a variant is unknown or badly written.
     """
-    known = [name for name in TASKS.names() if not task_class(name).needs_cameras]
+    known = [name for name in TASKS.names() if not task_class(name).is_seen()]
     tasks = [name for task in tasks for name in (known if task == ALL else [task])]
     texts = []
     for text in variants:

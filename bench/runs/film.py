@@ -227,8 +227,8 @@ def _filmed(
         render()
         for step in itertools.count():
             if step % run.policy.execute == 0:
-                obs = obs.to(config.device)
-                chunk = agent.decode(obs, agent.act(obs, deterministic=True)).to(env.device)
+                seen = run.policy.see(obs.to(config.device))
+                chunk = agent.decode(seen, agent.act(seen, deterministic=True)).to(env.device)
             obs, _, _, truncated, info = env.step(chunk[:, step % run.policy.execute])
             done = bool(info["success"] | truncated)
             if done or (step + 1) % every == 0:

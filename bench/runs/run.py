@@ -32,6 +32,7 @@ from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import build, evaluation_variants, read
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, read_record, run_id_of
+from symsteer.policies import POLICIES
 from symsteer.policies.files import save_policy
 from symsteer.terminal import to_paste
 from symsteer.variant import specs_at, variant_text
@@ -61,6 +62,8 @@ def check(
                 f"the actions of {name} have another layout than those of {config.task}; one "
                 "policy cannot be trained on both, so leave it out of --policy.tasks"
             )
+    observed = task_class(config.task).observation_layout
+    POLICIES.get(config.policy_name).check(config.policy, observed)
     build(specs_at(read(config.variants), 1))
     if any(spec.changes_nothing for spec in config.variants):
         raise UserError(

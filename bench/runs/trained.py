@@ -53,12 +53,12 @@ class Trained:
             UserError: if the observations have another width.
         """
         given = torch.as_tensor(obs)
-        if given.ndim != 2 or given.shape[1] != self.policy.obs_layout.dim:
+        if given.ndim != 2 or given.shape[1] != self.policy.task_layout.dim:
             raise UserError(
-                f"observations have the shape [N, {self.policy.obs_layout.dim}], not "
+                f"observations have the shape [N, {self.policy.task_layout.dim}], not "
                 f"{list(given.shape)}; make the environments with make_env()"
             )
-        seen = given.to(self.agent.device, torch.float32)
+        seen = self.policy.see(given.to(self.agent.device, torch.float32))
         chunk = self.agent.decode(seen, self.agent.act(seen, deterministic))
         return chunk[:, : self.policy.execute].to(given.device)
 

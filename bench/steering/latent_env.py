@@ -56,8 +56,9 @@ class LatentNoiseEnv:
 
     Args:
         env: parallel ManiSkill environments from :func:`symsteer.bench.tasks.make`.
-        policy: frozen decoder with the same layouts. All inputs and outputs are on its device,
-            also if physics runs on another one.
+        policy: frozen decoder with the same layouts; observations are what it makes of the
+            task's (:meth:`~symsteer.policies.contract.ChunkPolicy.see`). All inputs and outputs are
+            on its device, also if physics runs on another one.
         decode: ``(obs, action) -> chunk [N, Tp, Da]`` of an agent; default: the action is noise,
             and the policy decodes it.
         ignore_terminations: episodes go on to the time limit after a success, as in ManiSkill's
@@ -96,7 +97,7 @@ class LatentNoiseEnv:
         # In PhysX the order of contacts depends on the history of a scene. Only in fresh scenes
         # are episodes independent of those before.
         obs, _ = self.env.reset(seed=seeds, options={"reconfigure": True})
-        self._obs = obs.to(self.device)
+        self._obs = self.policy.see(obs.to(self.device))
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         self._return = torch.zeros(self.num_envs, device=self.device)
         self._success_once = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -137,7 +138,7 @@ class LatentNoiseEnv:
         over, success = ends[rows, last], success[rows, last]
         terminal = over & success & (not self.ignore_terminations)
         truncated = over & ~terminal
-        next_obs = seen.to(self.device)[rows, last]
+        next_obs = self.policy.see(seen.to(self.device)[rows, last])
         self._elapsed += last + 1
         self._success_once = success_once = succeeded[:, -1]
         self.control_steps += self.num_envs * (int(last.max()) + 1)
@@ -154,7 +155,7 @@ class LatentNoiseEnv:
         if len(ended):
             fresh, _ = self.env.reset(options={"env_idx": ended.to(self.env.device)})
             self._obs = next_obs.clone()
-            self._obs[ended] = fresh.to(self.device)[ended]
+            self._obs[ended] = self.policy.see(fresh.to(self.device)[ended])
             self._elapsed[ended] = 0
             self._return[ended] = 0
             self._success_once = success_once & ~over

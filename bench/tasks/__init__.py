@@ -53,6 +53,8 @@ TASKS: Registry[type[SymmetricTask]] = Registry(
         "PushT-v1": "symsteer.bench.tasks.push_t:PushT",
         "TiltedPushCube-v1": "symsteer.bench.tasks.tilted:TiltedPushCube",
         "TiltedPickCube-v1": "symsteer.bench.tasks.tilted:TiltedPickCube",
+        "HeightPushCube-v1": "symsteer.bench.tasks.heights:HeightPushCube",
+        "HeightPickCube-v1": "symsteer.bench.tasks.heights:HeightPickCube",
         "SeenPushCube-v1": "symsteer.bench.tasks.clouds:SeenPushCube",
         "SeenPickCube-v1": "symsteer.bench.tasks.clouds:SeenPickCube",
     },

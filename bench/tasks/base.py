@@ -161,6 +161,11 @@ class SymmetricTask(BaseEnv):
 
     render_human = _in_batched_branch(BaseEnv.render_human)
 
+    @classmethod
+    def is_seen(cls) -> bool:
+        """Whether points or a picture take the place of the poses of bodies."""
+        return bool(cls.observation_layout.cloud or cls.observation_layout.picture)
+
     # ------------------------------------------------------------------ scene
 
     def _load_agent(self, options: dict) -> None:

@@ -38,6 +38,7 @@ VARIANTS: Registry[type[Variant]] = Registry(
         "friction_patch": "symsteer.bench.variants.friction_patch:FrictionPatch",
         "obstacle": "symsteer.bench.variants.obstacle:Obstacle",
         "perception_bias": "symsteer.bench.variants.perception_bias:PerceptionBias",
+        "camera_rotation": "symsteer.bench.variants.camera_rotation:CameraRotation",
         "frame_offset": "symsteer.bench.variants.frame_offset:FrameOffset",
         "frame_rotation": "symsteer.bench.variants.frame_rotation:FrameRotation",
         "directional_reward": "symsteer.bench.variants.directional_reward:DirectionalReward",

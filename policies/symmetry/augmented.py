@@ -42,7 +42,7 @@ class AugmentedDiffusionPolicy(PlainDiffusionPolicy):
         augmentation = Augmentation(self.data_group)
         drawn = augmentation.draw(len(obs), generator).to(obs.device)
         return (
-            augmentation.apply(drawn, obs, self.obs_layout),
+            augmentation.apply(drawn, obs, self.task_layout),
             augmentation.apply(drawn, chunks, self.act_layout),
         )
 
@@ -68,5 +68,10 @@ class Augmentation:
         """Turn row i of ``x [count, ..., dim]`` by ``drawn[i]``."""
         if self.group.rotations == 0:
             return layout.rotate(x, drawn)
+        if layout.picture:
+            turned = x.clone()
+            for index, element in enumerate(self.group.elements):
+                turned[drawn == index] = layout.transform(x[drawn == index], *element)
+            return turned
         rho = self.group.representation(layout, x.dtype, x.device)[drawn]
         return torch.einsum("bij,b...j->b...i", rho, x)

@@ -58,6 +58,11 @@ class CanonicalDiffusionPolicy(PlainDiffusionPolicy):
         self.group = Group.parse(options.symmetry)
 
     @classmethod
+    def picture_group(cls, options: Any) -> Group:
+        """It has none: what a picture tells does not turn with an observed vector."""
+        return super(PlainDiffusionPolicy, cls).picture_group(options)
+
+    @classmethod
     def told_by_data(cls, options: Any, episodes: Sequence[Episode], obs_layout: Layout) -> Any:
         """With the anchor."""
         if options.anchor:

@@ -45,14 +45,15 @@ def merged_layout(layouts: Mapping[str, Layout]) -> Layout:
         layouts: observation layouts by task.
 
     Raises:
-        UserError: if a field has another kind in another task, or a task shows a cloud of points.
+        UserError: if a field has another kind in another task, or a task shows a picture or points.
     """
     fields: dict[str, Field] = {}
     for task, layout in layouts.items():
-        if layout.cloud:
+        if layout.cloud or layout.picture:
+            shown = "cloud of points" if layout.cloud else "picture"
             raise UserError(
-                f"{task} shows a cloud of points, which has no place in a policy for several "
-                "tasks; train one for each task"
+                f"{task} shows a {shown}, which has no place in a policy for several tasks; train "
+                "one for each task"
             )
         for field in layout.fields:
             if fields.setdefault(field.name, field) != field:

@@ -13,6 +13,7 @@ in the middle. With the trivial group C1 there is one slice: an ordinary diffusi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
@@ -130,6 +131,11 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
     name = "edp"
     Options = EquivariantOptions
     options: EquivariantOptions
+
+    @classmethod
+    def picture_group(cls, options: Any) -> Group:
+        """That of the options."""
+        return Group.parse_rotations(options.group)
 
     def make_denoiser(self) -> LiftedDenoiser:
         """The lifted network over the options' group."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import torch
 
@@ -61,6 +61,11 @@ class PlainDiffusionPolicy(DiffusionPolicy):
     name = "plain"
     Options = PlainOptions
     options: PlainOptions
+
+    @classmethod
+    def picture_group(cls, options: Any) -> Group:
+        """The trivial one."""
+        return Group.parse(TRIVIAL)
 
     def make_denoiser(self) -> LiftedDenoiser:
         """The same network over the trivial group."""

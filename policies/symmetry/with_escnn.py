@@ -142,6 +142,11 @@ class EscnnDiffusionPolicy(DiffusionPolicy):
     Options = EquivariantOptions
     options: EquivariantOptions
 
+    @classmethod
+    def picture_group(cls, options: Any) -> Group:
+        """That of the options."""
+        return Group.parse_rotations(options.group)
+
     def make_denoiser(self) -> LiftedDenoiser:
         """The lifted network over the options' group, with :meth:`make_encoder`."""
         options, group = self.options, Group.parse(self.options.group)

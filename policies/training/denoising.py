@@ -23,6 +23,8 @@ from symsteer.errors import UserError
 from symsteer.names import check
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
+from symsteer.policies.networks.pictures import PictureEncoder
+from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.training.diffusion import Diffusion, Prediction, Process
 from symsteer.policies.training.frames import Frame
 from symsteer.policies.training.gradient import GradientOptions, GradientPolicy
@@ -118,10 +120,15 @@ class DiffusionPolicy(GradientPolicy):
     options: Any
 
     def __init__(self, options: DenoisingOptions, obs_layout: Layout, act_layout: Layout):
-        options = options.resolved(obs_layout, act_layout)
-        super().__init__(options, obs_layout, act_layout)
+        eyes = None
+        if obs_layout.picture is not None:
+            eyes = PictureEncoder(obs_layout.picture, self.picture_group(options))
+        seen_layout = obs_layout if eyes is None else eyes.layout
+        options = options.resolved(seen_layout, act_layout)
+        super().__init__(options, seen_layout, act_layout)
+        self.task_layout, self.eyes = obs_layout, eyes
         self.diffusion = options.diffusion
-        self.frame = Frame(options.action_frame, obs_layout, act_layout)
+        self.frame = Frame(options.action_frame, self.obs_layout, act_layout)
         self.denoiser = self.make_denoiser()
         self.group = self.denoiser.group
         if options.zero_output:
@@ -131,7 +138,7 @@ class DiffusionPolicy(GradientPolicy):
                 f"orbit_targets need a group, and the network of {self.name} has none; leave them "
                 "out, or choose another policy"
             )
-        self._expanded: tuple[Denoiser, Sequence[torch.Tensor]] | None = None
+        self._expanded: tuple[Denoiser, Sequence[torch.Tensor], PictureEncoder | None] | None = None
         self.freeze()
 
     def _zero_output(self) -> None:
@@ -149,6 +156,24 @@ class DiffusionPolicy(GradientPolicy):
     def make_denoiser(self) -> Denoiser:
         """The network, untrained; it may read ``self.options`` and the layouts."""
 
+    @classmethod
+    def check(cls, options: Any, obs_layout: Layout) -> None:
+        """Pictures need an encoder; see :meth:`ChunkPolicy.check`."""
+        if obs_layout.picture:
+            cls.picture_group(options)
+
+    @classmethod
+    def picture_group(cls, options: Any) -> Group:
+        """Group of the encoder of pictures.
+
+        Raises:
+            UserError: if the policy has none.
+        """
+        raise UserError(
+            f"the policy {cls.name} takes no pictures; choose one with an encoder of them: edp, "
+            "escnn, plain or plain-augmented"
+        )
+
     @property
     def chunk_layout(self) -> Layout:
         """Geometry of an action as the network sees it."""
@@ -162,8 +187,21 @@ class DiffusionPolicy(GradientPolicy):
     def augment(
         self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Change a training batch; ``obs [B, obs_dim]`` as it is, ``chunks`` normalised."""
+        """Change a training batch; ``obs`` as the task gives it, ``chunks`` normalised."""
         return obs, chunks
+
+    def observation_statistics(self, obs: torch.Tensor) -> Normalizer:
+        """Of demonstrated observations; those of pictures are the encoder's."""
+        if self.eyes is None:
+            return super().observation_statistics(obs)
+        picture = self.eyes.picture
+        rest = Normalizer.fit(self.bounded_layout(picture.rest), obs[:, picture.rest_columns])
+        return self.eyes.statistics(obs, rest)
+
+    def see(self, obs: torch.Tensor) -> torch.Tensor:
+        """Encode the picture, if there is one; see :meth:`ChunkPolicy.see`."""
+        eyes = self._inference()[2]
+        return obs if eyes is None else eyes(obs)
 
     def loss(
         self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
@@ -175,6 +213,7 @@ class DiffusionPolicy(GradientPolicy):
         levels, noise = levels.to(device), noise.to(device)
         obs, clean = self.augment(obs, chunks, generator)
         noisy = self.diffusion.add_noise(clean, noise, levels)
+        obs = obs if self.eyes is None else self.eyes(obs)
         seen = known = self.normalized_observation(obs)
         if deviation := self.options.observation_noise:
             seen = known + deviation * torch.randn(known.shape, generator=generator).to(device)
@@ -193,7 +232,7 @@ class DiffusionPolicy(GradientPolicy):
 
     def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Follow the deterministic sampler from ``noise``; see :meth:`ChunkPolicy.decode`."""
-        denoiser, times = self._inference()
+        denoiser, times, _ = self._inference()
         seen = self.normalized_observation(obs)
         context, turn = denoiser.encode(seen), self.frame.angle(seen)
         clean = self.diffusion.sample(
@@ -216,13 +255,14 @@ class DiffusionPolicy(GradientPolicy):
         values = {k: options[k] for k in (*DECODE_FIELDS, *LATER_FIELDS) if k in options}
         return {key: x for key, x in values.items() if LATER_FIELDS.get(key) != x}
 
-    def _inference(self) -> tuple[Denoiser, Sequence[torch.Tensor]]:
-        """The denoiser with dense matrices, and what it sees of each noise level."""
+    def _inference(self) -> tuple[Denoiser, Sequence[torch.Tensor], PictureEncoder | None]:
+        """The denoiser with dense matrices, what it sees of each noise level, and the encoder."""
         if self._expanded is None:
             denoiser = self.denoiser.expanded()
             levels = torch.arange(self.options.diffusion_steps, device=self.device)
             # Not registered as a submodule: it is a cache, not part of the state.
-            self.__dict__["_expanded"] = denoiser, denoiser.encode_time(levels).split(1)
+            times = denoiser.encode_time(levels).split(1)
+            self.__dict__["_expanded"] = denoiser, times, self.eyes and self.eyes.expanded()
         return self.__dict__["_expanded"]
 
     def _apply(self, fn, recurse=True):

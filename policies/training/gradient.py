@@ -86,6 +86,10 @@ class GradientPolicy(ChunkPolicy):
         # The environment bounds actions block by block: train on what it executes.
         return obs, clip_blocks(chunks, cls.bounded_layout(act_layout), 1.0)
 
+    def observation_statistics(self, obs: torch.Tensor) -> Normalizer:
+        """Of demonstrated observations ``[M, task_layout.dim]``."""
+        return Normalizer.fit(self.bounded_layout(self.obs_layout), obs)
+
     @classmethod
     def fit(
         cls,
@@ -106,7 +110,7 @@ class GradientPolicy(ChunkPolicy):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             policy = cls(options, obs_layout, act_layout)
-        policy.obs_normalizer = Normalizer.fit(cls.bounded_layout(obs_layout), obs)
+        policy.obs_normalizer = policy.observation_statistics(obs)
         policy.act_normalizer = Normalizer.fit(cls.bounded_layout(act_layout), chunks)
         options = policy.options
         policy.to(device)

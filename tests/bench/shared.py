@@ -9,7 +9,7 @@ import torch
 
 from symsteer.bench.tasks import TASKS, SymmetricTask, make, task_class
 
-STATE_TASKS = [name for name in TASKS.names() if not task_class(name).needs_cameras]
+STATE_TASKS = [name for name in TASKS.names() if not task_class(name).is_seen()]
 """The tasks that run without a Vulkan driver."""
 
 FLAT_TASKS = [name for name in STATE_TASKS if not name.startswith("Tilted")]

@@ -93,6 +93,23 @@ def seen_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
     return np.concatenate(parts, axis=1)
 
 
+def heights_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
+    """The map of heights of the same state in several worlds, uint8."""
+    parts = []
+    for variant in ("none", "perception_bias:1", "camera_rotation:1", "obstacle:1"):
+        env = make(task, num_envs=1, variant=variant)
+        env.reset(seed=[seed])
+        expert = Expert(env)
+        for _ in range(steps):
+            env.step(expert.act())
+        # The root shows low things, too.
+        grey = (255 * (env.heights()[0] / SHOWN).clamp(0, 1).sqrt()).byte().numpy()
+        env.close()
+        large = Image.fromarray(grey).resize((VIEW, VIEW), Image.Resampling.NEAREST)
+        parts.append(captioned(np.asarray(large.convert("RGB")), variant))
+    return np.concatenate(parts, axis=1)
+
+
 def _view(places: np.ndarray) -> np.ndarray:
     """Points ``[P, 2]`` metres, to the right and upwards, uint8."""
     picture = Image.new("RGB", (VIEW, VIEW), "white")
@@ -106,7 +123,7 @@ def _view(places: np.ndarray) -> np.ndarray:
 def contact_sheet() -> np.ndarray:
     """Tasks in rows; each with its embodiments from top to bottom; uint8."""
     known = [(task, task_class(task)) for task in TASKS]
-    flat = [task for task, cls in known if not (issubclass(cls, Tilted) or cls.needs_cameras)]
+    flat = [task for task, cls in known if not (issubclass(cls, Tilted) or cls.is_seen())]
     pictures = [task_picture(task, axis=0) for task in flat]
     blank = [np.full_like(pictures[0], 255)] * (-len(pictures) % TASKS_PER_ROW)
     pictures += blank
@@ -126,8 +143,9 @@ def main() -> int:
         if len(sys.argv) == 2:
             picture = contact_sheet()
         else:
-            seen = task_class(sys.argv[2]).needs_cameras
-            picture = (seen_picture if seen else task_picture)(sys.argv[2])
+            kind = task_class(sys.argv[2])
+            seen = heights_picture if kind.observation_layout.picture else seen_picture
+            picture = (seen if kind.is_seen() else task_picture)(sys.argv[2])
         # The texture of the table would take most of the bytes.
         small = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
         with staged(Path(sys.argv[1])) as file:

@@ -221,6 +221,7 @@ MOVES = {
     "frame_offset": "resets",
     "spawn_sector": "resets",
     "perception_bias": "observation",
+    "camera_rotation": "observation",
     "frame_rotation": "observation",
     "observation_noise": "observation",
     "directional_reward": "reward",
@@ -234,7 +235,7 @@ def test_variants_move_what_they_claim_to_move(name, pushing):
     unbroken = pushing()
     half, full = pushing(f"{name}:0.5"), pushing(f"{name}:1")
     # Every rotation is still a symmetry of a turned observation; reflections are not.
-    claimed = set() if name == "frame_rotation" else {MOVES.get(name, "dynamics")}
+    claimed = set() if name.endswith("_rotation") else {MOVES.get(name, "dynamics")}
     for result in (half, full):
         assert broken(result, unbroken) == claimed
     if not claimed:

@@ -100,6 +100,24 @@ def test_frame_rotation_turns_the_observation():
         assert gap > 0.05 if reflect else gap < 1e-5, (angle, reflect, gap)
 
 
+def test_camera_rotation_turns_objects_alone():
+    """It commutes with rotations and not with reflections."""
+    env, seen = alike("camera_rotation")
+    layout, obs = env.observation_layout, torch.cat(list(seen.values()), dim=1)
+    for row, strength in enumerate(STRENGTHS.tolist()):
+        turned = layout.transform(obs[:1], math.radians(10) * strength)[0]
+        for field in layout.fields:
+            here, told = layout.slice(field.name), field.name.startswith("cube")
+            if "_to_" not in field.name and not field.name.startswith("grasp"):
+                expected = turned if told else obs[0]
+                assert torch.allclose(obs[row, here], expected[here], atol=1e-6), field.name
+    state = env.get_state_dict()
+    for angle, reflect in Group.parse("D8").elements:
+        env.set_state_dict(env.transform_state(state, angle, reflect))
+        gap = (env.get_obs() - layout.transform(obs, angle, reflect))[2].abs().max()
+        assert gap > 0.01 if reflect else gap < 1e-5, (angle, reflect, gap)
+
+
 def test_noise_is_that_of_the_episode_and_the_step():
     env, _ = alike("observation_noise")
     reference, alone = scene(num_envs=3), scene("observation_noise", torch.tensor([1.0]))
