@@ -23,6 +23,26 @@ VARIANTS = {
 }
 """What a step before success may cost besides 1, at full strength."""
 
+IN_WORDS = {
+    "gravity_tilt": "gravity leans to a side",
+    "wind": "wind on the object",
+    "action_gain": "weak motor along one axis",
+    "actuator_offset": "every motion ends to a side",
+    "friction_patch": "rough patch on the table",
+    "obstacle": "post on one side",
+    "perception_bias": "objects are seen to a side",
+    "camera_rotation": "objects are seen turned",
+    "frame_offset": "wrong centre",
+    "frame_rotation": "turned axes",
+    "directional_reward": "motion to a side costs more",
+    "spawn_sector": "objects start on one side",
+    "observation_noise": "noise along one axis",
+}
+"""What each variant is for somebody who does not know its name."""
+
+BIAS, BIAS_CENTIMETRES = "perception_bias", 2.0
+"""The variant that displaces what is seen, and by how much at strength 1."""
+
 TRAINING_ONLY = frozenset({"spawn_sector"})
 """Variants in which agents are not evaluated."""
 

@@ -16,6 +16,7 @@ from symsteer.leaderboard.sections import (
     claims,
     defect_map,
     how_to_read,
+    in_which_world,
     main_effects,
     performance_profiles,
     probability_of_improvement,
@@ -35,10 +36,11 @@ LARGEST = 60_000
 """Bytes of the largest page that stays one; of a larger one, sections have pages of their own."""
 
 SECTIONS: tuple[Section[Any], ...] = (
+    regret.SECTION,
+    in_which_world.SECTION,
+    verdicts.SECTION,
     what_symmetry_gains.SECTION,
     wins_and_losses.SECTION,
-    regret.SECTION,
-    verdicts.SECTION,
     verdicts.TESTS,
     how_to_read.SECTION,
     claims.SECTION,

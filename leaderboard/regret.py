@@ -6,20 +6,84 @@ policies and measured on the other half, then the halves are swapped. This regre
 
 The largest regret over cells is still that of an unlucky cell. It is compared with what an agent
 that truly loses nothing would show there, from simulated repetitions of the same cells.
+
+Intervals are those of the jackknife over base policies (Efron and Stein, 1981: its variance is too
+large rather than too small). They hold for a regret as it is defined here: against the agent that
+an experiment with half of the base policies would choose.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
+
+from symsteer.leaderboard.statistics import Interval
 
 Values = NDArray[np.float64]
 """A measure by agent and base policy, ``[agents, policies]``."""
 
 SPLITS = 100
 """Halves of the base policies over which a regret is averaged."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A measure in one cell.
+
+    Attributes:
+        values: ``[agents, policies]``.
+        policies: names; a base policy that several cells share has the same name there.
+        place: cells of other places share no base policy.
+    """
+
+    values: Values
+    policies: Sequence[str]
+    place: Hashable = ""
+
+    def without(self, policy: str) -> Cell:
+        """The cell without a base policy; itself if it does not have it."""
+        kept = [index for index, name in enumerate(self.policies) if name != policy]
+        if len(kept) == len(self.policies):
+            return self
+        return Cell(self.values[:, kept], [self.policies[i] for i in kept], self.place)
+
+
+def over_cells(
+    cells: Sequence[Cell], statistic: Callable[[Values], Values], splits: int = SPLITS
+) -> list[Interval]:
+    """A statistic of each agent's regrets with its 95 % interval.
+
+    Args:
+        cells: with the same agents and at least three base policies.
+        statistic: ``[agents, cells] -> [agents]``, such as the mean.
+        splits: see :func:`regrets`.
+    """
+    found = np.array([regrets(cell.values, splits) for cell in cells]).T
+    policies: dict[Hashable, dict[str, None]] = defaultdict(dict)
+    for cell in cells:
+        policies[cell.place] |= dict.fromkeys(cell.policies)
+    variance, freedom = np.zeros(len(found)), 0
+    for names in policies.values():
+        left_out = []
+        for name in names:
+            other = found.copy()
+            for index, cell in enumerate(cells):
+                if name in cell.policies:
+                    other[:, index] = regrets(cell.without(name).values, splits)
+            left_out.append(statistic(other))
+        # The variance with its divisor n, times n - 1.
+        variance += np.var(left_out, axis=0) * (len(names) - 1)
+        freedom += len(names) - 1
+    half = stats.t.ppf(0.975, freedom) * np.sqrt(variance)
+    return [
+        Interval(float(value), float(value - width), float(value + width))
+        for value, width in zip(statistic(found), half, strict=True)
+    ]
 
 
 def regrets(values: Values, splits: int = SPLITS, seed: int = 0) -> Values:

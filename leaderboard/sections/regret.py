@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,20 +11,29 @@ import numpy as np
 from symsteer.leaderboard.cell_names import cell_name
 from symsteer.leaderboard.figures import by_rows, look_of
 from symsteer.leaderboard.plots import Axis, Dot, Figure
-from symsteer.leaderboard.regret import Values, of_an_agent_without_regret, regrets
+from symsteer.leaderboard.regret import (
+    Cell,
+    Values,
+    of_an_agent_without_regret,
+    over_cells,
+    regrets,
+)
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
 from symsteer.leaderboard.sections import Section, View
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.study import Safe
-from symsteer.leaderboard.text import code, number, table_text
+from symsteer.leaderboard.text import code, folded, interval, number, table_text
 
-EXPLAINED = f"""\
-How much a learner is below the best learner of a cell, on average and in its worst cell: what one
-loses by taking it without knowing the world. The best learner is chosen on one half of the base
-policies and measured on the other, so that luck does not count; a regret may be negative. The cells
-are those in which all these learners have {MIN_SEEDS} base policies. The last row is an agent that
-loses nothing, simulated with the scatter of these cells: its worst cell is bad luck alone."""
+EXPLAINED = """\
+What a learner loses against the best learner of the world, on average and in its worst world: the
+price of taking it without knowing the world. In brackets: 95 % intervals."""
 
+HOW = f"""\
+The best learner of a world (a cell) is chosen on one half of the base policies and measured on the
+other half, so that luck does not count. Such a regret may be negative. The worlds are those in
+which all these learners have {MIN_SEEDS} base policies. The last row is an agent that loses
+nothing, simulated with the scatter of these cells: its worst world is bad luck alone. Intervals:
+[jackknife](https://doi.org/10.1214/aos/1176345462) over base policies."""
 
 MEASURES = ("success", "area")
 
@@ -36,6 +46,7 @@ class Regret:
         learners: names.
         cells: tables.
         success, area: ``[learners, cells]``.
+        mean, worst: over cells, of each measure and learner.
         nothing: of an agent without regret, success and area: mean and worst, over repetitions.
     """
 
@@ -43,6 +54,8 @@ class Regret:
     cells: list[Table]
     success: Values
     area: Values
+    mean: dict[str, list[Interval]]
+    worst: dict[str, list[Interval]]
     nothing: dict[str, tuple[float, float]]
 
 
@@ -56,23 +69,23 @@ def compute(summary: Summary) -> Regret | None:
     wanted = max(counts, key=lambda names: (counts[names], len(names)))
     names = [agent for agent in summary.agents if agent in wanted]
     cells: list[Table] = []
-    values: dict[str, list[Values]] = {measure: [] for measure in MEASURES}
+    values: dict[str, list[Cell]] = {measure: [] for measure in MEASURES}
     for table in summary.usual_tables:
         each = [_values(table, names, m) for m in MEASURES] if wanted <= learners[id(table)] else []
-        if each and each[0].shape[1] >= MIN_SEEDS:
+        if each and len(each[0].policies) >= MIN_SEEDS:
             cells.append(table)
             for measure, of_policies in zip(MEASURES, each, strict=True):
                 values[measure].append(of_policies)
     if not cells:
         return None
-    measured = {
-        measure: np.array([regrets(each) for each in values[measure]]).T for measure in MEASURES
-    }
-    nothing = {}
-    for measure in MEASURES:
-        draws = of_an_agent_without_regret(values[measure])
+    each_cell, mean, worst, nothing = {}, {}, {}, {}
+    for measure, of_cells in values.items():
+        each_cell[measure] = np.array([regrets(cell.values) for cell in of_cells]).T
+        mean[measure] = over_cells(of_cells, lambda found: found.mean(1))
+        worst[measure] = over_cells(of_cells, lambda found: found.max(1))
+        draws = of_an_agent_without_regret([cell.values for cell in of_cells])
         nothing[measure] = float(draws.mean()), float(draws.max(1).mean())
-    return Regret(names, cells, **measured, nothing=nothing)
+    return Regret(names, cells, each_cell["success"], each_cell["area"], mean, worst, nothing)
 
 
 def _learners(table: Table) -> frozenset[str]:
@@ -82,14 +95,15 @@ def _learners(table: Table) -> frozenset[str]:
     return frozenset(agent for agent, hashes in policies.items() if len(hashes) >= MIN_SEEDS)
 
 
-def _values(table: Table, learners: list[str], measure: str) -> Values:
+def _values(table: Table, learners: list[str], measure: str) -> Cell:
     by_policy: dict[str, dict[str, list[float]]] = {agent: {} for agent in learners}
     for agent, of_policy in by_policy.items():
         row = table.row_of(agent)
         for run in row.finished if row else ():
             of_policy.setdefault(run.policy, []).append(getattr(run, measure))
     shared = sorted(set.intersection(*map(set, by_policy.values())))
-    return np.array([[np.mean(by_policy[a][policy]) for policy in shared] for a in learners])
+    values = [[float(np.mean(by_policy[a][policy])) for policy in shared] for a in learners]
+    return Cell(np.array(values), shared, table.key.place)
 
 
 def render(regret: Regret | None, view: View) -> list[str]:
@@ -100,24 +114,22 @@ def render(regret: Regret | None, view: View) -> list[str]:
     order = regret.success.max(1).argsort(kind="stable")
     rows = [
         {"Learner": code(regret.learners[i])}
-        | _columns("success", regret.success[i].mean(), regret.success[i].max())
-        | _columns("area", regret.area[i].mean(), regret.area[i].max())
+        | _columns({m: (regret.mean[m][i], regret.worst[m][i]) for m in MEASURES})
         | {
-            "Worst cell by success": cell_name(
+            "Worst world by success": cell_name(
                 regret.cells[regret.success[i].argmax()], view.summary
             )
         }
         for i in order
     ]
-    last = {"Learner": "*without regret*"}
-    for measure, (mean, worst) in regret.nothing.items():
-        last |= _columns(measure, mean, worst)
+    last = {"Learner": "*without regret*"} | _columns(regret.nothing)
     safe = view.findings.study.safe
     return [
-        f"{EXPLAINED} Cells: {len(regret.cells)}.",
+        f"{EXPLAINED} Worlds: {len(regret.cells)}.",
         *([verdict(regret, safe)] if safe else []),
-        *view.drawn(kind="regret"),
         table_text([*rows, last], sparse=True),
+        *view.drawn(kind="regret"),
+        *folded("How it is measured", [HOW]),
     ]
 
 
@@ -145,8 +157,13 @@ def verdict(regret: Regret, safe: Safe) -> str:
     return f"{declared} **{result}**: above an agent without regret by {' and '.join(texts)}."
 
 
-def _columns(measure: str, mean: float, worst: float) -> dict[str, str]:
-    return {f"{measure}: mean": number(mean, 3), f"{measure}: worst": number(worst)}
+def _columns(of: Mapping[str, tuple[Interval | float, Interval | float]]) -> dict[str, str]:
+    """By measure: mean and worst."""
+    return {
+        f"{measure}: {name}": interval(value) if isinstance(value, Interval) else number(value)
+        for measure, both in of.items()
+        for name, value in zip(("mean", "worst"), both, strict=True)
+    }
 
 
 def figure(regret: Regret, summary: Summary) -> Figure:
@@ -170,8 +187,9 @@ def figure(regret: Regret, summary: Summary) -> Figure:
 
 
 SECTION = Section(
-    "Regret",
+    "What a wrong choice costs",
     lambda findings: compute(findings.summary),
     render,
+    where="first",
     figures=lambda regret, summary: [figure(regret, summary)] if regret else [],
 )

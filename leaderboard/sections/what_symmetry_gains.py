@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -95,11 +95,15 @@ def _gain(
     )
 
 
-def kinds(summary: Summary) -> dict[str, list[Table]]:
+def kinds(summary: Summary, words: Mapping[str, str] | None = None) -> dict[str, list[Table]]:
     """Tables by the kind of break: unbroken, each dial, each dial with an arm.
 
     Cells with another budget than most, with fewer demonstrations than the most of their place, or
     whose break begins in mid-run are kinds of their own.
+
+    Args:
+        summary: with the tables.
+        words: what to call a dial; else it is called by its name.
     """
 
     def others(key: Key) -> tuple[bool, bool]:
@@ -112,20 +116,22 @@ def kinds(summary: Summary) -> dict[str, list[Table]]:
     tables_by_kind: dict[str, list[Table]] = defaultdict(list)
     for table in sorted(summary.tables, key=lambda table: order(table.key)):
         longer, fewer = others(table.key)
-        words = [_break(table.key)]
-        words += [f"{count(table.key.env_steps)} steps"] if longer else []
-        words += ["few demonstrations"] if fewer else []
-        tables_by_kind[", ".join(words)].append(table)
+        kind = [_break(table.key, words or {})]
+        kind += [f"{count(table.key.env_steps)} steps"] if longer else []
+        kind += ["few demonstrations"] if fewer else []
+        tables_by_kind[", ".join(kind)].append(table)
     return dict(tables_by_kind)
 
 
-def _break(key: Key) -> str:
+def _break(key: Key, words: Mapping[str, str]) -> str:
     """What breaks the symmetry, without strengths."""
     arm = [] if key.embodiment == SYMMETRIC_EMBODIMENT else ["arm"]
     if key.variant == UNBROKEN:
         return "".join(arm) or "unbroken"
     constant = all(spec.is_constant for spec in parts_of(key.variant) or ())
-    return ", ".join([*arm, code(dial_of(key.variant)), *([] if constant else ["changing"])])
+    dials = dial_of(key.variant)
+    known = [words.get(dial, code(dial)) for dial in dials.split("+")] if words else [code(dials)]
+    return ", ".join([*arm, " and ".join(known), *([] if constant else ["changing"])])
 
 
 def render(measured: list[Gain], view: View) -> list[str]:
@@ -181,6 +187,5 @@ SECTION = Section(
     "What symmetry gains",
     lambda findings: gains(findings.summary, findings.audit),
     render,
-    where="first",
     figures=lambda measured, summary: [figure(measured)] if measured else [],
 )

@@ -89,5 +89,4 @@ SECTION = Section(
         "Against the best reference": against_references(findings.summary),
     },
     render,
-    where="first",
 )

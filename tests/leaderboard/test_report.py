@@ -171,7 +171,8 @@ def test_a_large_leaderboard_has_pages_of_its_own(
 
 TITLES = r"[A-Z][\w' ,-]+"
 HEADINGS = (
-    *("Leaderboard", "What symmetry gains", "At a glance", "Verdicts", "Details"),
+    *("Leaderboard", "What a wrong choice costs", "Which agent, in which world", "Verdicts"),
+    "Details",
     *("Unbroken symmetry", "A task that the map does not know"),
 )
 HOSTILE = [

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from symsteer.leaderboard.regret import of_an_agent_without_regret, regrets
+from symsteer.leaderboard.regret import Cell, of_an_agent_without_regret, over_cells, regrets
 from symsteer.leaderboard.sections import regret
 from symsteer.leaderboard.study import Safe
 from tests.leaderboard.record_factory import make_cell, view_of
@@ -58,6 +58,30 @@ def test_its_scatter_is_not_too_small_with_few_policies():
     assert 0.85 < simulated / true < 1.1
 
 
+def test_intervals_hold_what_other_policies_show():
+    """Eight cells of two places whose cells share base policies: at least 93 % of the intervals of
+    the mean have the expected value in them, and they are at most three times too wide."""
+    generator, names = np.random.default_rng(0), [str(i) for i in range(8)]
+    found = []
+    for _ in range(60):
+        own = 0.1 * generator.standard_normal((2, 3, 8))
+        cells = [
+            Cell(cell(generator, policies=8, scatter=0.05) + own[place], names, place)
+            for place in (0, 1)
+            for _ in range(4)
+        ]
+        found.append(over_cells(cells, lambda each: each.mean(1), splits=10))
+    values = np.array([[each.value for each in row] for row in found])
+    inside = [
+        row[agent].low <= values[:, agent].mean() <= row[agent].high
+        for row in found
+        for agent in range(3)
+    ]
+    assert np.mean(inside) >= 0.93
+    widths = np.array([[each.high - each.low for each in row] for row in found])
+    assert np.all(widths.mean(0) < 3 * 4 * values.std(0))
+
+
 def two_worlds():
     """In one world the first learner is best, in the other one the second."""
     worlds = {"none": (0.9, 0.5), "wind:1": (0.7, 0.8)}
@@ -77,12 +101,14 @@ def test_the_table_orders_learners_by_their_worst_cell():
     view = two_worlds()
     result = view.findings.of(regret.SECTION)
     np.testing.assert_allclose(result.success, [[0.0, 0.1], [0.4, 0.0]], atol=1e-9)
-    explained, table = regret.render(result, view)
-    assert explained.endswith("Cells: 2.")
+    explained, table, *_ = regret.render(result, view)
+    assert explained.endswith("Worlds: 2.")
     first, second, last = table.splitlines()[2:]
-    assert first.startswith("| `standard` | 0.050 | 0.10 |")
+    assert first.replace("\u00a0", " ").startswith(
+        "| `standard` | 0.05 [0.05, 0.05] | 0.10 [0.10, 0.10] |"
+    )
     assert first.endswith("| PickCube, wind 1 |")
-    assert second.startswith("| `equivariant` | 0.200 | 0.40 |")
+    assert second.startswith("| `equivariant` | 0.20")
     assert last.startswith("| *without regret* |")
 
 
