@@ -48,7 +48,7 @@ TRAINING_ONLY = frozenset({"spawn_sector"})
 
 POLICIES = (
     *("edp", "escnn", "frame-averaged", "so2", "spherical", "canonical", "plain"),
-    *("plain-augmented", "edp-joint", "plain-joint"),
+    *("plain-augmented", "edp-joint", "plain-joint", "edp-told"),
 )
 
 REFERENCES = ("base", "zero", "golden-ticket")

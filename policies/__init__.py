@@ -72,6 +72,7 @@ POLICIES: Registry[type[ChunkPolicy]] = Registry(
         "plain-augmented": "symsteer.policies.symmetry.augmented:AugmentedDiffusionPolicy",
         "edp-joint": "symsteer.policies.symmetry.joint:JointEquivariantPolicy",
         "plain-joint": "symsteer.policies.symmetry.joint:JointPlainPolicy",
+        "edp-told": "symsteer.policies.symmetry.told:ToldEquivariantPolicy",
     },
     "symsteer.policies.contract:ChunkPolicy",
 )

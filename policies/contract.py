@@ -45,6 +45,9 @@ class PolicyOptions:
         UserError: if a value is out of range.
     """
 
+    IN_USE: ClassVar[tuple[str, ...]] = ()
+    """Options that training does not depend on: a trained policy can be used with others."""
+
     horizon: Annotated[int, Field(le=1000)] = 8
     """Tp: actions in a chunk."""
     execute: int = 4
@@ -60,6 +63,16 @@ class PolicyOptions:
                 f"a chunk of {self.horizon} actions cannot execute {self.execute}; "
                 "choose execute <= horizon"
             )
+
+    def on(self, task: str) -> Self:
+        """The same in a run on a task, with what depends on the task filled in."""
+        return self
+
+    def trained(self) -> Self:
+        """The same with the defaults of the options ``IN_USE``."""
+        fields = dataclasses.fields(self)
+        defaults: dict[str, Any] = {f.name: f.default for f in fields if f.name in self.IN_USE}
+        return dataclasses.replace(self, **defaults)
 
     def require_positive(self, *fields: str) -> None:
         """Raise a UserError if one of these fields is less than 1."""
@@ -218,6 +231,19 @@ class ChunkPolicy(nn.Module, abc.ABC):
         """What networks see of ``obs [..., obs_dim]``: unit size, blocks of bounded length."""
         layout = self.bounded_layout(self.obs_layout)
         return clip_blocks(self.obs_normalizer.normalize(obs), layout, OBSERVATION_RADIUS)
+
+    def used_with(self, options: PolicyOptions) -> Self:
+        """The policy with the options ``IN_USE`` of others, unmeasured; itself if it has them."""
+        own = dataclasses.replace(
+            self.options, **{name: getattr(options, name) for name in self.options.IN_USE}
+        )
+        if own == self.options:
+            return self
+        policy = type(self)(own, self.task_layout, self.act_layout).to(self.device)
+        policy.load_state_dict(self.state_dict())
+        policy.training_record = dict(self.training_record)
+        policy.report = {key: value for key, value in self.report.items() if key == "world"}
+        return policy.freeze()
 
     def freeze(self) -> Self:
         """Evaluation mode, no gradients. To be called after every change of the weights."""

@@ -55,8 +55,9 @@ def parse_run(arguments: Sequence[str]) -> tuple[RunConfig, Execution]:
     names = {"agent": agent, "policy": {"name": [RunConfig.policy_name, *given["policy.name"]][-1]}}
     options = preset_options(preset[-1], agent, AGENTS.get(agent).Options) if preset else {}
     defaults = build_config({**names, "agent_options": options}, "symsteer run")
-    # A seed that is not given follows the run's seed, which is not known yet.
-    vars(defaults).update(policy_seed=None, demonstrations=DemonstrationConfig())
+    # What is not given follows the run's seed and task, which are not known yet.
+    later = {"policy": type(defaults.policy)(), "demonstrations": DemonstrationConfig()}
+    vars(defaults).update(policy_seed=None, **later)
     parsed = tyro.cli(
         _Arguments,
         prog="symsteer run",

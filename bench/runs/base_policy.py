@@ -43,7 +43,8 @@ def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
     task = task_class(config.task)
     layouts = (task.observation_layout, task.action_layout)
     if how.base_policy is not None:
-        return _measured(config, load_policy(how.base_policy, *layouts), how)
+        policy = load_policy(how.base_policy, *layouts)
+        return _measured(config, policy.used_with(config.policy), how)
     paths = {}
     for name in config.policy_tasks:
         given = how.demos if name == config.task else None
@@ -53,8 +54,9 @@ def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
     # The policies of several tasks are trained at once.
     place = _policy_folder(_on(config, min(config.policy_tasks)), how.runs, demos)
     with contextlib.nullcontext() if policy_path(folder).is_file() else built_once(place):
-        if not policy_path(folder).is_file():
-            for name, policy in _train(config, demos, how.quiet).items():
+        source = _source(config, how.runs, demos)
+        if not policy_path(source).is_file():
+            for name, policy in _train(_on(config, config.task), demos, how.quiet).items():
                 policy.report["world"] = {
                     "task": name,
                     "embodiment": config.embodiment,
@@ -62,7 +64,7 @@ def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
                     "policy_seed": config.policy_seed,
                 }
                 save_policy(policy, _policy_folder(_on(config, name), how.runs, demos))
-        policy = load_policy(folder, *layouts)
+        policy = load_policy(source, *layouts).used_with(config.policy)
         new = "steerability" not in policy.report
         policy = _measured(config, policy, how)
         if new:
@@ -92,17 +94,25 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
                 f"{path} was trained for {there}, and this run's {key} is {here}; name a policy of "
                 "the same task and embodiment"
             )
+    # A setting with its default value was not asked for: the value of the file is used.
+    plain = RunConfig(
+        task=config.task, agent=config.agent, policy_name=config.policy_name, seed=config.seed
+    )
+    default, asked = (flat(c.to_json()) for c in (plain, config))
+    default["policy.name"] = RunConfig.policy_name
+    in_use = {
+        key: getattr(config.policy, key)
+        for key in base.options.IN_USE
+        if asked.get(f"policy.{key}") != default.get(f"policy.{key}")
+    }
     settings: dict[str, Any] = {
-        "policy": {"name": POLICIES.name_of(type(base)), **base.options.to_json()}
+        "policy": {"name": POLICIES.name_of(type(base)), **base.options.to_json(), **in_use}
     }
     if "demonstrations" in world:
         settings["demonstrations"] = world["demonstrations"]
         settings["policy_seed"] = world.get("policy_seed")
     told = build_config(config.to_json() | settings, str(path))
-    # A setting with its default value was not asked for: the value of the file is used.
-    plain = RunConfig(agent=config.agent, policy_name=config.policy_name, seed=config.seed)
-    default, asked, known = (flat(c.to_json()) for c in (plain, config, told))
-    default["policy.name"] = RunConfig.policy_name
+    known = flat(told.to_json())
     for key, value in asked.items():
         if value not in (default[key], known.get(key)):
             raise UserError(
@@ -114,10 +124,10 @@ def with_policy_of(config: RunConfig, path: Path) -> RunConfig:
 
 
 def base_key(config: RunConfig) -> tuple:
-    """Runs with the same key steer the same base policy, if they do not begin from files."""
+    """Runs with the same key need one training, if they do not begin from files."""
     # A policy of several tasks is trained once for the runs on all of them.
     data = (config.policy_tasks, config.embodiment, config.demonstrations)
-    return (*data, config.policy_name, config.policy, config.policy_seed)
+    return (*data, config.policy_name, config.policy.trained(), config.policy_seed)
 
 
 def find_base(config: RunConfig, out: Path) -> Path | None:
@@ -126,7 +136,7 @@ def find_base(config: RunConfig, out: Path) -> Path | None:
     if not all(path.is_file() for path in paths.values()):
         return None
     try:
-        folder = _policy_folder(config, out, _loaded(config, paths))
+        folder = _source(config, out, _loaded(config, paths))
     except UserError:  # the run that trains the policy reports what is wrong with a file
         return None
     return folder if policy_path(folder).is_file() else None
@@ -224,8 +234,16 @@ def _policy_folder(config: RunConfig, out: Path, demos: Mapping[str, Demonstrati
     return out / "base" / f"{config.task}-{config.embodiment}-{short}-{key}"
 
 
+def _source(config: RunConfig, out: Path, demos: Mapping[str, Demonstrations]) -> Path:
+    """The policy's folder; unless it exists, that of the same one as it was trained."""
+    own = _policy_folder(config, out, demos)
+    there = policy_path(own).is_file()
+    return own if there else _policy_folder(_on(config, config.task), out, demos)
+
+
 def _on(config: RunConfig, task: str) -> RunConfig:
-    return dataclasses.replace(config, task=task)
+    """A run on another task of the policy, which is used there as it was trained."""
+    return dataclasses.replace(config, task=task, policy=config.policy.trained())
 
 
 def _train(

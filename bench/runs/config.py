@@ -140,8 +140,8 @@ class RunConfig(_Checked):
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
     def __post_init__(self) -> None:
-        tasks, complete = self.policy_tasks, vars(self)
-        for task in tasks:
+        complete = vars(self)
+        for task in self.policy_tasks:
             TASKS.check_allowed(task_name(task))
         for kind, name, options in (
             ("agent_options", self.agent, AGENTS.get(self.agent).Options),
@@ -154,9 +154,7 @@ class RunConfig(_Checked):
                 raise UserError(
                     f"{kind} are {type(given).__name__}, but {name!r} takes {options.__name__}"
                 )
-        if len(tasks) > 1:
-            # All of them, so that runs on each of these tasks ask for the same base policy.
-            complete["policy"] = dataclasses.replace(self.policy, tasks=tasks)  # type: ignore[call-arg]
+        complete["policy"] = self.policy.on(self.task)
         if self.policy_seed is None:
             complete["policy_seed"] = self.seed
         if self.demonstrations.seed is None:

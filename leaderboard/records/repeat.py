@@ -25,6 +25,8 @@ FILES = {"demonstrations": ("--demos", "FILE.h5"), "policy": ("--base-policy", "
 
 OPTION = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 VALUE = re.compile(r"(-?\d[\w.+-]*|\w[\w.:+,=@/-]*)?", re.ASCII)
+TEXTS = {"policy.instruction": re.compile(r"\w[\w ,.-]*", re.ASCII)}
+"""Options that are sentences; the command has them in quotes."""
 
 
 def repeat_command(config: Mapping[str, Any]) -> str | None:
@@ -46,7 +48,8 @@ def repeat_command(config: Mapping[str, Any]) -> str | None:
     for key, value in flat(own).items():
         name = key.replace("agent_options.", "agent.", 1)
         option = option_words(name, value)
-        if not OPTION.fullmatch(name) or not all(VALUE.fullmatch(word) for word in option[1:]):
+        valid = TEXTS.get(name, VALUE)
+        if not OPTION.fullmatch(name) or not all(valid.fullmatch(word) for word in option[1:]):
             return None
         words += option
     files = config.get("files")

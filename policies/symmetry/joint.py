@@ -89,23 +89,34 @@ class TaskDenoiser(LiftedDenoiser):
     def __init__(
         self, options: DenoisingOptions, obs_layout: Layout, act_layout: Layout, group: Group
     ):
-        super().__init__(options, Layout(obs_layout.fields[:-1]), act_layout, group)
-        self.tasks = obs_layout.fields[-1].multiplicity
+        *seen, last = obs_layout.fields
+        self.tasks = last.multiplicity if last.name == TASK else 0
+        super().__init__(options, Layout(seen) if self.tasks else obs_layout, act_layout, group)
         channels, films = self.condition.in_features, self.condition.out_features
-        self.task_in = nn.Linear(self.tasks, 2 * channels, bias=False)
-        self.task_condition = nn.Linear(self.tasks, films, bias=False)
+        self.task_in = nn.Linear(self.told_size, 2 * channels, bias=False)
+        self.task_condition = nn.Linear(self.told_size, films, bias=False)
         for layer in (self.task_in, self.task_condition):
             nn.init.zeros_(layer.weight)
 
-    def embed(self, obs: torch.Tensor) -> torch.Tensor:
-        """Embedding of a merged observation; ``[B, obs_dim] -> [B, order, channels]``."""
+    @property
+    def told_size(self) -> int:
+        """Numbers that tell the task."""
+        return self.tasks
+
+    def told(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """What is seen of an observation, and what tells the task, ``[B or 1, told_size]``."""
         seen, task = obs.split([obs.shape[-1] - self.tasks, self.tasks], dim=-1)
+        return seen, task
+
+    def embed(self, obs: torch.Tensor) -> torch.Tensor:
+        """Embedding of an observation; ``[B, obs_dim] -> [B, order, channels]``."""
+        seen, task = self.told(obs)
         scale, shift = self.task_in(task)[:, None].chunk(2, dim=-1)
         return self.obs_mix(functional.silu(self.obs_lift(seen) * (1 + scale) + shift))
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         """What the network sees of it; ``[B, obs_dim] -> [B, order, condition]``."""
-        return super().encode(obs) + self.task_condition(obs[:, -self.tasks :])[:, None]
+        return super().encode(obs) + self.task_condition(self.told(obs)[1])[:, None]
 
     def weights_of_task(
         self, columns: torch.Tensor, blank: torch.Tensor
@@ -119,16 +130,20 @@ class TaskDenoiser(LiftedDenoiser):
         """
         state = {key: value.double() for key, value in self.state_dict().items()}
         known, task = blank.double().split([len(blank) - self.tasks, self.tasks])
-        known = known.index_fill(0, columns, 0.0)
-        scale, shift = (state.pop("task_in.weight") @ task).chunk(2)
         weight = state["obs_lift.weight"]
-        bias = state["obs_lift.bias"] + weight @ known
-        state["obs_lift.weight"] = (1 + scale)[:, None] * weight[:, columns]
-        state["obs_lift.bias"] = (1 + scale) * bias + shift
+        state["obs_lift.weight"] = weight[:, columns]
+        state["obs_lift.bias"] = state["obs_lift.bias"] + weight @ known.index_fill(0, columns, 0.0)
+        self.fold(state, task)
+        return {key: value.to(blank.dtype) for key, value in state.items()}
+
+    def fold(self, state: dict[str, torch.Tensor], task: torch.Tensor) -> None:
+        """Make what tells the task, ``[tasks]``, a part of the weights of one task, in place."""
+        scale, shift = (state.pop("task_in.weight") @ task).chunk(2)
+        state["obs_lift.weight"] = (1 + scale)[:, None] * state["obs_lift.weight"]
+        state["obs_lift.bias"] = (1 + scale) * state["obs_lift.bias"] + shift
         state["condition.bias"] = (
             state["condition.bias"] + state.pop("task_condition.weight") @ task
         )
-        return {key: value.to(blank.dtype) for key, value in state.items()}
 
 
 @dataclass(frozen=True)
@@ -142,6 +157,11 @@ class JointOptions(DenoisingOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "tasks", tuple(sorted(set(self.tasks))))
+
+    def on(self, task: str) -> Self:
+        """With all tasks, so that runs on each of them ask for the same base policy."""
+        tasks = {task, *self.tasks}
+        return dataclasses.replace(self, tasks=tuple(tasks)) if len(tasks) > 1 else self
 
 
 class Joint(DiffusionPolicy):
@@ -195,6 +215,11 @@ class Joint(DiffusionPolicy):
         whole = cls.fit(options, episodes, merged, act_layout, seed, progress, device)
         return {name: whole.of_task(i, layouts[name]) for i, name in enumerate(names)}
 
+    def options_of(self, task: int) -> Any:
+        """Options of the policy for one task, as they were asked for."""
+        options = self.options
+        return dataclasses.replace(options, steps=options.steps // len(options.tasks))
+
     def of_task(self, task: int, obs_layout: Layout) -> Self:
         """The policy for one task, with the embedding in its weights.
 
@@ -207,13 +232,7 @@ class Joint(DiffusionPolicy):
         blank = merged_observation(
             statistics.scale.new_zeros(obs_layout.dim), obs_layout, merged, task
         )
-        options = self.options
-        policy = type(self)(
-            # As they were asked for.
-            dataclasses.replace(options, steps=options.steps // len(options.tasks)),
-            obs_layout,
-            self.act_layout,
-        ).to(self.device)
+        policy = type(self)(self.options_of(task), obs_layout, self.act_layout).to(self.device)
         policy.obs_normalizer.load_state_dict(
             {name: value[columns] for name, value in statistics.state_dict().items()}
         )

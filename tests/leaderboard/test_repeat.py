@@ -56,6 +56,16 @@ def test_committed_records(path) -> None:
     assert build_config(expected, "record").to_json() == again(repeat_command(config)).to_json()
 
 
+def test_a_sentence_is_one_word_of_the_command() -> None:
+    config = RunConfig(policy_name="edp-told")
+    assert " --policy.instruction 'Pick up the cube " in (repeat_command(config.to_json()) or "")
+    assert again(repeat_command(config.to_json())) == config
+    policy = config.to_json()["policy"]
+    for text in ("Push; rm -rf ~", "Push $(rm)", "Push\nrm", "--out=/tmp", "Push 'it'"):
+        change = {"policy": policy | {"instruction": text}}
+        assert repeat_command(config.to_json() | change) is None
+
+
 def test_files_have_placeholders() -> None:
     resolved = RunConfig().to_json() | {"files": {"demonstrations": "0" * 64}}
     command = repeat_command(resolved)

@@ -39,6 +39,18 @@ def test_base_policy_and_demonstrations_follow_the_runs_seed(preset):
     assert seeds("--demonstrations.seed", "2", "--seed", "5") == (5, 5, 2)
 
 
+def test_what_a_policy_is_told_follows_the_runs_task():
+    def told(*arguments: str) -> tuple[str, ...]:
+        config = parse_run(["--policy.name", "edp-told", *arguments])[0]
+        assert build_config(config.to_json(), "") == config
+        return config.policy.instruction, *config.policy.tasks
+
+    pull = "Pull the cube into the target."
+    assert told("--task", "PullCube-v1") == (pull, "PullCube-v1")
+    words = ("--task", "PullCube-v1", "--policy.tasks", "PushCube-v1", "--policy.instruction")
+    assert told(*words, "Drag it.") == ("Drag it.", "PullCube-v1", "PushCube-v1")
+
+
 def test_a_preset_replaces_defaults_and_explicit_options_win():
     preset = parse_run(["--agent.preset", "first"])[0].agent_options
     assert parse_run(["--agent.preset=first", "--agent.width", "31"])[0].agent_options == type(

@@ -1,13 +1,20 @@
 """Base policies of runs: made once, found again, steered; of several tasks, and of strangers."""
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from symsteer.bench.demos import collect
 from symsteer.bench.runs import base_policy
-from symsteer.bench.runs.base_policy import describe_base, find_base, prepare_base, with_policy_of
-from symsteer.bench.runs.config import build_config
+from symsteer.bench.runs.base_policy import (
+    base_key,
+    describe_base,
+    find_base,
+    prepare_base,
+    with_policy_of,
+)
+from symsteer.bench.runs.config import RunConfig, build_config
 from symsteer.bench.runs.folder import run_id
 from symsteer.bench.runs.run import check
 from symsteer.bench.tasks import task_class
@@ -15,6 +22,7 @@ from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from symsteer.policies import POLICIES
 from symsteer.policies.files import policy_path
+from symsteer.policies.words import sentences
 from symsteer.registry import allow
 from tests.bench.tiny_run import POLICY, execute, quiet, tiny_config
 from tests.marks import slow_except
@@ -135,6 +143,42 @@ def test_other_demonstrations_of_one_task_are_another_policy_of_all(tmp_path):
     for task in pair:
         assert find_base(joint(task, pair), tmp_path) is None
         assert find_base(joint(task, ()), tmp_path) is not None
+
+
+@pytest.mark.long
+def test_another_sentence_needs_no_training(tmp_path, monkeypatch):
+    pair, name = ("PickCube-v1", "PushCube-v1"), "edp-told"
+    first = joint("PushCube-v1", pair, name=name)
+    assert first.policy.instruction == sentences("PushCube-v1")[0]
+    base = prepare_base(first, quiet(runs=tmp_path))
+    monkeypatch.setattr(POLICIES.get(name), "fit_tasks", None)
+    options = dataclasses.replace(first.policy, instruction="Nudge the block to the goal.")
+    other = dataclasses.replace(first, policy=options)
+    assert base_key(other) == base_key(first) == base_key(joint("PickCube-v1", pair, name=name))
+    assert run_id(other, {}) != run_id(first, {})
+    # A sweep need not train anything for it.
+    assert find_base(other, tmp_path) == find_base(first, tmp_path)
+    told = prepare_base(other, quiet(runs=tmp_path))
+    place = find_base(other, tmp_path)
+    assert place != find_base(first, tmp_path)
+    assert told.options.instruction == "Nudge the block to the goal."
+    assert told.content_hash() != base.content_hash()
+    assert told.report["world"] == base.report["world"]
+    assert "steerability" in told.report
+    # A file keeps its sentence, unless the run asks for another one.
+    file, task = policy_path(place), "PushCube-v1"
+    assert with_policy_of(tiny_config(task=task), file).policy == other.policy
+    plain = RunConfig(task=task, policy_name=name)
+    assert with_policy_of(plain, file).policy == other.policy
+    asked = dataclasses.replace(plain.policy, instruction="Shove the cube.")
+    config = with_policy_of(dataclasses.replace(plain, policy=asked), file)
+    assert config.policy == dataclasses.replace(other.policy, instruction="Shove the cube.")
+    used = prepare_base(config, quiet(runs=tmp_path, base_policy=file))
+    assert used.options.instruction == "Shove the cube."
+    with pytest.raises(UserError, match=r"policy\.steps 20, and this run asks for 30"):
+        with_policy_of(
+            dataclasses.replace(plain, policy=dataclasses.replace(plain.policy, steps=30)), file
+        )
 
 
 def test_the_order_of_tasks_and_the_runs_own_do_not_matter():
