@@ -1,22 +1,22 @@
 """What an agent loses against the best one of each cell, measured without favour.
 
 The largest of several noisy means is larger than the mean of the agent that is truly best, so that
-every agent seems to lose something. Here the best agent of a cell is chosen on one half of the base
-policies and measured on the other half, then the halves are swapped. This regret may be negative.
-
-The largest regret over cells is still that of an unlucky cell. It is compared with what an agent
-that truly loses nothing would show there, from simulated repetitions of the same cells.
+every agent seems to lose something; and the largest of several noisy losses is that of an unlucky
+cell. So base policies are cut in halves. One half chooses the best agent of each cell, and the
+worst cell of each agent; the other half measures. Then they are swapped. Such a regret may be
+negative.
 
 Intervals are those of the jackknife over base policies (Efron and Stein, 1981: its variance is too
-large rather than too small). They hold for a regret as it is defined here: against the agent that
-an experiment with half of the base policies would choose.
+large rather than too small). They hold for a regret as it is defined here: of what an experiment
+with half of the base policies would choose.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ from scipy import stats
 from symsteer.leaderboard.statistics import Interval
 
 Values = NDArray[np.float64]
-"""A measure by agent and base policy, ``[agents, policies]``."""
 
 SPLITS = 100
 """Halves of the base policies over which a regret is averaged."""
@@ -37,7 +36,8 @@ class Cell:
 
     Attributes:
         values: ``[agents, policies]``.
-        policies: names; a base policy that several cells share has the same name there.
+        policies: their names, at least two; of a base policy that several cells share it is the
+            same in all.
         place: cells of other places share no base policy.
     """
 
@@ -46,94 +46,135 @@ class Cell:
     place: Hashable = ""
 
     def without(self, policy: str) -> Cell:
-        """The cell without a base policy; itself if it does not have it."""
+        """The cell without a base policy, which it has."""
         kept = [index for index, name in enumerate(self.policies) if name != policy]
-        if len(kept) == len(self.policies):
-            return self
         return Cell(self.values[:, kept], [self.policies[i] for i in kept], self.place)
 
 
-def over_cells(
-    cells: Sequence[Cell], statistic: Callable[[Values], Values], splits: int = SPLITS
-) -> list[Interval]:
-    """A statistic of each agent's regrets with its 95 % interval.
+@dataclass(frozen=True)
+class Regrets:
+    """By how much agents are below the best one.
 
-    Args:
-        cells: with the same agents and at least three base policies.
-        statistic: ``[agents, cells] -> [agents]``, such as the mean.
-        splits: see :func:`regrets`.
+    Attributes:
+        cells: ``[agents, cells]``.
+        mean, worst: over cells, ``[agents]``.
     """
-    found = np.array([regrets(cell.values, splits) for cell in cells]).T
-    policies: dict[Hashable, dict[str, None]] = defaultdict(dict)
-    for cell in cells:
-        policies[cell.place] |= dict.fromkeys(cell.policies)
-    variance, freedom = np.zeros(len(found)), 0
-    for names in policies.values():
-        left_out = []
-        for name in names:
-            other = found.copy()
-            for index, cell in enumerate(cells):
-                if name in cell.policies:
-                    other[:, index] = regrets(cell.without(name).values, splits)
-            left_out.append(statistic(other))
-        # The variance with its divisor n, times n - 1.
-        variance += np.var(left_out, axis=0) * (len(names) - 1)
-        freedom += len(names) - 1
-    half = stats.t.ppf(0.975, freedom) * np.sqrt(variance)
-    return [
-        Interval(float(value), float(value - width), float(value + width))
-        for value, width in zip(statistic(found), half, strict=True)
-    ]
+
+    cells: Values
+    mean: Values
+    worst: Values
 
 
-def regrets(values: Values, splits: int = SPLITS, seed: int = 0) -> Values:
-    """By how much each agent is below the best one of a cell, ``[agents]``.
+def regrets(cells: Sequence[Cell], splits: int = SPLITS, seed: int = 0) -> Regrets:
+    """Regrets of the agents that all cells have.
 
     Args:
-        values: of at least two base policies.
+        cells: with the same agents.
         splits: random halves.
         seed: of the halves.
     """
-    generator = np.random.default_rng(seed)
-    policies = values.shape[1]
-    ordered = values[:, [generator.permutation(policies) for _ in range(splits)]]
-    first, second = ordered[..., : policies // 2].mean(-1), ordered[..., policies // 2 :].mean(-1)
-    total = np.zeros(len(values))
-    for chosen, measured in ((first, second), (second, first)):
-        best = measured[chosen.argmax(0), np.arange(splits)]
-        total += (best - measured).sum(1)
-    return total / (2 * splits)
+    return _regrets([_halves(cell, splits, seed) for cell in cells])
+
+
+def _halves(cell: Cell, splits: int, seed: int) -> Values:
+    """``[2, splits * 2, agents]``: below the best agent where it was chosen, and where measured.
+
+    The same base policies are in the same halves in all cells.
+    """
+    generators = [np.random.default_rng([seed, *name.encode()]) for name in cell.policies]
+    order = np.stack([each.random(splits) for each in generators], axis=1).argsort(1)
+    ordered, cut = cell.values[:, order], len(generators) // 2
+    halves = ordered[..., :cut].mean(-1).T, ordered[..., cut:].mean(-1).T
+    found = []
+    for chosen, measured in (halves, halves[::-1]):
+        best = np.take_along_axis(measured, chosen.argmax(1)[:, None], 1)
+        found.append([chosen.max(1, keepdims=True) - chosen, best - measured])
+    return np.concatenate(found, axis=1)
+
+
+def _regrets(halves: Sequence[Values]) -> Regrets:
+    chosen, measured = np.stack(halves, axis=-1)
+    worst = np.take_along_axis(measured, chosen.argmax(-1)[..., None], -1)[..., 0]
+    return Regrets(measured.mean(0), measured.mean((0, 2)), worst.mean(0))
+
+
+def intervals(cells: Sequence[Cell], splits: int = SPLITS) -> tuple[list[Interval], list[Interval]]:
+    """Mean and worst regret of each agent with their 95 % intervals.
+
+    Args:
+        cells: with the same agents and at least three base policies.
+        splits: see :func:`regrets`.
+    """
+    halves = [_halves(cell, splits, 0) for cell in cells]
+    policies: dict[Hashable, dict[str, None]] = defaultdict(dict)
+    for cell in cells:
+        policies[cell.place] |= dict.fromkeys(cell.policies)
+    variances, freedoms = [], []
+    for place, names in policies.items():
+        left_out = []
+        for name in names:
+            lacks = [cell.place == place and name in cell.policies for cell in cells]
+            other = [
+                _halves(cell.without(name), splits, 0) if lack else half
+                for cell, half, lack in zip(cells, halves, lacks, strict=True)
+            ]
+            found = _regrets(other)
+            left_out.append([found.mean, found.worst])
+        # The variance with its divisor n, times n - 1.
+        variances.append(np.var(left_out, axis=0) * (len(names) - 1))
+        freedoms.append(len(names) - 1)
+    found, of_places = _regrets(halves), np.array(variances)
+    student = partial(_student, freedoms=np.array(freedoms))
+    mean, worst = (
+        [student(value, of_places[:, which, agent]) for agent, value in enumerate(values)]
+        for which, values in enumerate((found.mean, found.worst))
+    )
+    return mean, worst
+
+
+def _student(value: float, variances: Values, freedoms: Values) -> Interval:
+    """Interval for a sum of independent variances (Satterthwaite, 1946)."""
+    total = variances.sum()
+    freedom = total**2 / (variances**2 / freedoms).sum() if total else 1
+    half = stats.t.ppf(0.975, freedom) * np.sqrt(total)
+    return Interval(float(value), float(value - half), float(value + half))
 
 
 def of_an_agent_without_regret(
-    cells: Sequence[Values], draws: int = 200, splits: int = 10, seed: int = 0
-) -> Values:
+    cells: Sequence[Cell], draws: int = 200, splits: int = 10, seed: int = 0
+) -> tuple[Values, Values]:
     """Regrets that an agent would show whose true mean is the largest in each cell.
 
     The cells are repeated with residuals that are drawn anew: those of a base policy stay together,
     and the further agent has a residual of its own from all those of the cell.
 
     Args:
-        cells: a table for each cell.
+        cells: with the same agents.
         draws: repetitions.
         splits, seed: see :func:`regrets`.
 
     Returns:
-        ``[draws, cells]``.
+        Its mean and its worst regret in each repetition, both ``[draws]``.
     """
     generator = np.random.default_rng(seed)
-    result = np.zeros((draws, len(cells)))
-    for index, values in enumerate(cells):
-        agents, policies = values.shape
-        means = values.mean(1, keepdims=True)
-        # A mean of few policies is too close to their values.
-        residuals = (values - means) * np.sqrt(policies / (policies - 1))
-        shared = residuals.mean(0)
-        apart = (residuals - shared) * np.sqrt(agents / max(agents - 1, 1))
-        for draw in range(draws):
-            drawn = generator.integers(policies, size=policies)
-            own = apart[generator.integers(agents, size=policies), drawn]
-            further = means.max() + shared[drawn] + own
-            repeated = np.vstack([means + residuals[:, drawn], further])
-            result[draw, index] = regrets(repeated, splits, seed + draw)[-1]
-    return result
+    found = []
+    for draw in range(draws):
+        repeated = [_with_the_best(cell, generator) for cell in cells]
+        further = regrets(repeated, splits, seed + draw)
+        found.append([further.mean[-1], further.worst[-1]])
+    mean, worst = np.array(found).T
+    return mean, worst
+
+
+def _with_the_best(cell: Cell, generator: np.random.Generator) -> Cell:
+    """A repetition of a cell with the further agent as its last one."""
+    agents, policies = cell.values.shape
+    means = cell.values.mean(1, keepdims=True)
+    # A mean of few policies is too close to their values.
+    residuals = (cell.values - means) * np.sqrt(policies / (policies - 1))
+    shared = residuals.mean(0)
+    apart = (residuals - shared) * np.sqrt(agents / max(agents - 1, 1))
+    drawn = generator.integers(policies, size=policies)
+    own = apart[generator.integers(agents, size=policies), drawn]
+    further = means.max() + shared[drawn] + own
+    return Cell(np.vstack([means + residuals[:, drawn], further]), cell.policies, cell.place)

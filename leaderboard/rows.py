@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from functools import cached_property
+from statistics import fmean
 
 import numpy as np
 
@@ -50,6 +51,13 @@ class AgentRow:
     @property
     def finished(self) -> list[Run]:
         return [run for run in self.runs if run.finished]
+
+    def by_policy(self, measure: str) -> dict[str, float]:
+        """An attribute of the finished runs, mean over the runs on each base policy."""
+        values: dict[str, list[float]] = defaultdict(list)
+        for run in self.finished:
+            values[run.policy].append(getattr(run, measure))
+        return {policy: fmean(of_runs) for policy, of_runs in values.items()}
 
     @property
     def is_reference(self) -> bool:
@@ -116,6 +124,13 @@ class Table:
     def learners(self) -> list[AgentRow]:
         """Trusted rows with finished runs of agents that are no references."""
         return [row for row in self.trusted if row.finished and not row.is_reference]
+
+    @property
+    def decisive(self) -> frozenset[str]:
+        """The learners, without controls, with enough base policies for a verdict."""
+        names = {row.agent for row in self.learners if row.role == "learner"}
+        rows = [row for agent in names if (row := self.row_of(agent))]
+        return frozenset(r.agent for r in rows if len(r.by_policy("success")) >= MIN_SEEDS)
 
     def row_of(self, agent: str) -> AgentRow | None:
         """The agent's trusted row with its usual settings, else that with the most finished runs.

@@ -39,8 +39,8 @@ def seen_around(at: torch.Tensor, spacing: float, highest: int) -> list[torch.Te
     does not matter.
 
     Point i at distance r and bearing b adds w(r) exp(i k b) for each band and each frequency k.
-    The weights w are hats: in band j they rise from 0 to 1 and fall to 0 again, at j, j + 1 and
-    j + 2 spacings.
+    The weights w are hats: in band j = 1, 2, ... they rise from 0 to 1 and fall to 0 again, at
+    j - 1, j and j + 1 spacings.
 
     Args:
         at: where the points are, ``[N, points, 2]`` metres.

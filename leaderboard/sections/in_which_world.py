@@ -1,9 +1,9 @@
-"""Which agent, in which world, at which budget; and what a centimetre of camera error costs."""
+"""Which agent, in which world, at which budget; and what a camera error costs."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -16,13 +16,17 @@ from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
 from symsteer.leaderboard.sections import Section, View
 from symsteer.leaderboard.sections.what_symmetry_gains import kinds
 from symsteer.leaderboard.statistics import Interval, Sample, stratified_bootstrap
-from symsteer.leaderboard.text import NOTHING, code, count, interval, number, table_text
+from symsteer.leaderboard.text import NOTHING, SPACE, code, count, interval, number, table_text
 from symsteer.variant import UNBROKEN
 
 EXPLAINED = """\
-Success at the end of the budget, mean over tasks and strengths. **Bold**: the best learner of the
-world, and every learner that is not clearly below it (paired by base policy and episode, 95 %).
-"""
+Success at the end of the budget, mean over the cells of each kind of world (tasks and strengths).
+**Bold**: the best learner, and every learner that is not clearly below it (paired by base policy
+and episode, 95 %)."""
+
+CAMERA = """\
+**What a camera error costs**: change of final success where objects are seen so far from their
+place, on the same base policies, with 95 % intervals."""
 
 
 @dataclass(frozen=True)
@@ -31,59 +35,67 @@ class World:
 
     Attributes:
         kind: as markdown.
-        steps: the budget.
         tables: those cells.
         success: mean over them, by agent; the frozen policy without an agent is `BASE`.
         best: the best learner, and those that are not clearly below it.
     """
 
     kind: str
-    steps: int
     tables: list[Table]
     success: dict[str, float]
     best: list[str]
 
 
 @dataclass(frozen=True)
+class CameraError:
+    """What it costs to see objects displaced.
+
+    Attributes:
+        centimetres: by which they are displaced.
+        cells: their number.
+        change: of final success from the unbroken world, by agent.
+    """
+
+    centimetres: float
+    cells: int
+    change: dict[str, Interval]
+
+
+@dataclass(frozen=True)
 class InWorlds:
-    """Of every kind of world; what a centimetre costs, by agent."""
+    """Of every kind of world; and of every camera error."""
 
     worlds: list[World]
-    centimetre: dict[str, Interval]
+    errors: list[CameraError]
 
 
 def compute(summary: Summary) -> InWorlds:
-    """Kinds without a cell in which two learners have enough base policies are left out."""
-    worlds = (world_of(kind, tables) for kind, tables in kinds(summary, IN_WORDS).items())
-    return InWorlds([world for world in worlds if world], centimetre(summary))
+    """Kinds without a cell in which `STANDARD` and another learner have enough base policies are
+    left out."""
+    each = kinds(summary, IN_WORDS).items()
+    worlds = (world_of(kind, tables, summary.agents) for kind, tables in each)
+    return InWorlds([world for world in worlds if world], camera_errors(summary))
 
 
-def world_of(kind: str, tables: Sequence[Table]) -> World | None:
+def world_of(kind: str, tables: Sequence[Table], agents: Sequence[str]) -> World | None:
     """The learners that all cells have; if these are too few, those that most of them have."""
-    learners = {
-        id(table): {row.agent for row in table.learners if len(row.finished) >= MIN_SEEDS}
-        for table in tables
-    }
-    several = [frozenset(names) for names in learners.values() if {STANDARD} < names]
+    several = [table.decisive for table in tables if {STANDARD} < table.decisive]
     if not several:
         return None
     wanted = frozenset.intersection(*several)
     if len(wanted) == 1:
         wanted = Counter(several).most_common(1)[0][0]
-    used = [table for table in tables if wanted <= learners[id(table)]]
+    used = [table for table in tables if wanted <= table.decisive]
+    names = [agent for agent in agents if agent in wanted]
     success = {
-        agent: fmean(fmean(run.success for run in row.finished) for row in rows if row)
-        for agent in (BASE, *wanted)
+        agent: fmean(fmean(row.by_policy("success").values()) for row in rows if row)
+        for agent in (BASE, *names)
         if all(rows := [table.row_of(agent) for table in used])
     }
-    top = max(wanted, key=lambda agent: success[agent])
-    return World(
-        kind=kind,
-        steps=used[0].key.env_steps,
-        tables=used,
-        success=success,
-        best=[agent for agent in wanted if agent == top or not _above(used, top, agent)],
-    )
+    top = max(success[agent] for agent in names)
+    tops = [agent for agent in names if success[agent] == top]
+    best = [a for a in names if a in tops or not any(_above(used, one, a) for one in tops)]
+    return World(kind, used, success, best)
 
 
 def _above(tables: Sequence[Table], first: str, second: str) -> bool:
@@ -92,41 +104,54 @@ def _above(tables: Sequence[Table], first: str, second: str) -> bool:
     return any(pairs) and stratified_bootstrap([each for each in pairs if each]).sign > 0
 
 
-def centimetre(summary: Summary) -> dict[str, Interval]:
-    """What final success changes by for each centimetre by which objects are seen too far to a
-    side, by agent: from the unbroken world to each such world of the same place and budget."""
-    unbroken = {_place(t.key): t for t in summary.tables if t.key.variant == UNBROKEN}
-    slopes: dict[str, list[list[Sample]]] = defaultdict(list)
+def camera_errors(summary: Summary) -> list[CameraError]:
+    """By distance, in the places with the most distances and with the agents that all have."""
+    unbroken = {_place(t.key): t for t in summary.usual_tables if t.key.variant == UNBROKEN}
+    places: dict[tuple[str, ...], dict[float, Table]] = defaultdict(dict)
     for table in summary.usual_tables:
-        distance, other = _distance(table.key), unbroken.get(_place(table.key))
-        if not distance or not other:
-            continue
-        for agent in summary.agents:
-            before, after = _by_policy(other, agent), _by_policy(table, agent)
-            both = sorted(before.keys() & after.keys())
-            if len(both) >= MIN_SEEDS:
-                slopes[agent].append(
-                    [Sample.constant((after[p] - before[p]) / distance, p) for p in both]
+        if (distance := _distance(table.key)) and _place(table.key) in unbroken:
+            places[_place(table.key)][distance] = table
+    most = max(map(len, places.values()), default=0)
+    used = {place: tables for place, tables in places.items() if len(tables) == most}
+    shared = set.intersection(*map(set, used.values())) if used else set()
+    agents = [
+        agent
+        for agent, role in summary.roles.items()
+        if (agent == BASE or role == "learner")
+        and all(
+            len(_changes(unbroken[place], tables[distance], agent)) >= MIN_SEEDS
+            for place, tables in used.items()
+            for distance in shared
+        )
+    ]
+    return [
+        CameraError(
+            distance,
+            len(used),
+            {
+                agent: stratified_bootstrap(
+                    [_changes(unbroken[place], used[place][distance], agent) for place in used]
                 )
-    # The cells that most agents have, so that all are measured in the same worlds.
-    most = max(map(len, slopes.values()), default=0)
-    return {
-        agent: stratified_bootstrap(cells) for agent, cells in slopes.items() if len(cells) == most
-    }
+                for agent in agents
+            },
+        )
+        for distance in sorted(shared if STANDARD in agents else ())
+    ]
 
 
-def _by_policy(table: Table, agent: str) -> dict[str, float]:
-    """Final success on each base policy."""
-    row = table.row_of(agent)
-    return {run.policy: run.success for run in row.finished} if row else {}
+def _changes(before: Table, after: Table, agent: str) -> list[Sample]:
+    """Of final success, on each base policy that an agent has in both cells."""
+    rows = before.row_of(agent), after.row_of(agent)
+    first, second = (row.by_policy("success") if row else {} for row in rows)
+    return [Sample.constant(second[p] - first[p], p) for p in sorted(first.keys() & second.keys())]
 
 
-def _place(key: Key) -> tuple[object, ...]:
-    return key.place, key.env_steps, key.demonstrations
+def _place(key: Key) -> tuple[str, ...]:
+    return *key.place, key.settings
 
 
 def _distance(key: Key) -> float:
-    """By how many centimetres objects are seen too far to a side; 0 where nothing else holds."""
+    """By how many centimetres objects are seen displaced; 0 where anything else is broken, too."""
     parts = parts_of(key.variant) or ()
     if [part.name for part in parts] != [BIAS] or not isinstance(parts[0].strength, float):
         return 0.0
@@ -134,24 +159,28 @@ def _distance(key: Key) -> float:
 
 
 def render(found: InWorlds, view: View) -> list[str]:
-    """A row for each kind of world, a column for each agent."""
+    """A row for each kind of world, a column for each agent; the same for camera errors."""
     if not found.worlds:
         return []
-    agents = [a for a in view.summary.agents if any(a in w.success for w in found.worlds)]
+
+    def columns(agents: Container[str]) -> list[str]:
+        return [agent for agent in view.summary.agents if agent in agents]
+
+    shown = columns({agent for world in found.worlds for agent in world.success})
     rows = [
-        {"World": world.kind, "Steps": count(world.steps)}
-        | {code(agent): _shown(world, agent) for agent in agents}
+        {"World": world.kind, "Steps": count(world.tables[0].key.env_steps)}
+        | {code(agent): _shown(world, agent) for agent in shown}
         | {"Cells": str(len(world.tables))}
         for world in found.worlds
     ]
-    costs = [
-        f"{code(agent)} {interval(cost, sign=True)}" for agent, cost in found.centimetre.items()
+    errors = [
+        {"Camera error": f"{error.centimetres:g} cm".replace(" ", SPACE)}
+        | {code(agent): interval(error.change[agent], sign=True) for agent in columns(error.change)}
+        | {"Cells": str(error.cells)}
+        for error in found.errors
     ]
-    said = (
-        "**A centimetre of camera error** (objects are seen too far to a side) changes final "
-        f"success by: {'; '.join(costs)}."
-    )
-    return [EXPLAINED.strip(), table_text(rows, sparse=True), *([said] if costs else [])]
+    told = [CAMERA, table_text(errors)] if errors else []
+    return [EXPLAINED, table_text(rows, sparse=True), *told]
 
 
 def _shown(world: World, agent: str) -> str:

@@ -14,8 +14,8 @@ from symsteer.leaderboard.plots import Axis, Dot, Figure
 from symsteer.leaderboard.regret import (
     Cell,
     Values,
+    intervals,
     of_an_agent_without_regret,
-    over_cells,
     regrets,
 )
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
@@ -25,15 +25,16 @@ from symsteer.leaderboard.study import Safe
 from symsteer.leaderboard.text import code, folded, interval, number, table_text
 
 EXPLAINED = """\
-What a learner loses against the best learner of the world, on average and in its worst world: the
-price of taking it without knowing the world. In brackets: 95 % intervals."""
+What a learner loses against the best learner of the same cell (a task in one world), on average and
+in its worst cell: the price of taking it without knowing the world. In brackets: 95 % intervals."""
 
 HOW = f"""\
-The best learner of a world (a cell) is chosen on one half of the base policies and measured on the
-other half, so that luck does not count. Such a regret may be negative. The worlds are those in
-which all these learners have {MIN_SEEDS} base policies. The last row is an agent that loses
-nothing, simulated with the scatter of these cells: its worst world is bad luck alone. Intervals:
-[jackknife](https://doi.org/10.1214/aos/1176345462) over base policies."""
+The best learner of a cell, and the worst cell of a learner, are chosen on one half of the base
+policies and measured on the other half, so that luck does not count. Such a regret may be negative.
+The cells are those in which all these learners have {MIN_SEEDS} base policies. The last row is an
+agent that loses nothing, simulated with the scatter of these cells. The cell that is named is the
+one with the largest regret. Intervals: [jackknife](https://doi.org/10.1214/aos/1176345462) over
+base policies."""
 
 MEASURES = ("success", "area")
 
@@ -61,7 +62,7 @@ class Regret:
 
 def compute(summary: Summary) -> Regret | None:
     """None if no two learners share a cell."""
-    learners = {id(table): _learners(table) for table in summary.usual_tables}
+    learners = {id(table): table.decisive for table in summary.usual_tables}
     counts = Counter(names for names in learners.values() if len(names) > 1)
     if not counts:
         return None
@@ -80,43 +81,32 @@ def compute(summary: Summary) -> Regret | None:
         return None
     each_cell, mean, worst, nothing = {}, {}, {}, {}
     for measure, of_cells in values.items():
-        each_cell[measure] = np.array([regrets(cell.values) for cell in of_cells]).T
-        mean[measure] = over_cells(of_cells, lambda found: found.mean(1))
-        worst[measure] = over_cells(of_cells, lambda found: found.max(1))
-        draws = of_an_agent_without_regret([cell.values for cell in of_cells])
-        nothing[measure] = float(draws.mean()), float(draws.max(1).mean())
+        each_cell[measure] = regrets(of_cells).cells
+        mean[measure], worst[measure] = intervals(of_cells)
+        of_nothing = of_an_agent_without_regret(of_cells)
+        nothing[measure] = float(of_nothing[0].mean()), float(of_nothing[1].mean())
     return Regret(names, cells, each_cell["success"], each_cell["area"], mean, worst, nothing)
 
 
-def _learners(table: Table) -> frozenset[str]:
-    """The learners of a cell with enough base policies."""
-    rows = [table.row_of(row.agent) for row in table.learners if row.role == "learner"]
-    policies = {row.agent: {run.policy for run in row.finished} for row in rows if row}
-    return frozenset(agent for agent, hashes in policies.items() if len(hashes) >= MIN_SEEDS)
-
-
 def _values(table: Table, learners: list[str], measure: str) -> Cell:
-    by_policy: dict[str, dict[str, list[float]]] = {agent: {} for agent in learners}
-    for agent, of_policy in by_policy.items():
-        row = table.row_of(agent)
-        for run in row.finished if row else ():
-            of_policy.setdefault(run.policy, []).append(getattr(run, measure))
-    shared = sorted(set.intersection(*map(set, by_policy.values())))
-    values = [[float(np.mean(by_policy[a][policy])) for policy in shared] for a in learners]
+    rows = [row for agent in learners if (row := table.row_of(agent))]
+    by_policy = [row.by_policy(measure) for row in rows]
+    shared = sorted(set.intersection(*map(set, by_policy)))
+    values = [[values[policy] for policy in shared] for values in by_policy]
     return Cell(np.array(values), shared, table.key.place)
 
 
 def render(regret: Regret | None, view: View) -> list[str]:
-    """The verdict on a declared agent, the picture, and the table, the smallest worst regret of
-    success first."""
+    """The verdict on a declared agent, the table (the smallest worst regret of success first), the
+    picture."""
     if regret is None:
         return []
-    order = regret.success.max(1).argsort(kind="stable")
+    order = np.argsort([each.value for each in regret.worst["success"]], kind="stable")
     rows = [
         {"Learner": code(regret.learners[i])}
         | _columns({m: (regret.mean[m][i], regret.worst[m][i]) for m in MEASURES})
         | {
-            "Worst world by success": cell_name(
+            "Worst cell by success": cell_name(
                 regret.cells[regret.success[i].argmax()], view.summary
             )
         }
@@ -125,7 +115,7 @@ def render(regret: Regret | None, view: View) -> list[str]:
     last = {"Learner": "*without regret*"} | _columns(regret.nothing)
     safe = view.findings.study.safe
     return [
-        f"{EXPLAINED} Worlds: {len(regret.cells)}.",
+        f"{EXPLAINED} Cells: {len(regret.cells)}.",
         *([verdict(regret, safe)] if safe else []),
         table_text([*rows, last], sparse=True),
         *view.drawn(kind="regret"),
@@ -144,7 +134,8 @@ def verdict(regret: Regret, safe: Safe) -> str:
         return f"{declared} **Not tested**: it is not in all of these cells."
     holds, texts = [], []
     for measure, most in (("success", safe.success), ("area", safe.area)):
-        worst = dict(zip(regret.learners, getattr(regret, measure).max(1), strict=True))
+        values = [each.value for each in regret.worst[measure]]
+        worst = dict(zip(regret.learners, values, strict=True))
         above = worst.pop(safe.agent) - regret.nothing[measure][1]
         best = min(worst, key=lambda agent: worst[agent])
         least = worst[best] - regret.nothing[measure][1]

@@ -158,3 +158,6 @@ def test_the_whole_measurement(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(barriers, "train", None)
     assert barriers.main([str(tmp_path), *words]) == 0
     assert capsys.readouterr().out == first
+    # With one more of them all have other normalisers, and must be trained again.
+    with pytest.raises(TypeError):
+        barriers.main([str(tmp_path), *words, "--count", "3"])

@@ -25,7 +25,7 @@ import itertools
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ import torch
 
 from symsteer.bench.demos import Demonstrations, load
 from symsteer.bench.runs.base_policy import demonstration_file
-from symsteer.bench.runs.config import DemonstrationConfig, RunConfig
+from symsteer.bench.runs.config import DemonstrationConfig, RunConfig, content_key
 from symsteer.bench.steering.evaluation import held_out_episodes
 from symsteer.bench.steering.latent_env import LatentNoiseEnv
 from symsteer.bench.tasks import make
@@ -139,7 +139,11 @@ class Study:
     """
 
     def __init__(self, folder: Path, config: RunConfig, count: int, steps: int):
-        self.folder, self.steps, self.first = folder, steps, config.demonstrations.seed
+        self.steps, self.first = steps, config.demonstrations.seed
+        # All that decides what is trained, but for what `policy` is given.
+        demonstrated = asdict(config.demonstrations)
+        key = content_key(config.task, config.embodiment, demonstrated, count, steps)
+        self.policies = folder / "policies" / key
         files = []
         for seed in range(self.first, self.first + count + 1):
             wanted = replace(config.demonstrations, seed=seed)
@@ -149,11 +153,7 @@ class Study:
 
     def policy(self, name: str, number: int, start: int, batches: int) -> DiffusionPolicy:
         """A policy on the demonstrations of this number; trained once."""
-        path = (
-            self.folder
-            / "policies"
-            / f"{name}-{self.steps}-{self.first + number}-{start}-{batches}"
-        )
+        path = self.policies / f"{name}-{self.first + number}-{start}-{batches}"
         if not policy_path(path).is_file():
             demos = self.demos[number]
             save_policy(train(name, self.steps, demos, self.demos, start, batches), path)

@@ -116,14 +116,15 @@ class Geometry:
         """That of a policy.
 
         Raises:
-            UserError: if its network is another one than the lifted MLP without points.
+            UserError: if its network is another one than the lifted MLP without points or pictures.
         """
         denoiser = policy.denoiser
         # A subclass may have other layers.
-        if type(denoiser) is not LiftedDenoiser or not denoiser.flat or denoiser.cloud:
+        other = type(denoiser) is not LiftedDenoiser or not denoiser.flat
+        if other or denoiser.cloud or policy.task_layout.picture:
             raise UserError(
                 f"the parameter symmetries of this network of {policy.name} are not known; use "
-                "edp, plain or plain-augmented with network=mlp and a task without points"
+                "edp, plain or plain-augmented with network=mlp and a task that is seen as poses"
             )
         chunk = policy.chunk_layout.repeat(policy.horizon)
         return cls(denoiser.group, policy.obs_layout, chunk, policy.options.depth)

@@ -176,7 +176,7 @@ def read(folder: Path, episodes: int) -> list[Steered]:
     """The policies of a folder with their actors, in the order of the seeds.
 
     Raises:
-        UserError: if there are fewer than two, they are of several tasks or have other agents, an
+        UserError: if their number is odd, they are of several tasks or have other agents, an
             agent's action is not noise, or a run evaluated fewer episodes.
     """
     found: dict[int, Steered] = {}
@@ -206,8 +206,8 @@ def read(folder: Path, episodes: int) -> list[Steered]:
             f"{folder} has no runs, or they differ in more than their seed; name a folder in which "
             "every base policy has the same agents, task, embodiment and variant"
         )
-    if len(found) < 2:
-        raise UserError(f"{folder} has one base policy, and a pair needs two")
+    if len(found) % 2:
+        raise UserError(f"{folder} has {len(found)} base policies; pairs need an even number")
     return [found[seed] for seed in sorted(found)]
 
 
@@ -233,7 +233,7 @@ def main(arguments: Sequence[str]) -> int:
             variant=world["variant"],
         )
         with contextlib.closing(env):
-            for first, second in zip(steered[::2], steered[1::2], strict=False):
+            for first, second in zip(steered[::2], steered[1::2], strict=True):
                 rows += measure(first, second, env, given.episodes)
                 rows += measure(second, first, env, given.episodes)
     except UserError as error:

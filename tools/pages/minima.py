@@ -69,7 +69,6 @@ def _of_ways(
 def transfers(rows: Sequence[Row]) -> str:
     """Success on another policy beside what else is known of it: mean [lowest, highest]."""
     shown = {
-        "at home": "home",
         "no actor": "alone",
         "its own actor": "own_actor",
         "the other's actor": "moved",

@@ -188,7 +188,7 @@ def test_a_study_can_say_what_a_reader_must_know(tmp_path: Path) -> None:
     text = page_of(make_cell({"base": 0.3, "standard": 0.5, "equivariant": 0.7}), str(study))
     # There is no git here that could say that the commit is another one.
     assert "> **Mind this.**\n\n<details>" in text
-    assert text.index("*Limits*: one.\n\n</details>") < text.index("## Which agent, in which world")
+    assert text.index("*Limits*: one.\n\n</details>") < text.index("## Verdicts")
     assert re.search(r"declared in `other.toml` \(sha256 `[0-9a-f]{12}`, commit `abcdef0`\)", text)
 
 

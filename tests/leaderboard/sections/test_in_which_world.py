@@ -14,10 +14,10 @@ def view(*cells):
     return view_of(records)
 
 
-def rows(seen):
-    """The cells of the table, without its header."""
-    _, table, *_ = in_which_world.render(seen.findings.of(in_which_world.SECTION), seen)
-    lines = table.replace("\u00a0", " ").splitlines()[2:]
+def rows(seen, table=1):
+    """The cells of a table, without its header: that of worlds, or (3) that of camera errors."""
+    blocks = in_which_world.render(seen.findings.of(in_which_world.SECTION), seen)
+    lines = blocks[table].replace("\u00a0", " ").splitlines()[2:]
     return [line.strip("| ").split(" | ") for line in lines]
 
 
@@ -26,6 +26,22 @@ def test_the_best_learner_and_those_as_good_are_bold():
     assert rows(view((rates, {}))) == [
         ["unbroken", "50 k", "0.95", "0.50", "**0.90**", "**0.90**", "1"]
     ]
+
+
+def test_of_two_that_are_equally_good_both_are_what_others_are_compared_with():
+    """`slow` is clearly below `augmented`, with whose episodes its own agree, and not clearly below
+    `equivariant`."""
+    seen = view(({"standard": 0.1, "augmented": 0.5, "equivariant": 0.5, "slow": 0.4}, {}))
+    for row in seen.summary.tables[0].rows:
+        if row.agent in ("augmented", "slow"):
+            for run in row.runs:
+                # Both solve the first episodes, so that their differences do not scatter.
+                solved = round(40 * (0.5 if row.agent == "augmented" else 0.4))
+                for point in run.record.evaluations:
+                    point.episodes.success_once[:] = [1] * solved + [0] * (40 - solved)
+    world = in_which_world.world_of("unbroken", seen.summary.tables, seen.summary.agents)
+    assert world.success["augmented"] == world.success["equivariant"]
+    assert world.best == ["augmented", "equivariant"]
 
 
 def test_worlds_are_said_in_words_and_strengths_are_pooled():
@@ -49,16 +65,42 @@ def test_one_learner_alone_is_not_compared():
     assert in_which_world.render(seen.findings.of(in_which_world.SECTION), seen) == []
 
 
-def test_what_a_centimetre_costs():
-    """From .8 to .6 over the 2 cm of full strength, from .8 to .7 over 1 cm."""
-    worlds = {"none": 0.8, "perception_bias:1": 0.6, "perception_bias:0.5": 0.7}
+def test_five_runs_on_one_base_policy_are_not_enough():
+    records = make_cell({"standard": 0.5, "equivariant": 0.9})
+    seen = view_of(records)
+    assert len({record.base_policy.content_hash for record in records}) == 1
+    assert in_which_world.render(seen.findings.of(in_which_world.SECTION), seen) == []
+
+
+def test_controls_are_never_the_best():
+    records = make_cell({"standard": 0.2, "equivariant": 0.6, "wrong-group": 0.9})
+    for record in records:
+        record.base_policy.content_hash = f"{record.settings.seed:064d}"
+        if record.settings.agent == "wrong-group":
+            record.role = "control"
+    assert rows(view_of(records)) == [["unbroken", "50 k", "0.20", "**0.60**", "1"]]
+
+
+def test_what_a_camera_error_costs():
+    """From .8 to .6 over 2 cm, from .8 to .75 over 1 cm; not in proportion."""
+    worlds = {"none": 0.8, "perception_bias:1": 0.6, "perception_bias:0.5": 0.75}
     seen = view(
         *(({"standard": rate, "equivariant": 0.8}, {"variant": v}) for v, rate in worlds.items()),
         ({"standard": 0.1}, {"variant": "perception_bias:0.5+wind:1"}),
         ({"standard": 0.1}, {"variant": "perception_bias:0..1"}),
     )
-    found = seen.findings.of(in_which_world.SECTION).centimetre
-    assert {agent: cost.value for agent, cost in found.items()} == {
-        "standard": pytest.approx(-0.1),
-        "equivariant": pytest.approx(0.0),
-    }
+    near, far = seen.findings.of(in_which_world.SECTION).errors
+    assert (near.centimetres, far.centimetres) == (1, 2)
+    assert near.change["standard"].value == pytest.approx(-0.05)
+    assert far.change["standard"].value == pytest.approx(-0.2)
+    assert far.change["equivariant"].value == pytest.approx(0.0)
+    assert [row[0] for row in rows(seen, 3)] == ["1 cm", "2 cm"]
+
+
+def test_camera_errors_compare_agents_in_the_same_cells():
+    """`equivariant` was not run at 2 cm, so that it is left out at 1 cm, too."""
+    both = {"standard": 0.5, "equivariant": 0.5}
+    worlds = {"none": both, "perception_bias:0.5": both, "perception_bias:1": {"standard": 0.5}}
+    seen = view(*((rates, {"variant": variant}) for variant, rates in worlds.items()))
+    for error in seen.findings.of(in_which_world.SECTION).errors:
+        assert list(error.change) == ["standard"]

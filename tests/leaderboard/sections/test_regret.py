@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from symsteer.leaderboard.regret import Cell, of_an_agent_without_regret, over_cells, regrets
+from symsteer.leaderboard.regret import Cell, intervals, of_an_agent_without_regret, regrets
 from symsteer.leaderboard.sections import regret
 from symsteer.leaderboard.study import Safe
 from tests.leaderboard.record_factory import make_cell, view_of
@@ -14,72 +14,96 @@ GAPS = np.array([[0.0], [0.1], [0.3]])
 """By how much three agents are below the best one."""
 
 
-def cell(generator, gaps=GAPS, policies=12, scatter=0.1):
+def cell(generator, gaps=GAPS, policies=12, scatter=0.1, place=""):
     """Values with a part of the base policy and one of agent and base policy."""
     shared = 0.1 * generator.standard_normal((1, policies))
-    return 0.7 - gaps + shared + scatter * generator.standard_normal((len(gaps), policies))
+    values = 0.7 - gaps + shared + scatter * generator.standard_normal((len(gaps), policies))
+    return Cell(values, [f"{place}{policy}" for policy in range(policies)], place)
 
 
 def test_without_scatter_regrets_are_the_gaps():
-    np.testing.assert_allclose(regrets(cell(np.random.default_rng(0), scatter=0.0)), GAPS[:, 0])
+    found = regrets(
+        [cell(np.random.default_rng(0), gaps, scatter=0.0) for gaps in (GAPS, 2 * GAPS)]
+    )
+    np.testing.assert_allclose(found.cells, np.hstack([GAPS, 2 * GAPS]), atol=1e-12)
+    np.testing.assert_allclose(found.mean, 1.5 * GAPS[:, 0], atol=1e-12)
+    np.testing.assert_allclose(found.worst, 2 * GAPS[:, 0], atol=1e-12)
 
 
 def test_equal_agents_have_no_regret_on_average():
-    """The naive regret, below the largest mean, would be about half of the scatter of a mean."""
+    """The naive regret, below the largest mean, would be about half of the scatter of a mean, and
+    the largest of eight cells far more."""
+    generator, found = np.random.default_rng(0), []
+    for _ in range(60):
+        found.append(regrets([cell(generator, np.zeros((3, 1))) for _ in range(8)], splits=20))
+    naive = np.mean([each.cells.max(1) for each in found])
+    assert naive > 0.04
+    assert abs(np.mean([each.mean for each in found])) < 0.005
+    assert abs(np.mean([each.worst for each in found])) < 0.01
+
+
+def test_the_worst_cell_is_found():
+    """One cell of eight, with a loss of .3 behind a scatter of .1."""
     generator = np.random.default_rng(0)
-    cells = [cell(generator, np.zeros((3, 1))) for _ in range(300)]
-    naive = np.mean([each.mean(1).max() - each.mean(1) for each in cells])
-    assert naive > 0.02
-    assert abs(np.mean([regrets(each, splits=20) for each in cells])) < 0.005
+    gaps = np.array([[0.0], [0.3]])
+    cells = [cell(generator, gaps if index == 5 else 0 * gaps) for index in range(8)]
+    assert regrets(cells).worst[1] == pytest.approx(0.3, abs=0.08)
 
 
-def test_the_worst_cell_of_an_agent_without_regret_is_known():
-    """Simulated from the cells, it is that of an agent which is truly one of the best."""
+def test_an_agent_without_regret_is_like_one_that_is_truly_among_the_best():
     generator = np.random.default_rng(0)
     gaps = np.vstack([GAPS, [[0.0]]])
     repetitions = [[cell(generator, gaps) for _ in range(8)] for _ in range(60)]
-    true = np.mean([max(regrets(c, 10)[3] for c in cells) for cells in repetitions])
-    simulated = np.mean(
+    true = np.array([(r.mean[3], r.worst[3]) for r in (regrets(c, 10) for c in repetitions)])
+    simulated = np.array(
         [
-            of_an_agent_without_regret([c[:3] for c in cells], 20, 10).max(1).mean()
+            of_an_agent_without_regret([Cell(c.values[:3], c.policies) for c in cells], 20, 10)
             for cells in repetitions[:10]
         ]
     )
-    assert simulated == pytest.approx(true, abs=0.01)
-    assert true > 0.01
+    np.testing.assert_allclose(simulated.mean((0, 2)), true.mean(0), atol=0.01)
 
 
 def test_its_scatter_is_not_too_small_with_few_policies():
     """Residuals from a mean of four policies are too small by a seventh."""
     generator, gaps = np.random.default_rng(0), 3 * GAPS
     cells = [cell(generator, np.vstack([gaps, [[0.0]]]), 4) for _ in range(1500)]
-    true = np.std([regrets(each, 10)[3] for each in cells])
-    simulated = np.std(of_an_agent_without_regret([c[:3] for c in cells[:150]], 20, 10))
+    true = np.std([regrets([each], 10).mean[3] for each in cells])
+    without = [Cell(each.values[:3], each.policies) for each in cells[:150]]
+    simulated = np.std([of_an_agent_without_regret([each], 20, 10)[0] for each in without])
     assert 0.85 < simulated / true < 1.1
 
 
 def test_intervals_hold_what_other_policies_show():
-    """Eight cells of two places whose cells share base policies: at least 93 % of the intervals of
-    the mean have the expected value in them, and they are at most three times too wide."""
-    generator, names = np.random.default_rng(0), [str(i) for i in range(8)]
-    found = []
+    """At least 93 % of those of the mean and of the worst cell have the expected value in them.
+
+    Policies differ in how they suit an agent, in all cells of their place alike.
+    """
+    generator, found = np.random.default_rng(0), []
     for _ in range(60):
-        own = 0.1 * generator.standard_normal((2, 3, 8))
-        cells = [
-            Cell(cell(generator, policies=8, scatter=0.05) + own[place], names, place)
-            for place in (0, 1)
-            for _ in range(4)
-        ]
-        found.append(over_cells(cells, lambda each: each.mean(1), splits=10))
-    values = np.array([[each.value for each in row] for row in found])
-    inside = [
-        row[agent].low <= values[:, agent].mean() <= row[agent].high
-        for row in found
-        for agent in range(3)
-    ]
-    assert np.mean(inside) >= 0.93
-    widths = np.array([[each.high - each.low for each in row] for row in found])
-    assert np.all(widths.mean(0) < 3 * 4 * values.std(0))
+        cells = []
+        for place, policies, scatter in (("few", 5, 0.15), ("many", 9, 0.05)):
+            own = scatter * generator.standard_normal((3, policies))
+            drawn = [cell(generator, GAPS / 5, policies, scatter / 2, place) for _ in range(4)]
+            cells += [replace(each, values=each.values + own) for each in drawn]
+        found.append(intervals(cells, splits=10))
+    value, low, high = (
+        np.array([[[getattr(e, end) for e in each] for each in row] for row in found])
+        for end in ("value", "low", "high")
+    )
+    expected = value.mean(0)
+    assert ((low <= expected) & (expected <= high)).mean((0, 2)).min() >= 0.93
+    assert np.all((high - low).mean(0) < 3 * 4 * value.std(0))
+
+
+def test_degrees_of_freedom_are_those_of_the_places_with_the_variance():
+    """A place whose policies all agree adds none; five policies leave four, not twelve."""
+    generator = np.random.default_rng(0)
+    noisy = cell(generator, 10 * GAPS, 5, place="noisy")
+    sure = cell(generator, 10 * GAPS, 9, scatter=0.0, place="sure")
+    alone, both = (intervals(cells)[0][2] for cells in ([noisy], [noisy, sure]))
+    # A mean over two cells halves the width.
+    assert both.high - both.low == pytest.approx((alone.high - alone.low) / 2)
 
 
 def two_worlds():
@@ -102,7 +126,7 @@ def test_the_table_orders_learners_by_their_worst_cell():
     result = view.findings.of(regret.SECTION)
     np.testing.assert_allclose(result.success, [[0.0, 0.1], [0.4, 0.0]], atol=1e-9)
     explained, table, *_ = regret.render(result, view)
-    assert explained.endswith("Worlds: 2.")
+    assert explained.endswith("Cells: 2.")
     first, second, last = table.splitlines()[2:]
     assert first.replace("\u00a0", " ").startswith(
         "| `standard` | 0.05 [0.05, 0.05] | 0.10 [0.10, 0.10] |"
