@@ -12,19 +12,20 @@ points that are seen. A picture does not change when scene and hand turn togethe
 turns with them: exactly, by any angle, whatever the convolutions are.
 
 They matter when the hand alone rolls about the camera's axis, which turns the picture. Steerable
-ones commute with it (:class:`HandEncoder`), ordinary ones do in the mean over turned pictures
-(:class:`AveragedHandEncoder`): both exactly for quarter turns, else up to interpolation.
+ones commute with it (:class:`HandEncoder`), ordinary ones do in the mean over the quarter turns of
+the picture (:class:`AveragedHandEncoder`): both exactly for quarter turns, else roughly.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from typing import ClassVar
 
 import torch
 
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Field, Group, Picture, hand_rays, turn_pictures
+from symsteer.policies.geometry import Field, Group, Picture, hand_rays
 from symsteer.policies.networks.irreps import SpatialIrreps
 from symsteer.policies.networks.pictures import SHRINK, PictureEncoder
 
@@ -93,14 +94,17 @@ class HandEncoder(PictureEncoder):
         heights = torch.linalg.cross(level[:, 0], level[:, 1])
         return torch.cat([level, heights[:, None]], dim=1)
 
+    def weights(self, picture: torch.Tensor) -> torch.Tensor:
+        """Of the places of pictures ``[B, 1, side, side]``, 0 to 1, ``[B, keypoints, places]``."""
+        return self.logits(picture).sigmoid().mean(2)
+
     def in_world(self, picture: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
         """What pictures ``[B, 1, side, side]`` of hands turned by ``turn [B, 3, 3]`` tell."""
-        weights = self.logits(picture).sigmoid().mean(2)
         signals = _by_place(torch.cat([(picture > 0).to(picture), picture], dim=1))
         # [B, places, signals, harmonics], summed over the pixels of a place.
         harmonics = _harmonics(self.picture.side, picture.dtype, picture.device)
         sums = torch.einsum("bspi,pih->bpsh", signals, harmonics)
-        sums = torch.einsum("bkp,bpsh->bksh", weights, sums)
+        sums = torch.einsum("bkp,bpsh->bksh", self.weights(picture), sums)
         means = sums / (sums[:, :, :1, :1] + LEAST)
         means = means @ IRREPS.rotation(turn).mT[:, None]
         near = [means[:, :, 0, 1:4], means[:, :, 1, :4]]
@@ -113,22 +117,20 @@ class AveragedHandEncoder(HandEncoder):
 
     Args:
         picture: geometry of the picture.
-        group: whose turns the camera is taken to have made about its axis, C_n.
+        group: the picture is turned by those of its elements that are quarter turns, which keep
+            all pixels.
     """
 
     def __init__(self, picture: Picture, group: Group):
         super().__init__(picture, Group.parse("C1"))
-        self.frames = group
+        self.quarters = range(0, 4, 4 // math.gcd(4, group.order_of_rotations))
 
-    def in_world(self, picture: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
-        order = self.frames.order
-        angles = picture.new_tensor([angle for angle, _ in self.frames.elements])
-        pictures = picture.repeat(order, 1, 1, 1)
-        turned = turn_pictures(pictures, angles.repeat_interleave(len(picture)))
-        c, s, zero, one = angles.cos(), angles.sin(), 0 * angles, 0 * angles + 1
-        rolls = torch.stack([c, -s, zero, s, c, zero, zero, zero, one], -1).view(-1, 1, 3, 3)
-        told = super().in_world(turned, (turn @ rolls).flatten(0, 1))
-        return told.unflatten(0, (order, -1)).mean(0)
+    def weights(self, picture: torch.Tensor) -> torch.Tensor:
+        turned = torch.cat([torch.rot90(picture, q, (-2, -1)) for q in self.quarters])
+        side = self.picture.side // SHRINK
+        weights = super().weights(turned).unflatten(-1, (side, side)).chunk(len(self.quarters))
+        back = [torch.rot90(w, -q, (-2, -1)) for q, w in zip(self.quarters, weights, strict=True)]
+        return torch.stack(back).mean(0).flatten(2)
 
 
 def _by_place(pixels: torch.Tensor) -> torch.Tensor:
