@@ -11,6 +11,7 @@ TASKS = {
     **dict.fromkeys(("LiftPegUpright-v1", "TiltedPushCube-v1", "TiltedPickCube-v1"), 50),
     **dict.fromkeys(("SeenPushCube-v1", "SeenPickCube-v1"), 50),
     **dict.fromkeys(("HeightPushCube-v1", "HeightPickCube-v1"), 50),
+    **dict.fromkeys(("HandPushCube-v1", "HandPickCube-v1"), 50),
     **{"StackCube-v1": 60, "PokeCube-v1": 60, "ClutterPick-v1": 80, "PushT-v1": 100},
 }
 """The time limit of each task, in control steps."""

@@ -97,14 +97,24 @@ PICTURE = "picture_"
 """Fields with this prefix are the channels of a picture from above, one scalar for each pixel."""
 
 PIXEL = 0.01
-"""Side of a pixel, metres."""
+"""Side of a pixel of a picture from above, metres."""
+
+HAND = "hand_"
+"""Fields with this prefix are the channels of a picture from the hand, likewise."""
+
+FIELD_OF_VIEW = 2.2
+"""Of a camera in the hand from one side of its picture to the other, radians."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Where a picture from above lies in a vector.
+    """Where a picture lies in a vector.
 
-    Its centre is the origin. Rows go from +y to -y, columns from -x to +x.
+    From above: its centre is the origin, rows go from +y to -y, columns from -x to +x.
+
+    From the hand: a perspective picture of what lies ahead of the tool (its z axis), where rows go
+    from the tool's +x to -x, columns from -y to +y. It does not change when scene and hand turn
+    together.
 
     Attributes:
         channels: their names.
@@ -112,6 +122,7 @@ class Picture:
         columns: ``[channels * side * side]`` int64.
         rest: geometry of the other fields.
         rest_columns: ``[rest.dim]`` int64.
+        in_hand: whether it is a picture from the hand.
     """
 
     channels: tuple[str, ...]
@@ -119,6 +130,7 @@ class Picture:
     columns: torch.Tensor
     rest: Layout
     rest_columns: torch.Tensor
+    in_hand: bool = False
 
     def of(self, x: torch.Tensor) -> torch.Tensor:
         """The pictures ``[..., channels, side, side]`` in vectors ``[..., dim]``."""
@@ -131,6 +143,35 @@ class Picture:
         changed[..., self.rest_columns.to(x.device)] = rest
         changed[..., self.columns.to(x.device)] = pictures.flatten(-3)
         return changed
+
+    def transform(self, pixels: torch.Tensor, angle: float, reflect: bool) -> torch.Tensor:
+        """Pictures ``[..., channels, side, side]`` of the scene that (angle, reflect) acts on."""
+        if self.in_hand:
+            # The hand is its own mirror image across its x-z plane.
+            return pixels.flip(-1) if reflect else pixels
+        pixels = pixels.flip(-2) if reflect else pixels
+        quarters = round(angle / (math.pi / 2))
+        pixels = torch.rot90(pixels, quarters, (-2, -1))
+        left = angle - quarters * (math.pi / 2)
+        if abs(left) <= 1e-9:
+            return pixels
+        flat = pixels.reshape(-1, *pixels.shape[-3:])
+        return turn_pictures(flat, flat.new_full((len(flat),), left)).view_as(pixels)
+
+    def rotate(self, pixels: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+        """Pictures ``[N, channels, side, side]`` of scenes turned by ``angle [N]``, radians."""
+        return pixels if self.in_hand else turn_pictures(pixels, angle)
+
+
+def hand_rays(side: int) -> torch.Tensor:
+    """Unit vectors from a camera in the hand through ``side * side`` pixels, ``[side^2, 3]``.
+
+    In the tool's axes, float64; row by row.
+    """
+    line = (torch.arange(side, dtype=torch.float64) + 0.5) * (2 / side) - 1
+    line = math.tan(FIELD_OF_VIEW / 2) * line
+    x, y = torch.meshgrid(-line, line, indexing="ij")
+    return functional.normalize(torch.stack([x, y, torch.ones_like(x)], -1).flatten(0, 1), dim=-1)
 
 
 class Layout:
@@ -218,28 +259,31 @@ class Layout:
 
     @functools.cached_property
     def picture(self) -> Picture | None:
-        """The picture from above, if there is one: the fields ``picture_...``.
+        """The picture, if there is one: the fields ``picture_...``, or ``hand_...``.
 
         Raises:
-            UserError: if these fields are no scalars of the pixels of one square.
+            UserError: if these fields are no scalars of the pixels of one square, or of two.
         """
-        seen = [field for field in self.fields if field.name.startswith(PICTURE)]
+        seen = [field for field in self.fields if field.name.startswith((PICTURE, HAND))]
         if not seen:
             return None
+        prefix = HAND if seen[0].name.startswith(HAND) else PICTURE
         side = math.isqrt(seen[0].multiplicity)
         rest = [field for field in self.fields if field not in seen]
-        if not rest or any((f.frequency, f.odd, f.multiplicity) != (0, 0, side**2) for f in seen):
+        kinds = {(f.frequency, f.odd, f.multiplicity, f.name.startswith(prefix)) for f in seen}
+        if not rest or kinds != {(0, False, side**2, True)}:
             raise UserError(
-                "the fields picture_... of a layout need one scalar for each pixel of the same "
-                "square, and other fields beside them"
+                f"the fields {prefix}... of a layout need one scalar for each pixel of the same "
+                "square, other fields beside them, and no other picture"
             )
         index = torch.arange(self.dim)
         return Picture(
-            tuple(field.name.removeprefix(PICTURE) for field in seen),
+            tuple(field.name.removeprefix(prefix) for field in seen),
             side,
             torch.cat([index[self.slice(field.name)] for field in seen]),
             Layout(rest),
             torch.cat([index[self.slice(field.name)] for field in rest]),
+            prefix == HAND,
         )
 
     def split(self, at: int) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
@@ -315,30 +359,21 @@ class Layout:
     def transform(self, x: torch.Tensor, angle: float, reflect: bool = False) -> torch.Tensor:
         """Act with (angle, reflect) on the last axis of ``x [..., dim]``.
 
-        Pictures are interpolated, but for quarter turns.
+        Pictures from above are interpolated, but for quarter turns.
         """
         if picture := self.picture:
-            rest = x[..., picture.rest_columns.to(x.device)]
-            pixels = picture.of(x)
-            pixels = pixels.flip(-2) if reflect else pixels
-            quarters = round(angle / (math.pi / 2))
-            pixels = torch.rot90(pixels, quarters, (-2, -1))
-            left = angle - quarters * (math.pi / 2)
-            if abs(left) > 1e-9:
-                flat = pixels.reshape(-1, *pixels.shape[-3:])
-                turned = turn_pictures(flat, flat.new_full((len(flat),), left))
-                pixels = turned.view_as(pixels)
-            return picture.changed(x, picture.rest.transform(rest, angle, reflect), pixels)
+            rest = picture.rest.transform(x[..., picture.rest_columns.to(x.device)], angle, reflect)
+            return picture.changed(x, rest, picture.transform(picture.of(x), angle, reflect))
         return x @ self.matrix(angle, reflect, x.dtype).to(x.device).T
 
     def rotate(self, x: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
         """Rotate every row of ``x [N, ..., dim]`` by its own ``angle [N]`` (radians).
 
-        Pictures, of ``x [N, dim]`` alone, are interpolated.
+        Pictures, of ``x [N, dim]`` alone, are interpolated if they are from above.
         """
         if picture := self.picture:
             rest = picture.rest.rotate(x[:, picture.rest_columns.to(x.device)], angle)
-            return picture.changed(x, rest, turn_pictures(picture.of(x), angle))
+            return picture.changed(x, rest, picture.rotate(picture.of(x), angle))
         frequency, partner, sign = _quarter_turn(self, x.dtype, x.device)
         turn = angle.to(x).view(-1, *(1,) * (x.dim() - 1)) * frequency
         # x cos(k a) + J x sin(k a), where J rotates each vector by 90 degrees.

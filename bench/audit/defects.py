@@ -50,7 +50,7 @@ LEAST_DISPLACEMENT = 5e-4
 LEAST_SPREAD = 1e-3
 """A field whose spread over the resets is smaller does not enter their distance."""
 
-LENGTHS = ("_xy", "_z", "_width", "_height", "_place")
+LENGTHS = ("_xy", "_z", "_width", "_height", "_place", "_distance")
 """Ends of the names of observed lengths."""
 
 

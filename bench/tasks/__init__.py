@@ -55,6 +55,8 @@ TASKS: Registry[type[SymmetricTask]] = Registry(
         "TiltedPickCube-v1": "symsteer.bench.tasks.tilted:TiltedPickCube",
         "HeightPushCube-v1": "symsteer.bench.tasks.heights:HeightPushCube",
         "HeightPickCube-v1": "symsteer.bench.tasks.heights:HeightPickCube",
+        "HandPushCube-v1": "symsteer.bench.tasks.in_hand:HandPushCube",
+        "HandPickCube-v1": "symsteer.bench.tasks.in_hand:HandPickCube",
         "SeenPushCube-v1": "symsteer.bench.tasks.clouds:SeenPushCube",
         "SeenPickCube-v1": "symsteer.bench.tasks.clouds:SeenPickCube",
     },

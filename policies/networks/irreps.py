@@ -152,6 +152,19 @@ class SpatialIrreps(Irreps):
         flat[4] = torch.diag(flat.new_tensor([-1, -1, 2])) / math.sqrt(6)
         return one, cross, flat
 
+    def harmonics(self, n: torch.Tensor) -> torch.Tensor:
+        """Spherical harmonics of unit vectors ``[..., 3]``, ``[..., 9]``: 1, n, and n n^T."""
+        second = torch.einsum("iab,...a,...b->...i", self.matrices[2].to(n), n, n)
+        return torch.cat([torch.ones_like(n[..., :1]), n, second], dim=-1)
+
+    def rotation(self, turn: torch.Tensor) -> torch.Tensor:
+        """Wigner's matrices of rotations ``[B, 3, 3]`` in one, ``[B, 9, 9]``."""
+        flat = self.matrices[2].to(turn)
+        whole = turn.new_zeros(len(turn), self.dim, self.dim)
+        whole[:, 0, 0], whole[:, 1:4, 1:4] = 1, turn
+        whole[:, 4:, 4:] = torch.einsum("iab,Bac,jcd,Bbd->Bij", flat, turn, flat, turn)
+        return whole
+
     def _couple(self, left: int, right: int, out: int) -> list[torch.Tensor]:
         if not abs(left - right) <= out <= left + right:
             return []

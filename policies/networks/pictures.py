@@ -18,7 +18,7 @@ from __future__ import annotations
 import copy
 import math
 from collections import Counter
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import nn
@@ -38,10 +38,6 @@ SHRINK = 4
 REACH = 0.1
 """Metres that have unit size for the networks. Most of a keypoint's weights lie elsewhere, so that
 it moves less than what it follows."""
-
-SIZES = {True: (4, 4), False: (6, 24)}
-"""Channels and keypoints for each element of a group, and those of the trivial group: as many
-parameters, about as many numbers (tests/policies/test_pictures.py)."""
 
 
 class PictureConvolution(nn.Module):
@@ -135,6 +131,9 @@ class PictureEncoder(nn.Module):
         UserError: if quarter turns do not keep the pixels that the last convolution has.
     """
 
+    counts: ClassVar[dict[bool, tuple[int, int]]] = {True: (4, 4), False: (6, 24)}
+    """Channels and keypoints for each element of a group, and those of the trivial group: as many
+    parameters, about as many numbers (tests/policies/test_pictures.py)."""
     scale: torch.Tensor
 
     def __init__(self, picture: Picture, group: Group):
@@ -145,7 +144,7 @@ class PictureEncoder(nn.Module):
                 f"a picture of {picture.side} x {picture.side} pixels has no quarter turns after "
                 f"{SHRINK} of them became one; choose a multiple of {SHRINK}"
             )
-        channels, self.keypoints = SIZES[group.order > 1]
+        channels, self.keypoints = self.counts[group.order > 1]
         colors = len(picture.channels)
         self.layers = nn.ModuleList(
             PictureConvolution(group, channels if i else colors, channels, shape, not i)
@@ -156,14 +155,15 @@ class PictureEncoder(nn.Module):
         n = group.order
         turns = sorted((j if 2 * j <= n else j - n for j in range(n)), key=abs) if n > 1 else [1]
         self.turns = [1, *(j for j in turns if j != 1)]
-        self.told = Layout([*self._places(), *self._shapes()])
+        self.told = Layout(self.told_fields())
         # Numbers of the observation before the picture.
         self.start = int(picture.columns[0])
         before, after = picture.rest.split(self.start)
         self.layout = Layout([*before, *self.told.fields, *after])
 
-    def _places(self) -> list[Field]:
-        return [
+    def told_fields(self) -> list[Field]:
+        """Geometry of what the picture tells."""
+        fields = [
             field
             for k in range(self.keypoints)
             for field in (
@@ -171,10 +171,8 @@ class PictureEncoder(nn.Module):
                 *(Field(f"keypoint{k}_{name}", 0) for name in self.picture.channels),
             )
         ]
-
-    def _shapes(self) -> list[Field]:
         count = Counter(abs(j) for j in self.turns[1:])
-        return [
+        return fields + [
             Field(f"shape{j}", j, times * self.keypoints * (1 if j else 2))
             for j, times in count.items()
         ]
@@ -182,7 +180,7 @@ class PictureEncoder(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Observations with a picture as ``[B, layout.dim]``, environment units."""
         rest = obs[:, self.picture.rest_columns.to(obs.device)]
-        told = self.encode(self.picture.of(obs))
+        told = self.encode(obs)
         return torch.cat([rest[:, : self.start], told, rest[:, self.start :]], dim=1)
 
     def statistics(self, obs: torch.Tensor, rest: Normalizer) -> Normalizer:
@@ -195,14 +193,7 @@ class PictureEncoder(nn.Module):
             rest: normaliser of the other fields.
         """
         self.scale.copy_(self.picture.of(obs).abs().amax(dim=(0, 2, 3)).clamp_min(MINIMUM_RANGE))
-        sizes = torch.full((self.told.dim,), REACH / (self.picture.side * PIXEL / 2))
-        for field in self.told.fields:
-            _, _, part = field.name.partition("_")
-            if part in self.picture.channels:
-                size = float(self.scale[self.picture.channels.index(part)])
-                sizes[self.told.slice(field.name)] = size
-            elif part:
-                sizes[self.told.slice(field.name)] = REACH
+        sizes = self.sizes()
 
         def around(values: torch.Tensor, told: torch.Tensor) -> torch.Tensor:
             return torch.cat([values[: self.start], told.to(values), values[self.start :]])
@@ -214,29 +205,47 @@ class PictureEncoder(nn.Module):
             around(rest.deviation, sizes),
         )
 
-    def encode(self, picture: torch.Tensor) -> torch.Tensor:
-        """Encode ``[B, channels, side, side]``, environment units, as ``[B, told.dim]``."""
-        x = seen = _channels_last(picture / self.scale[:, None, None])
+    def sizes(self) -> torch.Tensor:
+        """What has unit size for the networks of what the picture tells, ``[told.dim]``."""
+        sizes = torch.full((self.told.dim,), REACH / (self.picture.side * PIXEL / 2))
+        for field in self.told.fields:
+            _, _, part = field.name.partition("_")
+            if part in self.picture.channels:
+                size = float(self.scale[self.picture.channels.index(part)])
+                sizes[self.told.slice(field.name)] = size
+            elif part:
+                sizes[self.told.slice(field.name)] = REACH
+        return sizes
+
+    def logits(self, picture: torch.Tensor) -> torch.Tensor:
+        """How much each place of ``picture [B, channels, side, side]`` is looked at.
+
+        Returns:
+            ``[B, keypoints, order, places]``.
+        """
+        x = _channels_last(picture / self.scale[:, None, None])
         for layer in self.layers:
             x = functional.relu(layer(x))
-        weights = self.weigh(x).flatten(2).softmax(-1)
-        places = _places(x.shape[-1], x)
+        return self.weigh(x).flatten(2).unflatten(1, (self.keypoints, -1))
+
+    def encode(self, obs: torch.Tensor) -> torch.Tensor:
+        """What the pictures of observations tell, ``[B, told.dim]``, environment units."""
+        picture = self.picture.of(obs)
+        weights = self.logits(picture).softmax(-1)
+        seen = functional.avg_pool2d(picture, SHRINK).flatten(2)
+        places = _places(self.picture.side // SHRINK, weights)
         n, half = self.group.order, self.picture.side * PIXEL / 2
-        # [B, keypoints, order, 2], each turned back by its element.
-        found = (weights @ places).unflatten(1, (-1, n))
-        z = torch.view_as_complex(found.contiguous())
-        angle = torch.arange(n, device=x.device, dtype=x.dtype) * (2 * math.pi / n)
-        values = (
-            weights.unflatten(1, (-1, n)).mean(2)
-            @ functional.avg_pool2d(seen, SHRINK).flatten(2).mT
-        )
+        # [B, keypoints, order], each turned back by its element.
+        z = torch.view_as_complex((weights @ places).contiguous())
+        angle = torch.arange(n, device=z.device, dtype=weights.dtype) * (2 * math.pi / n)
+        values = weights.mean(2) @ seen.mT
         parts = []
         for j in self.turns:
             unit = torch.polar(torch.ones_like(angle), angle * (j - 1)).to(z)
             mean = torch.view_as_real((z * unit).mean(-1))
             # The conjugate of a vector of frequency -j has frequency j.
             parts.append(mean * mean.new_tensor([1, -1 if j < 0 else 1]))
-        first = torch.cat([half * parts[0], values * self.scale], dim=-1)
+        first = torch.cat([half * parts[0], values], dim=-1)
         return torch.cat([first.flatten(1), *(part.flatten(1) for part in parts[1:])], dim=1)
 
     def expanded(self) -> Self:

@@ -12,13 +12,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import nn
 
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
+from symsteer.policies.networks.in_hand import AveragedHandEncoder
 from symsteer.policies.symmetry.lifted import EquivariantOptions, LiftedDenoiser
 from symsteer.policies.symmetry.unconstrained import TRIVIAL, matched_size
 from symsteer.policies.training.denoising import DiffusionPolicy
@@ -93,6 +94,12 @@ class FrameAveragedDiffusionPolicy(DiffusionPolicy):
     name = "frame-averaged"
     Options = AveragedOptions
     options: AveragedOptions
+    hand_encoder = AveragedHandEncoder
+
+    @classmethod
+    def hand_group(cls, options: Any) -> Group:
+        """That of the options."""
+        return Group.parse_rotations(options.group)
 
     def make_denoiser(self) -> AveragedDenoiser:
         """The average of :meth:`make_inner`."""

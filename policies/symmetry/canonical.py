@@ -21,6 +21,7 @@ import torch
 
 from symsteer.policies.contract import Episode
 from symsteer.policies.geometry import Group, Layout
+from symsteer.policies.networks.in_hand import AveragedHandEncoder
 from symsteer.policies.symmetry.unconstrained import PlainDiffusionPolicy, PlainOptions
 from symsteer.policies.training.frames import Frame, planar_vectors
 
@@ -49,18 +50,24 @@ class CanonicalDiffusionPolicy(PlainDiffusionPolicy):
     name = "canonical"
     Options = CanonicalOptions
     options: CanonicalOptions
+    hand_encoder = AveragedHandEncoder
 
     def __init__(self, options: CanonicalOptions, obs_layout: Layout, act_layout: Layout):
         if not options.anchor:
             options = dataclasses.replace(options, anchor=planar_vectors(obs_layout)[0].name)
         super().__init__(options, obs_layout, act_layout)
-        self.anchor = Frame(options.anchor, obs_layout, act_layout)
+        self.anchor = Frame(options.anchor, self.obs_layout, act_layout)
         self.group = Group.parse(options.symmetry)
 
     @classmethod
     def picture_group(cls, options: Any) -> Group:
-        """It has none: what a picture tells does not turn with an observed vector."""
+        """It has none: what a picture from above tells does not turn with an observed vector."""
         return super(PlainDiffusionPolicy, cls).picture_group(options)
+
+    @classmethod
+    def hand_group(cls, options: Any) -> Group:
+        """That of the agents."""
+        return Group.parse_rotations(options.symmetry)
 
     @classmethod
     def told_by_data(cls, options: Any, episodes: Sequence[Episode], obs_layout: Layout) -> Any:
@@ -74,12 +81,14 @@ class CanonicalDiffusionPolicy(PlainDiffusionPolicy):
         self, obs: torch.Tensor, chunks: torch.Tensor, generator: torch.Generator
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Turn each pair of observation and chunk into its frame."""
-        angle = self._angle(obs)
-        return self.obs_layout.rotate(obs, -angle), self.act_layout.rotate(chunks, -angle)
+        # An encoder of pictures comes later.
+        anchor = Frame(self.options.anchor, self.task_layout, self.act_layout)
+        angle = self._angle(obs, anchor)
+        return self.task_layout.rotate(obs, -angle), self.act_layout.rotate(chunks, -angle)
 
     def decode(self, obs: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Decode in the frame of the anchor; see :meth:`ChunkPolicy.decode`."""
-        angle = self._angle(obs)
+        angle = self._angle(obs, self.anchor)
         turned = self.obs_layout.rotate(obs, -angle), self.act_layout.rotate(noise, -angle)
         return self.act_layout.rotate(super().decode(*turned), angle)
 
@@ -87,8 +96,9 @@ class CanonicalDiffusionPolicy(PlainDiffusionPolicy):
         """Also the anchor."""
         return {**super().decode_settings(), "anchor": self.options.anchor}
 
-    def _angle(self, obs: torch.Tensor) -> torch.Tensor:
-        angle = self.anchor.angle(obs)
+    @staticmethod
+    def _angle(obs: torch.Tensor, anchor: Frame) -> torch.Tensor:
+        angle = anchor.angle(obs)
         assert angle is not None
         return angle
 

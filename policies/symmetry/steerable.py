@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
@@ -201,6 +202,11 @@ class PlanarSteerablePolicy(DiffusionPolicy):
     Options = PlanarOptions
     options: PlanarOptions
 
+    @classmethod
+    def hand_group(cls, options: Any) -> Group:
+        """That of the agents."""
+        return Group.parse_rotations(options.symmetry)
+
     def make_denoiser(self) -> IrrepDenoiser:
         """The network with planar irreps."""
         irreps = PlanarIrreps(self.options.max_frequency)
@@ -223,6 +229,11 @@ class SphericalPolicy(DiffusionPolicy):
     def bounded_layout(cls, layout: Layout) -> Layout:
         """Vectors in space have one norm."""
         return layout.spatial
+
+    @classmethod
+    def hand_group(cls, options: Any) -> Group:
+        """That of the agents."""
+        return Group.parse_rotations(options.symmetry)
 
     def make_denoiser(self) -> IrrepDenoiser:
         """The network with spatial irreps."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 import torch
 from pydantic import Field
@@ -23,6 +23,7 @@ from symsteer.errors import UserError
 from symsteer.names import check
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
+from symsteer.policies.networks.in_hand import HandEncoder
 from symsteer.policies.networks.pictures import PictureEncoder
 from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.training.diffusion import Diffusion, Prediction, Process
@@ -118,11 +119,10 @@ class DiffusionPolicy(GradientPolicy):
 
     Options = DenoisingOptions
     options: Any
+    hand_encoder: ClassVar[type[HandEncoder]] = HandEncoder
 
     def __init__(self, options: DenoisingOptions, obs_layout: Layout, act_layout: Layout):
-        eyes = None
-        if obs_layout.picture is not None:
-            eyes = PictureEncoder(obs_layout.picture, self.picture_group(options))
+        eyes = self.make_eyes(options, obs_layout)
         seen_layout = obs_layout if eyes is None else eyes.layout
         options = options.resolved(seen_layout, act_layout)
         super().__init__(options, seen_layout, act_layout)
@@ -159,18 +159,32 @@ class DiffusionPolicy(GradientPolicy):
     @classmethod
     def check(cls, options: Any, obs_layout: Layout) -> None:
         """Pictures need an encoder; see :meth:`ChunkPolicy.check`."""
-        if obs_layout.picture:
-            cls.picture_group(options)
+        cls.make_eyes(options, obs_layout)
+
+    @classmethod
+    def make_eyes(cls, options: Any, obs_layout: Layout) -> PictureEncoder | None:
+        """The encoder of the picture, untrained, if there is a picture."""
+        picture = obs_layout.picture
+        if picture is None:
+            return None
+        if picture.in_hand:
+            return cls.hand_encoder(picture, cls.hand_group(options))
+        return PictureEncoder(picture, cls.picture_group(options))
+
+    @classmethod
+    def hand_group(cls, options: Any) -> Group:
+        """Group of the encoder of pictures from the hand."""
+        return cls.picture_group(options)
 
     @classmethod
     def picture_group(cls, options: Any) -> Group:
-        """Group of the encoder of pictures.
+        """Group of the encoder of pictures from above.
 
         Raises:
             UserError: if the policy has none.
         """
         raise UserError(
-            f"the policy {cls.name} takes no pictures; choose one with an encoder of them: edp, "
+            f"the policy {cls.name} has no encoder of such pictures; choose one that has: edp, "
             "escnn, plain or plain-augmented"
         )
 

@@ -15,12 +15,14 @@ from pathlib import Path
 
 import numpy as np
 import sapien
+import torch
 from PIL import Image, ImageDraw
 
 from symsteer.bench.runs.film import CAMERA, SIZE, captioned
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
 from symsteer.bench.tasks.clouds import CAMERAS, PIXELS
 from symsteer.bench.tasks.experts import Expert
+from symsteer.bench.tasks.in_hand import InHand
 from symsteer.bench.tasks.tilted import Tilted
 from symsteer.errors import UserError
 from symsteer.files import staged
@@ -32,6 +34,8 @@ VIEW = 192
 """Width and height of a camera's picture and of a view of a cloud, pixels."""
 SHOWN = 0.2
 """Half of the width of what a view of a cloud shows, and the height that is white, metres."""
+DEEP = 0.25
+"""Distance from a camera in the hand that is almost black, metres."""
 
 
 def snapshot(task: str, embodiment: str, seed: int, steps: int) -> np.ndarray:
@@ -93,8 +97,8 @@ def seen_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
     return np.concatenate(parts, axis=1)
 
 
-def heights_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
-    """The map of heights of the same state in several worlds, uint8."""
+def worlds_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
+    """The picture of the same state in several worlds, uint8; what is near is light."""
     parts = []
     for variant in ("none", "perception_bias:1", "camera_rotation:1", "obstacle:1"):
         env = make(task, num_envs=1, variant=variant)
@@ -102,10 +106,15 @@ def heights_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
         expert = Expert(env)
         for _ in range(steps):
             env.step(expert.act())
-        # The root shows low things, too.
-        grey = (255 * (env.heights()[0] / SHOWN).clamp(0, 1).sqrt()).byte().numpy()
+        if isinstance(env, InHand):
+            seen = env.distances()[0]
+            light = torch.where(seen > 0, (1.2 - seen / DEEP).clamp(0.2, 1), 0)
+        else:
+            # The root shows low things, too.
+            light = (env.heights()[0] / SHOWN).clamp(0, 1).sqrt()
         env.close()
-        large = Image.fromarray(grey).resize((VIEW, VIEW), Image.Resampling.NEAREST)
+        grey = Image.fromarray((255 * light).byte().numpy())
+        large = grey.resize((VIEW, VIEW), Image.Resampling.NEAREST)
         parts.append(captioned(np.asarray(large.convert("RGB")), variant))
     return np.concatenate(parts, axis=1)
 
@@ -144,7 +153,7 @@ def main() -> int:
             picture = contact_sheet()
         else:
             kind = task_class(sys.argv[2])
-            seen = heights_picture if kind.observation_layout.picture else seen_picture
+            seen = worlds_picture if kind.observation_layout.picture else seen_picture
             picture = (seen if kind.is_seen() else task_picture)(sys.argv[2])
         # The texture of the table would take most of the bytes.
         small = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
