@@ -135,7 +135,7 @@ def load_policy(
 
     Raises:
         UserError: if the file is missing, damaged, no policy, of another version or layout, or if
-            its class is not installed or is code that nobody has consented to.
+            what it needs is not installed or is code that nobody has consented to.
     """
     path = policy_path(folder_or_path)
     if not path.is_file():

@@ -343,7 +343,10 @@ class Layout:
     def matrix(
         self, angle: float, reflect: bool = False, dtype: torch.dtype = torch.float64
     ) -> torch.Tensor:
-        """The representation of (angle, reflect), ``[dim, dim]``; angle in radians."""
+        """The representation of (angle, reflect), ``[dim, dim]``; angle in radians.
+
+        It leaves the pixels of pictures as they are; :meth:`transform` turns them.
+        """
         blocks = []
         for field in self.fields:
             sign = -1.0 if field.odd and reflect else 1.0
@@ -369,11 +372,13 @@ class Layout:
     def rotate(self, x: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
         """Rotate every row of ``x [N, ..., dim]`` by its own ``angle [N]`` (radians).
 
-        Pictures, of ``x [N, dim]`` alone, are interpolated if they are from above.
+        Pictures are interpolated if they are from above.
         """
         if picture := self.picture:
-            rest = picture.rest.rotate(x[:, picture.rest_columns.to(x.device)], angle)
-            return picture.changed(x, rest, picture.rotate(picture.of(x), angle))
+            rows = x.flatten(0, -2)
+            angle = angle.view(-1, *(1,) * (x.dim() - 2)).expand(x.shape[:-1]).flatten()
+            rest = picture.rest.rotate(rows[:, picture.rest_columns.to(x.device)], angle)
+            return picture.changed(rows, rest, picture.rotate(picture.of(rows), angle)).view_as(x)
         frequency, partner, sign = _quarter_turn(self, x.dtype, x.device)
         turn = angle.to(x).view(-1, *(1,) * (x.dim() - 1)) * frequency
         # x cos(k a) + J x sin(k a), where J rotates each vector by 90 degrees.

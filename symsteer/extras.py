@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from symsteer.errors import UserError
+from symsteer.registry import NotInstalledError
 
 EXTRAS = {
     "escnn": ("escnn.nn",),
@@ -36,14 +36,14 @@ def extra(name: str, what: str) -> Iterator[None]:
         what: what needs them.
 
     Raises:
-        UserError: in the place of an ImportError.
+        NotInstalledError: in the place of an ImportError.
     """
     try:
         yield
     except ImportError as error:
         if (error.name or "").partition(".")[0] == "symsteer":
             raise
-        raise UserError(
+        raise NotInstalledError(
             f"{what} needs the extra {name}, which cannot be imported ({error}); install it with: "
             f"{command(name)}"
         ) from error

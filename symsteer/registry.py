@@ -68,7 +68,7 @@ class Extension:
 
 
 class NotInstalledError(UserError):
-    """A file names a class of a package that is not installed here."""
+    """Something needs a package that is not installed here."""
 
 
 class NotAllowedError(UserError):

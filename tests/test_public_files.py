@@ -21,6 +21,7 @@ from packaging.specifiers import SpecifierSet
 
 from symsteer.bench.sweep.slurm import SlurmFile
 from symsteer.bench.sweep.suite import load_suite
+from symsteer.extras import command
 from tools.matrix import CELLS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -176,3 +177,10 @@ def test_a_forged_record_and_a_list_of_the_maintainers_are_refused(clone):
     (folder / "leaderboard" / "studies" / "answer.sha256").write_text("")
     code, said = submitted(folder)
     assert (code, "only maintainers change these files" in said) == (1, True), said
+
+
+def test_pages_install_escnn_as_messages_do():
+    pages = {page.name: page.read_text() for page in (ROOT / "docs").rglob("*.md")}
+    assert not [name for name, text in pages.items() if "symsteer[escnn]" in text]
+    with_command = [name for name, text in pages.items() if command("escnn") in text]
+    assert sorted(with_command) == ["hand-push-cube.md", "height-push-cube.md", "install.md"]

@@ -85,7 +85,8 @@ def audit(
         settings: what to measure.
         reference: the unbroken task, from :func:`reference_task`.
         visited: its states, from :func:`visit_all`; the same for all variants of a task.
-        policy: the policy that visited states; the result stores its content hash.
+        policy: visited states, and makes of pictures what agents see; the result stores its
+            content hash.
 
     Raises:
         UserError: see :meth:`AuditSettings.check`.

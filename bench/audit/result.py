@@ -90,7 +90,7 @@ class AuditSettings:
         if task.observation_layout.picture and self.states == "expert":
             raise UserError(
                 f"the pictures of {self.task} are compared after the encoder of a base policy; "
-                "leave --states out, so that one is trained, or name it with --base-policy"
+                "leave --base-policy none out, so that one is trained, or name its file there"
             )
         check_embodiment(self.embodiment)
         for spec in read(self.variant):
@@ -99,7 +99,12 @@ class AuditSettings:
                     f"{spec.text} has many strengths, but an audit measures one: "
                     f"give a number, e.g. {spec.name}:{spec.strength}"
                 )
-        check_group(self.group)
+        group = check_group(self.group)
+        if task.observation_layout.picture and group.reflections:
+            raise UserError(
+                f"no encoder of pictures has mirror symmetry, so that under {group} the encoder "
+                f"would be measured, not {self.task}; choose C_n, e.g. C{group.rotations}"
+            )
         if self.count < LEAST_STATES:
             raise UserError(f"--states is {self.count}; it must be at least {LEAST_STATES}")
         if not 1 <= self.chunk <= task.max_episode_steps:
@@ -176,7 +181,7 @@ class AuditResult:
 
     settings: AuditSettings
     base_policy: str | None
-    """Beginning of the content hash of the policy that visited states."""
+    """Beginning of the content hash of the policy that visited states and encoded pictures."""
     states: int
     moving: int
     unreachable: float

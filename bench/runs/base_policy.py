@@ -30,6 +30,17 @@ MEASURED = ("episodes", "action_std", "solvable", "equivariance_error", "jump", 
 """Of the steerability report, in the record under the same names."""
 
 
+def check_policy(config: RunConfig) -> None:
+    """Check that the base policy of a run can be trained, before demonstrations are collected.
+
+    Raises:
+        UserError: if it cannot see what one of its tasks shows, or an extra is missing.
+    """
+    for name in config.policy_tasks:
+        observed = task_class(name).observation_layout
+        POLICIES.get(config.policy_name).check(config.policy, observed)
+
+
 def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
     """The frozen base policy of a run, with its steerability report.
 
@@ -38,13 +49,15 @@ def prepare_base(config: RunConfig, how: Execution) -> ChunkPolicy:
     runs keeps demonstrations and policies.
 
     Raises:
-        UserError: if a file does not fit the task, or nothing can be written.
+        UserError: if a file does not fit the task, or nothing can be written; see also
+            :func:`check_policy`.
     """
     task = task_class(config.task)
     layouts = (task.observation_layout, task.action_layout)
     if how.base_policy is not None:
         policy = load_policy(how.base_policy, *layouts)
         return _measured(config, policy.used_with(config.policy), how)
+    check_policy(config)
     paths = {}
     for name in config.policy_tasks:
         given = how.demos if name == config.task else None

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from symsteer.agents import AGENTS
-from symsteer.bench.runs.base_policy import prepare_base, with_policy_of
+from symsteer.bench.runs.base_policy import check_policy, prepare_base, with_policy_of
 from symsteer.bench.runs.checkpoint import load_checkpoint
 from symsteer.bench.runs.config import Execution, RunConfig
 from symsteer.bench.runs.evaluator import Evaluator, check_room
@@ -32,7 +32,6 @@ from symsteer.bench.tasks import check_embodiment, task_class
 from symsteer.bench.variants import build, evaluation_variants, read
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import Episodes, Evaluation, read_record, run_id_of
-from symsteer.policies import POLICIES
 from symsteer.policies.files import save_policy
 from symsteer.terminal import to_paste
 from symsteer.variant import specs_at, variant_text
@@ -62,8 +61,7 @@ def check(
                 f"the actions of {name} have another layout than those of {config.task}; one "
                 "policy cannot be trained on both, so leave it out of --policy.tasks"
             )
-    observed = task_class(config.task).observation_layout
-    POLICIES.get(config.policy_name).check(config.policy, observed)
+    check_policy(config)
     build(specs_at(read(config.variants), 1))
     if any(spec.changes_nothing for spec in config.variants):
         raise UserError(

@@ -18,9 +18,10 @@ from typing import ClassVar
 import torch
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.sapien_utils import look_at
-from mani_skill.utils.structs import Link
+from mani_skill.utils.structs import Link, Pose
 from sapien.render import RenderBodyComponent
 
+from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.bench.tasks.move_cube import PushCube
 from symsteer.bench.tasks.pick_cube import PickCube
@@ -93,8 +94,7 @@ class Seen(SymmetricTask):
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         true = self.manipulated.pose
-        shift = (self.seen(true, "object").p - true.p)[:, None]
-        cloud = self._seen_cloud() + shift
+        cloud = moved(self._seen_cloud(), true, self.seen(true, "object"))
         points = {"cloud_xy": cloud[:, :, :2].flatten(1), "cloud_z": cloud[:, :, 2]}
         return {**super()._observe_task(), **points}
 
@@ -143,6 +143,18 @@ class Seen(SymmetricTask):
             points.append(local @ to_world[:, :3, :3].transpose(1, 2) + to_world[:, None, :3, 3])
             labels.append(picture["segmentation"].flatten(1).to(self.device))
         return torch.cat(points, dim=1), torch.cat(labels, dim=1)
+
+
+def moved(points: torch.Tensor, true: Pose, seen: Pose) -> torch.Tensor:
+    """Points ``[N, M, 3]``, moved as a body is from its true pose to where it is seen."""
+    back = true.q * true.q.new_tensor([1.0, -1.0, -1.0, -1.0])
+    matrix = quaternion_to_matrix(quaternion_multiply(seen.q, back))
+    arms = points - true.p[:, None]
+    # Sums of columns: a matrix product may round differently for another N.
+    turned = (matrix[:, None] * arms[:, :, None]).sum(3) - arms
+    # Where nothing turns, points stay to the bit.
+    turns = (seen.q != true.q).any(dim=1)[:, None, None]
+    return points + (seen.p - true.p)[:, None] + torch.where(turns, turned, 0.0)
 
 
 def thinned(points: torch.Tensor, valid: torch.Tensor, count: int) -> torch.Tensor:

@@ -14,10 +14,11 @@ from symsteer.bench.variants.base import Role, Variant
 class CameraRotation(Variant):
     """Objects are reported turned by 10 degrees * strength about the centre; tool and goal exact.
 
-    As with a camera over the workspace that is mounted at an angle. A map of heights is turned as
-    a whole. Vectors between tool and objects are wrong, so that a frozen policy misses. But
-    rotations of the plane commute with each other: every C_n remains a symmetry, and an audit must
-    find no defect under C_n beyond that of a picture's pixels. Reflections do not commute with it.
+    As with a camera over the workspace that is mounted at an angle. In maps of heights, clouds and
+    pictures from the hand, all bodies are seen turned. Vectors between tool and objects are wrong,
+    so that a frozen policy misses. But rotations of the plane commute with each other: every C_n
+    remains a symmetry, and an audit must find no defect under C_n beyond that of a picture's
+    pixels. Reflections do not commute with it.
     Breaks the observation, everywhere; rotations survive, reflections do not.
     """
 

@@ -1,4 +1,4 @@
-"""The camera is mounted at an angle: a control."""
+"""The axes of the whole observation are turned: a control."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ class PictureEncoder(nn.Module):
 
     counts: ClassVar[dict[bool, tuple[int, int]]] = {True: (4, 4), False: (6, 24)}
     """Channels and keypoints for each element of a group, and those of the trivial group: as many
-    parameters, about as many numbers (tests/policies/test_pictures.py)."""
+    parameters as C8 has, about as many numbers (tests/policies/test_pictures.py)."""
     scale: torch.Tensor
 
     def __init__(self, picture: Picture, group: Group):
@@ -235,7 +235,7 @@ class PictureEncoder(nn.Module):
         seen = functional.avg_pool2d(picture, SHRINK).flatten(2)
         places = _places(self.picture.side // SHRINK, weights)
         n, half = self.group.order, self.picture.side * PIXEL / 2
-        # [B, keypoints, order], each turned back by its element.
+        # [B, keypoints, order]; `unit` turns each back by its element.
         z = torch.view_as_complex((weights @ places).contiguous())
         angle = torch.arange(n, device=z.device, dtype=weights.dtype) * (2 * math.pi / n)
         values = weights.mean(2) @ seen.mT

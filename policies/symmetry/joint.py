@@ -53,7 +53,7 @@ def merged_layout(layouts: Mapping[str, Layout]) -> Layout:
             shown = "cloud of points" if layout.cloud else "picture"
             raise UserError(
                 f"{task} shows a {shown}, which has no place in a policy for several tasks; train "
-                "one for each task"
+                "another one, such as edp, for each task"
             )
         for field in layout.fields:
             if fields.setdefault(field.name, field) != field:
@@ -171,6 +171,11 @@ class Joint(DiffusionPolicy):
     """
 
     options: Any
+
+    @classmethod
+    def check(cls, options: Any, obs_layout: Layout) -> None:
+        """Nothing is shown to it, not even of one task; see :meth:`ChunkPolicy.check`."""
+        merged_layout({"the task": obs_layout})
 
     def make_denoiser(self) -> LiftedDenoiser:
         """The network of all tasks, or of one."""

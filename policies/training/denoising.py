@@ -159,7 +159,8 @@ class DiffusionPolicy(GradientPolicy):
     @classmethod
     def check(cls, options: Any, obs_layout: Layout) -> None:
         """Pictures need an encoder; see :meth:`ChunkPolicy.check`."""
-        cls.make_eyes(options, obs_layout)
+        with torch.random.fork_rng(devices=[]):
+            cls.make_eyes(options, obs_layout)
 
     @classmethod
     def make_eyes(cls, options: Any, obs_layout: Layout) -> PictureEncoder | None:

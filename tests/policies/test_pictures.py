@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from symsteer.policies.networks.pictures import PictureEncoder
 from symsteer.policies.symmetry.joint import merged_layout
 from tests.marks import policy_class
 from tests.policies.conftest import ACT, SMALL, as_type, assert_exact, noises
+from tests.policies.test_in_hand import SEEN as IN_HAND
 
 SIDE = 32
 HALF = SIDE * PIXEL / 2
@@ -96,7 +98,12 @@ def test_a_picture_turns_with_the_rest_of_the_observation() -> None:
     there, back = SEEN.transform(obs, math.pi / 2), SEEN.transform(obs, -math.pi / 2)
     assert torch.equal(SEEN.transform(there, math.pi), back)
     assert not torch.equal(there, back)
-    torch.testing.assert_close(SEEN.rotate(obs, torch.full((4,), math.pi / 2)), there)
+    quarter = torch.full((4,), math.pi / 2)
+    torch.testing.assert_close(SEEN.rotate(obs, quarter), there)
+    several = torch.stack([obs, back], dim=1)
+    turned = SEEN.rotate(several, quarter.index_fill(0, torch.tensor([1]), 0.3))
+    torch.testing.assert_close(turned[[0, 2, 3]], torch.stack([there, obs], 1)[[0, 2, 3]])
+    torch.testing.assert_close(turned[1], SEEN.transform(several[1], 0.3))
     # What is turned lies where its place is turned to, between pixels, too.
     for angle, reflect in ((0.3, False), (2.5, False), (0.8, True)):
         seen = SEEN.picture.of(SEEN.transform(obs, angle, reflect))[:, 0]
@@ -145,6 +152,23 @@ def test_quarter_turns_need_a_side_that_they_keep() -> None:
         PictureEncoder(picture, Group.parse("C4"))
     with pytest.raises(UserError, match="its symmetry must be C_n"):
         fit("edp", group="D4")
+
+
+@pytest.mark.parametrize("seen", [SEEN, IN_HAND], ids=["above", "hand"])
+def test_without_escnn_nothing_is_begun_and_no_good_file_is_called_damaged(
+    seen, tmp_path, monkeypatch
+) -> None:
+    policy = policy_class("edp")
+    options = policy.Options(**SMALL)
+    state = torch.random.get_rng_state()
+    policy.check(options, seen)
+    assert torch.equal(torch.random.get_rng_state(), state)
+    path = save_policy(policy(options, seen, ACT), tmp_path)
+    monkeypatch.setitem(sys.modules, "escnn", None)
+    for call in (lambda: policy.check(options, seen), lambda: load_policy(path)):
+        with pytest.raises(UserError, match=r"install it with: pip install --no-deps") as error:
+            call()
+        assert "damaged" not in str(error.value)
 
 
 def test_decoding_is_strict_in_what_the_encoder_tells() -> None:
@@ -209,3 +233,11 @@ def test_policies_without_an_encoder_say_which_have_one(name) -> None:
 def test_pictures_have_no_place_among_several_tasks() -> None:
     with pytest.raises(UserError, match="Seen shows a picture"):
         merged_layout({"Seen": SEEN})
+
+
+@pytest.mark.parametrize("name", ["edp-joint", "plain-joint", "edp-told"])
+@pytest.mark.parametrize("seen", [SEEN, IN_HAND], ids=["above", "hand"])
+def test_a_policy_for_several_tasks_refuses_pictures_before_the_work(name, seen) -> None:
+    policy = policy_class(name)
+    with pytest.raises(UserError, match=r"the task shows a picture, .* such as edp, for each task"):
+        policy.check(policy.Options(), seen)

@@ -9,7 +9,7 @@ from symsteer.bench.audit.result import AuditSettings
 from symsteer.bench.demos import collect, load
 from symsteer.bench.sim.headless import rendering_works
 from symsteer.bench.tasks import make, task_class
-from symsteer.bench.tasks.clouds import POINTS, thinned
+from symsteer.bench.tasks.clouds import POINTS, moved, thinned
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import execute, tiny_config
@@ -58,6 +58,26 @@ def test_few_points_occur_several_times_and_none_are_the_origin():
     assert torch.equal(chosen[0], torch.zeros(4, 3, dtype=torch.float64))
     assert torch.equal(chosen[1], points[1, [5, 5, 5, 5]])
     assert {tuple(p.tolist()) for p in chosen[2]} == {tuple(p.tolist()) for p in points[2, [7, 9]]}
+
+
+def test_variants_of_perception_turn_points_too():
+    points = POINTS_OF_THREE.float()
+    c, s = math.cos(math.radians(10)), math.sin(math.radians(10))
+    turned = points @ torch.tensor([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    shifted = points + torch.tensor([0.02, 0, 0])
+    for variant, wanted in (
+        ("none", points),
+        ("perception_bias", shifted),
+        ("camera_rotation", turned),
+    ):
+        strength = None if variant == "none" else (0.0, 1.0, 1.0)
+        env = make("PushCube-v1", num_envs=3, variant=variant, strength=strength)
+        env.reset(seed=[3, 4, 5])
+        true = env.manipulated.pose
+        found = moved(points, true, env.seen(true, "object"))
+        assert torch.equal(found[0], points[0])
+        torch.testing.assert_close(found[1:], wanted[1:], atol=1e-5, rtol=0)
+        env.close()
 
 
 @pytest.mark.parametrize("task", SEEN)

@@ -13,6 +13,7 @@ from symsteer.errors import UserError
 from symsteer.variant import VariantSpec, specs_at, variant_text
 from tests.bench.shared import STATE_TASKS
 from tests.bench.variants.scenes import act, scene
+from tests.marks import slow_except
 
 NAMES = sorted(VARIANTS)
 
@@ -145,11 +146,9 @@ def script(embodiment):
 
 
 @functools.cache
-def play(embodiment, **kwargs):
+def play(embodiment, task="PushCube-v1", **kwargs):
     """All that an episode, a partial reset and some more steps show: ``[N, ...]`` tensors."""
-    env = make(
-        "PushCube-v1", num_envs=3, embodiment=embodiment, reward_mode="normalized_dense", **kwargs
-    )
+    env = make(task, num_envs=3, embodiment=embodiment, reward_mode="normalized_dense", **kwargs)
     shown = [env.reset(seed=[1, 2, 3])[0].clone()]
 
     def step(action):
@@ -176,6 +175,19 @@ def test_strength_zero_is_the_unbroken_task_to_the_bit(name, embodiment):
     if name not in ("obstacle", "friction_patch"):  # which have tests of their own where they act
         pairs = zip(unbroken, mixed, strict=True)
         assert not all(torch.equal(plain[1], broken[1]) for plain, broken in pairs)
+
+
+SHOWN = ["camera_rotation", "frame_rotation", "observation_noise", "obstacle", "perception_bias"]
+
+
+@pytest.mark.parametrize("task", ["HeightPushCube-v1", "HandPushCube-v1"])
+@pytest.mark.parametrize("name", slow_except(SHOWN, "frame_rotation", "observation_noise"))
+def test_strength_zero_leaves_pictures_as_they_are_to_the_bit(name, task):
+    plain = play("floating", task)
+    mixed = play("floating", task, variant=name, strength=(0.0, 1.0, 0.0))
+    for one, other in zip(plain, mixed, strict=True):
+        assert torch.equal(one[[0, 2]], other[[0, 2]])
+    assert not torch.equal(plain[0][1], mixed[0][1])
 
 
 def test_strength_zero_of_all_is_the_unbroken_task_to_the_bit():
