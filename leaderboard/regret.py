@@ -36,8 +36,8 @@ class Cell:
 
     Attributes:
         values: ``[agents, policies]``.
-        policies: their names, at least two; of a base policy that several cells share it is the
-            same in all.
+        policies: their names, at least two; a base policy has the same name in all cells, and no
+            other one has it.
         place: cells of other places share no base policy.
     """
 
@@ -110,10 +110,10 @@ def intervals(cells: Sequence[Cell], splits: int = SPLITS) -> tuple[list[Interva
     for cell in cells:
         policies[cell.place] |= dict.fromkeys(cell.policies)
     variances, freedoms = [], []
-    for place, names in policies.items():
+    for names in policies.values():
         left_out = []
         for name in names:
-            lacks = [cell.place == place and name in cell.policies for cell in cells]
+            lacks = [name in cell.policies for cell in cells]
             other = [
                 _halves(cell.without(name), splits, 0) if lack else half
                 for cell, half, lack in zip(cells, halves, lacks, strict=True)

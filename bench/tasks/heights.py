@@ -2,24 +2,24 @@
 
 The map is what depth cameras around the workspace make together: in each pixel the height of what
 stands there, metres above the table. The table and the robot are cut off (a lab knows both). It is
-computed from the bodies' collision shapes, by a vertical ray through each pixel: exact, without a
-Vulkan driver, and in less than a millisecond.
+computed from the bodies' collision shapes, by vertical rays through each pixel: exact, and without
+a Vulkan driver.
 
 A map is a field of the layout, ``picture_height``. Quarter turns about the centre turn pixels into
-pixels; other turns interpolate (:class:`symsteer.policies.geometry.Picture`).
+pixels; other turns interpolate (:class:`symsteer.policies.picture.Picture`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
 
 from symsteer.bench.tasks.move_cube import PushCube
 from symsteer.bench.tasks.pick_cube import PickCube
-from symsteer.bench.tasks.solids import Scenery
-from symsteer.policies.geometry import PICTURE, PIXEL, Field
+from symsteer.bench.tasks.solids import Scenery, pictured
+from symsteer.policies.geometry import Field
+from symsteer.policies.picture import PICTURE, PIXEL
 
 SIDE = 64
 """Pixels in a row and in a column: the map shows 32 cm on each side of the centre."""
@@ -48,17 +48,12 @@ class Above(Scenery):
         return torch.nn.functional.avg_pool2d(found, RAYS)
 
 
-def seen_from_above(kept: Sequence[Field]) -> tuple[Field, ...]:
-    """Fields of a task that is seen from above: the map, and what it does not show."""
-    return Field(f"{PICTURE}height", 0, SIDE * SIDE), *kept
-
-
 class HeightPushCube(Above, PushCube):
     """Push a cube that a map of heights shows into a disc on the table, in any direction."""
 
     task_id = "HeightPushCube-v1"
-    task_fields: ClassVar[tuple[Field, ...]] = seen_from_above(
-        [f for f in PushCube.task_fields if f.name in ("goal_xy", "tcp_to_goal_xy")]
+    task_fields: ClassVar[tuple[Field, ...]] = pictured(
+        f"{PICTURE}height", SIDE, PushCube, "goal_xy", "tcp_to_goal_xy"
     )
 
 
@@ -66,6 +61,6 @@ class HeightPickCube(Above, PickCube):
     """Pick up a cube that a map of heights shows, and hold it at a goal in the air."""
 
     task_id = "HeightPickCube-v1"
-    task_fields: ClassVar[tuple[Field, ...]] = seen_from_above(
-        [f for f in PickCube.task_fields if f.name in ("goal_xy", "goal_z")]
+    task_fields: ClassVar[tuple[Field, ...]] = pictured(
+        f"{PICTURE}height", SIDE, PickCube, "goal_xy", "goal_z"
     )

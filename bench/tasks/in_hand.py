@@ -10,7 +10,6 @@ together; how the hand is turned is told beside it, by the tool's axes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -18,8 +17,9 @@ import torch
 from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.move_cube import PushCube
 from symsteer.bench.tasks.pick_cube import PickCube
-from symsteer.bench.tasks.solids import Scenery
-from symsteer.policies.geometry import HAND, Field, hand_rays
+from symsteer.bench.tasks.solids import Scenery, pictured
+from symsteer.policies.geometry import Field
+from symsteer.policies.picture import HAND, hand_rays
 
 SIDE = 64
 """Pixels in a row and in a column."""
@@ -49,17 +49,12 @@ class InHand(Scenery):
         return found.where(found.isfinite(), 0.0).unflatten(1, (SIDE, SIDE))
 
 
-def seen_from_hand(kept: Sequence[Field]) -> tuple[Field, ...]:
-    """Fields of a task that a camera in the hand sees: its picture, and what it does not show."""
-    return Field(f"{HAND}distance", 0, SIDE * SIDE), *kept
-
-
 class HandPushCube(InHand, PushCube):
     """Push a cube that a camera in the hand sees into a disc on the table, in any direction."""
 
     task_id = "HandPushCube-v1"
-    task_fields: ClassVar[tuple[Field, ...]] = seen_from_hand(
-        [f for f in PushCube.task_fields if f.name in ("goal_xy", "tcp_to_goal_xy")]
+    task_fields: ClassVar[tuple[Field, ...]] = pictured(
+        f"{HAND}distance", SIDE, PushCube, "goal_xy", "tcp_to_goal_xy"
     )
 
 
@@ -67,6 +62,6 @@ class HandPickCube(InHand, PickCube):
     """Pick up a cube that a camera in the hand sees, and hold it at a goal in the air."""
 
     task_id = "HandPickCube-v1"
-    task_fields: ClassVar[tuple[Field, ...]] = seen_from_hand(
-        [f for f in PickCube.task_fields if f.name in ("goal_xy", "goal_z")]
+    task_fields: ClassVar[tuple[Field, ...]] = pictured(
+        f"{HAND}distance", SIDE, PickCube, "goal_xy", "goal_z"
     )

@@ -18,6 +18,7 @@ from mani_skill.utils.structs import Actor, Pose
 from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
 from symsteer.errors import UserError
+from symsteer.policies.geometry import Field
 
 Components: TypeAlias = Sequence[torch.Tensor]
 """x, y and z of many vectors; each has as many axes, the first for the environments, of any size
@@ -147,3 +148,16 @@ class Scenery(SymmetricTask):
         raw[:, 3] = 1
         raw[rows] = body.pose.raw_pose
         return there, Pose.create(raw)
+
+
+def pictured(picture: str, side: int, task: type[SymmetricTask], *kept: str) -> tuple[Field, ...]:
+    """Fields of a task with a picture, of ``side * side`` pixels, in place of what it shows.
+
+    Args:
+        picture: name of its field.
+        side: pixels in a row and in a column.
+        task: with poses.
+        kept: fields of the task that the picture does not show.
+    """
+    shown = Field(picture, 0, side * side)
+    return shown, *(field for field in task.task_fields if field.name in kept)

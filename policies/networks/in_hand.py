@@ -25,9 +25,10 @@ from typing import ClassVar
 import torch
 
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Field, Group, Picture, hand_rays
+from symsteer.policies.geometry import Field, Group
 from symsteer.policies.networks.irreps import SpatialIrreps
 from symsteer.policies.networks.pictures import SHRINK, PictureEncoder
+from symsteer.policies.picture import Picture, hand_rays
 
 AXES = ("tcp_x_axis", "tcp_y_axis", "tcp_z_axis")
 """Fields with the horizontal parts of the tool's axes."""

@@ -25,8 +25,9 @@ from torch import nn
 from torch.nn import functional
 
 from symsteer.errors import UserError
-from symsteer.policies.geometry import PIXEL, Field, Group, Layout, Picture, escnn_package
+from symsteer.policies.geometry import Field, Group, Layout, escnn_package
 from symsteer.policies.normalizer import MINIMUM_RANGE, Normalizer
+from symsteer.policies.picture import PIXEL, Picture
 
 KERNELS = ((10, 4, 3), (5, 1, 2))
 """Size, stride and padding of each convolution; on an even number of pixels quarter turns keep all

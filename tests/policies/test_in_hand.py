@@ -9,10 +9,11 @@ import torch
 
 from symsteer.errors import UserError
 from symsteer.policies.files import load_policy, save_policy
-from symsteer.policies.geometry import Field, Group, Layout, hand_rays, turn_pictures
+from symsteer.policies.geometry import Field, Group, Layout
 from symsteer.policies.networks.denoiser import parameter_count
 from symsteer.policies.networks.in_hand import AXES, AveragedHandEncoder, HandEncoder
 from symsteer.policies.networks.irreps import SpatialIrreps
+from symsteer.policies.picture import hand_rays, turn_pictures
 from tests.marks import policy_class
 from tests.policies.conftest import ACT, SMALL, as_type, assert_exact, noises
 

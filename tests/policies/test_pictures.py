@@ -10,9 +10,10 @@ import torch
 
 from symsteer.errors import UserError
 from symsteer.policies.files import load_policy, save_policy
-from symsteer.policies.geometry import PIXEL, Field, Group, Layout
+from symsteer.policies.geometry import Field, Group, Layout
 from symsteer.policies.networks.denoiser import parameter_count
 from symsteer.policies.networks.pictures import PictureEncoder
+from symsteer.policies.picture import PIXEL
 from symsteer.policies.symmetry.joint import merged_layout
 from tests.marks import policy_class
 from tests.policies.conftest import ACT, SMALL, as_type, assert_exact, noises

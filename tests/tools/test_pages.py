@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from symsteer.files import write_together
-from tools.pages import audit, base_policies, minima, tuning
+from tools.pages import audit, base_policies, marks, minima, tuning
 from tools.pages.marks import BEGIN, END, with_tables
 
 TOOLS = (audit, base_policies, minima, tuning)
@@ -15,8 +15,8 @@ TOOLS = (audit, base_policies, minima, tuning)
 def written(monkeypatch):
     """What a tool writes, by path, in place of writing it."""
     files = {}
-    for tool in TOOLS:
-        monkeypatch.setattr(tool, "write_together", files.update)
+    for module in (audit, base_policies, tuning, marks):
+        monkeypatch.setattr(module, "write_together", files.update)
     return files
 
 

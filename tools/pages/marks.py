@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from symsteer.errors import UserError
+from symsteer.files import write_together
+from symsteer.terminal import complain
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 BEGIN, END = "<!-- tables: begin -->\n", "<!-- tables: end -->\n"
@@ -38,3 +41,23 @@ def check_checkout(page: Path) -> None:
     """
     if not page.is_file():
         raise UserError(f"there is no {page}: pages can be written in a checkout of SymSteer only")
+
+
+def write_tables(page: Path, render: Callable[[], str]) -> int:
+    """Write what ``render`` gives between the marks of a page of ``docs``.
+
+    Args:
+        page: its file.
+        render: gives markdown, or raises a UserError.
+
+    Returns:
+        The exit code.
+    """
+    try:
+        check_checkout(page)
+        text = with_tables(page.read_text(), render(), f"docs/{page.name}")
+        write_together({page: text.encode()})
+    except UserError as error:
+        return complain(error, f"error: {error}", 2)
+    print(f"wrote the tables of {page}")
+    return 0

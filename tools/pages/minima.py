@@ -17,13 +17,11 @@ from typing import Any
 from scipy import stats
 
 from symsteer.errors import UserError
-from symsteer.files import write_together
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.text import difference, number
 from symsteer.tables import markdown
-from symsteer.terminal import complain
 from tools.minima.barriers import barrier
-from tools.pages.marks import CHECKOUT, check_checkout, with_tables
+from tools.pages.marks import CHECKOUT, write_tables
 
 PAGE = CHECKOUT / "docs" / "minima.md"
 RESULTS = CHECKOUT / "leaderboard" / "results" / "minima"
@@ -162,14 +160,8 @@ def render(folder: Path) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Write docs/minima.md; returns the exit code."""
-    try:
-        check_checkout(PAGE)
-        tables = render(Path(arguments[0]) if arguments else RESULTS)
-        write_together({PAGE: with_tables(PAGE.read_text(), tables, "docs/minima.md").encode()})
-    except UserError as error:
-        return complain(error, f"error: {error}", 2)
-    print(f"wrote the tables of {PAGE}")
-    return 0
+    source = Path(arguments[0]) if arguments else RESULTS
+    return write_tables(PAGE, lambda: render(source))
 
 
 if __name__ == "__main__":

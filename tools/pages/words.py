@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from symsteer.errors import UserError
-from symsteer.files import write_together
 from symsteer.tables import markdown
-from symsteer.terminal import complain
-from tools.pages.marks import CHECKOUT, check_checkout, with_tables
+from tools.pages.marks import CHECKOUT, write_tables
 from tools.pages.minima import interval, spread
 
 PAGE = CHECKOUT / "docs" / "words.md"
@@ -80,14 +78,8 @@ def render(path: Path) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Write docs/words.md; returns the exit code."""
-    try:
-        check_checkout(PAGE)
-        tables = render(Path(arguments[0]) if arguments else RESULTS)
-        write_together({PAGE: with_tables(PAGE.read_text(), tables, "docs/words.md").encode()})
-    except UserError as error:
-        return complain(error, f"error: {error}", 2)
-    print(f"wrote the tables of {PAGE}")
-    return 0
+    source = Path(arguments[0]) if arguments else RESULTS
+    return write_tables(PAGE, lambda: render(source))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,8 @@ from symsteer.bench.tasks.heights import SIDE
 from symsteer.bench.tasks.solids import solids_of
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
-from symsteer.policies.geometry import PIXEL, Layout
+from symsteer.policies.geometry import Layout
+from symsteer.policies.picture import PIXEL
 from tests.bench.tiny_run import execute, tiny_config
 
 TASKS = ["HeightPushCube-v1", "HeightPickCube-v1"]

@@ -10,7 +10,7 @@ from symsteer.bench.sim.rotations import quaternion_to_matrix
 from symsteer.bench.tasks import make, task_class
 from symsteer.bench.tasks.in_hand import MOUNT, SIDE
 from symsteer.leaderboard.records import read_record
-from symsteer.policies.geometry import FIELD_OF_VIEW
+from symsteer.policies.picture import FIELD_OF_VIEW
 from tests.bench.tiny_run import execute, tiny_config
 
 TASKS = ["HandPushCube-v1", "HandPickCube-v1"]

@@ -28,20 +28,13 @@ def test_the_best_learner_and_those_as_good_are_bold():
     ]
 
 
-def test_of_two_that_are_equally_good_both_are_what_others_are_compared_with():
-    """`slow` is clearly below `augmented`, with whose episodes its own agree, and not clearly below
-    `equivariant`."""
-    seen = view(({"standard": 0.1, "augmented": 0.5, "equivariant": 0.5, "slow": 0.4}, {}))
-    for row in seen.summary.tables[0].rows:
-        if row.agent in ("augmented", "slow"):
-            for run in row.runs:
-                # Both solve the first episodes, so that their differences do not scatter.
-                solved = round(40 * (0.5 if row.agent == "augmented" else 0.4))
-                for point in run.record.evaluations:
-                    point.episodes.success_once[:] = [1] * solved + [0] * (40 - solved)
-    world = in_which_world.world_of("unbroken", seen.summary.tables, seen.summary.agents)
-    assert world.success["augmented"] == world.success["equivariant"]
-    assert world.best == ["augmented", "equivariant"]
+def test_of_two_that_are_equally_good_both_are_what_others_are_compared_with(monkeypatch):
+    monkeypatch.setattr(in_which_world, "_above", lambda _, *pair: pair == ("equivariant", "slow"))
+    summary = view(
+        ({"standard": 0.1, "augmented": 0.5, "equivariant": 0.5, "slow": 0.4}, {})
+    ).summary
+    world = in_which_world.world_of("unbroken", summary.tables, summary.agents)
+    assert world.best == ["standard", "augmented", "equivariant"]
 
 
 def test_worlds_are_said_in_words_and_strengths_are_pooled():
@@ -82,12 +75,20 @@ def test_controls_are_never_the_best():
 
 
 def test_what_a_camera_error_costs():
-    """From .8 to .6 over 2 cm, from .8 to .75 over 1 cm; not in proportion."""
+    """From .8 to .6 over 2 cm, from .8 to .75 over 1 cm; not in proportion.
+
+    PushCube has 1 cm alone, so that it would count in one row and not in the other.
+    """
     worlds = {"none": 0.8, "perception_bias:1": 0.6, "perception_bias:0.5": 0.75}
     seen = view(
         *(({"standard": rate, "equivariant": 0.8}, {"variant": v}) for v, rate in worlds.items()),
         ({"standard": 0.1}, {"variant": "perception_bias:0.5+wind:1"}),
         ({"standard": 0.1}, {"variant": "perception_bias:0..1"}),
+        ({"standard": 0.9, "equivariant": 0.9}, {"task": "PushCube-v1"}),
+        (
+            {"standard": 0.1, "equivariant": 0.1},
+            {"task": "PushCube-v1", "variant": "perception_bias:0.5"},
+        ),
     )
     near, far = seen.findings.of(in_which_world.SECTION).errors
     assert (near.centimetres, far.centimetres) == (1, 2)
