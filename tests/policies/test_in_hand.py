@@ -232,6 +232,7 @@ def test_what_a_picture_tells_has_unit_size() -> None:
     assert 0.5 < told.abs().max() <= 2.5
 
 
+@pytest.mark.long
 def test_the_place_is_learned() -> None:
     policy = fit("edp", steps=150, count=60, batch_size=64, group="C4")
     obs, place = observe(64, seed=2)

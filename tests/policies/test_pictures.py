@@ -198,6 +198,7 @@ def test_what_a_picture_tells_has_unit_size() -> None:
     torch.testing.assert_close(policy.eyes.scale, torch.tensor([0.05, 0.025]), atol=0.002, rtol=0)
 
 
+@pytest.mark.long
 def test_the_place_is_learned() -> None:
     policy = fit("edp", steps=150, count=60, batch_size=64, group="C4")
     obs, place = observe(64, seed=2)

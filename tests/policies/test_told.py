@@ -97,6 +97,7 @@ def test_the_same_words_are_the_same_actions_and_others_are_not(both, tmp_path):
     assert said(policy, held_out).report.keys() <= {"world"}
 
 
+@pytest.mark.long
 def test_it_obeys():
     """From the same observations, two sentences that were never heard want the opposite."""
     episodes = make_episodes(24, noise=0.2)

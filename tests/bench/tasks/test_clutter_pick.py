@@ -34,6 +34,7 @@ def solved(env, intent):
     return done.float().mean()
 
 
+@pytest.mark.long
 def test_the_cube_cannot_be_grasped_before_neighbours_are_pushed(env):
     assert (env.blocked()[1] != 0).any(dim=2).all()
     assert solved(env, lambda offset: PickCube.intent(env, offset)) <= 0.2
