@@ -165,7 +165,7 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> F
     (`cell_estimates`), and each defect within its interval. The points themselves are not drawn.
     """
     defects = np.array([point.defect.value for point in points])
-    settings = steered(points, defects=2)
+    settings = _steered(points)
     every = [unit for units in settings.values() for unit in units]
     if not every:
         return None
@@ -176,7 +176,8 @@ def fit(points: Sequence[Point], resamples: int = RESAMPLES, seed: int = 0) -> F
     ]
     estimates = cell_estimates(cells, resamples=resamples)
     slope = combined(estimates, [len(units) / total for units in settings.values()])
-    drawn = drawn_defects(points, resamples, seed)
+    generator = np.random.default_rng(seed)
+    drawn = np.stack([point.defect.draw(resamples, generator) for point in points])
     rise, run = np.zeros(resamples), np.zeros(resamples)
     for unit in every:
         x = _centred(drawn[list(unit)])
@@ -204,23 +205,15 @@ Unit = dict[int, Sample]
 """What a base policy has at each point, by the point's index."""
 
 
-def steered(points: Sequence[Point], defects: int = 1) -> dict[Key, list[Unit]]:
-    """The base policies of each setting that were steered at so many different defects."""
+def _steered(points: Sequence[Point]) -> dict[Key, list[Unit]]:
+    """The base policies of each setting that were steered at two defects or more."""
     units_of_setting: dict[Key, list[Unit]] = {}
     for setting in sorted({point.setting for point in points}):
         here = {i: point for i, point in enumerate(points) if point.setting == setting}
-        units = [
-            unit for unit in _units(here) if len({here[i].defect.value for i in unit}) >= defects
-        ]
+        units = [unit for unit in _units(here) if len({here[i].defect.value for i in unit}) > 1]
         if units:
             units_of_setting[setting] = units
     return units_of_setting
-
-
-def drawn_defects(points: Sequence[Point], resamples: int, seed: int = 0) -> Array:
-    """Each point's defect within its interval: [points, resamples]."""
-    generator = np.random.default_rng(seed)
-    return np.stack([point.defect.draw(resamples, generator) for point in points])
 
 
 def _units(points: Mapping[int, Point]) -> list[Unit]:

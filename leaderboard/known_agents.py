@@ -8,14 +8,20 @@ from symsteer.leaderboard.records import ROLES, Role
 BASE = "base"
 """The frozen policy with Gaussian noise; differences "against base" are measured to it."""
 
-STANDARD = "standard"
-"""Without symmetry, with the channels of the equivariant agent."""
+ZERO, CONSTANT = "zero", "golden-ticket"
+"""The frozen policy with no noise, and with the best constant one."""
+
+PROBE = (BASE, ZERO, CONSTANT)
+"""What is played in a world to ask it whether symmetry is in the way."""
+
+STANDARD, STRICT = "standard", "equivariant"
+"""Without symmetry, with the channels of the equivariant agent; and the equivariant agent."""
 
 WITHOUT_SYMMETRY = (STANDARD, "standard-matched", "augmented")
 """Rivals without symmetry in their networks: `standard`, the same with as many parameters as
 `equivariant`, and the fair one, which learns from rotated data."""
 
-WITH_SYMMETRY = ("equivariant", "residual-pathway", "approximate")
+WITH_SYMMETRY = (STRICT, "residual-pathway", "approximate")
 """All of it, and nearly all. The last is that of the first leaderboard, which `residual-pathway`
 has replaced."""
 
@@ -27,7 +33,7 @@ BETWEEN = ("slow", "free-bias", "resilient", "chooser", "balanced")
 """Agents that may leave the symmetry, or choose how much of it to keep."""
 
 ROW_ORDER = (
-    *(BASE, "zero", "golden-ticket"),
+    *(BASE, ZERO, CONSTANT),
     *WITHOUT_SYMMETRY,
     *WITH_SYMMETRY,
     *BETWEEN,

@@ -1,434 +1,342 @@
-"""Which agent to take in a world, from the map of advantages against audited defects.
+"""Which agent to take in a world of which no record says anything: two rules, from other tasks.
 
-The advantage of an agent over `STANDARD` is expected from, in this order: the records of this very
-cell; the line of this task; the line of the other tasks. docs/metrics.md has the formulas, and how
-the line is tested by leaving tasks out. Nothing is simulated here.
+*Kind*: what was better in other tasks whose world is broken in the same way.
+
+*Probe*: play the base policy, its zero noise, and the best constant noise of a search
+(`golden-ticket`). A constant noise treats one direction unlike the others, which a symmetric agent
+cannot do. Where it gains much over the better of the other two, symmetry is in the way. How much is
+much, a threshold, is learned from the records.
+
+Where a rule is unsure it refuses. docs/advise.md has the rules' record.
 """
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from statistics import fmean
 
 import numpy as np
+from scipy import stats
 
-from symsteer.leaderboard.advantage_by_defect import (
-    Point,
-    Unit,
-    drawn_defects,
-    fit,
-    points_of,
-    steered,
-)
-from symsteer.leaderboard.defects import Audit, AuditedDefect, dial_of, in_order
-from symsteer.leaderboard.keys import Key
-from symsteer.leaderboard.known_agents import STANDARD, row_place
-from symsteer.leaderboard.pairs import MEASURES
-from symsteer.leaderboard.rows import MIN_SEEDS, Summary
-from symsteer.leaderboard.statistics import (
-    RESAMPLES,
-    Array,
-    BootstrapEstimate,
-    Interval,
-    Sample,
-    cell_estimates,
-    combined,
-    percentile,
-    stratified_bootstrap,
-)
-from symsteer.variant import UNBROKEN
+from symsteer.leaderboard.defects import dial_of
+from symsteer.leaderboard.known_agents import BASE, CONSTANT, STANDARD, STRICT, ZERO
+from symsteer.leaderboard.pairs import MEASURES, advantage
+from symsteer.leaderboard.regret import Cell, regrets
+from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
+from symsteer.leaderboard.statistics import Interval, stratified_bootstrap
 
-LEAST_TASKS = 3
-"""Other tasks that an expectation for a new one needs."""
-
-LEAST_FREEDOM = 2
-"""Degrees of freedom that the distance of cells from their line needs."""
-
-LEAST_DIALS = 2
-"""Dials that the line of a part needs: how much dials differ cannot be known from one."""
-
-PART = "part "
-"""Begins the name of a kind of break that is a part of the defect, not a dial."""
-
-Source = Literal["this cell", "this task", "other tasks", ""]
+LEAST_TASKS = 2
+"""Other tasks that an answer needs."""
 
 
 @dataclass(frozen=True)
-class AuditedWorld:
-    """A place on the map: where an agent is wanted."""
-
-    task: str
-    embodiment: str
-    variant: str
-    group: str
-    defect: AuditedDefect
-
-    @property
-    def kinds(self) -> list[str]:
-        """How it is broken, the narrowest first: by its dial, by the part of its defect."""
-        dial = dial_of(self.variant)
-        return [UNBROKEN] if dial == UNBROKEN else [dial, PART + self.defect.part]
-
-    @classmethod
-    def of(cls, point: Point) -> AuditedWorld:
-        key = point.table.key
-        return cls(key.task, key.embodiment, key.variant, key.group, point.defect)
-
-
-@dataclass(frozen=True)
-class Expected:
-    """The expected advantage of an agent over `STANDARD` in a world.
+class Lesson:
+    """What the records say of a world.
 
     Attributes:
-        value: None if no record says anything.
-        interval: 95 %; None if its width is not known.
-        source: what it is expected from.
-        kind: which cells the line is through: a dial, or a part of the defect.
-        cells, policies, tasks: how many it rests on.
-        reasons: why it decides nothing, whatever the interval; empty if it may.
-        agent, measure: whose and of what; empty before it is known.
+        table: its cell.
+        gain: of the best constant noise; None if it was not played.
+        advantage: of `STRICT` over `STANDARD`, by measure.
+        rise: of the final success of each learner above the better of base policy and zero noise;
+            none if these were not played.
+        regret: of each learner, by measure.
     """
 
-    value: float | None = None
-    interval: Interval | None = None
-    source: Source = ""
-    kind: str = ""
-    cells: int = 0
-    policies: int = 0
-    tasks: int = 0
-    reasons: tuple[str, ...] = ()
-    agent: str = ""
-    measure: str = ""
+    table: Table
+    gain: Interval | None
+    advantage: dict[str, Interval]
+    rise: dict[str, float]
+    regret: dict[str, dict[str, float]]
 
     @property
-    def sign(self) -> int:
-        """+1 or -1 if it is clearly above or below 0, else 0."""
-        return self.interval.sign if self.interval and not self.reasons else 0
+    def task(self) -> str:
+        return self.table.key.task
+
+    @property
+    def kind(self) -> str:
+        """How it is broken, without strengths."""
+        return dial_of(self.table.key.variant)
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Which agents to take for a measure, the best first; none if that is undecided, and why."""
+class Question:
+    """A world in which an agent is wanted.
 
-    measure: str
-    agents: tuple[str, ...]
-    reason: str = ""
+    Attributes:
+        kind: how it is broken, a variant without strength or `none`; empty if unknown.
+        gain: of the best constant noise there; None if it was not played.
+        measured: what the records say of this very world; None if they do not have it.
+    """
+
+    kind: str = ""
+    gain: Interval | None = None
+    measured: Lesson | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a rule says.
+
+    Attributes:
+        sign: +1: `STRICT`; -1: `STANDARD`; 0: it refuses.
+        reason: what it rests on, or why it refuses.
+        lessons: worlds like this one, by the rule.
+    """
+
+    sign: int
+    reason: str
+    lessons: tuple[Lesson, ...] = ()
+
+
+Rule = Callable[[Sequence[Lesson], Question, str], Answer]
+"""From lessons of other tasks, a question and a measure."""
+
+
+def lessons_of(summary: Summary) -> list[Lesson]:
+    """Of all cells with the usual budget in which `STRICT` and `STANDARD` have enough policies."""
+    return [_lesson(t) for t in summary.usual_tables if {STRICT, STANDARD} <= t.decisive]
+
+
+def _lesson(table: Table) -> Lesson:
+    effects = {measure: advantage(table, STRICT, STANDARD, measure) for measure in MEASURES}
+    learners = {name: row for name in sorted(table.decisive) if (row := table.row_of(name))}
+    references = [row for name in (BASE, ZERO) if (row := table.row_of(name)) and row.success]
+    best = max((row.success.value for row in references if row.success), default=None)
+    rise = {
+        name: row.success.value - best
+        for name, row in learners.items()
+        if row.success and best is not None
+    }
+    regret: dict[str, dict[str, float]] = {}
+    for measure, attribute in zip(MEASURES, ("area", "success"), strict=True):
+        values = {name: row.by_policy(attribute) for name, row in learners.items()}
+        shared = sorted(set.intersection(*map(set, values.values())))
+        regret[measure] = {}
+        if len(shared) >= MIN_SEEDS:
+            each = np.array([[values[name][policy] for policy in shared] for name in learners])
+            found = regrets([Cell(each, shared)]).mean
+            regret[measure] = dict(zip(learners, map(float, found), strict=True))
+    return Lesson(
+        table,
+        gain_in(table),
+        {m: stratified_bootstrap([list(pairs.values())]) for m, pairs in effects.items() if pairs},
+        rise,
+        regret,
+    )
+
+
+def gain_in(table: Table) -> Interval | None:
+    """What the best constant noise gains over the better of base policy and zero noise.
+
+    In final success, with a 95 % interval over base policies and episodes; None if any of the three
+    was not played on a common base policy.
+    """
+    rows = [row for name in (BASE, ZERO) if (row := table.row_of(name)) and row.success]
+    if len(rows) < 2 or not table.row_of(CONSTANT):
+        return None
+    better = max(rows, key=lambda row: row.success.value if row.success else 0.0).agent
+    pairs = advantage(table, CONSTANT, better, "success")
+    return stratified_bootstrap([list(pairs.values())]) if pairs else None
+
+
+def by_kind(lessons: Sequence[Lesson], question: Question, measure: str) -> Answer:
+    """What was better in the worlds of other tasks that are broken in the same way.
+
+    It refuses if there are too few of them, if none is decided, or if the decided ones disagree.
+    """
+    if not question.kind:
+        return Answer(0, "the kind of break is not known")
+    like = tuple(lesson for lesson in lessons if lesson.kind == question.kind)
+    tasks = {lesson.task for lesson in like}
+    if len(tasks) < LEAST_TASKS:
+        return Answer(0, f"other tasks with such a world: {len(tasks)}, {LEAST_TASKS} are needed")
+    signs = [sign for lesson in like if (sign := _sign(lesson, measure))]
+    if not signs:
+        return Answer(0, f"no difference is clear in {len(like)} such worlds", like)
+    if len(set(signs)) > 1:
+        return Answer(0, f"of {len(like)} such worlds, some are won by either", like)
+    return Answer(signs[0], f"{len(signs)} of {len(like)} such worlds are decided, all alike", like)
+
+
+def by_probe(lessons: Sequence[Lesson], question: Question, measure: str) -> Answer:
+    """Whether the best constant noise gains more than the records' threshold.
+
+    It refuses if the interval of the gain holds the threshold.
+    """
+    if question.gain is None:
+        return Answer(0, "the world was not probed")
+    known = [lesson for lesson in lessons if lesson.gain]
+    if len({lesson.task for lesson in known}) < LEAST_TASKS:
+        return Answer(0, f"fewer than {LEAST_TASKS} other tasks were probed")
+    limit = threshold(known, measure)
+    if limit is None:
+        return Answer(0, "in the probed worlds that are decided, one agent always wins")
+    low, high = question.gain.low, question.gain.high
+    if low < limit <= high:
+        return Answer(0, f"the gain may lie on either side of {limit:+.3f}")
+    above = low >= limit
+    like = tuple(one for one in known if one.gain and (one.gain.value >= limit) == above)
+    word = "at least" if above else "less than"
+    return Answer(-1 if above else 1, f"a constant noise gains {word} {limit:+.3f}", like)
+
+
+RULES: dict[str, Rule] = {"kind": by_kind, "probe": by_probe}
+
+
+def threshold(lessons: Sequence[Lesson], measure: str) -> float | None:
+    """The gain that best tells where `STANDARD` wins: fewest wrong signs of the decided worlds.
+
+    Halfway between two worlds; of several equally good thresholds the middle one. None if the
+    decided worlds have one sign, or one gain.
+    """
+    decided = sorted(
+        (lesson.gain.value, sign)
+        for lesson in lessons
+        if lesson.gain and (sign := _sign(lesson, measure))
+    )
+    if len({sign for _, sign in decided}) < 2:
+        return None
+    gains = [gain for gain, _ in decided]
+    candidates = [(a + b) / 2 for a, b in pairwise(gains) if a < b]
+    errors = [sum((gain >= limit) == (sign > 0) for gain, sign in decided) for limit in candidates]
+    best = [limit for limit, e in zip(candidates, errors, strict=True) if e == min(errors)]
+    return best[len(best) // 2] if best else None
+
+
+def _sign(lesson: Lesson, measure: str) -> int:
+    """Of the advantage of `STRICT`; 0 if it is not decided."""
+    return lesson.advantage[measure].sign if measure in lesson.advantage else 0
+
+
+# What they say together.
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What the records say about a world."""
-
-    world: AuditedWorld
-    expected: tuple[Expected, ...]
-    choices: tuple[Choice, ...]
-
-
-def advise(summaries: Sequence[Summary], audit: Audit, world: AuditedWorld) -> Advice:
-    """What to expect of each learner in a world, and which one to take.
-
-    Args:
-        summaries: of the records of each study; runs are paired within one.
-        audit: their defects.
-        world: where.
-    """
-    expected = []
-    for agent in learners(summaries):
-        for measure in MEASURES:
-            points = [
-                point
-                for summary in summaries
-                for point in points_of(summary, audit, world.embodiment, agent, measure)
-            ]
-            if points:
-                # Points with few base policies decide nothing, and count only if all are such.
-                lines = Lines(decisive(points) or points)
-                expected.append(replace(expect(world, lines), agent=agent, measure=measure))
-    choices = tuple(choose(m, [e for e in expected if e.measure == m]) for m in MEASURES)
-    return Advice(world, tuple(expected), choices)
-
-
-def learners(summaries: Sequence[Summary]) -> list[str]:
-    """The learners of all studies but `STANDARD`, in the page's order."""
-    roles = {agent: role for summary in summaries for agent, role in summary.roles.items()}
-    names = [agent for agent, role in roles.items() if role == "learner" and agent != STANDARD]
-    return sorted(names, key=lambda agent: row_place(agent, "learner"))
-
-
-def decisive(points: Sequence[Point]) -> list[Point]:
-    """The points with enough base policies."""
-    return [point for point in points if point.policies >= MIN_SEEDS]
-
-
-def choose(measure: str, expected: Sequence[Expected]) -> Choice:
-    """The agents that are clearly better than `STANDARD`; this one if all are clearly worse.
-
-    Agents of which no record says anything do not count, unless that is so of all.
-    """
-    expected = [e for e in expected if e.value is not None] or expected
-    better = sorted((e for e in expected if e.sign > 0), key=lambda e: -(e.value or 0.0))
-    if better:
-        return Choice(measure, tuple(e.agent for e in better))
-    if expected and all(e.sign < 0 for e in expected):
-        return Choice(measure, (STANDARD,))
-    if not expected:
-        return Choice(measure, (), f"no audited cell has paired runs of a learner and {STANDARD}")
-    if any(not e.reasons for e in expected):
-        return Choice(measure, (), "no interval lies above 0, and not all lie below it")
-    reasons = dict.fromkeys(reason for e in expected for reason in e.reasons)
-    return Choice(measure, (), "; ".join(reasons))
-
-
-def expect(world: AuditedWorld, lines: Lines, known: bool = True) -> Expected:
-    """The expectation from one agent's points.
-
-    The first one that may decide something; else the first one, with the reason why it may not.
-
-    Args:
-        world: where.
-        lines: of the agent.
-        known: whether the cells of this task count.
-    """
-    undecided = []
-    for expected in _expectations(world, lines, known):
-        if not expected.reasons:
-            return expected
-        undecided.append(expected)
-    nothing = f"no mapped cell is like it: {' or '.join(world.kinds)}"
-    return undecided[0] if undecided else Expected(reasons=(nothing,))
-
-
-def _expectations(world: AuditedWorld, lines: Lines, known: bool) -> Iterator[Expected]:
-    if known and (measured := _measured(world, lines)):
-        yield measured
-    for own in (True, False) if known else (False,):
-        for kind in world.kinds:
-            if line := lines.line(world.task, kind, own):
-                yield line.at(world)
-
-
-def _measured(world: AuditedWorld, lines: Lines) -> Expected | None:
-    """From the records of this very cell; of several studies, the mean over them."""
-    place = world.task, in_order(world.variant), world.group
-    cells = [
-        point
-        for point in lines.points
-        if (point.table.key.task, in_order(point.table.key.variant), point.table.key.group) == place
-    ]
-    if not cells:
-        return None
-    pairs = [list(point.pairs.values()) for point in cells]
-    interval = stratified_bootstrap(pairs, lines.resamples)
-    policies = max(point.policies for point in cells)
-    return Expected(
-        value=interval.value,
-        interval=interval,
-        source="this cell",
-        kind=dial_of(world.variant),
-        cells=len(cells),
-        policies=policies,
-        tasks=1,
-        reasons=_too_few(policies),
-    )
-
-
-def _too_few(policies: int) -> tuple[str, ...]:
-    return () if policies >= MIN_SEEDS else (f"base policies: {policies}, {MIN_SEEDS} are needed",)
-
-
-@dataclass(frozen=True)
-class _Level:
-    """The mean over base policies of a setting: of the defect, of the advantage, of each cell."""
-
-    task: str
-    defect: float
-    drawn: Array
-    advantage: BootstrapEstimate
-    cells: list[tuple[float, float]]
-    policies: set[str]
-
-
-@dataclass(frozen=True)
-class _Line:
-    """A line in the defect, at the mean level of some tasks.
+    """What to take in a world, for one measure.
 
     Attributes:
-        kind: of the cells that it goes through, beside the unbroken ones.
-        own: whether its level is that of the world's own task.
-        levels: of the settings whose mean level it has, each task with the same weight.
-        cells: that it goes through.
-        slope: of the advantage; 0 through unbroken cells alone.
-        spread, freedom: standard deviation of a cell around it, and its degrees of freedom.
-        defects: the smallest and the largest.
-        dials: those of its broken cells.
+        answers: of each rule.
+        agent: to take.
+        refused: whether no rule has an answer, or two disagree, so that the agent is the fallback.
+        rise: expected of its final success above the better of base policy and zero noise, with the
+            interval of 95 % of such worlds; None if fewer than three such worlds tell.
+        regret: expected, likewise.
+        worlds: how many worlds are like this one.
     """
 
-    kind: str
-    own: bool
-    levels: list[_Level]
-    weights: list[float]
-    cells: int
-    slope: BootstrapEstimate
-    spread: float
-    freedom: int
-    defects: tuple[float, float]
-    dials: set[str]
-
-    @property
-    def tasks(self) -> set[str]:
-        return {level.task for level in self.levels}
-
-    @property
-    def policies(self) -> set[str]:
-        return {policy for level in self.levels for policy in level.policies}
-
-    def reasons(self, world: AuditedWorld) -> Iterator[str]:
-        """Why it decides nothing; none if it may."""
-        yield from _too_few(len(self.policies))
-        if self.own and self.freedom < LEAST_FREEDOM:
-            yield "too few cells to say how far they lie from their line"
-        if self.kind.startswith(PART) and len(self.dials) < LEAST_DIALS:
-            yield f"mapped dials of {self.kind}: {len(self.dials)}, {LEAST_DIALS} are needed"
-        if not self.own and len(self.tasks) < LEAST_TASKS:
-            yield f"other tasks with such cells: {len(self.tasks)}, {LEAST_TASKS} are needed"
-        low, high = self.defects
-        if world.defect.interval.low > high or world.defect.interval.high < low:
-            yield f"its defect lies beyond those of the map, {low:.2f} to {high:.2f}"
-
-    def at(self, world: AuditedWorld) -> Expected:
-        """What it says of a world."""
-        x, pairs = world.defect.value, list(zip(self.weights, self.levels, strict=True))
-        resamples = len(self.slope.episodes)
-        centre = sum(w * level.defect for w, level in pairs)
-        parts = [*(level.advantage for level in self.levels), self.slope]
-        line = combined(parts, [*self.weights, x - centre])
-        # What the uncertainty of the audits changes, beside the slope's draws.
-        moved = world.defect.draw(resamples, np.random.default_rng(1)) - x
-        moved = moved - np.sum([w * (level.drawn - level.defect) for w, level in pairs], axis=0)
-        line = replace(line, episodes=line.episodes + self.slope.value * moved)
-        interval = None
-        if self.freedom > 0:
-            away = np.random.default_rng(2).standard_t(self.freedom, resamples)
-            interval = percentile(line.value, line.draws() + self.spread * away)
-        return Expected(
-            value=line.value,
-            interval=interval,
-            source="this task" if self.own else "other tasks",
-            kind=self.kind,
-            cells=self.cells,
-            policies=len(self.policies),
-            tasks=len(self.tasks),
-            reasons=tuple(self.reasons(world)),
-        )
+    measure: str
+    answers: dict[str, Answer]
+    agent: str
+    refused: bool
+    rise: Interval | None
+    regret: Interval | None
+    worlds: int
 
 
-class Lines:
-    """The points of one agent in one measure, and the lines through them, each fitted once."""
+def advise(
+    lessons: Sequence[Lesson],
+    question: Question,
+    measure: str,
+    fallback: str = STANDARD,
+    rules: Iterable[str] = RULES,
+) -> Advice:
+    """What to take.
 
-    def __init__(self, points: Sequence[Point], resamples: int = RESAMPLES) -> None:
-        self.points = points
-        self.resamples = resamples
-        self._fitted: dict[tuple[str, str, bool], _Line | None] = {}
+    Args:
+        lessons: of other tasks.
+        question: the world.
+        measure: one of `MEASURES`.
+        fallback: the agent that is safe where the rules refuse.
+        rules: those that count.
+    """
+    answers = {name: RULES[name](lessons, question, measure) for name in rules}
+    if question.measured:
+        measured = _measured(question.measured, measure)
+        # What was measured in this very world counts before all rules.
+        answers = {"records": measured} | ({} if measured.sign else answers)
+    signs = {answer.sign for answer in answers.values()} - {0}
+    refused = len(signs) != 1
+    agent = fallback if refused else STRICT if signs.pop() > 0 else STANDARD
+    said = [answer.lessons for answer in answers.values() if refused or answer.sign]
+    like = list({id(one): one for group in said for one in group}.values()) or list(lessons)
+    rises = [one.rise[agent] for one in like if agent in one.rise]
+    lost = [one.regret[measure][agent] for one in like if agent in one.regret[measure]]
+    return Advice(measure, answers, agent, refused, _predicted(rises), _predicted(lost), len(like))
 
-    def line(self, task: str, kind: str, own: bool) -> _Line | None:
-        """The line through the cells of one kind and the unbroken ones; None without such cells.
 
-        Args:
-            task: of the world.
-            kind: of break; `none` for the level of the unbroken cells alone.
-            own: at the level of this task, with the slope of all; else without any of its cells.
-        """
-        place = task, kind, own
-        if place not in self._fitted:
-            self._fitted[place] = self._fit(task, kind, own)
-        return self._fitted[place]
+def _measured(lesson: Lesson, measure: str) -> Answer:
+    effect = lesson.advantage.get(measure)
+    if effect is None:
+        return Answer(0, "no paired runs")
+    bounds = f"[{effect.low:+.3f}, {effect.high:+.3f}]"
+    text = f"{STRICT} minus {STANDARD} is {effect.value:+.3f} {bounds}"
+    return Answer(effect.sign, text if effect.sign else f"undecided: {text}", (lesson,))
 
-    def _fit(self, task: str, kind: str, own: bool) -> _Line | None:
-        chosen = [
-            point
-            for point in self.points
-            if (own or point.table.key.task != task)
-            and (point.dial in (UNBROKEN, kind) or PART + point.defect.part == kind)
-        ]
-        settings = steered(chosen, 1 if kind == UNBROKEN else 2)
-        at = {key: units for key, units in settings.items() if not own or key.task == task}
-        if not at:
-            return None
-        others = {key: units for key, units in settings.items() if key not in at}
-        levels = self._levels(at, chosen)
-        every = levels + self._levels(others, chosen)
-        fitted = None if kind == UNBROKEN else fit(chosen, self.resamples)
-        slope = fitted.slope if fitted else combined([levels[0].advantage], [0.0])
-        tasks = [level.task for level in levels]
-        weights = [1 / len(set(tasks)) / tasks.count(task) for task in tasks]
-        cells = sum(len(level.cells) for level in every)
-        if own:
-            # How far cells lie from the lines of their settings.
-            freedom = cells - len(every) - (kind != UNBROKEN)
-            number = sum(len(level.cells) for level in levels)
-            squares = [
-                (y - level.advantage.value - slope.value * (x - level.defect)) ** 2
-                for level in every
-                for x, y in level.cells
-            ]
-        else:
-            # How far the cells of a task lie from the line of all tasks, as a mean over its cells.
-            number, freedom = len(set(tasks)), len(set(tasks)) - 1
-            squares = _by_task(levels, weights, slope.value)
-        spread = math.sqrt(sum(squares) / freedom) if freedom > 0 else 0.0
-        defects = [defect for level in every for defect, _ in level.cells]
-        return _Line(
-            kind=kind,
-            own=own,
-            levels=levels,
-            weights=weights,
-            cells=cells,
-            slope=slope,
-            spread=spread * math.sqrt(1 + 1 / number),
-            freedom=freedom,
-            defects=(min(defects), max(defects)),
-            dials={point.dial for point in chosen} - {UNBROKEN},
-        )
 
-    def _levels(self, settings: dict[Key, list[Unit]], points: Sequence[Point]) -> list[_Level]:
-        """The levels of settings, drawn together."""
-        if not settings:
-            return []
-        defects = np.array([point.defect.value for point in points])
-        drawn = drawn_defects(points, self.resamples)
-        means = cell_estimates(
-            [[Sample.mean(list(unit.values())) for unit in units] for units in settings.values()],
-            resamples=self.resamples,
-        )
-        return [
-            _Level(
-                task=key.task,
-                defect=float(np.mean([defects[list(unit)].mean() for unit in units])),
-                drawn=np.mean([drawn[list(unit)].mean(axis=0) for unit in units], axis=0),
-                advantage=advantage,
-                cells=[
-                    (
-                        float(defects[i]),
-                        float(np.mean([unit[i].value for unit in units if i in unit])),
+def _predicted(values: Sequence[float]) -> Interval | None:
+    """Mean, and the interval in which a further world lies with 95 % (normal)."""
+    if len(values) < 3:
+        return None
+    spread = float(np.std(values, ddof=1)) * (1 + 1 / len(values)) ** 0.5
+    half = float(stats.t.ppf(0.975, len(values) - 1)) * spread
+    return Interval(fmean(values), fmean(values) - half, fmean(values) + half)
+
+
+# How it would have been for a task without records.
+
+
+@dataclass(frozen=True)
+class Score:
+    """How rules would have answered for tasks that they know nothing of.
+
+    Attributes:
+        rule: its name, or both.
+        worlds: that are decided.
+        answered, right: of these.
+        regret: mean over all worlds, decided or not, of the agent that was advised.
+        fixed: the same of an agent that is taken everywhere.
+    """
+
+    rule: str
+    measure: str
+    worlds: int
+    answered: int
+    right: int
+    regret: float
+    fixed: dict[str, float]
+
+
+def leave_tasks_out(lessons: Sequence[Lesson], fallback: str = STANDARD) -> list[Score]:
+    """Each world is asked about with the lessons of the other tasks alone, if these are enough."""
+    found: list[Score] = []
+    if len({lesson.task for lesson in lessons}) <= LEAST_TASKS:
+        return found
+    for measure in MEASURES:
+        for rules in (*((name,) for name in RULES), tuple(RULES)):
+            answered = right = worlds = 0
+            regret: dict[str, list[float]] = defaultdict(list)
+            advised: list[float] = []
+            for lesson in lessons:
+                others = [other for other in lessons if other.task != lesson.task]
+                question = Question(lesson.kind, lesson.gain)
+                advice = advise(others, question, measure, fallback, rules)
+                known = lesson.regret[measure]
+                if {STRICT, STANDARD, fallback} <= known.keys():
+                    for agent in (STRICT, STANDARD, fallback):
+                        regret[agent].append(known[agent])
+                    advised.append(known[advice.agent])
+                if sign := _sign(lesson, measure):
+                    worlds += 1
+                    answered += not advice.refused
+                    right += not advice.refused and advice.agent == (
+                        STRICT if sign > 0 else STANDARD
                     )
-                    for i in sorted({i for unit in units for i in unit})
-                ],
-                policies={sample.policy for unit in units for sample in unit.values()},
-            )
-            for (key, units), advantage in zip(settings.items(), means, strict=True)
-        ]
-
-
-def _by_task(levels: Sequence[_Level], weights: Sequence[float], slope: float) -> list[float]:
-    """The mean square distance of each task's cells from the line of all tasks."""
-    height = sum(
-        w * (level.advantage.value - slope * level.defect)
-        for w, level in zip(weights, levels, strict=True)
-    )
-    squares: dict[str, list[float]] = defaultdict(list)
-    for level in levels:
-        squares[level.task] += [(y - height - slope * x) ** 2 for x, y in level.cells]
-    return [float(np.mean(of_task)) for of_task in squares.values()]
+            if worlds and advised:
+                fixed = {agent: fmean(values) for agent, values in regret.items()}
+                name = " and ".join(rules)
+                found.append(Score(name, measure, worlds, answered, right, fmean(advised), fixed))
+    return found

@@ -17,7 +17,7 @@ from symsteer.leaderboard.known_agents import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.pairs import MEASURES, SHORT_NAMES
 from symsteer.leaderboard.plots import GREY, Axis, Dot, Figure, Look, Plot, Rule, Trace, cut
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
-from symsteer.leaderboard.sections import Section, View, unknown_task
+from symsteer.leaderboard.sections import Section, View
 from symsteer.leaderboard.text import (
     MARKS,
     NOTHING,
@@ -128,7 +128,7 @@ def defect_map(summary: Summary, audit: Audit) -> DefectMap:
 
 
 def render(advantages: DefectMap, view: View) -> list[str]:
-    """Figures, slopes and numbers by embodiment, the test on unknown tasks, and what is missing."""
+    """Figures, slopes and numbers by embodiment, and what is missing."""
     parts = [EXPLAINED]
     for embodiment in advantages.embodiments:
         panels = [
@@ -139,7 +139,6 @@ def render(advantages: DefectMap, view: View) -> list[str]:
         numbers = folded("The map's numbers", [_numbers(view.summary, panels)])
         parts += [f"### {code(embodiment)}", *view.drawn(embodiment), _slopes(panels)]
         parts.append("\n\n".join(numbers))
-    parts += view.blocks(unknown_task.SECTION)
     if not advantages.embodiments:
         parts.append("There is no map yet: no audited cell has paired runs of these agents.")
     if advantages.unaudited:

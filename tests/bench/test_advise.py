@@ -1,4 +1,4 @@
-"""`symsteer advise`: worlds by name and from an audit; mistakes."""
+"""`symsteer advise`: worlds by name, by their kind and by a probe; mistakes."""
 
 from __future__ import annotations
 
@@ -8,21 +8,31 @@ import pytest
 
 from symsteer.leaderboard import paths
 from symsteer.leaderboard.records import write_record
-from tests.leaderboard.record_factory import steered
-from tests.leaderboard.test_defects import CELL
+from tests.leaderboard.record_factory import make_cell, with_policies
 
-VARIANTS = {"none": 0.9, "action_gain:0.5": 0.7, "action_gain:1": 0.2}
-TASKS = ("PickCube-v1", "PushCube-v1", "StackCube-v1", "PullCube-v1")
+WORLDS = {
+    "none": {"base": 0.2, "zero": 0.4, "golden-ticket": 0.4, "equivariant": 0.8, "standard": 0.5},
+    "perception_bias:1": {
+        **{"base": 0.2, "zero": 0.4, "golden-ticket": 0.6},
+        **{"equivariant": 0.5, "standard": 0.8},
+    },
+}
+TASKS = ("PickCube-v1", "PushCube-v1", "StackCube-v1")
+
+
+def write(folder, records):
+    for record in records:
+        write_record(record, folder / f"{record.run_id}.json")
+    return folder
 
 
 @pytest.fixture(scope="module")
 def records(tmp_path_factory):
-    """Runs of four audited tasks, in which symmetry helps only while the world is symmetric."""
+    """Three tasks in which symmetry helps while the world is symmetric."""
     folder = tmp_path_factory.mktemp("records")
     for task in TASKS:
-        rates = {variant: (0.5, rate, 0.5) for variant, rate in VARIANTS.items()}
-        for record in steered(rates, task=task):
-            write_record(record, folder / task / f"{record.run_id}.json")
+        for variant, rates in WORLDS.items():
+            write(folder / task, with_policies(make_cell(rates, variant=variant, task=task)))
     return folder
 
 
@@ -31,67 +41,65 @@ def advise(records, command):
     return lambda *arguments: command("advise", *arguments, "--runs", records)
 
 
-def test_a_world_by_name(advise):
-    world = ("--task", "PushT-v1", "--variant", "action_gain:0.25")
-    code, shown = advise(*world)
+def told(shown):
+    return {one["measure"]: one["agent"] for one in json.loads(shown.out)["advice"]}
+
+
+def test_a_world_of_the_records(advise):
+    code, shown = advise("--task", "PickCube-v1", "--variant", "perception_bias:1")
     assert code == 0
-    found = json.loads(advise(*world, "--json")[1].out)
-    assert "PushT-v1, floating, action_gain:0.25, C8" in shown.out
-    assert "committed audit" in shown.out
-    (data,) = found["advice"]
-    (one,) = [
-        e for e in data["expected"] if (e["agent"], e["measure"]) == ("equivariant", "success")
-    ]
-    assert (one["source"], one["kind"], one["tasks"]) == ("other tasks", "action_gain", 4)
-    assert 0.1 < one["value"] < 0.5
-    assert f"{one['value']:+.3f} [" in shown.out
-    assert "success: take equivariant" in shown.out
-    (test,) = found["left_out"]
-    assert len(test["tasks"]) == 4
-    assert "by success in 12/12 cells (the agent that is best" in shown.out
-    header, row = shown.out.partition("Test: each task")[2].splitlines()[1:3]
-    assert row.index("equivariant") == header.index("Agent")
+    assert "success: take standard\n  records  take standard" in shown.out
+    assert "From 6 worlds of 3 tasks, of 1 study." in shown.out
 
 
-def test_worlds_of_an_audit(advise, tmp_path):
-    worlds = [
-        CELL | {"task": "Mine-v1", "variant": variant, "decision": [x, x, x], "part": "tool"}
-        for variant, x in (("action_gain:0.1", 0.1), ("shelf:0.5", 0.2))
-    ]
-    (tmp_path / "summary.json").write_text(json.dumps(worlds))
-    code, shown = advise("--audit", tmp_path)
+def test_a_world_that_no_record_has(advise):
+    code, shown = advise("--task", "PushT-v1", "--variant", "perception_bias:0.5", "--json")
     assert code == 0
-    assert "Mine-v1, floating, action_gain:0.1, C8" in shown.out
-    # The task and its dial are unknown here, and one dial is not enough for a part.
-    assert "kind of break         shelf or else part tool" in shown.out
-    assert "success: undecided, because" in shown.out
-    assert shown.out.count("Test: each task from") == 1
-
-
-@pytest.mark.long
-def test_the_file_of_one_audit(advise, tmp_path, command):
-    small = ("--base-policy", "none", "--states", 8, "--out", tmp_path)
-    code, _ = command("audit", "--task", "PushCube-v1", "--variant", "wind:0.3", *small)
+    assert told(shown) == {"auc": "standard", "success": "standard"}
+    code, shown = advise("--kind", "none", "--json")
+    assert told(shown) == {"auc": "equivariant", "success": "equivariant"}
+    code, shown = advise("--kind", "wind")
     assert code == 0
-    for path in (tmp_path, tmp_path / "audit.json"):
-        code, shown = advise("--audit", path)
-        assert code == 0
-        assert "PushCube-v1, floating, wind:0.3, C8" in shown.out
+    assert "success: take standard, because the rules refuse" in shown.out
+    assert "play base, zero and golden-ticket" in shown.out
+
+
+def test_a_probe_in_a_world_without_a_name(advise, tmp_path):
+    rates = {"base": 0.3, "zero": 0.2, "golden-ticket": 0.8}
+    probe = write(tmp_path / "probe", make_cell(rates, task="Mine-v1", episodes=200))
+    code, shown = advise("--probe", probe, "--json")
+    assert code == 0
+    found = json.loads(shown.out)
+    assert found["gain"]["value"] == pytest.approx(0.5)
+    assert told(shown) == {"auc": "standard", "success": "standard"}
+    for one in found["advice"]:
+        assert one["answers"]["kind"]["sign"] == 0
+        assert one["answers"]["probe"]["worlds"] == 3
+    code, shown = advise("--probe", probe)
+    assert "gain of the best constant noise  +0.500 [" in shown.out
+
+
+def test_a_test_on_left_out_tasks_is_shown(advise):
+    _, shown = advise("--kind", "none")
+    _, table = shown.out.split("Test: each world from the runs of the other tasks\n")
+    header, *rows = table.splitlines()
+    row = next(row for row in rows if row.startswith("kind     ") and "success" in row)
+    assert header.split()[:4] == ["Rule", "By", "Decided", "Answered"]
+    assert row.split()[1:6] == ["success", "6", "6", "6/6", "6/6"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), "name one world"),
-        (("--task", "PushT-v1", "--audit", "x"), "name one world"),
+        ((), "name a world"),
+        (("--task", "PushT-v1", "--kind", "wind"), "either with --task and --variant, or"),
         (("--task", "PushTea-v1"), "did you mean 'PushT-v1'"),
         (("--task", "PushT-v1", "--variant", "wnid:1"), "did you mean 'wind'"),
         (("--task", "PushT-v1", "--variant", "wind"), "wind"),
         (("--task", "all"), "not all"),
         (("--task", "PushT-v1", "--embodiment", "hand"), "hand"),
-        (("--task", "PushT-v1", "--variant", "wind:0.33"), "symsteer audit --task PushT-v1"),
-        (("--audit", "nowhere"), "cannot read nowhere"),
-        (("--audit", "."), "holds no audit"),
+        (("--kind", "wnid"), "did you mean 'wind'"),
+        (("--probe", "nowhere"), "nowhere"),
     ],
 )
 def test_mistakes(advise, tmp_path, monkeypatch, arguments, words):
@@ -102,8 +110,19 @@ def test_mistakes(advise, tmp_path, monkeypatch, arguments, words):
     assert shown.err.count("\n") == 1
 
 
+def test_a_probe_is_all_references_in_one_world(advise, tmp_path):
+    one = write(tmp_path / "one", make_cell({"base": 0.3, "zero": 0.2}, task="Mine-v1"))
+    code, shown = advise("--probe", one)
+    assert code == 2
+    assert "needs finished runs of base, zero, golden-ticket" in shown.err
+    other = write(tmp_path / "other", make_cell({"base": 0.3}, task="Other-v1"))
+    code, shown = advise("--probe", one, other)
+    assert code == 2
+    assert "the probe has runs of 2 worlds" in shown.err
+
+
 def test_an_installed_package_has_no_committed_records(tmp_path, monkeypatch, command):
     monkeypatch.setattr(paths, "RECORDS", tmp_path / "nothing")
-    code, shown = command("advise", "--task", "PushT-v1")
+    code, shown = command("advise", "--kind", "wind")
     assert code == 2
     assert "name run folders: symsteer advise --runs RUNS" in shown.err

@@ -241,6 +241,11 @@ def steered(
         for variant, values in rates.items()
         for record in make_cell(dict(zip(agents, values, strict=True)), variant=variant, **config)
     ]
+    return with_policies(records, policies)
+
+
+def with_policies(records: list[RunRecord], policies: int = 5) -> list[RunRecord]:
+    """The same records, with a base policy of the task's for each seed."""
     for record in records:
         which = f"{record.settings.task} {record.settings.seed % policies}"
         record.base_policy.content_hash = hashlib.sha256(which.encode()).hexdigest()

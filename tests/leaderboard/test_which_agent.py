@@ -1,212 +1,183 @@
-"""Advice from the map: the crossing is found, measured cells count first, intervals cover."""
+"""Advice: what two rules learn from worlds whose answer is known, and where they refuse."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from symsteer.leaderboard.advantage_by_defect import Point, points_of
-from symsteer.leaderboard.defects import Audit, AuditedDefect, Part
-from symsteer.leaderboard.rows import Summary, Table
-from symsteer.leaderboard.statistics import Interval, Sample
+from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.which_agent import (
-    Advice,
-    AuditedWorld,
-    Choice,
-    Expected,
-    Lines,
+    Lesson,
+    Question,
     advise,
-    choose,
-    expect,
+    by_kind,
+    by_probe,
+    gain_in,
+    leave_tasks_out,
+    lessons_of,
+    threshold,
 )
-from tests.leaderboard.conftest import TASKS, crossing
-from tests.leaderboard.record_factory import steered, summary_of
+from tests.leaderboard.record_factory import make_cell, summary_of, with_policies
 
-Map = tuple[Summary, Audit]
-
-
-def world(variant: str, defect: float, task: str = "New-v1", part: Part = "tool") -> AuditedWorld:
-    interval = Interval(defect, 0.95 * defect, 1.05 * defect)
-    return AuditedWorld(task, "floating", variant, "C8", AuditedDefect(interval, part))
-
-
-def expected_in(where: AuditedWorld, summary: Summary, audit: Audit) -> Expected:
-    """The expected advantage of `equivariant` in final success."""
-    points = points_of(summary, audit, where.embodiment, "equivariant", "success")
-    return expect(where, Lines(points, resamples=500))
+WORLDS = {
+    # The gain of the best constant noise above `zero`, and the better of both agents.
+    "none": (0.0, "equivariant"),
+    "action_gain:1": (0.05, "equivariant"),
+    "perception_bias:1": (0.2, "standard"),
+    "actuator_offset:1": (0.25, "standard"),
+}
 
 
-def test_the_crossing_is_found_for_a_new_task(map_of_five: Map) -> None:
-    def of(advice: Advice, agent: str, measure: str) -> float:
-        (one,) = [e for e in advice.expected if (e.agent, e.measure) == (agent, measure)]
-        assert one.value is not None
-        return one.value
+def lessons_in(task: str, worlds: dict[str, tuple[float, str]] = WORLDS) -> list[Lesson]:
+    """Both agents rise by 0.4 and 0.1 above the better reference, which is `zero`."""
+    cells = []
+    for variant, (gain, better) in worlds.items():
+        worse = "standard" if better == "equivariant" else "equivariant"
+        rates = {"base": 0.2, "zero": 0.4, "golden-ticket": 0.4 + gain, better: 0.8, worse: 0.5}
+        cells.append(with_policies(make_cell(rates, variant=variant, task=task)))
+    return lessons_of(summary_of(*cells))
 
-    summary, audit = map_of_five
-    near, far = (advise([summary], audit, world("wind:0.3", x)) for x in (0.05, 0.45))
-    for choice in near.choices:
-        assert choice.agents[0] == "equivariant"
-        assert of(near, "equivariant", choice.measure) == pytest.approx(0.25, abs=0.02)
-    for choice in far.choices:
-        assert choice.agents == ("approximate",)
-        assert of(far, "equivariant", choice.measure) == pytest.approx(-0.15, abs=0.02)
-        assert of(far, "approximate", choice.measure) == pytest.approx(0.1, abs=0.02)
+
+@pytest.fixture(scope="module")
+def lessons() -> list[Lesson]:
+    return [lesson for task in ("A-v1", "B-v1", "C-v1") for lesson in lessons_in(task)]
+
+
+def test_a_lesson_is_what_was_measured(lessons: list[Lesson]) -> None:
+    assert len(lessons) == 12
+    bias = next(lesson for lesson in lessons if lesson.kind == "perception_bias")
+    assert bias.gain
+    assert bias.gain.value == pytest.approx(0.2)
+    assert bias.advantage["success"].value == pytest.approx(-0.3)
+    assert bias.advantage["success"].sign == -1
+    assert bias.rise == pytest.approx({"standard": 0.4, "equivariant": 0.1})
+    assert bias.regret["success"] == pytest.approx({"standard": 0.0, "equivariant": 0.3})
+
+
+def test_a_gain_needs_all_three_references() -> None:
+    for missing in ("base", "zero", "golden-ticket"):
+        names = [n for n in ("base", "zero", "golden-ticket") if n != missing]
+        (table,) = summary_of(make_cell(dict.fromkeys(names, 0.5))).tables
+        assert gain_in(table) is None
+
+
+def test_a_kind_that_other_tasks_had_is_answered(lessons: list[Lesson]) -> None:
+    for kind, sign in (("none", 1), ("action_gain", 1), ("perception_bias", -1)):
+        answer = by_kind(lessons, Question(kind), "success")
+        assert (answer.sign, len(answer.lessons)) == (sign, 3)
+
+
+def test_the_kind_refuses_what_it_cannot_know(lessons: list[Lesson]) -> None:
+    assert by_kind(lessons, Question("wind"), "success").reason.startswith("other tasks with")
+    assert by_kind(lessons, Question(), "success").sign == 0
+    one_task = [lesson for lesson in lessons if lesson.task == "A-v1"]
+    assert by_kind(one_task, Question("none"), "success").sign == 0
+    other = lessons_in("D-v1", {"none": (0.0, "standard")})
+    contradicted = by_kind([*lessons, *other], Question("none"), "success")
+    assert (contradicted.sign, "either" in contradicted.reason) == (0, True)
+    nobody = {"success": Interval(0.1, -0.1, 0.3)}
+    unclear = [replace(lesson, advantage=nobody) for lesson in lessons]
+    assert by_kind(unclear, Question("none"), "success").reason.startswith("no difference is clear")
+
+
+def test_the_threshold_lies_between_the_worlds_of_either_agent(lessons: list[Lesson]) -> None:
+    limit = threshold(lessons, "success")
+    assert limit == pytest.approx(0.125)
+    one_sign = [lesson for lesson in lessons if lesson.kind == "none"]
+    assert threshold(one_sign, "success") is None
+    # One world on the wrong side moves it no further than it must.
+    odd = lessons_in("D-v1", {"none": (0.3, "equivariant")})
+    assert threshold([*lessons, *odd], "success") == pytest.approx(0.125)
 
 
 @pytest.mark.parametrize(
-    ("where", "value", "rests_on"),
+    ("gain", "sign", "worlds"),
     [
-        # Four cells of each task, without the obstacle.
-        (world("wind:0.3", 0.05), 0.25, ("other tasks", "wind", 20, 25, 5)),
-        # A dial that nobody has mapped: by the part of its defect, which two dials have.
-        (world("friction_patch:1", 0.05), 0.25, ("other tasks", "part tool", 25, 25, 5)),
-        (world("none", 0.0), 0.3, ("other tasks", "none", 5, 25, 5)),
-        (world("wind:0.50", 0.2, "D-v1"), 0.15, ("this cell", "wind", 1, 5, 1)),
+        (Interval(0.0, -0.1, 0.1), 1, 6),
+        (Interval(0.2, 0.15, 0.3), -1, 6),
+        (Interval(0.2, 0.1, 0.3), 0, 0),
+        (None, 0, 0),
     ],
 )
-def test_an_expectation_says_what_it_rests_on(
-    map_of_five: Map, where: AuditedWorld, value: float, rests_on: tuple[object, ...]
+def test_a_probe_is_answered_where_it_is_clear(
+    lessons: list[Lesson], gain: Interval | None, sign: int, worlds: int
 ) -> None:
-    one = expected_in(where, *map_of_five)
-    assert one.value == pytest.approx(value, abs=0.02)
-    assert (one.source, one.kind, one.cells, one.policies, one.tasks) == rests_on
-    assert one.reasons == ()
+    answer = by_probe(lessons, Question(gain=gain), "success")
+    assert (answer.sign, len(answer.lessons)) == (sign, worlds)
 
 
-def test_a_known_task_has_its_own_level() -> None:
-    offsets = crossing(dict(zip(TASKS, (0.0, 0.025, -0.025, 0.0, 0.25), strict=True)))
-    one = expected_in(world("wind:0.3", 0.15, "E-v1"), *offsets)
-    assert (one.source, one.tasks) == ("this task", 1)
-    assert one.value == pytest.approx(0.3 - 0.15 + 0.25, abs=0.02)
-    new = expected_in(world("wind:0.3", 0.15), *offsets)
-    assert new.value == pytest.approx(0.3 - 0.15 + 0.05, abs=0.02)
-    # What tasks differ in is a part of the interval of a new one.
-    assert new.interval.high - new.interval.low > 2 * (one.interval.high - one.interval.low)
-    assert new.interval.high > 0.4
-
-
-def test_too_little_decides_nothing(map_of_five: Map) -> None:
-    def reason(where: AuditedWorld, summary: Summary, audit: Audit) -> str:
-        one = expected_in(where, summary, audit)
-        assert one.sign == 0
-        return "; ".join(one.reasons)
-
-    near = world("wind:0.3", 0.1)
-    for number in (1, 2):
-        few = crossing(dict.fromkeys(TASKS[:number], 0.0))
-        assert f"other tasks with such cells: {number}, 3 are needed" in reason(near, *few)
-    alone = crossing(dict.fromkeys(TASKS, 0.0), policies=1)
-    here = world("wind:0.5", 0.2, "A-v1")
-    assert reason(here, *alone) == "base policies: 1, 5 are needed"
-    # Two tasks with two cells each: one degree of freedom is left.
-    summary, audit = few
-    ends = {place: d for place, d in audit.items() if place[2] in ("none", "wind:1")}
-    one = expected_in(world("wind:0.3", 0.1, "A-v1"), summary, ends)
-    assert (one.source, one.cells) == ("this task", 4)
-    assert one.reasons == ("too few cells to say how far they lie from their line",)
-    summary, audit = map_of_five
-    far = reason(world("wind:0.3", 0.9), summary, audit)
-    assert "lies beyond those of the map, 0.00 to 0.50" in far
-    # The controls alone are no line.
-    nothing = reason(world("directional_reward:1", 0.1, part="cost"), summary, audit)
-    assert nothing == "no mapped cell is like it: directional_reward or part cost"
-    # What one dial of a part does says nothing of another dial.
-    no_obstacle = {place: d for place, d in audit.items() if place[2] != "obstacle:1"}
-    one_dial = reason(world("friction_patch:1", 0.1), summary, no_obstacle)
-    assert "mapped dials of part tool: 1, 2 are needed" in one_dial
-
-
-def test_an_embodiment_without_cells_is_undecided(map_of_five: Map) -> None:
-    summary, audit = map_of_five
-    advice = advise([summary], audit, replace(world("wind:0.3", 0.1), embodiment="panda"))
-    assert advice.expected == ()
-    assert {(choice.agents, choice.reason) for choice in advice.choices} == {
-        ((), "no audited cell has paired runs of a learner and standard")
-    }
-
-
-def test_an_uncertain_audit_widens_the_interval(map_of_five: Map) -> None:
-    where = world("wind:0.3", 0.2)
-    vague = replace(where, defect=AuditedDefect(Interval(0.2, 0.0, 0.4), "tool"))
-    sure, unsure = (expected_in(w, *map_of_five).interval for w in (where, vague))
-    assert unsure.value == sure.value
-    assert unsure.high - unsure.low > 1.2 * (sure.high - sure.low)
-
-
-def test_studies_are_paired_apart_and_few_policies_do_not_count(map_of_five: Map) -> None:
-    summary, audit = map_of_five
-    other = summary_of(steered({"wind:0.5": (0.9, 0.1, 0.1)}, policies=1, task="A-v1"))
-    where = world("wind:0.5", 0.2, "A-v1")
-    assert advise([summary, other], audit, where) == advise([summary], audit, where)
-
-
-def test_the_choice() -> None:
-    def expected(agent: str, low: float, high: float, *reasons: str) -> Expected:
-        interval = Interval((low + high) / 2, low, high)
-        return Expected(interval.value, interval, reasons=reasons, agent=agent, measure="auc")
-
-    below, above = expected("a", -0.3, -0.1), expected("b", 0.1, 0.2)
-    best, open_ = expected("c", 0.2, 0.4), expected("d", -0.1, 0.9)
-    poor = expected("e", 0.5, 0.6, "base policies: 1", "tasks: 1")
-    unknown = replace(poor, value=None, interval=None, reasons=("no mapped cell is like it: wind",))
-    for given, agents in (
-        ([below, above, best, open_], ("c", "b")),
-        ([below, below], ("standard",)),
-        ([below, open_], ()),
-        ([poor], ()),
-        # An agent of which too little is known does not make the others worse.
-        ([below, poor], ()),
-        # One of which nothing is known does not keep the others from being worse.
-        ([below, unknown], ("standard",)),
+def test_a_probe_needs_other_tasks_that_were_probed(lessons: list[Lesson]) -> None:
+    gain = Interval(0.2, 0.15, 0.3)
+    for known in (
+        [replace(lesson, gain=None) for lesson in lessons],
+        [lesson for lesson in lessons if lesson.task == "A-v1"],
+        [lesson for lesson in lessons if lesson.kind == "none"],
     ):
-        assert choose("auc", given).agents == agents
-    poorer = replace(poor, reasons=("tasks: 1",))
-    assert choose("auc", [poor, poorer]).reason == "base policies: 1; tasks: 1"
-    assert choose("auc", [unknown]) == Choice("auc", (), "no mapped cell is like it: wind")
+        assert by_probe(known, Question(gain=gain), "success").sign == 0
 
 
-def drawn_map(
-    generator: np.random.Generator, table: Table, tasks: int, policies: int = 6
-) -> list[Point]:
-    """Tasks differ by 0.1 in level and 0.2 in slope, policies by 0.1 in level, cells by 0.02."""
-    points = []
-    for task in range(tasks):
-        level, slope = 0.2 + generator.normal(0, 0.1), -0.6 + generator.normal(0, 0.2)
-        own = generator.normal(0, 0.1, size=policies)
-        for strength, truth in zip((0.0, 0.3, 0.6, 1.0), (0.02, 0.15, 0.3, 0.5), strict=True):
-            measured = float(abs(truth + generator.normal(0, 0.01)))
-            defect = AuditedDefect(Interval(measured, measured - 0.02, measured + 0.02), "tool")
-            height = level + slope * truth + generator.normal(0, 0.02)
-            names = [f"task {task} policy {policy}" for policy in range(policies)]
-            values = height + own + generator.normal(0, 0.03, size=policies)
-            pairs = {
-                (name, seed): Sample.constant(float(value), name)
-                for seed, (name, value) in enumerate(zip(names, values, strict=True))
-            }
-            text = f"wind:{strength}" if strength else "none"
-            key = replace(table.key, task=f"T{task}-v1", breaking=(strength > 0, text))
-            points.append(Point(replace(table, key=key), defect, pairs))
-    return points
+def test_rules_that_agree_or_stand_alone_decide_and_others_refuse(lessons: list[Lesson]) -> None:
+    low, high = Interval(0.0, -0.1, 0.1), Interval(0.2, 0.15, 0.3)
+    cases = {
+        ("equivariant", False): (Question("none", low), Question("none"), Question(gain=low)),
+        ("standard", False): (Question("perception_bias", high), Question("wind", high)),
+        ("safe", True): (Question("none", high), Question("wind"), Question()),
+    }
+    for (agent, refused), questions in cases.items():
+        for question in questions:
+            advice = advise(lessons, question, "success", "safe")
+            assert (advice.agent, advice.refused) == (agent, refused), question
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("known", [True, False])
-def test_intervals_cover_what_is_measured(known: bool) -> None:
-    """The measured advantage of a cell that the line has not seen, of a known and of a new task."""
-    table = summary_of(steered({"none": (0.5, 0.6, 0.5)})).tables[0]
-    generator = np.random.default_rng(3)
-    inside, widths, trials = 0, [], 60
-    for _ in range(trials):
-        points = drawn_map(generator, table, 6)
-        unseen = points[-2]
-        lines = Lines([point for point in points if point is not unseen], resamples=300)
-        found = expect(AuditedWorld.of(unseen), lines, known=known)
-        assert (found.source, found.reasons) == ("this task" if known else "other tasks", ())
-        assert found.interval is not None
-        value = float(np.mean([sample.value for sample in unseen.pairs.values()]))
-        inside += found.interval.low <= value <= found.interval.high
-        widths.append(found.interval.high - found.interval.low)
-    assert inside >= 0.9 * trials
-    assert np.median(widths) < (0.45 if known else 0.9)
+def test_what_is_expected_is_what_worlds_like_it_showed(lessons: list[Lesson]) -> None:
+    advice = advise(lessons, Question("perception_bias"), "success")
+    assert advice.worlds == 3
+    assert advice.rise
+    assert advice.rise.value == pytest.approx(0.4)
+    assert advice.regret
+    assert advice.regret.value == pytest.approx(0.0, abs=1e-9)
+    # Where the rules refuse, all worlds are like it: two of four are lost by 0.3.
+    refused = advise(lessons, Question("wind"), "success")
+    assert (refused.worlds, refused.agent) == (12, "standard")
+    assert refused.regret
+    assert refused.regret.value == pytest.approx(0.15)
+    assert refused.regret.low < 0 < 0.3 < refused.regret.high
+
+
+def test_what_was_measured_in_this_world_counts_before_the_rules(lessons: list[Lesson]) -> None:
+    here = next(lesson for lesson in lessons if lesson.kind == "perception_bias")
+    question = Question("none", Interval(0.0, -0.1, 0.1), here)
+    advice = advise(lessons, question, "success")
+    assert advice.agent == "standard"
+    assert list(advice.answers) == ["records"]
+    unclear = replace(here, advantage={"success": Interval(0.1, -0.1, 0.3)})
+    advice = advise(lessons, replace(question, measured=unclear), "success")
+    assert advice.agent == "equivariant"
+    assert list(advice.answers) == ["records", "kind", "probe"]
+
+
+def test_tasks_are_left_out_one_by_one(lessons: list[Lesson]) -> None:
+    """D's worlds are the reverse of the others', so that no rule is right about them."""
+    turned = {
+        variant: (gain, "standard" if better == "equivariant" else "equivariant")
+        for variant, (gain, better) in WORLDS.items()
+    }
+    found = leave_tasks_out([*lessons, *lessons_in("D-v1", turned)])
+    kind, _, both = (score for score in found if score.measure == "success")
+    assert (kind.rule, kind.worlds) == ("kind", 16)
+    # Of A, B and C, D contradicts the other two; D itself is answered, wrongly.
+    assert (kind.answered, kind.right) == (4, 0)
+    assert both.rule == "kind and probe"
+    agreed = leave_tasks_out(lessons)
+    for score in agreed:
+        # A probe is unclear where the interval of its gain is wide; it is never wrong here.
+        assert (score.worlds, score.right) == (12, score.answered)
+        assert score.answered == (6 if score.rule == "probe" else 12)
+        assert score.rule == "probe" or score.regret == pytest.approx(0.0, abs=1e-9)
+        assert set(score.fixed) == {"equivariant", "standard"}
+        assert min(score.fixed.values()) > 0.1
+
+
+def test_of_two_tasks_none_can_be_left_out(lessons: list[Lesson]) -> None:
+    assert leave_tasks_out([lesson for lesson in lessons if lesson.task != "A-v1"]) == []

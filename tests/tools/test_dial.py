@@ -3,13 +3,13 @@
 import pytest
 
 from symsteer.errors import UserError
-from tools.pages.dial import Trial, below_best, loss, render, shared
+from tools.pages.dial import Trial, below_best, complete, loss, render, shared
 
 
 def trials(values):
     """Success and area by agent, world and base policy."""
     return [
-        Trial(agent, "defaults", world, seed, area, success, 60.0)
+        Trial(agent, "dial", world, seed, area, success, 60.0)
         for (agent, world), pairs in values.items()
         for seed, (success, area) in enumerate(pairs)
     ]
@@ -24,8 +24,8 @@ VALUES = {
 
 
 def test_a_loss_is_the_largest_regret_in_units_of_what_may_be_lost():
-    of_candidate = below_best(trials(VALUES))
-    standard, slow = (of_candidate[name, "defaults"] for name in ("standard", "slow"))
+    of_candidate = below_best(complete(trials(VALUES)))
+    standard, slow = (of_candidate[name, "dial"] for name in ("standard", "slow"))
     assert standard["none"] == pytest.approx((0.1, 0.03))
     assert slow["bias"] == pytest.approx((0.1, 0.0))
     assert loss(standard) == pytest.approx(2.0)
@@ -35,11 +35,11 @@ def test_a_loss_is_the_largest_regret_in_units_of_what_may_be_lost():
     ]
 
 
-def test_only_base_policies_that_all_have_count():
-    more = [*trials(VALUES), Trial("slow", "defaults", "none", 7, 0.0, 0.0, 60.0)]
-    assert below_best(more) == below_best(trials(VALUES))
-    with pytest.raises(UserError, match="no base policy of none has been tried by all"):
-        below_best([*trials(VALUES), Trial("free-bias", "defaults", "none", 7, 0.0, 0.0, 60.0)])
+def test_only_settings_with_all_worlds_and_base_policies_are_compared():
+    more = [*trials(VALUES), Trial("free-bias", "dial", "none", 0, 1.0, 1.0, 60.0)]
+    assert below_best(complete(more)) == below_best(complete(trials(VALUES)))
+    with pytest.raises(UserError, match="no setting was tried in all worlds"):
+        complete([*more, Trial("free-bias", "dial", "none", 7, 0.0, 0.0, 60.0)])
 
 
 def test_a_setting_that_all_share_is_chosen_by_the_mean_over_agents():
@@ -51,6 +51,6 @@ def test_a_setting_that_all_share_is_chosen_by_the_mean_over_agents():
         ("slow", "b"): 0.5,
     }
     runs = [Trial(*key, "none", 0, 0.5, value, 60.0) for key, value in success.items()]
-    of_candidate = below_best(shared(runs))
+    of_candidate = below_best(complete(shared(runs)))
     assert of_candidate["all", "a"]["none"] == pytest.approx((0.0, 0.0))
     assert of_candidate["all", "b"]["none"] == pytest.approx((0.1, 0.0))

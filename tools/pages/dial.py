@@ -2,15 +2,19 @@
 
 python -m tools.pages.dial                       # the tables of the committed trials
 python -m tools.pages.dial RUNS [RUNS ...]       # adds finished runs of these folders
+python -m tools.pages.dial --tasks StackCube-v1 --seeds 120      # only of this task and this policy
 
-If all agents have the same settings, as in dial-a, a table before the others takes them together.
+A setting is compared if it has all worlds and base policies that any setting has. If all agents
+have the same settings, as in dial-a, a table before the others takes them together.
 
 The committed trials are leaderboard/results/dial/trials.json: a run each, with its setting (the
-options that are not the agent's defaults), its area under the success curve and its final success.
+options that are not those of the preset dial), its area under the success curve and its final
+success.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections import defaultdict
@@ -23,6 +27,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from symsteer.agents import AGENTS
+from symsteer.agents.presets import preset_options
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
 from symsteer.leaderboard.keys import agent_options
@@ -43,7 +48,7 @@ class Trial:
     """One finished run.
 
     Attributes:
-        setting: options that differ from the agent's defaults, as text.
+        setting: options that differ from those of the preset ``dial``, as text.
         world: task and variant.
         area: under the curve of held-out success, as a share of the budget.
         success: in the final evaluation.
@@ -70,14 +75,16 @@ def trial_of(path: Path) -> Trial | None:
     if record.status != "finished" or record.final is None:
         return None
     config = record.settings
-    usual = agent_options({"agent_options": vars(AGENTS.get(config.agent).Options())})
+    kind = AGENTS.get(config.agent).Options
+    preset = kind(**preset_options("dial", config.agent, kind))
+    usual = agent_options({"agent_options": vars(preset)})
     options = agent_options(record.config)
     changed = {name: text for name, text in options.items() if usual.get(name) != text}
     steps = [evaluation.env_steps for evaluation in record.evaluations]
     successes = [evaluation.success_once for evaluation in record.evaluations]
     return Trial(
         config.agent,
-        " ".join(f"{name}={value}" for name, value in sorted(changed.items())) or "defaults",
+        " ".join(f"{name}={value}" for name, value in sorted(changed.items())) or "dial",
         f"{config.task} {config.variant}",
         config.seed,
         area_under_curve(steps, successes, config.env_steps),
@@ -90,22 +97,34 @@ Candidate = tuple[str, str]
 """An agent and its setting."""
 
 
-def below_best(trials: Iterable[Trial]) -> dict[Candidate, dict[str, tuple[float, float]]]:
+def complete(trials: Iterable[Trial]) -> dict[Candidate, list[Trial]]:
+    """The trials of each candidate that has all worlds and base policies that any has."""
+    of_candidate: dict[Candidate, list[Trial]] = defaultdict(list)
+    for trial in trials:
+        of_candidate[trial.agent, trial.setting].append(trial)
+    places = {c: {(t.world, t.seed) for t in tried} for c, tried in of_candidate.items()}
+    every = set().union(*places.values())
+    found = {c: tried for c, tried in of_candidate.items() if places[c] == every}
+    if not found:
+        raise UserError(
+            "no setting was tried in all worlds with all base policies; finish the suite, or name "
+            "fewer with --tasks and --seeds"
+        )
+    return found
+
+
+def below_best(
+    candidates: Mapping[Candidate, Sequence[Trial]],
+) -> dict[Candidate, dict[str, tuple[float, float]]]:
     """By how much each candidate is below the best one of each world, in success and in area.
 
-    Both are means over the base policies that all candidates of a world have.
+    Both are means over base policies.
     """
-    by_world: dict[str, dict[Candidate, dict[int, Trial]]] = defaultdict(lambda: defaultdict(dict))
-    for trial in trials:
-        by_world[trial.world][trial.agent, trial.setting][trial.seed] = trial
     result: dict[Candidate, dict[str, tuple[float, float]]] = defaultdict(dict)
-    for world, candidates in by_world.items():
-        shared = sorted(set.intersection(*(set(runs) for runs in candidates.values())))
-        if not shared:
-            raise UserError(f"no base policy of {world} has been tried by all; finish the suite")
+    for world in sorted({trial.world for tried in candidates.values() for trial in tried}):
         means = {
-            candidate: np.mean([(runs[s].success, runs[s].area) for s in shared], axis=0)
-            for candidate, runs in candidates.items()
+            candidate: np.mean([(t.success, t.area) for t in tried if t.world == world], axis=0)
+            for candidate, tried in candidates.items()
         }
         best = np.max(list(means.values()), axis=0)
         for candidate, mean in means.items():
@@ -132,12 +151,13 @@ def shared(trials: Iterable[Trial]) -> list[Trial]:
 
 def render(trials: Sequence[Trial]) -> str:
     """A row for each candidate, the best of an agent first; in markdown."""
-    of_candidate = below_best(trials)
+    candidates = complete(trials)
+    of_candidate = below_best(candidates)
     rows = []
     for (agent, setting), regret in sorted(
         of_candidate.items(), key=lambda item: (item[0][0], loss(item[1]))
     ):
-        runs = [t for t in trials if (t.agent, t.setting) == (agent, setting)]
+        runs = candidates[agent, setting]
         worst = max(regret, key=lambda world: regret[world][0])
         rows.append(
             [
@@ -160,19 +180,32 @@ def render(trials: Sequence[Trial]) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Collect, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").split("\n", 1)[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("runs", nargs="*", type=Path, help="folders of runs to add")
+    parser.add_argument("--tasks", nargs="*", default=[], help="all if none is named")
+    parser.add_argument("--seeds", nargs="*", type=int, default=[], help="all if none is named")
+    given = parser.parse_args(arguments)
     known: list[Trial] = []
     if TRIALS.is_file():
         known = TypeAdapter(list[Trial]).validate_json(TRIALS.read_bytes())
     by_key: dict[Any, Trial] = {trial.key: trial for trial in known}
-    for folder in arguments:
-        for path in sorted(Path(folder).glob("*/record.json")):
+    for folder in given.runs:
+        for path in sorted(folder.glob("*/record.json")):
             if (trial := trial_of(path)) is not None:
                 by_key[trial.key] = trial
-    if arguments:
+    if given.runs:
         text = json.dumps([asdict(by_key[key]) for key in sorted(by_key)], indent=0)
         TRIALS.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(TRIALS, f"{text}\n".encode())
-    trials = list(by_key.values())
+    trials = [
+        trial
+        for trial in by_key.values()
+        if (not given.tasks or trial.world.split()[0] in given.tasks)
+        and (not given.seeds or trial.seed in given.seeds)
+    ]
     settings = [
         {t.setting for t in trials if t.agent == agent} for agent in {t.agent for t in trials}
     ]
