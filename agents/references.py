@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 
 from symsteer.agents.agent import Agent
+from symsteer.agents.episodes import Played
+from symsteer.policies.sides import sides
 
 
 class BaseAgent(Agent):
@@ -16,6 +20,22 @@ class BaseAgent(Agent):
     def act(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
         """Noise ``[B, Tp, Da]``; random even if ``deterministic``, as the base policy is."""
         return self.gaussian_noise(len(obs))
+
+    def diagnostics(self, played: Played) -> Mapping[str, float | None]:
+        """Whether the episodes look the same on all sides (`symsteer.policies.sides`)."""
+        seen = played.greedy
+        chunks = self.decode(seen.obs.flatten(0, 1), seen.noise.flatten(0, 1))
+        actions = chunks.unflatten(0, seen.obs.shape[:2])[:, :, : self.context.execute]
+        found = sides(
+            self.obs_layout,
+            self.act_layout,
+            seen.obs,
+            actions,
+            seen.next_obs,
+            seen.running,
+            played.generator,
+        )
+        return {"direction_p": found.direction, "axis_p": found.axis}
 
 
 class ZeroAgent(Agent):

@@ -11,9 +11,6 @@ BASE = "base"
 ZERO, CONSTANT = "zero", "golden-ticket"
 """The frozen policy with no noise, and with the best constant one."""
 
-PROBE = (BASE, ZERO, CONSTANT)
-"""What is played in a world to ask it whether symmetry is in the way."""
-
 STANDARD, STRICT = "standard", "equivariant"
 """Without symmetry, with the channels of the equivariant agent; and the equivariant agent."""
 

@@ -1,4 +1,4 @@
-"""Which agent to take in a world of which no record says anything: two rules, from other tasks.
+"""Which agent to take in a world of which no record says anything: three rules.
 
 *Kind*: what was better in other tasks whose world is broken in the same way.
 
@@ -6,6 +6,9 @@
 (`golden-ticket`). A constant noise treats one direction unlike the others, which a symmetric agent
 cannot do. Where it gains much over the better of the other two, symmetry is in the way. How much is
 much, a threshold, is learned from the records.
+
+*Decisions*: where the base policy's own episodes are unlike on opposite sides, more than by chance
+(`symsteer.policies.sides`), symmetry is in the way. This rule learns nothing from the records.
 
 Where a rule is unsure it refuses. docs/advise.md has the rules' record.
 """
@@ -31,6 +34,9 @@ from symsteer.leaderboard.statistics import Interval, stratified_bootstrap
 LEAST_TASKS = 2
 """Other tasks that an answer needs."""
 
+UNLIKE, ALIKE = 0.01, 0.1
+"""p-values below the first: opposite sides are unlike; above the second: nothing says so."""
+
 
 @dataclass(frozen=True)
 class Lesson:
@@ -43,6 +49,7 @@ class Lesson:
         rise: of the final success of each learner above the better of base policy and zero noise;
             none if these were not played.
         regret: of each learner, by measure.
+        direction: p-value of the base policy's episodes being alike on all sides; None if unknown.
     """
 
     table: Table
@@ -50,6 +57,7 @@ class Lesson:
     advantage: dict[str, Interval]
     rise: dict[str, float]
     regret: dict[str, dict[str, float]]
+    direction: float | None = None
 
     @property
     def task(self) -> str:
@@ -68,11 +76,13 @@ class Question:
     Attributes:
         kind: how it is broken, a variant without strength or `none`; empty if unknown.
         gain: of the best constant noise there; None if it was not played.
+        direction: p-value of the base policy's episodes there being alike on all sides.
         measured: what the records say of this very world; None if they do not have it.
     """
 
     kind: str = ""
     gain: Interval | None = None
+    direction: float | None = None
     measured: Lesson | None = None
 
 
@@ -125,6 +135,7 @@ def _lesson(table: Table) -> Lesson:
         {m: stratified_bootstrap([list(pairs.values())]) for m, pairs in effects.items() if pairs},
         rise,
         regret,
+        direction_in(table),
     )
 
 
@@ -140,6 +151,18 @@ def gain_in(table: Table) -> Interval | None:
     better = max(rows, key=lambda row: row.success.value if row.success else 0.0).agent
     pairs = advantage(table, CONSTANT, better, "success")
     return stratified_bootstrap([list(pairs.values())]) if pairs else None
+
+
+def direction_in(table: Table) -> float | None:
+    """p-value of the base policies' episodes being alike on all sides (Fisher's over runs).
+
+    None if it was not measured, or if the policy is not symmetric, which sides then show.
+    """
+    row = None if table.key.base.startswith("plain") else table.row_of(BASE)
+    values = (
+        [v for run in row.finished if (v := run.last("direction_p")) is not None] if row else []
+    )
+    return float(stats.combine_pvalues(values).pvalue) if values else None
 
 
 def by_kind(lessons: Sequence[Lesson], question: Question, measure: str) -> Answer:
@@ -183,7 +206,25 @@ def by_probe(lessons: Sequence[Lesson], question: Question, measure: str) -> Ans
     return Answer(-1 if above else 1, f"a constant noise gains {word} {limit:+.3f}", like)
 
 
-RULES: dict[str, Rule] = {"kind": by_kind, "probe": by_probe}
+def by_decisions(lessons: Sequence[Lesson], question: Question, measure: str) -> Answer:
+    """Whether the base policy's episodes are unlike on opposite sides.
+
+    It refuses if the p-value lies between the two limits.
+    """
+    p = question.direction
+    if p is None:
+        return Answer(0, "no decisions are known")
+    if UNLIKE <= p <= ALIKE:
+        return Answer(0, f"whether opposite sides are alike is unclear (p = {p:.3f})")
+    known = tuple(one for one in lessons if one.direction is not None)
+    if p < UNLIKE:
+        like = tuple(one for one in known if (one.direction or 0.0) < UNLIKE)
+        return Answer(-1, f"opposite sides are unlike (p = {p:.3f})", like)
+    like = tuple(one for one in known if (one.direction or 0.0) > ALIKE)
+    return Answer(1, f"opposite sides look alike (p = {p:.3f})", like)
+
+
+RULES: dict[str, Rule] = {"kind": by_kind, "probe": by_probe, "decisions": by_decisions}
 
 
 def threshold(lessons: Sequence[Lesson], measure: str) -> float | None:
@@ -294,7 +335,7 @@ class Score:
     """How rules would have answered for tasks that they know nothing of.
 
     Attributes:
-        rule: its name, or both.
+        rule: its name, or those of all.
         worlds: that are decided.
         answered, right: of these.
         regret: mean over all worlds, decided or not, of the agent that was advised.
@@ -315,14 +356,18 @@ def leave_tasks_out(lessons: Sequence[Lesson], fallback: str = STANDARD) -> list
     found: list[Score] = []
     if len({lesson.task for lesson in lessons}) <= LEAST_TASKS:
         return found
+    told = {"kind": True, "probe": any(lesson.gain for lesson in lessons)}
+    told["decisions"] = any(lesson.direction is not None for lesson in lessons)
+    asked = [name for name in RULES if told[name]]
+    choices = [(name,) for name in asked] + ([tuple(asked)] if len(asked) > 1 else [])
     for measure in MEASURES:
-        for rules in (*((name,) for name in RULES), tuple(RULES)):
+        for rules in choices:
             answered = right = worlds = 0
             regret: dict[str, list[float]] = defaultdict(list)
             advised: list[float] = []
             for lesson in lessons:
                 others = [other for other in lessons if other.task != lesson.task]
-                question = Question(lesson.kind, lesson.gain)
+                question = Question(lesson.kind, lesson.gain, lesson.direction)
                 advice = advise(others, question, measure, fallback, rules)
                 known = lesson.regret[measure]
                 if {STRICT, STANDARD, fallback} <= known.keys():

@@ -45,7 +45,8 @@ def advise(
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none.
         kind: A variant without strength that is most like your world, or none: e.g.
             perception_bias if a camera is displaced.
-        probe: Folders of finished runs of the agents base, zero and golden-ticket in your world.
+        probe: Folders of finished runs in your world: of the agent base, whose decisions are asked
+            whether sides are alike, and of zero and golden-ticket, if a constant noise shall tell.
         runs: Folders of runs or records to learn from. Default: the committed records.
         json: Print only JSON, with every number.
     """
@@ -87,14 +88,17 @@ def advise(
     fallback = safe.agent if safe else STANDARD
     here = _here(lessons, task, embodiment, variant)
     others = [lesson for lesson in lessons if lesson.task != task]
-    gain = _gain(probed) if probed else here.gain if here else None
-    question = dataclasses.replace(question, gain=gain, measured=here)
+    gain, direction = (here.gain, here.direction) if here else (None, None)
+    if probed:
+        gain, direction = _found(probed)
+    question = dataclasses.replace(question, gain=gain, direction=direction, measured=here)
     advices = [advise(others, question, measure, fallback) for measure in MEASURES]
     scores = leave_tasks_out(lessons, fallback)
     if json:
         data = {
             "worlds": len(lessons),
             "gain": gain,
+            "direction": direction,
             "advice": [_as_data(one) for one in advices],
             "left_out": [dataclasses.asdict(score) for score in scores],
         }
@@ -106,7 +110,7 @@ def advise(
         f"{'study' if len(folders) == 1 else 'studies'}.",
         _facts(question),
         *map(_text, advices),
-        *([ASK] if question.gain is None and any(one.refused for one in advices) else []),
+        *([ASK] if probed is None and any(one.refused for one in advices) else []),
         _record(scores),
     ]
     print(printable("\n\n".join(blocks)))
@@ -150,15 +154,17 @@ def _probed(folders: tuple[Path, ...]) -> Table:
     return tables[0]
 
 
-def _gain(table: Table) -> Interval:
-    from symsteer.leaderboard.known_agents import PROBE
-    from symsteer.leaderboard.which_agent import gain_in
+def _found(table: Table) -> tuple[Interval | None, float | None]:
+    """What a probe tells: the gain of the best constant noise, and whether sides are alike."""
+    from symsteer.leaderboard.which_agent import direction_in, gain_in
 
-    gain = gain_in(table)
-    if gain is None:
-        names = ", ".join(PROBE)
-        raise UserError(f"the probe needs finished runs of {names} on the same base policy")
-    return gain
+    gain, direction = gain_in(table), direction_in(table)
+    if gain is None and direction is None:
+        raise UserError(
+            "the probe needs a finished run of base with this version, or runs of base, zero and "
+            "golden-ticket on the same base policy"
+        )
+    return gain, direction
 
 
 def _here(lessons: list[Lesson], task: str | None, embodiment: str, variant: str) -> Lesson | None:
@@ -188,6 +194,8 @@ def _facts(question: Question) -> str:
     facts = [["kind of break", question.kind or "not known"]]
     gain = _interval(question.gain) if question.gain else "not played"
     facts.append(["gain of the best constant noise", gain])
+    alike = "not known" if question.direction is None else f"p = {question.direction:.3f}"
+    facts.append(["opposite sides are alike", alike])
     return aligned([], facts, left=2)
 
 

@@ -79,6 +79,16 @@ def test_a_probe_in_a_world_without_a_name(advise, tmp_path):
     assert "gain of the best constant noise  +0.500 [" in shown.out
 
 
+def test_decisions_alone_are_a_probe(advise, tmp_path):
+    records = make_cell({"base": 0.3}, task="Mine-v1", seeds=1)
+    records[0].evaluations[-1].diagnostics["direction_p"] = 0.001
+    probe = write(tmp_path / "probe", records)
+    code, shown = advise("--probe", probe)
+    assert code == 0
+    assert "opposite sides are alike         p = 0.001" in shown.out
+    assert "decisions  take standard  opposite sides are unlike (p = 0.001)" in shown.out
+
+
 def test_a_test_on_left_out_tasks_is_shown(advise):
     _, shown = advise("--kind", "none")
     _, table = shown.out.split("Test: each world from the runs of the other tasks\n")
@@ -110,11 +120,11 @@ def test_mistakes(advise, tmp_path, monkeypatch, arguments, words):
     assert shown.err.count("\n") == 1
 
 
-def test_a_probe_is_all_references_in_one_world(advise, tmp_path):
+def test_a_probe_says_something_of_one_world(advise, tmp_path):
     one = write(tmp_path / "one", make_cell({"base": 0.3, "zero": 0.2}, task="Mine-v1"))
     code, shown = advise("--probe", one)
     assert code == 2
-    assert "needs finished runs of base, zero, golden-ticket" in shown.err
+    assert "runs of base, zero and golden-ticket on the same base policy" in shown.err
     other = write(tmp_path / "other", make_cell({"base": 0.3}, task="Other-v1"))
     code, shown = advise("--probe", one, other)
     assert code == 2

@@ -8,11 +8,14 @@ import pytest
 
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.which_agent import (
+    RULES,
     Lesson,
     Question,
     advise,
+    by_decisions,
     by_kind,
     by_probe,
+    direction_in,
     gain_in,
     leave_tasks_out,
     lessons_of,
@@ -117,6 +120,24 @@ def test_a_probe_needs_other_tasks_that_were_probed(lessons: list[Lesson]) -> No
         assert by_probe(known, Question(gain=gain), "success").sign == 0
 
 
+def test_opposite_sides_that_are_unlike_call_for_no_symmetry(lessons: list[Lesson]) -> None:
+    known = [replace(one, direction=0.001 * (4 if one.kind == "none" else 400)) for one in lessons]
+    for p, sign, worlds in ((0.001, -1, 3), (0.05, 0, 0), (0.4, 1, 9), (None, 0, 0)):
+        answer = by_decisions(known, Question(direction=p), "success")
+        assert (answer.sign, len(answer.lessons)) == (sign, worlds)
+
+
+def test_sides_are_known_of_symmetric_policies_alone() -> None:
+    for policy, wanted in (("edp", 0.0199), ("plain", None)):
+        records = with_policies(make_cell({"base": 0.2}, seeds=2))
+        for record, p in zip(records, (0.01, 0.3), strict=True):
+            record.base_policy.name = policy
+            record.evaluations[-1].diagnostics["direction_p"] = p
+        (table,) = summary_of(records).tables
+        # Fisher: 0.003 (1 - log 0.003).
+        assert direction_in(table) == (wanted and pytest.approx(wanted, rel=0.05))
+
+
 def test_rules_that_agree_or_stand_alone_decide_and_others_refuse(lessons: list[Lesson]) -> None:
     low, high = Interval(0.0, -0.1, 0.1), Interval(0.2, 0.15, 0.3)
     cases = {
@@ -147,14 +168,14 @@ def test_what_is_expected_is_what_worlds_like_it_showed(lessons: list[Lesson]) -
 
 def test_what_was_measured_in_this_world_counts_before_the_rules(lessons: list[Lesson]) -> None:
     here = next(lesson for lesson in lessons if lesson.kind == "perception_bias")
-    question = Question("none", Interval(0.0, -0.1, 0.1), here)
+    question = Question("none", Interval(0.0, -0.1, 0.1), measured=here)
     advice = advise(lessons, question, "success")
     assert advice.agent == "standard"
     assert list(advice.answers) == ["records"]
     unclear = replace(here, advantage={"success": Interval(0.1, -0.1, 0.3)})
     advice = advise(lessons, replace(question, measured=unclear), "success")
     assert advice.agent == "equivariant"
-    assert list(advice.answers) == ["records", "kind", "probe"]
+    assert list(advice.answers) == ["records", *RULES]
 
 
 def test_tasks_are_left_out_one_by_one(lessons: list[Lesson]) -> None:

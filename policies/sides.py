@@ -1,0 +1,99 @@
+"""Do decisions look the same on all sides? An exact test (ours), without a model or training.
+
+In a symmetric world, with a symmetric policy, a whole episode and the episode turned by a quarter
+are equally likely. So the mean of any vector over episodes is 0, but for chance: of what is seen,
+of how it changes, of what is done. A mean that is not 0 has a *direction*: one side is unlike the
+opposite one, as behind a displaced camera. The same holds for products of two vectors (frequency
+2), whose mean has an *axis*: x is unlike y, as with a weak motor along x.
+
+Whether a mean is too large for chance is asked by a randomisation test: every episode is turned by
+a random quarter, 999 times over (Lehmann and Romano, Testing Statistical Hypotheses, chapter 15).
+Its level is exact for any number of episodes: no distribution is assumed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from symsteer.policies.geometry import Layout
+
+DRAWS = 999
+
+RESTING = 1e-4
+"""Vectors at rest: those with less than this share of the largest one's root mean square."""
+
+
+@dataclass(frozen=True)
+class Sides:
+    """p-values: how likely means as large as these are in a symmetric world.
+
+    Attributes:
+        direction: of vectors.
+        axis: of products of two vectors.
+    """
+
+    direction: float
+    axis: float
+
+
+def vectors(layout: Layout, x: torch.Tensor) -> torch.Tensor:
+    """The horizontal vectors in ``x [..., dim]`` as complex numbers ``[..., fields]``.
+
+    Of a field with several blocks, such as a cloud of points, the mean.
+    """
+    parts = [
+        x[..., layout.slice(field.name)].unflatten(-1, (-1, 2)).mean(-2)
+        for field in layout.fields
+        if field.frequency == 1
+    ]
+    stacked = torch.stack(parts, -2) if parts else x.new_zeros((*x.shape[:-1], 0, 2))
+    return torch.view_as_complex(stacked.double().contiguous())
+
+
+def sides(
+    obs_layout: Layout,
+    act_layout: Layout,
+    obs: torch.Tensor,
+    actions: torch.Tensor,
+    next_obs: torch.Tensor,
+    counts: torch.Tensor,
+    generator: torch.Generator,
+) -> Sides:
+    """The test on N episodes of T decisions.
+
+    Args:
+        obs_layout, act_layout: of observations and actions.
+        obs, next_obs: before and after each decision, ``[T, N, obs_dim]``.
+        actions: executed, ``[T, N, steps, act_dim]``.
+        counts: which decisions count, ``[T, N]`` bool; at least one of each episode.
+        generator: of the random quarters.
+    """
+    before, after = vectors(obs_layout, obs), vectors(obs_layout, next_obs)
+    done = vectors(act_layout, actions.sum(2))
+    seen = torch.cat([before, after - before, done], dim=-1)
+    weights = (counts / counts.sum(0)).to(seen.dtype)[..., None]
+    directed = (weights * seen).sum(0)
+    first, second = torch.triu_indices(seen.shape[-1], seen.shape[-1], device=seen.device)
+    axial = torch.einsum("tni,tnj->nij", weights * seen, seen)[:, first, second]
+    quarters = torch.randint(4, (DRAWS, obs.shape[1]), generator=generator, device=obs.device)
+    turns = torch.view_as_complex(
+        torch.tensor([[1, 0], [0, 1], [-1, 0], [0, -1]], dtype=torch.float64, device=obs.device)
+    )[quarters]
+    return Sides(_p_value(directed, turns), _p_value(axial, turns**2))
+
+
+def _p_value(values: torch.Tensor, turns: torch.Tensor) -> float:
+    """Of means over episodes ``values [N, features]``, under ``turns [draws, N]``."""
+    spread = values.abs().square().mean(0).sqrt()
+    # What moves less than this is an error of rounding, which has a direction of its own.
+    moves = spread > RESTING * spread.max() if values.shape[1] else spread > 0
+    if not moves.any():
+        return 1.0
+    values = values[:, moves] / spread[moves]
+    drawn = torch.cat([torch.ones_like(turns[:1]), turns])
+    sizes = (drawn @ values).abs() ** 2
+    # In the same units, so that the largest of them is not that of the most variable one.
+    largest = ((sizes - sizes.mean(0)) / sizes.std(0).clamp(min=1e-12)).amax(1)
+    return float((largest >= largest[0]).double().mean())
