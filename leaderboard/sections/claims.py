@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from symsteer.leaderboard.statistics import (
     CONFIDENCE,
     BootstrapEstimate,
     Effect,
+    Interval,
     Sample,
     ShareDifference,
     cell_estimates,
@@ -30,7 +31,7 @@ from symsteer.leaderboard.statistics import (
     units_of,
 )
 from symsteer.leaderboard.study import Cells, Claim, Study
-from symsteer.leaderboard.text import NOTHING, SPACE, code, number, stacked, table_text
+from symsteer.leaderboard.text import NOTHING, SPACE, code, interval, number, stacked, table_text
 from symsteer.names import unknown
 from symsteer.variant import specs_at, variant_text
 
@@ -42,7 +43,8 @@ Effects are differences of two agents, paired by base policy and seed (success a
 episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNIT:g} of defect,
 within base policies. *Supported* and *contradicted* need p < 0.05 for "no effect", *equivalent*
 needs it for "an effect of at least the smallest one of interest"; otherwise a claim is *undecided*.
-Both p-values are corrected for the number of tests of a family (Holm), the intervals are not."""
+Both p-values are corrected for the number of tests of a family (Holm), the intervals are not. *But
+not without* names each task without whose cells the interval holds 0."""
 
 MEASURE_WORDS = {
     "auc": "area under the curve",
@@ -75,6 +77,10 @@ class ClaimOutcome:
     """Of no effect, corrected for the number of tested claims of the family (Holm)."""
     p_equal: float = 1.0
     """Of an effect at least as large as the smallest of interest, corrected in the same way."""
+    by_task: Mapping[str, Interval] = field(default_factory=dict)
+    """The effect in the cells of each task, if there are several."""
+    rests_on: tuple[str, ...] = ()
+    """The tasks without whose cells the interval does not exclude 0 on the same side."""
 
     @property
     def verdict(self) -> str:
@@ -161,10 +167,11 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
         reason = f"fewer than {MIN_SEEDS} pairs of runs in every cell"
     else:
         sides = [[(t, pairs) for t, pairs in side if len(pairs) >= MIN_SEEDS] for side in sides]
-    weights = [sign / len(side) for sign, side in zip((1, -1), sides, strict=False) for _ in side]
     everything = [cell for side in sides for cell in side]
     effect: Effect | None
     counts = ""
+    by_task: dict[str, Interval] = {}
+    rests_on: list[str] = []
     if claim.effect == "slope":
         points = [
             Point(table, defect, pairs)
@@ -177,11 +184,15 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
         everything = [(p.table, dict(p.pairs)) for p in points if p.setting in fitted.settings]
         effect, reason = combined([fitted.slope], [SLOPE_UNIT]), reason or fitted.reason
     else:
-        drawn = combined(cell_estimates([list(p.values()) for _, p in everything]), weights)
+        drawn = _mean(sides)
         effect = drawn
         if claim.measure == "diverged":
             effect, counts = _shares(everything, claim, drawn)
             reason = reason if effect else "nobody diverged"
+        else:
+            by_task, without = _tasks(sides)
+            sign = drawn.interval().sign
+            rests_on = [task for task, left in without.items() if sign and left.sign != sign]
     pairs_used = {pair for _, pairs in everything for pair in pairs}
     return ClaimOutcome(
         claim,
@@ -191,7 +202,30 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
         policies=len({policy for policy, _ in pairs_used}),
         reason=reason,
         counts=counts,
+        by_task=by_task,
+        rests_on=tuple(rests_on),
     )
+
+
+def _mean(sides: Sequence[Used]) -> BootstrapEstimate:
+    """Mean over the cells of the first side, less that of the second one if there is one."""
+    weights = [sign / len(side) for sign, side in zip((1, -1), sides, strict=False) for _ in side]
+    cells = [list(pairs.values()) for side in sides for _, pairs in side]
+    return combined(cell_estimates(cells), weights)
+
+
+def _tasks(sides: Sequence[Used]) -> tuple[dict[str, Interval], dict[str, Interval]]:
+    """The effect in each of several tasks, and without each of them, where all sides have cells."""
+    tasks = sorted({table.key.task for side in sides for table, _ in side})
+    alone, without = {}, {}
+    for task in tasks if len(tasks) > 1 else ():
+        there = [[cell for cell in side if cell[0].key.task == task] for side in sides]
+        elsewhere = [[cell for cell in side if cell[0].key.task != task] for side in sides]
+        if all(there):
+            alone[task] = _mean(there).interval()
+        if all(elsewhere):
+            without[task] = _mean(elsewhere).interval()
+    return alone, without
 
 
 def selected(cells: Cells, tables: Sequence[Table], audit: Audit) -> tuple[list[Table], str]:
@@ -339,6 +373,13 @@ def render(outcomes: list[ClaimOutcome], view: View) -> list[str]:
     parts = [EXPLAINED, origin]
     if rows:
         parts.append(table_text(rows, left=3))
+    if several := [outcome for outcome in outcomes if outcome.by_task]:
+        by_task = [
+            {"Claim": title(outcome.claim)}
+            | {code(task): interval(each, sign=True) for task, each in outcome.by_task.items()}
+            for outcome in several
+        ]
+        parts += ["The same effects in each task:", table_text(by_task, sparse=True)]
     if untested:
         lines = [f"- {reason}: {'; '.join(names)}" for reason, names in untested.items()]
         parts.append("Not tested:\n\n" + "\n".join(lines))
@@ -358,6 +399,8 @@ def verdict_text(outcome: ClaimOutcome) -> str:
     text = f"**{outcome.verdict}**"
     if outcome.reason:
         return f"{text}: {outcome.reason}"
+    if outcome.verdict in ("supported", "contradicted") and outcome.rests_on:
+        text += f", but not without {' or '.join(map(code, outcome.rests_on))}"
     if outcome.policies >= MIN_SEEDS or outcome.verdict == "undecided":
         return text
     policies = "one base policy" if outcome.policies == 1 else f"{outcome.policies} base policies"

@@ -18,7 +18,7 @@ from symsteer.leaderboard.sections.claims import (
     verdict_text,
 )
 from symsteer.leaderboard.statistics import CONFIDENCE, Interval
-from symsteer.leaderboard.text import NOTHING, compact, table_text
+from symsteer.leaderboard.text import NOTHING, code, compact, table_text
 
 POWER = 0.8
 
@@ -51,7 +51,12 @@ def render(said: dict[str, list[ClaimOutcome]], view: View) -> list[str]:
         return ["\n".join(lines), "Each with its tests: [the paper's claims](PAPER.md)."]
     named: dict[str, list[str]] = {}
     for outcome in view.findings.of(claims.SECTION):
-        named.setdefault(outcome.verdict, []).append(title(outcome.claim))
+        rest = (
+            f" (but not without {' or '.join(map(code, outcome.rests_on))})"
+            if outcome.rests_on
+            else ""
+        )
+        named.setdefault(outcome.verdict, []).append(title(outcome.claim) + rest)
     order = ("supported", "contradicted", "equivalent", "undecided", "not tested")
     lines = [
         f"- **{verdict.capitalize()}** ({len(named[verdict])}): {'; '.join(named[verdict])}."

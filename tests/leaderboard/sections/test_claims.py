@@ -11,7 +11,7 @@ import pytest
 from symsteer.errors import UserError
 from symsteer.leaderboard.defects import Audit
 from symsteer.leaderboard.records import RunRecord
-from symsteer.leaderboard.sections.claims import SECTION, ClaimOutcome, claims
+from symsteer.leaderboard.sections.claims import SECTION, ClaimOutcome, claims, verdict_text
 from symsteer.leaderboard.statistics import ShareDifference
 from symsteer.leaderboard.study import PAPER, Claim, Safe, Study, read_study
 from tests.leaderboard.record_factory import (
@@ -24,6 +24,7 @@ from tests.leaderboard.record_factory import (
     summary_of,
     table_after,
     view_of,
+    with_policies,
 )
 
 DEFECTS = {"none": 0.01, "wind:0.1": 0.04, "wind:0.5": 0.1, "wind:0.8": 0.26, "wind:1": 0.4}
@@ -90,6 +91,30 @@ def test_differences_are_means_over_the_selected_cells() -> None:
     ]
     found = outcomes(cells(rates), *(claim_of(cells=chosen) for _, chosen in selections))
     assert [value(one) for one in found] == pytest.approx([expected for expected, _ in selections])
+
+
+def test_a_verdict_names_the_task_without_which_it_does_not_hold() -> None:
+    """A gains .6, B and C gain nothing; then all gain .3."""
+    rates = {"A-v1": 0.9, "B-v1": 0.3, "C-v1": 0.3}
+    for gains, rests_on in ((rates, ("A-v1",)), (dict.fromkeys(rates, 0.6), ())):
+        records = [
+            record
+            for task, rate in gains.items()
+            for record in make_cell({"standard": 0.3, "equivariant": rate}, task=task)
+        ]
+        (one,) = outcomes(with_policies(records), claim_of())
+        assert (one.verdict, one.rests_on) == ("supported", rests_on)
+        assert {task: each.value for task, each in one.by_task.items()} == pytest.approx(
+            {task: rate - 0.3 for task, rate in gains.items()}
+        )
+        words = ", but not without `A-v1`" if rests_on else ""
+        assert verdict_text(one) == f"**supported**{words}"
+
+
+def test_one_task_is_not_left_out() -> None:
+    rates = {"none": {"standard": 0.3, "equivariant": 0.9}}
+    (one,) = outcomes(cells(rates), claim_of())
+    assert (one.rests_on, one.by_task) == ((), {})
 
 
 def test_no_difference_is_undecided_until_it_is_shown_to_be_small() -> None:
