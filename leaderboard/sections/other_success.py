@@ -1,0 +1,93 @@
+"""Whether the answer depends on what counts as success, or on how the agent acts."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from statistics import fmean
+
+from symsteer.leaderboard.catalogue import IN_WORDS
+from symsteer.leaderboard.known_agents import STANDARD, STRICT
+from symsteer.leaderboard.rows import MIN_SEEDS, AgentRow, Summary, Table
+from symsteer.leaderboard.runs import Run
+from symsteer.leaderboard.sections import Section, View
+from symsteer.leaderboard.sections.what_symmetry_gains import kinds
+from symsteer.leaderboard.statistics import Interval, Sample, stratified_bootstrap
+from symsteer.leaderboard.text import difference, table_text
+
+EXPLAINED = f"""\
+`{STRICT}` minus `{STANDARD}` by other measures of success, mean over the cells of a kind of world,
+paired by base policy, with 95 % intervals. *Once*: at any step of the episode; *at the end*: at its
+last step. *Stochastic*: the actor with its exploration. All of them are of the final evaluation."""
+
+MEASURES = ("once", "at the end", "once, stochastic", "at the end, stochastic")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A kind of world.
+
+    Attributes:
+        kind: as markdown.
+        effects: by measure, those that enough base policies have.
+        cells: that any of them rests on.
+    """
+
+    kind: str
+    effects: dict[str, Interval]
+    cells: int
+
+
+def measured(run: Run) -> dict[str, float]:
+    """The shares of successes that a finished run's final evaluation has."""
+    assert run.record.final is not None
+    episodes = run.record.final.episodes
+    values = {
+        "once": fmean(map(float, episodes.success_once)),
+        "at the end": fmean(map(float, episodes.success_at_end)),
+        "once, stochastic": run.last("success_stochastic"),
+        "at the end, stochastic": run.last("success_at_end_stochastic"),
+    }
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def compute(summary: Summary) -> list[Row]:
+    """Kinds without a measure in a cell with enough base policies are left out."""
+    rows = []
+    for kind, tables in kinds(summary, IN_WORDS).items():
+        cells = {name: [c for t in tables if (c := _pairs(t, name))] for name in MEASURES}
+        effects = {name: stratified_bootstrap(each) for name, each in cells.items() if each}
+        if effects:
+            rows.append(Row(kind, effects, max(map(len, cells.values()))))
+    return rows
+
+
+def _pairs(table: Table, name: str) -> list[Sample]:
+    rows = table.row_of(STRICT), table.row_of(STANDARD)
+    strict, plain = (_by_policy(row, name) if row else {} for row in rows)
+    shared = sorted(strict.keys() & plain.keys())
+    if len(shared) < MIN_SEEDS:
+        return []
+    return [Sample.constant(strict[policy] - plain[policy], policy) for policy in shared]
+
+
+def _by_policy(row: AgentRow, name: str) -> dict[str, float]:
+    values: dict[str, list[float]] = defaultdict(list)
+    for run in row.finished:
+        if (value := measured(run).get(name)) is not None:
+            values[run.policy].append(value)
+    return {policy: fmean(of_runs) for policy, of_runs in values.items()}
+
+
+def render(rows: list[Row], view: View) -> list[str]:
+    """A row for each kind of world, a column for each measure that any of them has."""
+    shown = [
+        {"World": row.kind}
+        | {name: difference(each) for name, each in row.effects.items()}
+        | {"Cells": str(row.cells)}
+        for row in rows
+    ]
+    return [EXPLAINED, table_text(shown, sparse=True)] if shown else []
+
+
+SECTION = Section("Other measures of success", lambda findings: compute(findings.summary), render)
