@@ -49,9 +49,9 @@ alone, never from a comparison of policies, tasks or embodiments. Its interval d
 (runs, where a task has one policy) and episodes, and the defects within their intervals; it is
 about these cells. With fewer than {MIN_SEEDS} base policies it decides nothing. Lines in the figure
 have this slope and go through the mean of their task; the fan has the slopes of the interval. They
-are bent, because the axis of the defect is logarithmic. An advantage *ends* where the line crosses
-0; between the numbers in brackets 0 is not excluded (95 %, Fieller's method), and a dash there
-means: up to the end of the measured range."""
+are bent, because the axis of the defect is logarithmic. An advantage *ends* where the line of a
+single task crosses 0; between the numbers in brackets 0 is not excluded (95 %, Fieller's method),
+and a dash there means: up to the end of the measured range."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ class Panel:
     Attributes:
         fit: over all dials; None if no base policy was steered at two defects.
         dials: fits to the unbroken control and one dial, by its name.
+        tasks: fits to the cells of one task, by its name, if there are several.
     """
 
     embodiment: str
@@ -69,6 +70,7 @@ class Panel:
     points: tuple[Point, ...] = ()
     fit: Fit | None = None
     dials: Mapping[str, Fit] = field(default_factory=dict)
+    tasks: Mapping[str, Fit] = field(default_factory=dict)
 
     @property
     def reason(self) -> str:
@@ -122,9 +124,16 @@ def defect_map(summary: Summary, audit: Audit) -> DefectMap:
                     points=tuple(points),
                     fit=fit(points),
                     dials={dial: fitted for dial, fitted in fits.items() if fitted},
+                    tasks=_by_task(points),
                 )
     unaudited = tuple(table for table in summary.tables if not defect_of(table.key, audit))
     return DefectMap(panels, unaudited)
+
+
+def _by_task(points: Sequence[Point]) -> dict[str, Fit]:
+    tasks = sorted({point.table.key.task for point in points})
+    fits = {task: fit([p for p in points if p.table.key.task == task]) for task in tasks}
+    return {task: fitted for task, fitted in fits.items() if fitted and len(tasks) > 1}
 
 
 def render(advantages: DefectMap, view: View) -> list[str]:
@@ -161,6 +170,7 @@ def _slopes(panels: Sequence[Panel]) -> str:
         fits: dict[str, Fit | None] = {code(dial): fit for dial, fit in panel.dials.items()}
         if len(fits) > 1:
             fits = {"all": panel.fit, **fits}
+        fits |= {f"all, {code(task)}": fitted for task, fitted in panel.tasks.items()}
         rows += [_slope(panel, dial, fit) for dial, fit in (fits or {NOTHING: None}).items()]
     return table_text(rows, left=3)
 
@@ -168,6 +178,8 @@ def _slopes(panels: Sequence[Panel]) -> str:
 def _slope(panel: Panel, dial: str, fit: Fit | None) -> dict[str, str]:
     slope = fit.slope.interval() if fit else None
     reason = fit.reason if fit else panel.reason
+    # Tasks have levels of their own: where the mean of several crosses 0 is true of none of them.
+    one_task = fit is not None and len({line.setting.task for line in fit.lines}) == 1
     return {
         "Agent": code(panel.agent),
         "Advantage in": SHORT_NAMES[panel.measure],
@@ -175,7 +187,9 @@ def _slope(panel: Panel, dial: str, fit: Fit | None) -> dict[str, str]:
         "Base policies": str(fit.policies) if fit else NOTHING,
         # A mark would be read as a decision.
         "Slope per 1 of defect": stacked(slope, sign=True, marks="" if reason else mark_of(slope)),
-        "Advantage ends at a defect of": _crossing(fit) if fit and not reason else NOTHING,
+        "Advantage ends at a defect of": _crossing(fit)
+        if fit and one_task and not reason
+        else NOTHING,
         "Undecided because": reason or ("" if mark_of(slope) else "the interval contains 0"),
     }
 

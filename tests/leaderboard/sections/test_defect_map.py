@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from symsteer.leaderboard.sections.defect_map import SECTION, audit_commands, defect_map
+from symsteer.leaderboard.text import NOTHING
 from tests.leaderboard.record_factory import (
     audit_of,
     make_cell,
@@ -50,6 +51,25 @@ def test_every_dial_has_a_slope() -> None:
     assert slopes == pytest.approx({"action_gain": 0.0, "obstacle+wind": 0.0, "wind": -1.0})
     assert panel.fit is not None
     assert -1 < panel.fit.slope.value < 0
+
+
+def test_an_advantage_ends_in_a_task_and_not_in_a_mean_of_tasks() -> None:
+    """A's advantage ends at 0.1, that of B at 0.3: the mean of both, 0.2, is true of neither."""
+    defects = {"none": 0.0, "wind:0.5": 0.2, "wind:1": 0.4}
+    records, audit = [], {}
+    for task, end in (("A-v1", 0.1), ("B-v1", 0.3)):
+        rates = {variant: (0.5, 0.5 + end - defect, 0.5) for variant, defect in defects.items()}
+        records += steered(rates, task=task)
+        audit |= audit_of(defects, width=0.001, task=task)
+    view = view_of(records, audit=audit)
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for block in view.blocks(SECTION)
+        for line in block.splitlines()
+        if line.startswith("| `equivariant` | success |")
+    ]
+    ends = {row[2]: row[5].partition("\u00a0")[0] for row in rows if len(row) == 7}
+    assert ends == {"`wind`": NOTHING, "all, `A-v1`": "0.10", "all, `B-v1`": "0.30"}
 
 
 def test_the_page_names_slopes_parts_and_what_is_missing() -> None:
