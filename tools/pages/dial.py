@@ -7,24 +7,20 @@ python -m tools.pages.dial --tasks StackCube-v1 --seeds 120      # only of this 
 A setting is compared if it has all worlds and base policies that any setting has. If all agents
 have the same settings, as in dial-a, a table before the others takes them together.
 
-The committed trials are leaderboard/results/dial/trials.json: a run each, with its setting (the
-options that are not those of the preset dial), its area under the success curve and its final
-success.
+The committed trials are the records of leaderboard/results/search. The setting of a trial are the
+options that are not those of the preset dial.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from symsteer.agents import AGENTS
 from symsteer.agents.presets import preset_options
@@ -37,7 +33,7 @@ from symsteer.tables import markdown
 from symsteer.terminal import complain
 from tools.pages.marks import CHECKOUT
 
-TRIALS = CHECKOUT / "leaderboard" / "results" / "dial" / "trials.json"
+TRIALS = CHECKOUT / "leaderboard" / "results" / "search"
 
 SUCCESS, AREA = 0.05, 0.03
 """Regrets of equal weight: what the safe agent may lose."""
@@ -62,11 +58,6 @@ class Trial:
     area: float
     success: float
     seconds: float
-
-    @property
-    def key(self) -> tuple[str, str, str, int]:
-        """What makes it a trial of its own."""
-        return self.agent, self.setting, self.world, self.seed
 
 
 def trial_of(path: Path) -> Trial | None:
@@ -188,21 +179,15 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--tasks", nargs="*", default=[], help="all if none is named")
     parser.add_argument("--seeds", nargs="*", type=int, default=[], help="all if none is named")
     given = parser.parse_args(arguments)
-    known: list[Trial] = []
-    if TRIALS.is_file():
-        known = TypeAdapter(list[Trial]).validate_json(TRIALS.read_bytes())
-    by_key: dict[Any, Trial] = {trial.key: trial for trial in known}
     for folder in given.runs:
         for path in sorted(folder.glob("*/record.json")):
-            if (trial := trial_of(path)) is not None:
-                by_key[trial.key] = trial
-    if given.runs:
-        text = json.dumps([asdict(by_key[key]) for key in sorted(by_key)], indent=0)
-        TRIALS.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(TRIALS, f"{text}\n".encode())
+            if trial_of(path):
+                TRIALS.mkdir(parents=True, exist_ok=True)
+                write_atomically(TRIALS / f"{path.parent.name}.json", path.read_bytes())
+    every = [trial for path in sorted(TRIALS.glob("*.json")) if (trial := trial_of(path))]
     trials = [
         trial
-        for trial in by_key.values()
+        for trial in every
         if (not given.tasks or trial.world.split()[0] in given.tasks)
         and (not given.seeds or trial.seed in given.seeds)
     ]
