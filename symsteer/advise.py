@@ -28,7 +28,7 @@ def advise(
     task: str | None = None,
     embodiment: str = "floating",
     variant: str = "none",
-    kind: str | None = None,
+    broken_by: str | None = None,
     probe: tuple[Path, ...] = (),
     runs: tuple[Path, ...] = (),
     json: bool = False,
@@ -37,13 +37,13 @@ def advise(
     """Say which agent to take in a world, and how sure that is (docs/advise.md).
 
     The world is named by --task and --variant, or, if SymSteer does not have it, by how it is
-    broken (--kind), by a probe in it, or by both.
+    broken (--broken-by), by a probe in it, or by both.
 
     Args:
         task: Task; `symsteer list` names them.
         embodiment: floating or panda.
         variant: How the symmetry is broken, e.g. action_gain:0.5, or none.
-        kind: A variant without strength that is most like your world, or none: e.g.
+        broken_by: The variant that is most like your world, without strength, or none: e.g.
             perception_bias if a camera is displaced.
         probe: Folders of finished runs in your world: of the agent base, whose decisions are asked
             whether sides are alike, and of zero and golden-ticket, if a constant noise shall tell.
@@ -51,10 +51,10 @@ def advise(
         json: Print only JSON, with every number.
     """
     allow(task, variant, *trust)
-    if not (task or kind or probe):
-        raise UserError("name a world: with --task and --variant, --kind, or --probe RUNS")
-    if task and kind:
-        raise UserError("name the world either with --task and --variant, or with --kind")
+    if not (task or broken_by or probe):
+        raise UserError("name a world: with --task and --variant, --broken-by, or --probe RUNS")
+    if task and broken_by:
+        raise UserError("name the world either with --task and --variant, or with --broken-by")
     from symsteer.leaderboard.known_agents import STANDARD
     from symsteer.leaderboard.pairs import MEASURES
     from symsteer.leaderboard.paths import REPRODUCTIONS, STUDY, chosen_records
@@ -72,7 +72,7 @@ def advise(
     # Mistakes first: to read the records takes seconds.
     if task:
         _known(task, embodiment, variant)
-    question = Question(_kind(kind, variant if task else None))
+    question = Question(_kind(broken_by, variant if task else None))
     probed = _probed(probe) if probe else None
     # Of the committed records, submitted ones that nobody has made again give no advice.
     listed = None if runs else read_list(FOLDER / f"{STUDY}.toml")
@@ -128,16 +128,16 @@ def _known(task: str, embodiment: str, variant: str) -> None:
     named[0].check()
 
 
-def _kind(kind: str | None, variant: str | None) -> str:
+def _kind(broken_by: str | None, variant: str | None) -> str:
     from symsteer.bench.variants import VARIANTS
     from symsteer.leaderboard.defects import dial_of
     from symsteer.names import check
     from symsteer.variant import UNBROKEN
 
-    if kind is None:
+    if broken_by is None:
         return dial_of(variant) if variant else ""
-    check("kind of break", [kind], [UNBROKEN, *VARIANTS])
-    return kind
+    check("kind of break", [broken_by], [UNBROKEN, *VARIANTS])
+    return broken_by
 
 
 def _probed(folders: tuple[Path, ...]) -> Table:

@@ -56,9 +56,9 @@ def test_a_world_that_no_record_has(advise):
     code, shown = advise("--task", "PushT-v1", "--variant", "perception_bias:0.5", "--json")
     assert code == 0
     assert told(shown) == {"auc": "standard", "success": "standard"}
-    code, shown = advise("--kind", "none", "--json")
+    code, shown = advise("--broken-by", "none", "--json")
     assert told(shown) == {"auc": "equivariant", "success": "equivariant"}
-    code, shown = advise("--kind", "wind")
+    code, shown = advise("--broken-by", "wind")
     assert code == 0
     assert "success: take standard, because the rules refuse" in shown.out
     assert "play base, zero and golden-ticket" in shown.out
@@ -90,7 +90,7 @@ def test_decisions_alone_are_a_probe(advise, tmp_path):
 
 
 def test_a_test_on_left_out_tasks_is_shown(advise):
-    _, shown = advise("--kind", "none")
+    _, shown = advise("--broken-by", "none")
     _, table = shown.out.split("Test: each world from the runs of the other tasks\n")
     header, *rows = table.splitlines()
     row = next(row for row in rows if row.startswith("kind     ") and "success" in row)
@@ -102,13 +102,13 @@ def test_a_test_on_left_out_tasks_is_shown(advise):
     ("arguments", "words"),
     [
         ((), "name a world"),
-        (("--task", "PushT-v1", "--kind", "wind"), "either with --task and --variant, or"),
+        (("--task", "PushT-v1", "--broken-by", "wind"), "either with --task and --variant, or"),
         (("--task", "PushTea-v1"), "did you mean 'PushT-v1'"),
         (("--task", "PushT-v1", "--variant", "wnid:1"), "did you mean 'wind'"),
         (("--task", "PushT-v1", "--variant", "wind"), "wind"),
         (("--task", "all"), "not all"),
         (("--task", "PushT-v1", "--embodiment", "hand"), "hand"),
-        (("--kind", "wnid"), "did you mean 'wind'"),
+        (("--broken-by", "wnid"), "did you mean 'wind'"),
         (("--probe", "nowhere"), "nowhere"),
     ],
 )
@@ -133,6 +133,6 @@ def test_a_probe_says_something_of_one_world(advise, tmp_path):
 
 def test_an_installed_package_has_no_committed_records(tmp_path, monkeypatch, command):
     monkeypatch.setattr(paths, "RECORDS", tmp_path / "nothing")
-    code, shown = command("advise", "--kind", "wind")
+    code, shown = command("advise", "--broken-by", "wind")
     assert code == 2
     assert "name run folders: symsteer advise --runs RUNS" in shown.err
