@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from symsteer.agents.episodes import Played, Rollout
 from symsteer.errors import UserError
 
 
@@ -15,6 +16,27 @@ def test_base_is_seeded_standard_noise(problem):
     assert noise.std().item() == pytest.approx(1.0, abs=0.02)
     assert torch.equal(noise, problem.agent("base", seed=1).act(obs))
     assert not torch.equal(noise, problem.agent("base", seed=2).act(obs))
+
+
+@pytest.mark.parametrize("where", ["obs", "noise", "nowhere", "over"])
+def test_base_says_whether_sides_are_alike(problem, where):
+    """One side is pushed in what is seen, in what is done, or only after success."""
+    shape, noise = (4, 60), problem.batch(240).noise.unflatten(0, (4, 60))
+    obs, following = (problem.batch(240, seed).obs.unflatten(0, shape) for seed in (1, 2))
+    running = torch.ones(shape, dtype=torch.bool)
+    running[2:] = False
+    shift = torch.zeros(problem.obs_layout.dim)
+    shift[problem.obs_layout.slice("goal_xy")] = torch.tensor([1.0, 0.0])
+    if where == "noise":
+        noise[..., problem.act_layout.slice("xy")] += torch.tensor([1.0, 0.0])
+    if where in ("obs", "over"):
+        rows = running if where == "obs" else ~running
+        obs, following = (x + rows[..., None] * shift for x in (obs, following))
+    played = Rollout({}, obs, noise, torch.zeros(shape), following, running, ~running)
+    agent, generator = problem.agent("base"), torch.Generator().manual_seed(0)
+    found = agent.diagnostics(Played(played, None, (-1.0, 0.0), generator))
+    assert set(found) == {"direction_p", "axis_p"}
+    assert (found["direction_p"] <= 0.002) == (where in ("obs", "noise"))
 
 
 def test_zero_is_fixed_by_the_group(problem):

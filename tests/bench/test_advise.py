@@ -52,6 +52,12 @@ def test_a_world_of_the_records(advise):
     assert "From 6 worlds of 3 tasks, of 1 study." in shown.out
 
 
+def test_rules_learn_from_the_other_tasks_alone(advise):
+    world = ("--task", "PickCube-v1", "--variant", "perception_bias:0.5")
+    found = json.loads(advise(*world, "--json")[1].out)
+    assert {one["answers"]["kind"]["worlds"] for one in found["advice"]} == {2}
+
+
 def test_a_world_that_no_record_has(advise):
     code, shown = advise("--task", "PushT-v1", "--variant", "perception_bias:0.5", "--json")
     assert code == 0
