@@ -83,6 +83,11 @@ class ClaimOutcome:
     """The tasks without whose cells the interval does not exclude 0 on the same side."""
 
     @property
+    def needs(self) -> tuple[str, ...]:
+        """The tasks without which a decided claim would not be decided."""
+        return self.rests_on if self.verdict in ("supported", "contradicted") else ()
+
+    @property
     def verdict(self) -> str:
         """`equivalent`, `supported`, `contradicted`, `undecided` or `not tested`."""
         level = 1 - CONFIDENCE
@@ -399,8 +404,8 @@ def verdict_text(outcome: ClaimOutcome) -> str:
     text = f"**{outcome.verdict}**"
     if outcome.reason:
         return f"{text}: {outcome.reason}"
-    if outcome.verdict in ("supported", "contradicted") and outcome.rests_on:
-        text += f", but not without {' or '.join(map(code, outcome.rests_on))}"
+    if outcome.needs:
+        text += f", but not without {' or '.join(map(code, outcome.needs))}"
     if outcome.policies >= MIN_SEEDS or outcome.verdict == "undecided":
         return text
     policies = "one base policy" if outcome.policies == 1 else f"{outcome.policies} base policies"

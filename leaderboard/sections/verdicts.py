@@ -52,9 +52,7 @@ def render(said: dict[str, list[ClaimOutcome]], view: View) -> list[str]:
     named: dict[str, list[str]] = {}
     for outcome in view.findings.of(claims.SECTION):
         rest = (
-            f" (but not without {' or '.join(map(code, outcome.rests_on))})"
-            if outcome.rests_on
-            else ""
+            f" (but not without {' or '.join(map(code, outcome.needs))})" if outcome.needs else ""
         )
         named.setdefault(outcome.verdict, []).append(title(outcome.claim) + rest)
     order = ("supported", "contradicted", "equivalent", "undecided", "not tested")

@@ -7,7 +7,7 @@ python -m tools.pages.dial --tasks StackCube-v1 --seeds 120      # only of this 
 A setting is compared if it has all worlds and base policies that any setting has. If all agents
 have the same settings, as in dial-a, a table before the others takes them together.
 
-The committed trials are the records of leaderboard/results/search. The setting of a trial are the
+The committed trials are the records of leaderboard/results/search. The setting of a trial: the
 options that are not those of the preset dial.
 """
 

@@ -111,6 +111,12 @@ def test_a_verdict_names_the_task_without_which_it_does_not_hold() -> None:
         assert verdict_text(one) == f"**supported**{words}"
 
 
+def test_an_undecided_claim_needs_no_task() -> None:
+    """The interval excludes 0, but not after correction: without A it holds 0."""
+    one = ClaimOutcome(claim_of(), ShareDifference((9, 10), (1, 10)), p=0.2, rests_on=("A-v1",))
+    assert (one.verdict, one.needs) == ("undecided", ())
+
+
 def test_one_task_is_not_left_out() -> None:
     rates = {"none": {"standard": 0.3, "equivariant": 0.9}}
     (one,) = outcomes(cells(rates), claim_of())
