@@ -156,7 +156,8 @@ def gain_in(table: Table) -> Interval | None:
 def direction_in(table: Table) -> float | None:
     """p-value of the base policies' episodes being alike on all sides (Fisher's over runs).
 
-    None if it was not measured, or if the policy is not symmetric, which sides then show.
+    Runs share their initial states, so that of several runs it is not exact. None if it was not
+    measured, or if the policy is not symmetric, which sides then show.
     """
     row = None if table.key.base.startswith("plain") else table.row_of(BASE)
     values = (
