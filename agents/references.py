@@ -22,7 +22,7 @@ class BaseAgent(Agent):
         return self.gaussian_noise(len(obs))
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
-        """Whether the episodes look the same on all sides (`symsteer.policies.sides`)."""
+        """Whether episodes look the same on all sides, and drift (`symsteer.policies.sides`)."""
         seen = played.greedy
         chunks = self.decode(seen.obs.flatten(0, 1), seen.noise.flatten(0, 1))
         actions = chunks.unflatten(0, seen.obs.shape[:2])[:, :, : self.context.execute]
@@ -35,7 +35,12 @@ class BaseAgent(Agent):
             seen.running,
             played.generator,
         )
-        return {"direction_p": found.direction, "axis_p": found.axis}
+        return {
+            "direction_p": found.direction,
+            "axis_p": found.axis,
+            "drift_x": found.drift.real,
+            "drift_y": found.drift.imag,
+        }
 
 
 class ZeroAgent(Agent):

@@ -159,11 +159,23 @@ def direction_in(table: Table) -> float | None:
     Runs share their initial states, so that of several runs it is not exact. None if it was not
     measured, or if the policy is not symmetric, which sides then show.
     """
-    row = None if table.key.base.startswith("plain") else table.row_of(BASE)
-    values = (
-        [v for run in row.finished if (v := run.last("direction_p")) is not None] if row else []
-    )
+    values = [] if table.key.base.startswith("plain") else _of_base(table, "direction_p")
     return float(stats.combine_pvalues(values).pvalue) if values else None
+
+
+def drift_in(table: Table) -> tuple[float, float] | None:
+    """Metres along x and y that the tool moves in each decision without being told to.
+
+    The mean over runs of `BASE`; None if it was not measured.
+    """
+    along = [_of_base(table, name) for name in ("drift_x", "drift_y")]
+    return (fmean(along[0]), fmean(along[1])) if all(along) else None
+
+
+def _of_base(table: Table, name: str) -> list[float]:
+    """A diagnostic of the finished runs of `BASE`, at their end."""
+    row = table.row_of(BASE)
+    return [v for run in row.finished if (v := run.last(name)) is not None] if row else []
 
 
 def by_kind(lessons: Sequence[Lesson], question: Question, measure: str) -> Answer:

@@ -64,6 +64,7 @@ def advise(
     from symsteer.leaderboard.which_agent import (
         Question,
         advise,
+        drift_in,
         leave_tasks_out,
         lessons_of,
     )
@@ -99,6 +100,7 @@ def advise(
             "worlds": len(lessons),
             "gain": gain,
             "direction": direction,
+            "drift": drift_in(probed) if probed else None,
             "advice": [_as_data(one) for one in advices],
             "left_out": [dataclasses.asdict(score) for score in scores],
         }
@@ -108,7 +110,7 @@ def advise(
     blocks = [
         f"From {len(lessons)} worlds of {tasks} tasks, of {len(folders)} "
         f"{'study' if len(folders) == 1 else 'studies'}.",
-        _facts(question),
+        _facts(question, drift_in(probed) if probed else None),
         *map(_text, advices),
         *([ASK] if probed is None and any(one.refused for one in advices) else []),
         _record(scores),
@@ -190,12 +192,15 @@ def _as_data(advice: Advice) -> dict[str, object]:
 # What the terminal shows.
 
 
-def _facts(question: Question) -> str:
+def _facts(question: Question, drift: tuple[float, float] | None) -> str:
     facts = [["kind of break", question.kind or "not known"]]
     gain = _interval(question.gain) if question.gain else "not played"
     facts.append(["gain of the best constant noise", gain])
     alike = "not known" if question.direction is None else f"p = {question.direction:.3f}"
     facts.append(["opposite sides are alike", alike])
+    if drift:
+        along = " and ".join(f"{100 * d:+.2f}" for d in drift)
+        facts.append(["drift of the tool", f"{along} cm a decision, along x and y"])
     return aligned([], facts, left=2)
 
 

@@ -35,7 +35,7 @@ def test_base_says_whether_sides_are_alike(problem, where):
     played = Rollout({}, obs, noise, torch.zeros(shape), following, running, ~running)
     agent, generator = problem.agent("base"), torch.Generator().manual_seed(0)
     found = agent.diagnostics(Played(played, None, (-1.0, 0.0), generator))
-    assert set(found) == {"direction_p", "axis_p"}
+    assert set(found) == {"direction_p", "axis_p", "drift_x", "drift_y"}
     assert (found["direction_p"] <= 0.002) == (where in ("obs", "noise"))
 
 

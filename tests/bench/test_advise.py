@@ -87,11 +87,13 @@ def test_a_probe_in_a_world_without_a_name(advise, tmp_path):
 
 def test_decisions_alone_are_a_probe(advise, tmp_path):
     records = make_cell({"base": 0.3}, task="Mine-v1", seeds=1)
-    records[0].evaluations[-1].diagnostics["direction_p"] = 0.001
+    found = {"direction_p": 0.001, "drift_x": 0.0171, "drift_y": -0.0004}
+    records[0].evaluations[-1].diagnostics.update(found)
     probe = write(tmp_path / "probe", records)
     code, shown = advise("--probe", probe)
     assert code == 0
     assert "opposite sides are alike         p = 0.001" in shown.out
+    assert "drift of the tool                +1.71 and -0.04 cm a decision, along x" in shown.out
     assert "decisions  take standard  opposite sides are unlike (p = 0.001)" in shown.out
 
 

@@ -14,8 +14,13 @@ OBS = Layout([Field("tool_xy", 1), Field("z", 0), Field("cloud_xy", 1, 3), Field
 ACT = Layout([Field("xy", 1), Field("gripper", 0)])
 
 
-def episodes(count: int, seed: int, shift: float = 0.0, gain: float = 1.0) -> Sides:
-    """Walks towards the origin from all sides: seen with a shift, or with a weak motor along x."""
+def episodes(
+    count: int, seed: int, shift: float = 0.0, gain: float = 1.0, drift: float = 0.0
+) -> Sides:
+    """Walks towards the origin from all sides.
+
+    Seen with a shift along x, with a weak motor along x, or with a drift along y.
+    """
     generator = torch.Generator().manual_seed(seed)
     angle = 2 * math.pi * torch.rand(count, generator=generator, dtype=torch.float64)
     place = torch.stack([angle.cos(), angle.sin()], -1)
@@ -24,6 +29,7 @@ def episodes(count: int, seed: int, shift: float = 0.0, gain: float = 1.0) -> Si
         noise = 0.3 * torch.randn(count, 1, 2, generator=generator, dtype=torch.float64)
         step = -0.3 * (place[:, None] + noise)
         following = place + step[:, 0] * torch.tensor([gain, 1.0])
+        following += torch.tensor([0.0, drift])
         columns.append((place, torch.cat([step, torch.zeros(count, 1, 1)], -1), following))
         place = following
     places, actions, followings = (torch.stack(each) for each in zip(*columns, strict=True))
@@ -61,6 +67,14 @@ def test_a_shift_has_a_direction_and_a_weak_motor_an_axis():
     assert weak.direction > 0.05
 
 
+def test_a_drift_is_known_and_a_shift_of_what_is_seen_is_none():
+    """Actions explain how the tool moves, but for the drift."""
+    drifting, shifted = episodes(40, 0, drift=0.07), episodes(40, 0, shift=0.5)
+    assert drifting.direction <= 0.002
+    assert drifting.drift == pytest.approx(0.07j)
+    assert shifted.drift == pytest.approx(0j, abs=1e-9)
+
+
 def test_errors_of_rounding_have_no_say():
     """A tilt of 1e-8 to one side, in every episode."""
     flat = Layout([Field("axis_xy", 1), Field("tool_xy", 1)])
@@ -80,4 +94,4 @@ def test_without_vectors_nothing_is_unlike():
         torch.ones(3, 5, dtype=torch.bool),
         torch.Generator().manual_seed(0),
     )
-    assert alike == Sides(1.0, 1.0)
+    assert alike == Sides(1.0, 1.0, 0j)
