@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import attrgetter
 from statistics import fmean
 
 import numpy as np
@@ -52,11 +54,13 @@ class AgentRow:
     def finished(self) -> list[Run]:
         return [run for run in self.runs if run.finished]
 
-    def by_policy(self, measure: str) -> dict[str, float]:
-        """An attribute of the finished runs, mean over the runs on each base policy."""
+    def by_policy(self, measure: str | Callable[[Run], float | None]) -> dict[str, float]:
+        """A measure of the finished runs that have it, mean over the runs on each base policy."""
+        of = attrgetter(measure) if isinstance(measure, str) else measure
         values: dict[str, list[float]] = defaultdict(list)
         for run in self.finished:
-            values[run.policy].append(getattr(run, measure))
+            if (value := of(run)) is not None:
+                values[run.policy].append(value)
         return {policy: fmean(of_runs) for policy, of_runs in values.items()}
 
     @property

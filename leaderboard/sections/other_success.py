@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import dataclass
+from functools import partial
 from statistics import fmean
 
 from symsteer.leaderboard.catalogue import IN_WORDS
 from symsteer.leaderboard.known_agents import STANDARD, STRICT
-from symsteer.leaderboard.rows import MIN_SEEDS, AgentRow, Summary, Table
+from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
 from symsteer.leaderboard.runs import Run
 from symsteer.leaderboard.sections import Section, View
 from symsteer.leaderboard.sections.what_symmetry_gains import kinds
@@ -20,7 +20,12 @@ EXPLAINED = f"""\
 paired by base policy, with 95 % intervals. *Once*: at any step of the episode; *at the end*: at its
 last step. *Stochastic*: the actor with its exploration. All of them are of the final evaluation."""
 
-MEASURES = ("once", "at the end", "once, stochastic", "at the end, stochastic")
+STOCHASTIC = {
+    "once, stochastic": "success_stochastic",
+    "at the end, stochastic": "success_at_end_stochastic",
+}
+
+MEASURES = ("once", "at the end", *STOCHASTIC)
 
 
 @dataclass(frozen=True)
@@ -38,17 +43,14 @@ class Row:
     cells: int
 
 
-def measured(run: Run) -> dict[str, float]:
-    """The shares of successes that a finished run's final evaluation has."""
+def measured(run: Run, name: str) -> float | None:
+    """A share of successes in a finished run's final evaluation; None if it does not have it."""
     assert run.record.final is not None
-    episodes = run.record.final.episodes
-    values = {
-        "once": fmean(map(float, episodes.success_once)),
-        "at the end": fmean(map(float, episodes.success_at_end)),
-        "once, stochastic": run.last("success_stochastic"),
-        "at the end, stochastic": run.last("success_at_end_stochastic"),
-    }
-    return {name: value for name, value in values.items() if value is not None}
+    if name == "once":
+        return fmean(map(float, run.record.final.episodes.success_once))
+    if name == "at the end":
+        return fmean(map(float, run.record.final.episodes.success_at_end))
+    return run.last(STOCHASTIC[name])
 
 
 def compute(summary: Summary) -> list[Row]:
@@ -64,19 +66,12 @@ def compute(summary: Summary) -> list[Row]:
 
 def _pairs(table: Table, name: str) -> list[Sample]:
     rows = table.row_of(STRICT), table.row_of(STANDARD)
-    strict, plain = (_by_policy(row, name) if row else {} for row in rows)
+    of = partial(measured, name=name)
+    strict, plain = (row.by_policy(of) if row else {} for row in rows)
     shared = sorted(strict.keys() & plain.keys())
     if len(shared) < MIN_SEEDS:
         return []
     return [Sample.constant(strict[policy] - plain[policy], policy) for policy in shared]
-
-
-def _by_policy(row: AgentRow, name: str) -> dict[str, float]:
-    values: dict[str, list[float]] = defaultdict(list)
-    for run in row.finished:
-        if (value := measured(run).get(name)) is not None:
-            values[run.policy].append(value)
-    return {policy: fmean(of_runs) for policy, of_runs in values.items()}
 
 
 def render(rows: list[Row], view: View) -> list[str]:
