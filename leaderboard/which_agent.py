@@ -194,7 +194,7 @@ def by_kind(lessons: Sequence[Lesson], question: Question, measure: str) -> Answ
         return Answer(0, f"no difference is clear in {len(like)} such worlds", like)
     if len(set(signs)) > 1:
         return Answer(0, f"of {len(like)} such worlds, some are won by either", like)
-    return Answer(signs[0], f"{len(signs)} of {len(like)} such worlds are decided, all alike", like)
+    return Answer(signs[0], f"{len(signs)} of {len(like)} such worlds are decided, and agree", like)
 
 
 def by_probe(lessons: Sequence[Lesson], question: Question, measure: str) -> Answer:

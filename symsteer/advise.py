@@ -215,7 +215,7 @@ def _text(advice: Advice) -> str:
     if advice.regret:
         lines.append(f"  below the best learner: {_interval(advice.regret)}")
     if advice.rise or advice.regret:
-        lines.append(f"  (95 % of such worlds, from {advice.worlds} like it)")
+        lines.append(f"  (in brackets: 95 % of such worlds, estimated from {advice.worlds})")
     return "\n".join(lines)
 
 

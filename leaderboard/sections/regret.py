@@ -25,8 +25,9 @@ from symsteer.leaderboard.study import Safe
 from symsteer.leaderboard.text import code, folded, interval, number, table_text
 
 EXPLAINED = """\
-What a learner loses against the best learner of the same cell (a task in one world), on average and
-in its worst cell: the price of taking it without knowing the world. In brackets: 95 % intervals."""
+What a learner loses against the best learner of the same cell (one world, one budget), on average
+and in its worst cell: the price of taking it without knowing the world. In brackets: 95 %
+intervals."""
 
 HOW = f"""\
 The best learner of a cell, and the worst cell of a learner, are chosen on one half of the base

@@ -48,7 +48,8 @@ def render(said: dict[str, list[ClaimOutcome]], view: View) -> list[str]:
     """Their verdicts as a list, or else those of all claims by name."""
     if said:
         lines = [f"- {text}: {standing(tested)}." for text, tested in said.items()]
-        return ["\n".join(lines), "Each with its tests: [the paper's claims](PAPER.md)."]
+        known = "*Equivalent*: the effect is shown to be smaller than the smallest one of interest."
+        return [known, "\n".join(lines), "Each with its tests: [the paper's claims](PAPER.md)."]
     named: dict[str, list[str]] = {}
     for outcome in view.findings.of(claims.SECTION):
         rest = (

@@ -1,4 +1,4 @@
-"""Measures speed; docs/speed.md and docs/agents.md have results.
+"""Measures speed; docs/speed.md has results.
 
 python -m tools.speed simulation    # against stock ManiSkill and PhysX alone, in five minutes
 python -m tools.speed memory        # resident memory over 10,000 steps with resets

@@ -96,7 +96,7 @@ def test_the_papers_statements_have_their_tests() -> None:
     efficiency, divergence, *_ = said
     assert overall[efficiency] == "2 supported, 1 not tested"
     assert overall[divergence] == "**not tested**"
-    verdicts, link = view.blocks(SECTION)
+    _, verdicts, link = view.blocks(SECTION)
     assert f"- {efficiency}: 2 supported, 1 not tested.\n" in verdicts
     assert "(PAPER.md)" in link
     for statement, tested in said.items():
