@@ -64,6 +64,7 @@ AGENTS: Registry[type[Agent]] = Registry(
         "slow": "symsteer.agents.slow:SlowAgent",
         "free-bias": "symsteer.agents.free_bias:FreeBiasAgent",
         "resilient": "symsteer.agents.resilient:ResilientAgent",
+        "screened": "symsteer.agents.screened:ScreenedAgent",
         "chooser": "symsteer.agents.chooser:ChooserAgent",
         "balanced": "symsteer.agents.balanced:BalancedAgent",
         "relaxed": "symsteer.agents.relaxed:RelaxedAgent",

@@ -10,12 +10,17 @@ worse than another one,
     c_i = confidence sqrt(log(3 log n_i / 0.05) / n_i),
 
 its d_i is doubled. A score is 1 plus the return as a share of the time limit, so that it lies in
-[0, 1]. An evaluation plays the learner with the best recent scores. An update of all three costs
-three times that of one.
+[0, 1].
+
+The paper's learners do not change; ours learn, and one that is late may end best. So every third
+episode goes round (ours), and an evaluation plays the learner with the best recent scores, where
+all forget by the same clock, the episodes of all. An update of all three costs three times that of
+one.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
@@ -40,6 +45,9 @@ KINDS: tuple[type[SacAgent], ...] = (StandardAgent, EquivariantAgent, SlowAgent)
 UNSURE = 0.05
 """Probability that the bounds of the scores may be wrong."""
 
+ROUND = 3
+"""Every such episode goes round."""
+
 
 @dataclass(frozen=True)
 class BalancedOptions(SacOptions):
@@ -51,8 +59,8 @@ class BalancedOptions(SacOptions):
     """d_i at the start."""
     confidence: float = 0.2
     """Factor on the uncertainty of the scores."""
-    memory: float = 0.98
-    """Weight in the recent score that an episode leaves to those before it."""
+    memory: float = 0.99
+    """Weight in the recent scores that an episode, of any learner, leaves to those before it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,6 +80,7 @@ class Balance:
         plays, scores, bounds: n, u and d of each learner.
         recent: its recent score, and the weight that it has.
         pending: episodes that have begun and not ended.
+        begun: all that have begun.
     """
 
     def __init__(self, learners: int, options: BalancedOptions):
@@ -79,13 +88,18 @@ class Balance:
         self.plays, self.pending = [0] * learners, [0] * learners
         self.scores, self.bounds = [0.0] * learners, [options.bound] * learners
         self.recent = [(0.0, 0.0)] * learners
+        self.begun = 0
 
     def begin(self) -> int:
         """The learner of a new episode."""
-        count = range(len(self.plays))
+        learners = range(len(self.plays))
         chosen = min(
-            count, key=lambda i: self.bounds[i] * math.sqrt(self.plays[i] + self.pending[i])
+            learners, key=lambda i: self.bounds[i] * math.sqrt(self.plays[i] + self.pending[i])
         )
+        turn, rest = divmod(self.begun, ROUND)
+        if rest == ROUND - 1:
+            chosen = turn % len(learners)
+        self.begun += 1
         self.pending[chosen] += 1
         return chosen
 
@@ -96,9 +110,10 @@ class Balance:
             return
         self.plays[learner] += 1
         self.scores[learner] += score
-        total, weight = self.recent[learner]
         memory = self.options.memory
-        self.recent[learner] = (memory * total + score, memory * weight + 1)
+        self.recent = [(memory * total, memory * weight) for total, weight in self.recent]
+        total, weight = self.recent[learner]
+        self.recent[learner] = (total + score, weight + 1)
         played = [i for i, n in enumerate(self.plays) if n]
         n, mean = self.plays[learner], self.scores[learner] / self.plays[learner]
         best = max(self.scores[i] / self.plays[i] - self._doubt(i) for i in played)
@@ -134,7 +149,10 @@ class BalancedAgent(Agent):
             known = {field.name for field in dataclasses.fields(kind.Options)}
             learner = kind(context, kind.Options(**{k: x for k, x in given.items() if k in known}))
             learner.generator, learner.streams = self.generator, [self.generator]
-            learner.replay = self.learners[0].replay if self.learners else learner.replay
+            if self.learners:
+                learner.replay = self.learners[0].replay
+                # Their warm-up would be the same noise three times.
+                learner.generators = self.learners[0].generators
             self.learners.append(learner)
         self.replay = self.learners[0].replay
         self.networks = {
@@ -186,8 +204,7 @@ class BalancedAgent(Agent):
             learner.owe(len(transition.reward))
         if len(self.returns):
             # Environments that began anew, before their episodes had ended.
-            for row in (transition.obs != self.following).any(-1).nonzero().flatten().tolist():
-                self._end(row, None)
+            self.returns[(transition.obs != self.following).any(-1)] = 0
         else:
             self.returns = torch.zeros_like(transition.reward)
         self.returns += transition.reward
@@ -233,7 +250,7 @@ class BalancedAgent(Agent):
 
     def state_dict(self) -> dict[str, Any]:
         """Also the learners, and who has played how well."""
-        balance = {k: list(x) for k, x in vars(self.balance).items() if k != "options"}
+        balance = {k: copy.copy(x) for k, x in vars(self.balance).items() if k != "options"}
         kept = {"players": list(self.players), "returns": self.returns, "following": self.following}
         states = [learner.state_dict() for learner in self.learners]
         state = {**super().state_dict(), "learners": states, "balance": balance, **kept}
@@ -244,7 +261,7 @@ class BalancedAgent(Agent):
         super().load_state_dict(state)
         for learner, stored in zip(self.learners, state["learners"], strict=True):
             learner.load_state_dict(stored)
-        vars(self.balance).update({k: list(x) for k, x in state["balance"].items()})
+        vars(self.balance).update({k: copy.copy(x) for k, x in state["balance"].items()})
         self.players, self.limit = list(state["players"]), state["limit"]
         self.returns, self.following = (
             state[name].to(self.device) for name in ("returns", "following")

@@ -22,15 +22,7 @@ Found in the paper: the gate, its loss, both mixtures. Our choices, for they wer
   acting needs no samples.
 
 Upper-tail outliers are relative: where the symmetry is broken everywhere alike, nothing stands out.
-The option ``label = "turned"`` (ours) is absolute. It asks what the plain predictor gains over the
-equivariant one on decisions that it was not trained on, more than on turned copies of them. In a
-symmetric world a decision and its copy cannot be told apart. The error of the equivariant predictor
-is the same for both and drops out:
-
-- held-out decisions: half of them, by the fourth decimal of their first noise;
-- label: 1 where the plain predictor's error is larger for the copy. Its mean is 1/2 in a symmetric
-  world; the gate, which is trained towards it, opens above 1/2 + ``margin``;
-- if the running mean over all states is above 1/2 + ``margin``, the agent is plain everywhere.
+Whether it is, ``screened`` asks.
 """
 
 from __future__ import annotations
@@ -55,10 +47,8 @@ from symsteer.agents.sac import VALUE
 from symsteer.agents.standard import StandardAgent
 from symsteer.errors import UserError
 from symsteer.policies.geometry import Field, Group, Layout
-from symsteer.policies.symmetry.augmented import Augmentation
 
 Gate = Literal["hard", "soft"]
-Label = Literal["outliers", "turned"]
 
 START = -3.0
 """Output of untrained gates before the sigmoid: closed, so that the agent starts equivariant."""
@@ -75,11 +65,6 @@ class PartialOptions(SacOptions):
     """`hard`: lambda is 0 or 1; `soft`: lambda as predicted."""
     fence: float = 1.5
     """Distance of the fence above the median, in units of that of the first quartile below it."""
-    label: Label = "outliers"
-    """What the gate learns: outliers of the disagreement, or where turned copies are predicted
-    worse."""
-    margin: float = 0.15
-    """With `turned`: how far above 1/2 the share of worse copies must lie, in (0, 1/2)."""
 
     agent = "the partial agent"
     known_critics = ("aliased", "sampler")
@@ -88,7 +73,6 @@ class PartialOptions(SacOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("not be negative", lambda value: value >= 0, "fence")
-        self._require("lie in (0, 1/2)", lambda value: 0 < value < 0.5, "margin")
 
 
 @tuned
@@ -112,7 +96,6 @@ class PartialAgent(StandardAgent):
         reflections = Group.parse(self.options.group).reflections
         self.invariant = following.invariant_mask(reflections).to(self.device, self.dtype)
         self.sizes = torch.ones(self.blocks.shape[1], device=self.device, dtype=self.dtype)
-        self.evidence = torch.full((), 0.5, device=self.device, dtype=self.dtype)
 
     @property
     def following(self) -> Layout:
@@ -141,13 +124,7 @@ class PartialAgent(StandardAgent):
         """lambda(s, a), or lambda(s) without actions, as the options say."""
         inputs = obs if judged is None else torch.cat([obs, judged], -1)
         share = self._opening("state_gate" if judged is None else "gate", inputs)
-        least = 0.5
-        if self.options.label == "turned":
-            least += self.options.margin
-            share = torch.where(self.evidence > least, 1.0, share)
-            if self.options.gate == "soft":
-                return (2 * share - 1).clamp(min=0)
-        return (share > least).to(share) if self.options.gate == "hard" else share
+        return (share > 0.5).to(share) if self.options.gate == "hard" else share
 
     def _opening(self, name: str, inputs: torch.Tensor) -> torch.Tensor:
         """What a gate predicts, in (0, 1)."""
@@ -193,26 +170,15 @@ class PartialAgent(StandardAgent):
         share = 1 - MEMORY if self.updates > 1 else 1.0
         centred = wanted - wanted.mean(0) * self.invariant
         self.sizes.lerp_((centred.square() @ self.blocks).mean(0), share)
-        held = (1e4 * batch.noise[..., 0, 0]).frac().abs() > 0.5
-        turned = self.options.label == "turned"
-        kept = ~held if turned else torch.ones_like(held)
         predictions = []
         for name in ("strict_predictor", "plain_predictor"):
             prediction = self.networks[name](inputs)[0]
-            error = self._distance(prediction, wanted)
-            self._descend(name, (error * kept).sum() / kept.sum().clamp(min=1), batch)
+            self._descend(name, self._distance(prediction, wanted).mean(), batch)
             predictions.append(prediction.detach())
         disagreement = self._distance(*predictions)
-        if turned:
-            label = self._worse_turned(obs, batch.actions, wanted, error.detach())
-            counted = held.to(self.dtype) / held.sum().clamp(min=1)
-            self.evidence.lerp_((label * counted).sum(), share)
-        else:
-            label = self._outlying(disagreement.log())
-            counted = torch.full_like(label, 1 / len(label))
+        label = self._outlying(disagreement.log())
         opening = self._opening("gate", inputs)
-        loss = F.binary_cross_entropy(opening, label, counted, reduction="sum")
-        self._descend("gate", loss, batch)
+        self._descend("gate", F.binary_cross_entropy(opening, label), batch)
         banked = batch["bank_actions"].flatten(-2)
         repeated = obs.unsqueeze(1).expand(-1, banked.shape[1], -1)
         with torch.no_grad():
@@ -223,7 +189,6 @@ class PartialAgent(StandardAgent):
         return {
             "train/disagreement": disagreement.mean(),
             "train/gate": opening.detach().mean(),
-            "train/evidence": self.evidence.clone(),
         }
 
     def _outlying(self, size: torch.Tensor) -> torch.Tensor:
@@ -232,27 +197,6 @@ class PartialAgent(StandardAgent):
             size, torch.tensor([0.25, 0.5], device=self.device, dtype=self.dtype)
         )
         return (size > middle + self.options.fence * (middle - low)).to(self.dtype)
-
-    @torch.no_grad()
-    def _worse_turned(
-        self, obs: torch.Tensor, actions: torch.Tensor, wanted: torch.Tensor, error: torch.Tensor
-    ) -> torch.Tensor:
-        """1 where the plain predictor's error is larger for a turned copy, else 0, ``[B]``."""
-        group = Group.parse(self.options.group)
-        # All elements but the identity.
-        drawn = torch.randint(
-            1, group.order, (len(obs),), generator=self.generator, device=self.device
-        )
-        obs, actions, wanted = (
-            Augmentation(group).apply(drawn, x, layout)
-            for x, layout in (
-                (obs, self.obs_layout),
-                (actions, self.act_layout),
-                (wanted, self.following),
-            )
-        )
-        there = self.networks["plain_predictor"](torch.cat([obs, actions.flatten(-2)], -1))[0]
-        return (self._distance(there, wanted) > error).to(self.dtype)
 
     def _distance(self, one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
         """d ``[B]`` of two predictions ``[B, dim]``."""
@@ -269,12 +213,9 @@ class PartialAgent(StandardAgent):
 
     def state_dict(self) -> dict[str, Any]:
         """Also the running mean squares."""
-        kept = {"sizes": self.sizes.clone(), "evidence": self.evidence.clone()}
-        return {**super().state_dict(), **kept}
+        return {**super().state_dict(), "sizes": self.sizes.clone()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where :meth:`state_dict` was taken."""
         super().load_state_dict(state)
-        for name in ("sizes", "evidence"):
-            kept = getattr(self, name)
-            kept.copy_(tensor_like(state.get(name, kept), kept))
+        self.sizes.copy_(tensor_like(state["sizes"], self.sizes))

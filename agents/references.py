@@ -24,16 +24,12 @@ class BaseAgent(Agent):
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
         """Whether episodes look the same on all sides, and drift (`symsteer.policies.sides`)."""
         seen = played.greedy
-        chunks = self.decode(seen.obs.flatten(0, 1), seen.noise.flatten(0, 1))
-        actions = chunks.unflatten(0, seen.obs.shape[:2])[:, :, : self.context.execute]
+        at, episodes = seen.running.nonzero(as_tuple=True)
+        obs, noise = seen.obs[at, episodes], seen.noise[at, episodes]
+        actions = self.decode(obs, noise)[:, : self.context.execute]
         found = sides(
-            self.obs_layout,
-            self.act_layout,
-            seen.obs,
-            actions,
-            seen.next_obs,
-            seen.running,
-            played.generator,
+            *(self.obs_layout, self.act_layout, obs, actions, seen.next_obs[at, episodes]),
+            *(episodes, played.generator),
         )
         return {
             "direction_p": found.direction,

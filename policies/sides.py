@@ -65,34 +65,38 @@ def sides(
     obs: torch.Tensor,
     actions: torch.Tensor,
     next_obs: torch.Tensor,
-    counts: torch.Tensor,
+    episodes: torch.Tensor,
     generator: torch.Generator,
 ) -> Sides:
-    """The test on N episodes of T decisions.
+    """The test on n decisions.
 
     Args:
         obs_layout, act_layout: of observations and actions.
-        obs, next_obs: before and after each decision, ``[T, N, obs_dim]``.
-        actions: executed, ``[T, N, steps, act_dim]``.
-        counts: which decisions count, ``[T, N]`` bool; at least one of each episode.
+        obs, next_obs: before and after each decision, ``[n, obs_dim]``.
+        actions: executed, ``[n, steps, act_dim]``.
+        episodes: number of the episode of each decision, ``[n]`` int64.
         generator: of the random quarters.
     """
+    # On the processor: least squares of dependent columns are not for a GPU.
+    obs, actions, next_obs, episodes = (x.cpu() for x in (obs, actions, next_obs, episodes))
     before = vectors(obs_layout, obs)
     change = vectors(obs_layout, next_obs) - before
-    done = vectors(act_layout, actions.sum(2))
+    done = vectors(act_layout, actions.sum(1))
     # Least squares without a constant turn as the episodes do: the level stays exact.
-    unexplained = change - done @ torch.linalg.lstsq(done[counts], change[counts]).solution
+    unexplained = change - done @ torch.linalg.lstsq(done, change).solution
     seen = torch.cat([before, change, done, unexplained], dim=-1)
-    weights = (counts / counts.sum(0)).to(seen.dtype)[..., None]
-    directed = (weights * seen).sum(0)
-    first, second = torch.triu_indices(seen.shape[-1], seen.shape[-1], device=seen.device)
-    axial = torch.einsum("tni,tnj->nij", weights * seen, seen)[:, first, second]
-    quarters = torch.randint(4, (DRAWS, obs.shape[1]), generator=generator, device=obs.device)
-    turns = torch.view_as_complex(
-        torch.tensor([[1, 0], [0, 1], [-1, 0], [0, -1]], dtype=torch.float64, device=obs.device)
-    )[quarters]
-    drift = _drift(done[counts], change[counts])
-    return Sides(_p_value(directed, turns), _p_value(axial, turns**2), drift)
+    first, second = torch.triu_indices(seen.shape[-1], seen.shape[-1])
+    _, numbers, counts = episodes.unique(return_inverse=True, return_counts=True)
+
+    def means(values: torch.Tensor) -> torch.Tensor:
+        sums = values.new_zeros(len(counts), values.shape[1]).index_add_(0, numbers, values)
+        return sums / counts.unsqueeze(1)
+
+    directed, axial = means(seen), means(seen[:, first] * seen[:, second])
+    shape, device = (DRAWS, len(counts)), generator.device
+    quarters = torch.randint(4, shape, generator=generator, device=device).cpu()
+    turns = torch.tensor([1, 1j, -1, -1j], dtype=torch.complex128)[quarters]
+    return Sides(_p_value(directed, turns), _p_value(axial, turns**2), _drift(done, change))
 
 
 def _drift(actions: torch.Tensor, changes: torch.Tensor) -> complex:

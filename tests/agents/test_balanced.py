@@ -20,21 +20,36 @@ def test_a_worse_learner_plays_fewer_episodes_and_does_not_lead():
         learner = balance.begin()
         chance = (0.8, 0.8, 0.3)[learner]
         balance.end(learner, float(torch.rand((), generator=generator) < chance))
-    assert balance.plays[2] < 100 < 200 < min(balance.plays[:2])
+    assert balance.plays[2] < 130 < 200 < min(balance.plays[:2])
     assert balance.best != 2
+
+
+def test_a_learner_that_rises_late_leads_in_the_end():
+    """Its success rises from .4 to .95 in the last two thirds of 540 episodes, 64 at a time."""
+    leads = 0
+    for seed in range(10):
+        balance = Balance(3, BalancedOptions())
+        generator = torch.Generator().manual_seed(seed)
+        for done in range(0, 540, 64):
+            rising = 0.4 + 0.825 * max(0.0, done / 540 - 1 / 3)
+            for learner in [balance.begin() for _ in range(64)]:
+                chance = rising if learner == 0 else 0.6
+                balance.end(learner, 0.6 * float(torch.rand((), generator=generator) < chance))
+        leads += balance.best == 0
+    assert leads >= 8
 
 
 def test_equal_learners_share_the_episodes():
     balance = Balance(3, BalancedOptions())
     for _ in range(300):
         balance.end(balance.begin(), 0.5)
-    assert balance.plays == [100] * 3
+    assert max(balance.plays) - min(balance.plays) <= 2
     assert balance.bounds == [BalancedOptions().bound] * 3
 
 
 def test_episodes_under_way_and_given_up_count_as_they_should():
     balance = Balance(3, BalancedOptions())
-    assert [balance.begin() for _ in range(4)] == [0, 1, 2, 0]
+    assert [balance.begin() for _ in range(4)] == [0, 1, 0, 2]
     balance.end(0, None)
     assert balance.pending == [1, 1, 1]
     assert balance.plays == [0, 0, 0]

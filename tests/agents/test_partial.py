@@ -83,18 +83,16 @@ def world(broken, count=2048):
     reward = torch.full((count,), -1.0)
     if broken == "dynamics":
         after[windy, 1] += 0.4
-    if broken == "everywhere":
-        after[:, 1] += 0.4
     if broken == "reward":
         reward[windy] -= 1.0
     nothing = torch.zeros(count)
     return Transition(obs, noise, noise[:, :1].clamp(-1, 1), reward, after, nothing, nothing), windy
 
 
-def learned(broken, **options):
+def learned(broken):
     context = AgentContext(OBS, ACT, 2, 1, lambda obs, noise: noise.clamp(-1, 1), lambda obs: obs)
     settings = {"width": 64, "lr": 3e-3, "batch_size": 128, "warmup": 0, "utd": 1e-9}
-    agent = PartialAgent(context, PartialOptions(gate="soft", **settings, **options))
+    agent = PartialAgent(context, PartialOptions(gate="soft", **settings))
     transition, windy = world(broken)
     agent.observe(transition)
     agent.owed += 400
@@ -128,40 +126,6 @@ def test_in_a_symmetric_world_they_stay_closed():
     assert share.mean() < 0.35
     of_actions = agent.share(seen.obs, seen.actions)
     assert auroc(of_actions, windy) < 0.75
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("broken", "least", "most"), [("nothing", 0.45, 0.55), ("everywhere", 0.8, 1.0)]
-)
-def test_turned_copies_tell_a_break_that_is_everywhere(broken, least, most):
-    agent, seen, _ = learned(broken, label="turned")
-    assert least < agent.evidence < most
-    share = agent._share(agent._features(seen.obs), None)
-    if broken == "nothing":
-        assert share.mean() < 0.35
-    else:
-        assert (share == 1).all()
-        # Outliers cannot tell it.
-        relative, seen, _ = learned(broken)
-        assert relative._share(relative._features(seen.obs), None).mean() < 0.35
-
-
-def test_copies_are_turned(problem, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(
-        "symsteer.agents.partial.Augmentation.apply",
-        lambda self, elements, x, layout: drawn.append(elements) or x,
-    )
-    learn(problem, problem.agent("partial", label="turned"), 3)
-    assert {*torch.cat(drawn).tolist()} == {*range(1, 8)}
-
-
-@pytest.mark.long
-def test_turned_copies_find_where_the_symmetry_is_broken():
-    agent, seen, windy = learned("dynamics", label="turned")
-    share = agent._opening("state_gate", agent._features(seen.obs)).detach()
-    assert auroc(share, windy) > 0.9
 
 
 def test_noise_and_actions_must_differ():

@@ -42,7 +42,9 @@ def episodes(
 
     counts = torch.ones(places.shape[:2], dtype=torch.bool)
     counts[2:, ::3] = False
-    return sides(OBS, ACT, seen(places), actions, seen(followings), counts, generator)
+    at, numbers = counts.nonzero(as_tuple=True)
+    decisions = (x[at, numbers] for x in (seen(places), actions, seen(followings)))
+    return sides(OBS, ACT, *decisions, numbers, generator)
 
 
 def test_of_a_field_with_blocks_the_mean_counts():
@@ -78,20 +80,19 @@ def test_a_drift_is_known_and_a_shift_of_what_is_seen_is_none():
 def test_errors_of_rounding_have_no_say():
     """A tilt of 1e-8 to one side, in every episode."""
     flat = Layout([Field("axis_xy", 1), Field("tool_xy", 1)])
-    values = torch.randn(1, 30, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    values = torch.randn(30, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     values[..., :2] = 1e-8
-    counts = torch.ones(1, 30, dtype=torch.bool)
-    still = torch.zeros(1, 30, 1, 3, dtype=torch.float64)
-    alike = sides(flat, ACT, values, still, values, counts, torch.Generator().manual_seed(0))
+    still = torch.zeros(30, 1, 3, dtype=torch.float64)
+    numbers, generator = torch.arange(30), torch.Generator().manual_seed(0)
+    alike = sides(flat, ACT, values, still, values, numbers, generator)
     assert alike.direction > 0.05
 
 
 def test_without_vectors_nothing_is_unlike():
     flat = Layout([Field("z", 0)])
-    values = torch.randn(3, 5, 1)
+    values = torch.randn(15, 1)
     alike = sides(
-        *(flat, flat, values, torch.randn(3, 5, 2, 1), values),
-        torch.ones(3, 5, dtype=torch.bool),
-        torch.Generator().manual_seed(0),
+        *(flat, flat, values, torch.randn(15, 2, 1), values),
+        *(torch.arange(15) % 5, torch.Generator().manual_seed(0)),
     )
     assert alike == Sides(1.0, 1.0, 0j)
