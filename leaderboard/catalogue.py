@@ -61,8 +61,9 @@ AGENTS: dict[str, Role] = {
     **dict.fromkeys(REFERENCES, "reference"),
     **dict.fromkeys(("standard", "standard-matched", "augmented", "equivariant"), "learner"),
     **dict.fromkeys(("residual-pathway", "relaxed", "projected", "constrained"), "learner"),
-    **dict.fromkeys(("slow", "free-bias", "resilient", "chooser", "balanced"), "learner"),
-    **dict.fromkeys(("partial", "ensemble", "displaced", "residual", "best-of-n"), "learner"),
+    **dict.fromkeys(("slow", "free-bias", "screened", "resilient", "chooser"), "learner"),
+    **dict.fromkeys(("balanced", "partial", "ensemble", "displaced"), "learner"),
+    **dict.fromkeys(("residual", "best-of-n"), "learner"),
     **{"wrong-group": "control"},
     **RETIRED_AGENTS,
 }

@@ -23,6 +23,7 @@ STYLES: dict[str, tuple[str, str, Dash]] = {
     "approximate": ("#009E73", "^", "-"),
     "slow": ("#6A3D9A", "^", "-"),
     "free-bias": ("#B15928", "v", "-"),
+    "screened": ("#E7298A", "D", "-"),
     "resilient": ("#332288", "d", (0, (5, 1))),
     "chooser": ("#1B9E77", "o", (0, (5, 1))),
     "balanced": ("#A6761D", "s", (0, (5, 1))),
