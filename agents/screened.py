@@ -18,16 +18,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import nn
 
 from symsteer.agents.agent import AgentContext, Budget
 from symsteer.agents.asymmetry import PenaltyAgent, PenaltyOptions
 from symsteer.agents.episodes import Played
+from symsteer.agents.networks import Parameters
 from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import tuned
 from symsteer.agents.replay import Transition
 from symsteer.agents.residual_pathway import ResidualPathway
-from symsteer.agents.slow import Slow
 from symsteer.errors import UserError
+from symsteer.policies.networks.equivariant import EquivariantLayer
 from symsteer.policies.sides import sides
 
 
@@ -44,10 +46,19 @@ class ScreenedOptions(PenaltyOptions):
         self._require("lie in [0, 1]", lambda value: 0 <= value <= 1, "level")
 
 
-class Screened(Slow, ResidualPathway):
-    """An equivariant layer, with a plain one beside it that counts once its rate is 1."""
+class Screened(ResidualPathway):
+    """An equivariant layer, with a plain one beside it that counts if it is open."""
 
-    rate = bias_rate = 0.0
+    def __init__(self, strict: EquivariantLayer):
+        super().__init__(strict)
+        # A parameter, because a team stacks parameters; the optimiser leaves it alone.
+        self.open = nn.Parameter(torch.zeros(()), requires_grad=False)
+
+    def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
+        weight, bias = self.strict_of(parameters)
+        opened = parameters["open"].detach().unsqueeze(-1)
+        bias = bias + opened * parameters["free.bias"]
+        return weight + opened.unsqueeze(-1) * parameters["free.weight"], bias
 
 
 @tuned
@@ -59,6 +70,7 @@ class ScreenedAgent(PenaltyAgent):
     """
 
     name = "screened"
+    in_teams = True
     Options = ScreenedOptions
     options: ScreenedOptions
     Layer = Screened
@@ -93,16 +105,11 @@ class ScreenedAgent(PenaltyAgent):
         # Environment by environment.
         episodes = begins.view(-1, num_envs).T.flatten().cumsum(0).view(num_envs, -1).T.flatten()
         seen = (self.obs_layout, self.act_layout, obs, actions, next_obs)
-        self._settle_for(sides(*seen, episodes, self._new_generator(2)).direction)
-
-    def _settle_for(self, direction: float | None) -> None:
-        """Open the free paths, or not."""
-        self.direction = direction
-        rate = float(direction is not None and direction <= self.options.level)
+        self.direction = sides(*seen, episodes, self._new_generator(2)).direction
         for network in self.networks.values():
-            for layer in network.modules():
-                if isinstance(layer, Screened):
-                    layer.rate = layer.bias_rate = rate
+            with torch.no_grad():
+                for _, parameters in network.layers():
+                    parameters["open"].fill_(self.direction <= self.options.level)
             network.changed()
 
     def diagnostics(self, played: Played) -> Mapping[str, float | None]:
@@ -116,4 +123,4 @@ class ScreenedAgent(PenaltyAgent):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where :meth:`state_dict` was taken."""
         super().load_state_dict(state)
-        self._settle_for(state["direction"])
+        self.direction = state["direction"]

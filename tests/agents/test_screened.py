@@ -7,6 +7,7 @@ import torch
 
 from symsteer.agents.agent import Budget
 from symsteer.agents.replay import Transition
+from symsteer.agents.team import Team
 from symsteer.errors import UserError
 from tests.agents.conftest import errors
 
@@ -113,3 +114,23 @@ def test_the_replay_must_hold_the_warm_up(problem):
 def test_options_out_of_range_are_refused(problem):
     with pytest.raises(UserError, match="agent option level must lie in"):
         screened(problem, level=1.5)
+
+
+def test_members_of_a_team_decide_for_themselves(problem):
+    """One of them sees a shift; each learns what it learns alone."""
+    shifts = (0.7, 0.0)
+    alone, members = ([screened(problem, seed=s) for s in (0, 1)] for _ in range(2))
+    team = Team(members)
+    for pair in zip(alone, members, strict=True):
+        for agent in pair:
+            play(problem, agent, shift=shifts[agent.context.seed], decisions=6)
+    assert [member.direction <= 0.01 for member in members] == [True, False]
+    for _ in range(5):
+        for agent in alone:
+            agent.update(agent.new_batch())
+        team.update([member.new_batch() for member in members])
+    obs = problem.batch().obs
+    for one, other in zip(alone, members, strict=True):
+        torch.testing.assert_close(one.act(obs, True), other.act(obs, True), rtol=1e-4, atol=1e-5)
+    opened, closed = (max(errors(member, problem).values()) for member in members)
+    assert opened > 1e-3 > closed
