@@ -1,8 +1,9 @@
-"""Trials of the suites dial-a and dial-b: collects them, and chooses by minimax regret.
+"""Trials of the suites dial-a to dial-d: collects them, and chooses by minimax regret.
 
 python -m tools.pages.dial                       # the tables of the committed trials
 python -m tools.pages.dial RUNS [RUNS ...]       # adds finished runs of these folders
 python -m tools.pages.dial --tasks StackCube-v1 --seeds 120      # only of this task and this policy
+python -m tools.pages.dial --without utd noise_bound             # only what stage A has chosen
 
 A setting is compared if it has all worlds and base policies that any setting has. If all agents
 have the same settings, as in dial-a, a table before the others takes them together.
@@ -178,6 +179,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("runs", nargs="*", type=Path, help="folders of runs to add")
     parser.add_argument("--tasks", nargs="*", default=[], help="all if none is named")
     parser.add_argument("--seeds", nargs="*", type=int, default=[], help="all if none is named")
+    parser.add_argument(
+        "--without", nargs="*", default=[], help="options that may not differ from the preset"
+    )
     given = parser.parse_args(arguments)
     for folder in given.runs:
         for path in sorted(folder.glob("*/record.json")):
@@ -190,6 +194,7 @@ def main(arguments: Sequence[str]) -> int:
         for trial in every
         if (not given.tasks or trial.world.split()[0] in given.tasks)
         and (not given.seeds or trial.seed in given.seeds)
+        and not any(f" {name}=" in f" {trial.setting}" for name in given.without)
     ]
     settings = [
         {t.setting for t in trials if t.agent == agent} for agent in {t.agent for t in trials}
