@@ -110,6 +110,12 @@ def test_all_learn_from_all_decisions(problem):
     assert all(learner.replay is agent.replay for learner in agent.learners)
 
 
+def test_learners_play_different_noise_in_the_warm_up(problem):
+    agent = problem.agent("balanced", warmup=100)
+    noise = agent.act(problem.batch(12).obs)
+    assert len(noise.flatten(1).unique(dim=0)) == 12
+
+
 def test_evaluations_play_the_best_one(problem):
     agent = problem.agent("balanced")
     obs = problem.batch(8, seed=3).obs

@@ -39,6 +39,21 @@ def test_base_says_whether_sides_are_alike(problem, where):
     assert (found["direction_p"] <= 0.002) == (where in ("obs", "noise"))
 
 
+def test_base_says_how_far_the_tool_drifts(problem):
+    shape, noise = (4, 60), problem.batch(240).noise.unflatten(0, (4, 60))
+    obs = problem.batch(240, 1).obs.unflatten(0, shape)
+    agent, following = problem.agent("base"), obs.clone()
+    done = agent.decode(obs.flatten(0, 1), noise.flatten(0, 1))[:, : agent.context.execute]
+    moved = done[..., problem.act_layout.slice("xy")].sum(1).unflatten(0, shape)
+    following[..., problem.obs_layout.slice("tcp_xy")] += moved + torch.tensor([0.1, -0.2])
+    running = torch.ones(shape, dtype=torch.bool)
+    played = Rollout({}, obs, noise, torch.zeros(shape), following, running, ~running)
+    generator = torch.Generator().manual_seed(0)
+    found = agent.diagnostics(Played(played, None, (-1.0, 0.0), generator))
+    assert found["drift_x"] == pytest.approx(0.1, abs=1e-5)
+    assert found["drift_y"] == pytest.approx(-0.2, abs=1e-5)
+
+
 def test_zero_is_fixed_by_the_group(problem):
     noise = problem.agent("zero").act(problem.batch().obs)
     assert noise.shape == (32, problem.horizon, problem.act_layout.dim)
