@@ -10,9 +10,9 @@ Whether a mean is too large for chance is asked by a randomisation test: every e
 a random quarter, 999 times over (Lehmann and Romano, Testing Statistical Hypotheses, chapter 15).
 Its level is exact for any number of episodes: no distribution is assumed.
 
-How large a constant shift of every motion is, is estimated: the change of the tool in a decision is
-regressed on the executed actions, by a complex factor, as symmetry asks, and a constant, which
-symmetry forbids. The constant is the *drift*.
+If every motion is shifted alike, the size of the shift is estimated, too. The change of the tool in
+a decision is fitted by the executed actions times a complex factor, which symmetry allows, plus a
+constant, which it forbids. The constant is the *drift*.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ RESTING = 1e-4
 
 @dataclass(frozen=True)
 class Sides:
-    """p-values: how likely means as large as these are in a symmetric world.
+    """How unlike the sides are.
 
     Attributes:
-        direction: of vectors.
-        axis: of products of two vectors.
+        direction: p-value: how likely means of vectors as large as these are in a symmetric world.
+        axis: the same of products of two vectors.
         drift: what the tool moves in each decision without being told to, x + iy, in units of the
             observation (metres). The tool is the vector whose changes the actions explain best.
     """

@@ -90,6 +90,7 @@ def advise(
     here = _here(lessons, task, embodiment, variant)
     others = [lesson for lesson in lessons if lesson.task != task]
     gain, direction = (here.gain, here.direction) if here else (None, None)
+    drift = drift_in(probed) if probed else None
     if probed:
         gain, direction = _found(probed)
     question = dataclasses.replace(question, gain=gain, direction=direction, measured=here)
@@ -100,7 +101,7 @@ def advise(
             "worlds": len(lessons),
             "gain": gain,
             "direction": direction,
-            "drift": drift_in(probed) if probed else None,
+            "drift": drift,
             "advice": [_as_data(one) for one in advices],
             "left_out": [dataclasses.asdict(score) for score in scores],
         }
@@ -110,7 +111,7 @@ def advise(
     blocks = [
         f"From {len(lessons)} worlds of {tasks} tasks, of {len(folders)} "
         f"{'study' if len(folders) == 1 else 'studies'}.",
-        _facts(question, drift_in(probed) if probed else None),
+        _facts(question, drift),
         *map(_text, advices),
         *([ASK] if probed is None and any(one.refused for one in advices) else []),
         _record(scores),

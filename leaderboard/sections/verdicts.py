@@ -48,8 +48,10 @@ def render(said: dict[str, list[ClaimOutcome]], view: View) -> list[str]:
     """Their verdicts as a list, or else those of all claims by name."""
     if said:
         lines = [f"- {text}: {standing(tested)}." for text, tested in said.items()]
-        known = "*Equivalent*: the effect is shown to be smaller than the smallest one of interest."
-        return [known, "\n".join(lines), "Each with its tests: [the paper's claims](PAPER.md)."]
+        meaning = (
+            "*Equivalent*: the effect is shown to be smaller than the smallest one of interest."
+        )
+        return [meaning, "\n".join(lines), "Each with its tests: [the paper's claims](PAPER.md)."]
     named: dict[str, list[str]] = {}
     for outcome in view.findings.of(claims.SECTION):
         rest = (

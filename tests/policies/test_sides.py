@@ -15,11 +15,17 @@ ACT = Layout([Field("xy", 1), Field("gripper", 0)])
 
 
 def episodes(
-    count: int, seed: int, shift: float = 0.0, gain: float = 1.0, drift: float = 0.0
+    count: int,
+    seed: int,
+    shift: float = 0.0,
+    gain: float = 1.0,
+    drift: float = 0.0,
+    slip: float = 0.0,
 ) -> Sides:
     """Walks towards the origin from all sides.
 
-    Seen with a shift along x, with a weak motor along x, or with a drift along y.
+    Seen with a shift along x, with a weak motor along x, with a drift along y, or with random
+    slips, which actions do not explain.
     """
     generator = torch.Generator().manual_seed(seed)
     angle = 2 * math.pi * torch.rand(count, generator=generator, dtype=torch.float64)
@@ -30,6 +36,8 @@ def episodes(
         step = -0.3 * (place[:, None] + noise)
         following = place + step[:, 0] * torch.tensor([gain, 1.0])
         following += torch.tensor([0.0, drift])
+        if slip:
+            following += slip * torch.randn(count, 2, generator=generator, dtype=torch.float64)
         columns.append((place, torch.cat([step, torch.zeros(count, 1, 1)], -1), following))
         place = following
     places, actions, followings = (torch.stack(each) for each in zip(*columns, strict=True))
@@ -55,7 +63,7 @@ def test_of_a_field_with_blocks_the_mean_counts():
 @pytest.mark.parametrize("count", [6, 40])
 def test_in_a_symmetric_world_the_level_is_exact(count):
     """A share of .05 of 300 worlds is within .02 and .09 in all but one of 1,000 trials."""
-    found = [episodes(count, seed) for seed in range(300)]
+    found = [episodes(count, seed, slip=0.1) for seed in range(300)]
     for name in ("direction", "axis"):
         values = torch.tensor([getattr(one, name) for one in found])
         assert 0.02 <= (values <= 0.05).double().mean() <= 0.09
@@ -71,9 +79,9 @@ def test_a_shift_has_a_direction_and_a_weak_motor_an_axis():
 
 def test_a_drift_is_known_and_a_shift_of_what_is_seen_is_none():
     """Actions explain how the tool moves, but for the drift."""
-    drifting, shifted = episodes(40, 0, drift=0.07), episodes(40, 0, shift=0.5)
+    drifting, shifted = episodes(40, 0, drift=0.005), episodes(40, 0, shift=0.5)
     assert drifting.direction <= 0.002
-    assert drifting.drift == pytest.approx(0.07j)
+    assert drifting.drift == pytest.approx(0.005j)
     assert shifted.drift == pytest.approx(0j, abs=1e-9)
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from symsteer.errors import UserError
-from tools.pages.dial import Trial, below_best, complete, loss, render, shared
+from tools.pages.dial import Trial, below_best, complete, loss, main, render, shared
 
 
 def trials(values):
@@ -54,3 +54,14 @@ def test_a_setting_that_all_share_is_chosen_by_the_mean_over_agents():
     of_candidate = below_best(complete(shared(runs)))
     assert of_candidate["all", "a"]["none"] == pytest.approx((0.0, 0.0))
     assert of_candidate["all", "b"]["none"] == pytest.approx((0.1, 0.0))
+
+
+def test_settings_that_a_stage_has_dropped_can_be_left_out(capsys):
+    chosen = ["--tasks", "PokeCube-v1", "--seeds", "120"]
+    assert main(chosen) == 0
+    assert "`noise_bound=1.0 utd=0.5`" in capsys.readouterr().out
+    assert main([*chosen, "--without", "utd", "noise_bound"]) == 0
+    rows = capsys.readouterr().out
+    assert "`penalty=30.0`" in rows
+    assert "utd" not in rows
+    assert "noise_bound" not in rows
