@@ -330,10 +330,7 @@ class SacAgent(Agent):
         """Store the decisions; each one after the warm-up adds ``utd`` due updates."""
         fields = vars(transition)
         self.replay.add({**fields, **self._banked(fields[self.bank_at])})
-        self.owe(len(transition.reward))
-
-    def owe(self, decisions: int) -> None:
-        """Count decisions that are in the replay, and the updates that are due for them."""
+        decisions = len(transition.reward)
         if self.decisions >= self.options.warmup:
             self.owed += decisions * self.options.utd
         self.decisions += decisions

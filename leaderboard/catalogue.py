@@ -54,15 +54,18 @@ POLICIES = (
 
 REFERENCES = ("base", "zero", "golden-ticket")
 
-RETIRED_AGENTS: dict[str, Role] = {"approximate": "learner", "best-of-n-kernel": "learner"}
+RETIRED_AGENTS: dict[str, Role] = {
+    **dict.fromkeys(("approximate", "best-of-n-kernel"), "learner"),
+    **dict.fromkeys(("resilient", "chooser", "balanced"), "learner"),
+}
 """Agents whose records stay when SymSteer has them no more; `approximate` is of version 0.1."""
 
 AGENTS: dict[str, Role] = {
     **dict.fromkeys(REFERENCES, "reference"),
     **dict.fromkeys(("standard", "standard-matched", "augmented", "equivariant"), "learner"),
     **dict.fromkeys(("residual-pathway", "relaxed", "projected", "constrained"), "learner"),
-    **dict.fromkeys(("slow", "free-bias", "screened", "resilient", "chooser"), "learner"),
-    **dict.fromkeys(("balanced", "partial", "ensemble", "displaced"), "learner"),
+    **dict.fromkeys(("slow", "free-bias", "screened"), "learner"),
+    **dict.fromkeys(("partial", "ensemble", "displaced"), "learner"),
     **dict.fromkeys(("residual", "best-of-n"), "learner"),
     **{"wrong-group": "control"},
     **RETIRED_AGENTS,

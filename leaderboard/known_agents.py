@@ -26,8 +26,8 @@ USING_SYMMETRY = ("augmented", *WITH_SYMMETRY)
 """The agents whose advantage over `STANDARD` is shown by kind of break and on the map: the fair
 rival has the symmetry from data, the others have it in their networks."""
 
-BETWEEN = ("slow", "free-bias", "screened", "resilient", "chooser", "balanced")
-"""Agents that may leave the symmetry, or choose how much of it to keep."""
+BETWEEN = ("slow", "free-bias", "screened")
+"""Agents that may leave the symmetry, or choose whether to."""
 
 ROW_ORDER = (
     *(BASE, ZERO, CONSTANT),

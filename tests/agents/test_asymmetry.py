@@ -17,19 +17,17 @@ from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
 from tests.agents.conftest import ACT, OBS, errors, trained
 
 WITH_DIAL = ("residual-pathway", "relaxed", "projected")
-ALL = (*WITH_DIAL, "constrained", "slow", "free-bias", "resilient")
+ALL = (*WITH_DIAL, "constrained", "slow", "free-bias")
 FREE = {
     "constrained": {"dual_lr": 0.0},
     "slow": {"rate": 1.0},
     "free-bias": {},
-    "resilient": {"initial_multiplier": 0.0, "dual_lr": 0.0},
     **{name: {"penalty": 0.0} for name in WITH_DIAL},
 }
 STRICT = {
     "slow": {"rate": 0.0},
     "residual-pathway": {"penalty": math.inf},
     "free-bias": {"penalty": math.inf},
-    "chooser": {"rate": 0.0, "actors": "strict"},
 }
 
 
@@ -207,23 +205,6 @@ def test_slow_numbers_move_at_a_fraction_of_the_rate(problem):
         whole = dense_of(layer, parameters)
         for one, other, wanted in zip(whole, strict, (rate, rate / 2), strict=True):
             assert (one - other).abs().max().item() == pytest.approx(1e-3 * wanted, rel=1e-3)
-
-
-def test_the_plain_path_that_may_come_in_has_the_norm_of_the_strict_one(problem):
-    for layer, _ in problem.agent("resilient").actor.layers():
-        strict = dense(layer.strict)[0].norm()
-        torch.testing.assert_close(layer.free.weight.norm(), strict, rtol=1e-4, atol=0)
-
-
-def test_the_multiplier_falls_until_the_plain_path_pays(problem):
-    agent = problem.agent("resilient", price=2.0, initial_multiplier=1.0, dual_lr=0.5)
-    layers = [parameters for _, parameters in agent.actor.layers()]
-    with torch.no_grad():
-        layers[1]["gamma"].fill_(-1.0)
-        assert agent.penalty("actor", None).item() == pytest.approx(1.0)
-        agent.settle("actor")
-    # lambda + 0.5 (|gamma| - lambda / 2)
-    assert [layer["multiplier"].item() for layer in layers] == pytest.approx([0.75, 1.25, 0.75])
 
 
 @pytest.mark.parametrize("elastic", [False, True])

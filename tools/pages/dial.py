@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from symsteer.agents import AGENTS
+from symsteer.agents.options import SacOptions
 from symsteer.agents.presets import preset_options
 from symsteer.errors import UserError
 from symsteer.files import write_atomically
@@ -67,7 +68,8 @@ def trial_of(path: Path) -> Trial | None:
     if record.status != "finished" or record.final is None:
         return None
     config = record.settings
-    kind = AGENTS.get(config.agent).Options
+    # Some agents of the search are no longer here; all their own options are shown.
+    kind = AGENTS.get(config.agent).Options if config.agent in AGENTS else SacOptions
     preset = kind(**preset_options("dial", config.agent, kind))
     usual = agent_options({"agent_options": vars(preset)})
     options = agent_options(record.config)
