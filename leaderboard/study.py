@@ -103,6 +103,16 @@ class Safe(_Table):
     area: Annotated[float, Field(gt=0)]
 
 
+class Probe(_Table):
+    """A rule that is declared: `standard` wins where the best constant noise gains at least so
+    much, elsewhere `equivariant` does."""
+
+    gain: float
+    """Of final success, above the better of base policy and zero noise."""
+    right: Annotated[float, Field(gt=0, le=1)] = 0.9
+    """Share of the decided worlds in which the rule is right."""
+
+
 class _File(_Table):
     description: str = ""
     notice: str = ""
@@ -113,6 +123,7 @@ class _File(_Table):
     claim: tuple[Claim, ...] = ()
     statement: tuple[Statement, ...] = ()
     safe: Safe | None = None
+    probe: Probe | None = None
 
     @model_validator(mode="after")
     def _names_fit(self) -> _File:
@@ -141,6 +152,7 @@ class Study:
         listed: hashes of the records and reproductions of the study's own (`read_list`); None if
             the study has no list.
         safe: the agent that is declared safe, if there is one.
+        probe: the rule that is declared, if there is one.
     """
 
     notice: str
@@ -152,6 +164,7 @@ class Study:
     sha256: str
     listed: frozenset[str] | None = None
     safe: Safe | None = None
+    probe: Probe | None = None
 
 
 def read_study(name_or_path: str) -> Study:
@@ -184,6 +197,7 @@ def read_study(name_or_path: str) -> Study:
         claims=file.claim,
         statements=file.statement,
         safe=file.safe,
+        probe=file.probe,
         source=source.name,
         sha256=hashlib.sha256(source.read_bytes()).hexdigest(),
         listed=read_list(path),

@@ -68,6 +68,10 @@ class Lesson:
         """How it is broken, without strengths."""
         return dial_of(self.table.key.variant)
 
+    def sign(self, measure: str) -> int:
+        """Of the advantage of `STRICT`; 0 if it is not decided."""
+        return self.advantage[measure].sign if measure in self.advantage else 0
+
 
 @dataclass(frozen=True)
 class Question:
@@ -189,7 +193,7 @@ def by_kind(lessons: Sequence[Lesson], question: Question, measure: str) -> Answ
     tasks = {lesson.task for lesson in like}
     if len(tasks) < LEAST_TASKS:
         return Answer(0, f"other tasks with such a world: {len(tasks)}, {LEAST_TASKS} are needed")
-    signs = [sign for lesson in like if (sign := _sign(lesson, measure))]
+    signs = [sign for lesson in like if (sign := lesson.sign(measure))]
     if not signs:
         return Answer(0, f"no difference is clear in {len(like)} such worlds", like)
     if len(set(signs)) > 1:
@@ -249,7 +253,7 @@ def threshold(lessons: Sequence[Lesson], measure: str) -> float | None:
     decided = sorted(
         (lesson.gain.value, sign)
         for lesson in lessons
-        if lesson.gain and (sign := _sign(lesson, measure))
+        if lesson.gain and (sign := lesson.sign(measure))
     )
     if len({sign for _, sign in decided}) < 2:
         return None
@@ -258,11 +262,6 @@ def threshold(lessons: Sequence[Lesson], measure: str) -> float | None:
     errors = [sum((gain >= limit) == (sign > 0) for gain, sign in decided) for limit in candidates]
     best = [limit for limit, e in zip(candidates, errors, strict=True) if e == min(errors)]
     return best[len(best) // 2] if best else None
-
-
-def _sign(lesson: Lesson, measure: str) -> int:
-    """Of the advantage of `STRICT`; 0 if it is not decided."""
-    return lesson.advantage[measure].sign if measure in lesson.advantage else 0
 
 
 # What they say together.
@@ -387,7 +386,7 @@ def leave_tasks_out(lessons: Sequence[Lesson], fallback: str = STANDARD) -> list
                     for agent in (STRICT, STANDARD, fallback):
                         regret[agent].append(known[agent])
                     advised.append(known[advice.agent])
-                if sign := _sign(lesson, measure):
+                if sign := lesson.sign(measure):
                     worlds += 1
                     answered += not advice.refused
                     right += not advice.refused and advice.agent == (

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from symsteer.leaderboard.known_agents import STANDARD, STRICT
-from symsteer.leaderboard.pairs import SHORT_NAMES
+from collections.abc import Sequence
+
+from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT, ZERO
+from symsteer.leaderboard.pairs import MEASURES, SHORT_NAMES
 from symsteer.leaderboard.sections import Findings, Section, View
+from symsteer.leaderboard.study import Probe
 from symsteer.leaderboard.text import code, number, share, table_text
-from symsteer.leaderboard.which_agent import Score, leave_tasks_out, lessons_of
+from symsteer.leaderboard.which_agent import Lesson, Score, leave_tasks_out, lessons_of
+
+Found = tuple[list[Lesson], list[Score]]
 
 EXPLAINED = f"""\
 Would `symsteer advise` have been right about each of these worlds without the runs of its task?
@@ -32,15 +37,41 @@ def scores(found: list[Score]) -> list[dict[str, str]]:
     ]
 
 
-def render(found: list[Score], view: View) -> list[str]:
-    """Empty where no task could be left out."""
-    return [EXPLAINED, table_text(scores(found), left=2)] if found else []
+def verdict(lessons: Sequence[Lesson], probe: Probe) -> str:
+    """Whether a declared rule is right often enough, by both measures."""
+    declared = (
+        f"Declared before the runs: where the best constant noise gains at least "
+        f"{number(probe.gain, 3)} over the better of `{BASE}` and `{ZERO}`, `{STANDARD}` is "
+        f"better, elsewhere `{STRICT}`; in at least {number(100 * probe.right, 0)} % of the "
+        "decided worlds."
+    )
+    texts, holds = [], []
+    for measure in MEASURES:
+        right = [
+            (lesson.gain.value < probe.gain) == (sign > 0)
+            for lesson in lessons
+            if lesson.gain and (sign := lesson.sign(measure))
+        ]
+        texts.append(f"{share(sum(right), len(right))} by {SHORT_NAMES[measure]}")
+        holds += [sum(right) >= probe.right * len(right)] if right else []
+    result = ("Supported" if all(holds) else "Contradicted") if holds else "Not tested"
+    return f"{declared} **{result}**: right in {' and in '.join(texts)}."
 
 
-def compute(findings: Findings) -> list[Score]:
+def render(found: Found, view: View) -> list[str]:
+    """Empty where no task could be left out, and no rule was declared."""
+    lessons, scored = found
+    probe = view.findings.study.probe
+    return [
+        *([verdict(lessons, probe)] if probe else []),
+        *([EXPLAINED, table_text(scores(scored), left=2)] if scored else []),
+    ]
+
+
+def compute(findings: Findings) -> Found:
     """With the declared safe agent as the fallback, if there is one."""
-    safe = findings.study.safe
-    return leave_tasks_out(lessons_of(findings.summary), safe.agent if safe else STANDARD)
+    safe, lessons = findings.study.safe, lessons_of(findings.summary)
+    return lessons, leave_tasks_out(lessons, safe.agent if safe else STANDARD)
 
 
 SECTION = Section("Advice for a task without records", compute, render)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from symsteer.leaderboard.sections.unknown_task import SECTION
-from tests.leaderboard.record_factory import make_cell, view_of, with_policies
+import pytest
+
+from symsteer.leaderboard.sections.unknown_task import SECTION, verdict
+from symsteer.leaderboard.study import Probe
+from symsteer.leaderboard.which_agent import lessons_of
+from tests.leaderboard.record_factory import make_cell, summary_of, view_of, with_policies
 
 
 def test_rules_are_shown_with_their_refusals() -> None:
@@ -22,3 +26,30 @@ def test_rules_are_shown_with_their_refusals() -> None:
 
 def test_without_both_agents_there_is_no_section() -> None:
     assert view_of(make_cell({"base": 0.2, "standard": 0.5})).blocks(SECTION) == []
+
+
+@pytest.mark.parametrize(
+    ("gain", "said"),
+    [
+        # Above what the constant noise gains where `standard` wins: wrong there.
+        (0.3, "**Contradicted**: right in 1/2 by AUC and in 1/2 by success."),
+        (0.1, "**Supported**: right in 2/2 by AUC and in 2/2 by success."),
+        (-0.1, "**Contradicted**: right in 1/2 by AUC and in 1/2 by success."),
+    ],
+)
+def test_a_declared_rule_is_tested_in_decided_worlds(gain: float, said: str) -> None:
+    worlds = {
+        "none": {"golden-ticket": 0.4, "equivariant": 0.8, "standard": 0.5},
+        "wind:1": {"golden-ticket": 0.6, "equivariant": 0.5, "standard": 0.8},
+        "wind:2": {"golden-ticket": 0.6, "equivariant": 0.5, "standard": 0.5},  # undecided
+    }
+    cells = [
+        with_policies(make_cell({"base": 0.2, "zero": 0.4, **rates}, variant=variant))
+        for variant, rates in worlds.items()
+    ]
+    assert verdict(lessons_of(summary_of(*cells)), Probe(gain=gain)).endswith(said)
+
+
+def test_without_a_constant_noise_the_rule_is_not_tested() -> None:
+    cell = with_policies(make_cell({"base": 0.2, "equivariant": 0.8, "standard": 0.5}))
+    assert "**Not tested**" in verdict(lessons_of(summary_of(cell)), Probe(gain=0.1))
