@@ -105,7 +105,8 @@ def area_difference(run: Run, partner: Run, budget: int) -> Sample | None:
             blocks[step] = Sample.pooled(differences.items()).blocks[0]
     if not blocks:
         return None
-    return Sample(tuple(blocks.values()), area_weights(list(blocks), budget), run.policy)
+    begin = max(run.first_update, partner.first_update)
+    return Sample(tuple(blocks.values()), area_weights(list(blocks), budget, begin), run.policy)
 
 
 def _partner(run: Run, row: AgentRow) -> Run | None:

@@ -21,6 +21,7 @@ from symsteer.leaderboard.records import (
     RunRecord,
     check_reproduction,
     file_hash,
+    flat,
     read_record,
     read_reproductions,
 )
@@ -93,6 +94,16 @@ class Run:
         return list(self.curve), [evaluation.success_once for evaluation in self.curve.values()]
 
     @cached_property
+    def first_update(self) -> int:
+        """Environment steps of the warm-up, in which nothing is learned; 0 if there is none."""
+        config = flat(self.record.config)
+        warmup, execute = config.get("agent_options.warmup"), config.get("policy.execute")
+        if not (isinstance(warmup, int) and isinstance(execute, int)):
+            return 0
+        steps = warmup * execute
+        return steps if 0 < steps < self.record.settings.env_steps else 0
+
+    @cached_property
     def final_success(self) -> dict[int, float]:
         """success_once of the final evaluation by episode seed (empty before the end)."""
         return episode_success(self.record.final) if self.record.final else {}
@@ -135,8 +146,8 @@ class Run:
 
     @property
     def area(self) -> float:
-        """Area under the success curve over the budget; the run must be finished."""
-        return area_under_curve(*self.points, self.record.settings.env_steps)
+        """Area under the success curve from the first update on; the run must be finished."""
+        return area_under_curve(*self.points, self.record.settings.env_steps, self.first_update)
 
     @property
     def feasible(self) -> tuple[float, float] | None:

@@ -584,9 +584,9 @@ def paired_differences(first: Mapping[Key, float], second: Mapping[Key, float]) 
     return {key: value - second[key] for key, value in first.items() if key in second}
 
 
-def area_weights(steps: Sequence[int], budget: int) -> tuple[float, ...]:
+def area_weights(steps: Sequence[int], budget: int, begin: int = 0) -> tuple[float, ...]:
     """What each evaluation weighs in `area_under_curve`, which is linear in the values."""
-    return tuple(area_under_curve(steps, list(unit), budget) for unit in np.eye(len(steps)))
+    return tuple(area_under_curve(steps, list(unit), budget, begin) for unit in np.eye(len(steps)))
 
 
 def steps_to_threshold(

@@ -41,13 +41,16 @@ def newcombe(
     return p - q - math.hypot(p - p_low, q_high - q), p - q + math.hypot(p_high - p, q - q_low)
 
 
-def area_under_curve(steps: Sequence[int], values: Sequence[float], budget: int) -> float:
-    """Area under a learning curve by the trapezoidal rule, as a share of `budget` x 1.
+def area_under_curve(
+    steps: Sequence[int], values: Sequence[float], budget: int, begin: int = 0
+) -> float:
+    """Mean height of a learning curve from step `begin` to the budget, by the trapezoidal rule.
 
     The first value is held back to step 0 and the last one on to the budget; what lies beyond the
     budget is left out. One evaluation gives its own value.
     """
     knots = np.array([0, *steps, max(budget, steps[-1])], dtype=np.float64)
     heights = np.array([values[0], *values, values[-1]], dtype=np.float64)
-    inside = np.unique(np.concatenate([knots[knots <= budget], [float(budget)]]))
-    return float(trapezoid(np.interp(inside, knots, heights), inside) / budget)
+    within = knots[(knots > begin) & (knots < budget)]
+    inside = np.unique([float(begin), *within, float(budget)])
+    return float(trapezoid(np.interp(inside, knots, heights), inside) / (budget - begin))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from symsteer.leaderboard.keys import recipe_of
-from symsteer.leaderboard.pairs import area_pairs, reference_success, success_pairs
+from symsteer.leaderboard.pairs import area_difference, area_pairs, reference_success, success_pairs
 from symsteer.leaderboard.records import Evaluation, RunRecord, config_hash
 from symsteer.leaderboard.row_numbers import summarize
 from symsteer.leaderboard.rows import AgentRow, Summary
@@ -170,6 +170,25 @@ def test_curves_give_area_threshold_and_dip() -> None:
     assert standard.area == pytest.approx((sum(heights) - (heights[0] + heights[-1]) / 2) / 5)
     assert row(summary, "base").threshold_steps == []
     assert row(summary, "base").dip is None
+
+
+@pytest.mark.parametrize(("warmup", "first"), [(0, 0), (2_500, 10_000), (12_500, 0), ("?", 0)])
+def test_the_area_counts_from_the_first_update_on(warmup: object, first: int) -> None:
+    """A warm-up of 2,500 decisions of four steps; one beyond the budget, or of no number, is none.
+
+    The curve rises from 0 to 1 over 50,000 steps.
+    """
+    options = {"agent_options": {"warmup": warmup}, "policy": {"execute": 4}}
+    curve = points((0, [0, 0]), (50_000, [1, 1]))
+    found = run(make_record(curve, **options))
+    assert found.first_update == first
+    assert found.area == pytest.approx((1 + first / 50_000) / 2)
+    partner = run(
+        make_record(points((0, [0, 0]), (50_000, [0, 0])), agent="equivariant", **options)
+    )
+    difference = area_difference(found, partner, 50_000)
+    assert difference
+    assert difference.value == pytest.approx(found.area)
 
 
 def points(*points: tuple[int, list[int]]) -> list[Evaluation]:

@@ -291,6 +291,13 @@ def test_area_under_curve_is_linear(steps: list[int], values: list[float], area:
     assert np.dot(area_weights(steps, 100), values) == pytest.approx(area)
 
 
+def test_what_comes_before_the_first_update_does_not_count() -> None:
+    """A line from 0 to 1: from step 20 on its mean height is 0.6."""
+    assert area_under_curve([0, 100], [0.0, 1.0], 100, 20) == pytest.approx(0.6)
+    assert area_under_curve([0, 50, 100], [0.0, 0.0, 1.0], 100, 50) == pytest.approx(0.5)
+    assert sum(area_weights([0, 30, 100], 100, 50)) == pytest.approx(1.0)
+
+
 def test_steps_to_threshold_and_their_median() -> None:
     assert steps_to_threshold([0, 10, 20], [0.1, 0.5, 0.6], 0.5) == 10
     assert steps_to_threshold([0, 10, 20], [0.9, 0.1, 0.5], 0.5) == 20
