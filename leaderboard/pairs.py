@@ -105,7 +105,7 @@ def area_difference(run: Run, partner: Run, budget: int) -> Sample | None:
             blocks[step] = Sample.pooled(differences.items()).blocks[0]
     if not blocks:
         return None
-    begin = max(run.first_update, partner.first_update)
+    begin = max(run.area_begin, partner.area_begin)
     return Sample(tuple(blocks.values()), area_weights(list(blocks), budget, begin), run.policy)
 
 

@@ -117,7 +117,8 @@ def contents(
         The folder, the files by their path in it, and the number of records.
     """
     claims = read_study(study)
-    runs = load_runs(records, reproductions_for(records, reproductions), claims.listed)
+    marks = reproductions_for(records, reproductions)
+    runs = load_runs(records, marks, claims.listed, claims.area_from)
     out = _folder(out)
     return out, render(runs, out, read_audit(audit), claims), len(runs)
 

@@ -27,7 +27,7 @@ from symsteer.leaderboard.records import (
 )
 from symsteer.leaderboard.records.measures import area_under_curve
 from symsteer.leaderboard.statistics import Sample, paired_differences
-from symsteer.leaderboard.study import all_listed
+from symsteer.leaderboard.study import AreaFrom, all_listed
 
 FINAL_WINDOW = 5
 """The final window is the last fifth of the budget."""
@@ -52,6 +52,8 @@ class Run:
     """Whether it counts: all do but submitted ones that no maintainer has reproduced."""
     digest: str = ""
     """sha256 of the record's file."""
+    area_from: AreaFrom = "start"
+    """Where the area under the success curve begins."""
 
     @property
     def seed(self) -> int:
@@ -94,8 +96,10 @@ class Run:
         return list(self.curve), [evaluation.success_once for evaluation in self.curve.values()]
 
     @cached_property
-    def first_update(self) -> int:
-        """Environment steps of the warm-up, in which nothing is learned; 0 if there is none."""
+    def area_begin(self) -> int:
+        """Environment steps at which the area begins; 0 too if there is no warm-up."""
+        if self.area_from == "start":
+            return 0
         config = flat(self.record.config)
         warmup, execute = config.get("agent_options.warmup"), config.get("policy.execute")
         if not (isinstance(warmup, int) and isinstance(execute, int)):
@@ -146,8 +150,8 @@ class Run:
 
     @property
     def area(self) -> float:
-        """Area under the success curve from the first update on; the run must be finished."""
-        return area_under_curve(*self.points, self.record.settings.env_steps, self.first_update)
+        """Area under the success curve; the run must be finished."""
+        return area_under_curve(*self.points, self.record.settings.env_steps, self.area_begin)
 
     @property
     def feasible(self) -> tuple[float, float] | None:
@@ -234,7 +238,10 @@ def aligned(run: Run, other: Run) -> dict[int, int]:
 
 
 def load_runs(
-    paths: Iterable[Path], reproductions: Path | None = None, listed: Collection[str] | None = None
+    paths: Iterable[Path],
+    reproductions: Path | None = None,
+    listed: Collection[str] | None = None,
+    area_from: AreaFrom = "start",
 ) -> list[Run]:
     """Read the records that `paths` name: files, run folders, folders of either.
 
@@ -247,6 +254,7 @@ def load_runs(
         listed: hashes of the records and reproductions that are the study's own (`Study.listed`).
             Others are submitted. A submitted run is trusted if one of its row was reproduced by a
             listed reproduction. None: nothing is known, and all are trusted.
+        area_from: where areas under success curves begin (`Study.area_from`).
     """
     known = read_reproductions(reproductions) if reproductions else {}
     vouched = all_listed() if listed is None and known else listed or ()
@@ -254,7 +262,7 @@ def load_runs(
     for file in record_files(paths):
         record, digest = read_record(file), file_hash(file)
         trusted = listed is None or digest in listed
-        runs.append(Run(file, record, known.get(digest), trusted, digest))
+        runs.append(Run(file, record, known.get(digest), trusted, digest, area_from))
         if reproductions and digest in known:
             path = reproductions / f"{digest}.json"
             counts = file_hash(path) in vouched, listed is None

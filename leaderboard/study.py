@@ -26,6 +26,10 @@ FOLDER = Path(__file__).resolve().parent / "studies"
 
 Measure = Literal["auc", "success", "diverged", "magnitude", "bias"]
 
+AreaFrom = Literal["start", "first update"]
+"""Where the area under a success curve begins. In the warm-up before the first update nothing is
+learned."""
+
 Words = Annotated[str, Field(pattern=r"^[\w ,;:.()'=%-]{1,120}$")]
 """Text that the page shows as it is."""
 
@@ -124,6 +128,7 @@ class _File(_Table):
     statement: tuple[Statement, ...] = ()
     safe: Safe | None = None
     probe: Probe | None = None
+    area_from: AreaFrom = "start"
 
     @model_validator(mode="after")
     def _names_fit(self) -> _File:
@@ -153,6 +158,7 @@ class Study:
             the study has no list.
         safe: the agent that is declared safe, if there is one.
         probe: the rule that is declared, if there is one.
+        area_from: where areas under success curves begin.
     """
 
     notice: str
@@ -165,6 +171,7 @@ class Study:
     listed: frozenset[str] | None = None
     safe: Safe | None = None
     probe: Probe | None = None
+    area_from: AreaFrom = "start"
 
 
 def read_study(name_or_path: str) -> Study:
@@ -198,6 +205,7 @@ def read_study(name_or_path: str) -> Study:
         statements=file.statement,
         safe=file.safe,
         probe=file.probe,
+        area_from=file.area_from,
         source=source.name,
         sha256=hashlib.sha256(source.read_bytes()).hexdigest(),
         listed=read_list(path),

@@ -62,7 +62,7 @@ def generate(
     _check_folder(out)
     claims = read_study(study)
     marks = reproductions_for(records, reproductions)
-    summary = summarize(load_runs(records, marks, claims.listed))
+    summary = summarize(load_runs(records, marks, claims.listed, claims.area_from))
     folder = audit if audit and audit.is_dir() else None
     # A folder without a summary has maps alone, and the committed numbers are used.
     file = folder / SUMMARY if folder else audit
