@@ -189,7 +189,7 @@ class Run:
         return {seed: fmean(successes) for seed, successes in values.items()}
 
     def measured(self, measure: str) -> float | None:
-        """Final success, divergence, largest |Q| over the feasible, |Q bias|; None if unknown.
+        """Final success, area, divergence, largest |Q| over the feasible, |Q bias|; None: unknown.
 
         A run that failed after Q had diverged counts as diverged; the others need its end.
         """
@@ -197,8 +197,8 @@ class Run:
             return None if self.diverged is None else float(self.diverged)
         if not self.finished:
             return None
-        if measure == "success":
-            return self.success
+        if measure in ("success", "auc"):
+            return self.success if measure == "success" else self.area
         if measure == "magnitude":
             return self.record.divergence.magnitude if self.record.divergence else None
         biases = [e.diagnostics.get("q_bias") for e in self.final_window.values()]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from statistics import fmean
 
 import numpy as np
 
@@ -43,6 +44,7 @@ Effects are differences of two agents, paired by base policy and seed (success a
 episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNIT:g} of defect,
 within base policies. *Supported* and *contradicted* need p < 0.05 for "no effect", *equivalent*
 needs it for "an effect of at least the smallest one of interest"; otherwise a claim is *undecided*.
+Below a difference: the means of both agents (of an interaction, in the first cells).
 Both p-values are corrected for the number of tests of a family (Holm), the intervals are not. *But
 not without* names each task without whose cells the interval holds 0."""
 
@@ -71,8 +73,8 @@ class ClaimOutcome:
     """Base policies that they steer."""
     reason: str = ""
     """Why it is not tested."""
-    counts: str = ""
-    """Of shares, the numbers behind them."""
+    behind: str = ""
+    """The numbers behind a difference: both agents' means or, of shares, counts."""
     p: float = 1.0
     """Of no effect, corrected for the number of tested claims of the family (Holm)."""
     p_equal: float = 1.0
@@ -174,7 +176,7 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
         sides = [[(t, pairs) for t, pairs in side if len(pairs) >= MIN_SEEDS] for side in sides]
     everything = [cell for side in sides for cell in side]
     effect: Effect | None
-    counts = ""
+    behind = ""
     by_task: dict[str, Interval] = {}
     rests_on: list[str] = []
     if claim.effect == "slope":
@@ -192,9 +194,10 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
         drawn = _mean(sides)
         effect = drawn
         if claim.measure == "diverged":
-            effect, counts = _shares(everything, claim, drawn)
+            effect, behind = _shares(everything, claim, drawn)
             reason = reason if effect else "nobody diverged"
         else:
+            behind = _means(sides[0], claim)
             by_task, without = _tasks(sides)
             sign = drawn.interval().sign
             rests_on = [task for task, left in without.items() if sign and left.sign != sign]
@@ -206,7 +209,7 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
         pairs=sum(len(pairs) for _, pairs in everything),
         policies=len({policy for policy, _ in pairs_used}),
         reason=reason,
-        counts=counts,
+        behind=behind,
         by_task=by_task,
         rests_on=tuple(rests_on),
     )
@@ -324,6 +327,19 @@ def _values(table: Table, agent: str, measure: str) -> dict[Pair, float]:
     return max(candidates, key=lambda each: each[:3], default=(False, False, 0, {}))[-1]
 
 
+def _means(cells: Used, claim: Claim) -> str:
+    """Both agents' measure, mean over cells of the runs that are paired."""
+    means = []
+    for agent in claim.agents:
+        each = [
+            fmean(values[pair] for pair in pairs)
+            for table, pairs in cells
+            if (values := _values(table, agent, claim.measure)).keys() >= pairs.keys()
+        ]
+        means.append(number(fmean(each), 2) if len(each) == len(cells) else NOTHING)
+    return " against ".join(means)
+
+
 def _shares(cells: Used, claim: Claim, drawn: BootstrapEstimate) -> tuple[Effect | None, str]:
     """A difference of shares, and the numbers behind it; no effect where nobody diverged.
 
@@ -362,7 +378,7 @@ def render(outcomes: list[ClaimOutcome], view: View) -> list[str]:
         if outcome.effect is None:
             untested.setdefault(outcome.reason, []).append(title(claim))
             continue
-        size = size_text(outcome) + (f"<br>{outcome.counts}" if outcome.counts else "")
+        size = size_text(outcome) + (f"<br>{outcome.behind}" if outcome.behind else "")
         p_values = f"{p_text(outcome.p)}<br>{p_text(outcome.p_equal)}"
         rows.append(
             {

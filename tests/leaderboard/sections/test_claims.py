@@ -160,7 +160,7 @@ def test_of_several_settings_the_usual_ones_stand_for_an_agent() -> None:
     for elsewhere, counts in ((2, "5/5 against 0/5"), (5, "0/3 against 0/3")):
         others = diverging("standard", [], variant="wind:1")[:elsewhere]
         (found,) = outcomes(unusual + usual + others, here)
-        assert found.counts == f"{counts} diverged"
+        assert found.behind == f"{counts} diverged"
 
 
 def test_verdicts_are_corrected_within_a_family() -> None:
@@ -188,10 +188,12 @@ def test_an_interaction_is_tested_as_one() -> None:
     )
     assert (value(alike), alike.verdict) == (pytest.approx(0), "equivalent")
     assert (value(alone), alone.verdict) == (pytest.approx(0.4), "supported")
+    assert alone.behind == alike.behind == "0.80 against 0.40"
     rates = {"none": {"standard": 0.6, "equivariant": 0.6}, "wind:1": gain}
     (found,) = outcomes(cells(rates), claim_of(**broken))
     assert value(found) == pytest.approx(0.4)
     assert (found.verdict, found.cells, found.pairs) == ("supported", 2, 10)
+    assert found.behind == "0.80 against 0.40"  # in the broken cell
     (found,) = outcomes(cells({"wind:1": gain}), claim_of(**broken))
     assert found.reason == "there are no unbroken cells"
 
@@ -237,7 +239,7 @@ def test_divergence_counts_runs(status: str) -> None:
     standard = diverging("standard", range(5), status)
     (found,) = outcomes(standard + diverging("equivariant", []), DIVERGED)
     assert (found.pairs, found.verdict) == (5, "supported")
-    assert found.counts == "5/5 against 0/5 diverged"
+    assert found.behind == "5/5 against 0/5 diverged"
     assert found.effect is not None
     interval = found.effect.interval()
     assert (interval.value, interval.high) == (1.0, 1.0)
@@ -264,7 +266,7 @@ def test_a_policy_in_two_worlds_is_one_trial() -> None:
         ]
 
     (runs,) = outcomes(worlds(range(4)), DIVERGED)
-    assert (runs.counts, runs.verdict) == ("8/10 against 0/10 diverged", "supported")
+    assert (runs.behind, runs.verdict) == ("8/10 against 0/10 diverged", "supported")
     (drawn,) = outcomes(policies(worlds(range(3)), lambda r: str(r.settings.seed)), DIVERGED)
     assert (drawn.policies, drawn.verdict) == (5, "undecided")
     assert value(drawn) == pytest.approx(0.6)
