@@ -46,6 +46,11 @@ demonstrations, the budget and the held-out episodes.
 - Statistics use finished runs. Failed, interrupted, running and missing ones are counted under
   **Status**. The seeds below the number of seeds and episodes are links to the records."""
 
+FROM_FIRST_UPDATE = """\
+Here areas (AUC) begin with the first update: the warm-up, in which nothing is learned, does not
+count."""
+"""Shown only where it is so."""
+
 MADE_AGAIN = """\
 Some runs were made again from their records (`symsteer reproduce`); **Status** counts them.
 *Reproduced exactly*: every episode and every measured number agrees. *Reproduced alike*: the 95 %
@@ -60,8 +65,13 @@ have no rank, come last in their tables, and nothing is concluded from them."""
 
 def render(summary: Summary, view: View) -> list[str]:
     """How to read the page."""
-    texts = READING, MADE_AGAIN * summary.has_reproductions, SUBMITTED * summary.has_marks
-    return [text for text in texts if text]
+    shown = {
+        READING: True,
+        FROM_FIRST_UPDATE: view.findings.study.area_from == "first update",
+        MADE_AGAIN: summary.has_reproductions,
+        SUBMITTED: summary.has_marks,
+    }
+    return [text for text, is_so in shown.items() if is_so]
 
 
 SECTION = Section("How to read it", lambda findings: findings.summary, render)

@@ -117,6 +117,24 @@ def test_the_audit_changes_the_page() -> None:
     assert len({render_page(view_of(records, audit=audit)) for audit in audits}) == 3
 
 
+def test_a_study_says_where_areas_begin(tmp_path: Path) -> None:
+    """A success that is there from the first update on: half of the curve is warm-up."""
+    options = {"agent_options": {"warmup": 6_250}, "policy": {"execute": 4}}
+    steps = {0: 0, 24_999: 0, 25_000: 1, 50_000: 1}
+    curve = [make_evaluation([x] * 4, step, step == 50_000) for step, x in steps.items()]
+    write_record(make_record(curve, **options), tmp_path / "record.json")
+    areas, told = {}, {}
+    for begin in ("start", "first update"):
+        (tmp_path / "mine.toml").write_text(f'area_from = "{begin}"\n')
+        out = tmp_path / begin
+        generate([tmp_path / "record.json"], out, study=str(tmp_path / "mine.toml"))
+        (row,) = csv.DictReader((out / "leaderboard.csv").open())
+        areas[begin] = float(row["auc"])
+        told[begin] = any("begin with the first update" in x.read_text() for x in out.rglob("*.md"))
+    assert areas == pytest.approx({"start": 0.5, "first update": 1.0}, abs=1e-3)
+    assert told == {"start": False, "first update": True}
+
+
 def test_stale_files_go_and_foreign_ones_stay(tmp_path: Path) -> None:
     """A study without statements has no PAPER.md; another file of this name is not ours."""
     write_record(make_record(agent="base"), tmp_path / "record.json")
