@@ -36,11 +36,18 @@ class SlowOptions(SacOptions):
     """Factor on the rate of the biases."""
     critic_speed: float = 1.0
     """Factor on the rate of the critics."""
+    start: int = 0
+    """Updates of a network before its plain path moves."""
+    shared: bool = False
+    """Whether Adam divides steps of the plain path by the gradients of the strict one: a gradient
+    that is as small as noise then makes a small step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require(
-            "not be negative", lambda value: value >= 0, "rate", "bias_speed", "critic_speed"
+            "not be negative",
+            lambda value: value >= 0,
+            *("rate", "bias_speed", "critic_speed", "start"),
         )
 
 
@@ -76,3 +83,21 @@ class SlowAgent(AsymmetricAgent):
             assert isinstance(layer, Slow)
             layer.rate, layer.bias_rate = rate, rate * self.options.bias_speed
         return layers
+
+    def settle(self, name: str) -> None:
+        """Hold the plain path at 0 before its start; give it the strict path's second moments."""
+        optimizer = self.optimizers[name]
+        begun = optimizer.steps > self.options.start
+        squares = iter(optimizer.moments["exp_avg_sq"])
+        for _, parameters in self.networks[name].layers():
+            mean = {}
+            for part, numbers in parameters.items():
+                path, kind = part.split(".", 1)
+                square = next(squares)
+                if path == "strict":
+                    dims = tuple(range(1, square.dim()))
+                    mean[kind] = square.mean(dims)
+                    continue
+                numbers.mul_(begun)
+                if self.options.shared:
+                    square.copy_(mean[kind].view(-1, *[1] * (square.dim() - 1)).expand_as(square))

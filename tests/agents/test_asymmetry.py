@@ -207,6 +207,23 @@ def test_slow_numbers_move_at_a_fraction_of_the_rate(problem):
             assert (one - other).abs().max().item() == pytest.approx(1e-3 * wanted, rel=1e-3)
 
 
+def test_slow_numbers_wait_for_their_start(problem):
+    agent = trained("slow", 4, start=2, rate=1.0)
+    early = trained("slow", 2, start=2, rate=1.0)
+    assert all(layer.free.weight.any() for layer, _ in agent.actor.layers())
+    assert not any(layer.free.weight.any() for layer, _ in early.actor.layers())
+
+
+def test_the_slow_path_shares_the_second_moments(problem):
+    agent = trained("slow", 2, shared=True)
+    squares = iter(agent.optimizers["critic"].moments["exp_avg_sq"])
+    for _, parameters in agent.critic.layers():
+        square = dict(zip(parameters, squares, strict=False))
+        for kind in ("weight", "bias"):
+            free, strict = square[f"free.{kind}"].flatten(1), square[f"strict.{kind}"].flatten(1)
+            torch.testing.assert_close(free, strict.mean(1, True).expand_as(free))
+
+
 @pytest.mark.parametrize("elastic", [False, True])
 def test_multipliers_follow_the_paper(problem, elastic):
     agent = problem.agent("constrained", dual_lr=0.5, elastic=elastic)
