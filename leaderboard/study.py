@@ -107,14 +107,25 @@ class Safe(_Table):
     area: Annotated[float, Field(gt=0)]
 
 
-class Probe(_Table):
-    """A rule that is declared: `standard` wins where the best constant noise gains at least so
-    much, elsewhere `equivariant` does."""
+class _Rule(_Table):
+    """A declared rule: where `standard` wins; elsewhere `equivariant` does."""
+
+    right: Annotated[float, Field(gt=0, le=1)] = 0.9
+    """Share of the decided worlds in which the rule is right."""
+
+
+class Probe(_Rule):
+    """`standard` wins where the best constant noise gains at least so much."""
 
     gain: float
     """Of final success, above the better of base policy and zero noise."""
-    right: Annotated[float, Field(gt=0, le=1)] = 0.9
-    """Share of the decided worlds in which the rule is right."""
+
+
+class Kind(_Rule):
+    """`standard` wins in the worlds that are broken in one of these ways."""
+
+    standard: Names
+    """Variants without strength."""
 
 
 class _File(_Table):
@@ -128,6 +139,7 @@ class _File(_Table):
     statement: tuple[Statement, ...] = ()
     safe: Safe | None = None
     probe: Probe | None = None
+    kind: Kind | None = None
     area_from: AreaFrom = "start"
 
     @model_validator(mode="after")
@@ -157,7 +169,7 @@ class Study:
         listed: hashes of the records and reproductions of the study's own (`read_list`); None if
             the study has no list.
         safe: the agent that is declared safe, if there is one.
-        probe: the rule that is declared, if there is one.
+        probe, kind: the rules that are declared.
         area_from: where areas under success curves begin.
     """
 
@@ -171,6 +183,7 @@ class Study:
     listed: frozenset[str] | None = None
     safe: Safe | None = None
     probe: Probe | None = None
+    kind: Kind | None = None
     area_from: AreaFrom = "start"
 
 
@@ -205,6 +218,7 @@ def read_study(name_or_path: str) -> Study:
         statements=file.statement,
         safe=file.safe,
         probe=file.probe,
+        kind=file.kind,
         area_from=file.area_from,
         source=source.name,
         sha256=hashlib.sha256(source.read_bytes()).hexdigest(),

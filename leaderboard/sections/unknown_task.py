@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT, ZERO
 from symsteer.leaderboard.pairs import MEASURES, SHORT_NAMES
 from symsteer.leaderboard.sections import Findings, Section, View
-from symsteer.leaderboard.study import Probe
+from symsteer.leaderboard.study import Kind, Probe
 from symsteer.leaderboard.text import code, number, share, table_text
 from symsteer.leaderboard.which_agent import Lesson, Score, leave_tasks_out, lessons_of
 
@@ -37,23 +37,30 @@ def scores(found: list[Score]) -> list[dict[str, str]]:
     ]
 
 
-def verdict(lessons: Sequence[Lesson], probe: Probe) -> str:
+def verdict(lessons: Sequence[Lesson], rule: Probe | Kind) -> str:
     """Whether a declared rule is right often enough, by both measures."""
+    if isinstance(rule, Probe):
+        where = (
+            f"where the best constant noise gains at least {number(rule.gain, 3)} over the better "
+            f"of `{BASE}` and `{ZERO}`"
+        )
+        broken = [lesson.gain.value >= rule.gain if lesson.gain else None for lesson in lessons]
+    else:
+        where = f"in worlds with {', '.join(map(code, rule.standard))}"
+        broken = [lesson.kind in rule.standard for lesson in lessons]
     declared = (
-        f"Declared before the runs: where the best constant noise gains at least "
-        f"{number(probe.gain, 3)} over the better of `{BASE}` and `{ZERO}`, `{STANDARD}` is "
-        f"better, elsewhere `{STRICT}`; in at least {number(100 * probe.right, 0)} % of the "
-        "decided worlds."
+        f"Declared before the runs: {where}, `{STANDARD}` is better, elsewhere `{STRICT}`; in at "
+        f"least {number(100 * rule.right, 0)} % of the decided worlds."
     )
     texts, holds = [], []
     for measure in MEASURES:
         right = [
-            (lesson.gain.value < probe.gain) == (sign > 0)
-            for lesson in lessons
-            if lesson.gain and (sign := lesson.sign(measure))
+            is_broken == (sign < 0)
+            for lesson, is_broken in zip(lessons, broken, strict=True)
+            if is_broken is not None and (sign := lesson.sign(measure))
         ]
         texts.append(f"{share(sum(right), len(right))} by {SHORT_NAMES[measure]}")
-        holds += [sum(right) >= probe.right * len(right)] if right else []
+        holds += [sum(right) >= rule.right * len(right)] if right else []
     result = ("Supported" if all(holds) else "Contradicted") if holds else "Not tested"
     return f"{declared} **{result}**: right in {' and in '.join(texts)}."
 
@@ -61,9 +68,9 @@ def verdict(lessons: Sequence[Lesson], probe: Probe) -> str:
 def render(found: Found, view: View) -> list[str]:
     """Empty where no task could be left out, and no rule was declared."""
     lessons, scored = found
-    probe = view.findings.study.probe
+    study = view.findings.study
     return [
-        *([verdict(lessons, probe)] if probe else []),
+        *(verdict(lessons, rule) for rule in (study.kind, study.probe) if rule),
         *([EXPLAINED, table_text(scores(scored), left=2)] if scored else []),
     ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from symsteer.leaderboard.sections.unknown_task import SECTION, verdict
-from symsteer.leaderboard.study import Probe
+from symsteer.leaderboard.study import Kind, Probe
 from symsteer.leaderboard.which_agent import lessons_of
 from tests.leaderboard.record_factory import make_cell, summary_of, view_of, with_policies
 
@@ -29,15 +29,20 @@ def test_without_both_agents_there_is_no_section() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gain", "said"),
+    ("rule", "said"),
     [
         # Above what the constant noise gains where `standard` wins: wrong there.
-        (0.3, "**Contradicted**: right in 1/2 by AUC and in 1/2 by success."),
-        (0.1, "**Supported**: right in 2/2 by AUC and in 2/2 by success."),
-        (-0.1, "**Contradicted**: right in 1/2 by AUC and in 1/2 by success."),
+        (Probe(gain=0.3), "**Contradicted**: right in 1/2 by AUC and in 1/2 by success."),
+        (Probe(gain=0.1), "**Supported**: right in 2/2 by AUC and in 2/2 by success."),
+        (Probe(gain=-0.1), "**Contradicted**: right in 1/2 by AUC and in 1/2 by success."),
+        (Kind(standard=("wind",)), "**Supported**: right in 2/2 by AUC and in 2/2 by success."),
+        (
+            Kind(standard=("obstacle",)),
+            "**Contradicted**: right in 1/2 by AUC and in 1/2 by success.",
+        ),
     ],
 )
-def test_a_declared_rule_is_tested_in_decided_worlds(gain: float, said: str) -> None:
+def test_a_declared_rule_is_tested_in_decided_worlds(rule: Probe | Kind, said: str) -> None:
     worlds = {
         "none": {"golden-ticket": 0.4, "equivariant": 0.8, "standard": 0.5},
         "wind:1": {"golden-ticket": 0.6, "equivariant": 0.5, "standard": 0.8},
@@ -47,7 +52,7 @@ def test_a_declared_rule_is_tested_in_decided_worlds(gain: float, said: str) -> 
         with_policies(make_cell({"base": 0.2, "zero": 0.4, **rates}, variant=variant))
         for variant, rates in worlds.items()
     ]
-    assert verdict(lessons_of(summary_of(*cells)), Probe(gain=gain)).endswith(said)
+    assert verdict(lessons_of(summary_of(*cells)), rule).endswith(said)
 
 
 def test_without_a_constant_noise_the_rule_is_not_tested() -> None:
