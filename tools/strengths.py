@@ -32,7 +32,7 @@ ROOM = 0.2, 0.8
 """Unbroken success outside of this leaves no room below or above."""
 
 Successes = Mapping[str, Mapping[str, Mapping[int, float]]]
-"""Final success by task, variant and seed."""
+"""Final success by task and embodiment, variant and seed."""
 
 
 def read(folders: Sequence[Path]) -> Successes:
@@ -42,7 +42,8 @@ def read(folders: Sequence[Path]) -> Successes:
         record = read_record(path)
         config = record.settings
         if config.agent == "base" and record.status == "finished" and record.final:
-            found[config.task][config.variant][config.seed] = record.final.success_once
+            place = f"{config.task} {config.embodiment}"
+            found[place][config.variant][config.seed] = record.final.success_once
     if not found:
         names = ", ".join(map(str, folders))
         raise UserError(f"{names}: no finished run of base; run the suite strengths first")
@@ -76,9 +77,9 @@ def chosen(strengths: Sequence[float], shares: Sequence[float]) -> float | None:
 
 
 def render(found: Successes) -> str:
-    """A row for each task and break: what is kept at each strength, and which one is chosen."""
+    """A row for each place and break: what is kept at each strength, and which one is chosen."""
     rows = []
-    for task, successes in sorted(found.items()):
+    for place, successes in sorted(found.items()):
         usual = float(np.mean(list(successes.get(UNBROKEN, {}).values()) or [0.0]))
         room = "" if ROOM[0] <= usual <= ROOM[1] else ", no room"
         dials: dict[str, dict[float, str]] = defaultdict(dict)
@@ -95,8 +96,8 @@ def render(found: Successes) -> str:
             )
             strength = chosen(strengths, shares)
             answer = "too weak" if strength is None else f"`{dial}:{strength:g}`"
-            rows.append([f"`{task}`", f"{usual:.2f}{room}", f"`{dial}`", tried, answer])
-    return markdown(["task", "unbroken success", "break", "kept", "chosen"], rows, left=5)
+            rows.append([place, f"{usual:.2f}{room}", f"`{dial}`", tried, answer])
+    return markdown(["world", "unbroken success", "break", "kept", "chosen"], rows, left=5)
 
 
 def main(arguments: Sequence[str]) -> int:
