@@ -1,7 +1,8 @@
 """Strengths of breaks that harm the base policy equally in all tasks, from runs of ``base``.
 
 symsteer sweep strengths --runs runs/strengths
-python -m tools.strengths runs/strengths
+python -m tools.strengths runs/strengths                 # of these runs
+python -m tools.strengths leaderboard/results/strengths  # of the committed ones
 
 A strength of 1 means little in one task and everything in another. So the strength of a break is
 chosen for each task: the one at which the base policy keeps half of its unbroken success, between
@@ -25,6 +26,9 @@ from symsteer.tables import markdown
 from symsteer.terminal import complain
 from symsteer.variant import UNBROKEN, parse_variant
 
+RECORDS = "*/record.json", "*.json"
+"""Of runs, and of the committed ones."""
+
 HALF = 0.5
 """Share of the unbroken success that a base policy shall keep."""
 
@@ -38,7 +42,9 @@ Successes = Mapping[str, Mapping[str, Mapping[int, float]]]
 def read(folders: Sequence[Path]) -> Successes:
     """Final success of the finished runs of ``base``."""
     found: dict[str, dict[str, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
-    for path in sorted(path for folder in folders for path in folder.glob("*/record.json")):
+    for path in sorted(
+        path for folder in folders for name in RECORDS for path in folder.glob(name)
+    ):
         record = read_record(path)
         config = record.settings
         if config.agent == "base" and record.status == "finished" and record.final:
