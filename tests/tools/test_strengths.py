@@ -50,6 +50,10 @@ def test_the_table_of_runs(tmp_path, capsys):
     ]
     assert cells[4] == "`wind:0.75`"
     assert render(read([tmp_path])).endswith(row)
+    # The committed records lie side by side.
+    for path in tmp_path.glob("*/record.json"):
+        path.rename(tmp_path / f"{path.parent.name}.json")
+    assert render(read([tmp_path])).endswith(row)
 
 
 def test_without_runs_there_is_one_sentence(tmp_path):
