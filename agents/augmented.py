@@ -8,14 +8,14 @@ can leave the symmetry. Where the world breaks the symmetry, some rotated transi
 
 from __future__ import annotations
 
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent
 from symsteer.policies.geometry import Group
 from symsteer.policies.symmetry.augmented import Augmentation
 
 
-@tuned
+@defaults_of("minimax")
 class AugmentedAgent(StandardAgent):
     """Plain actor, plain critics, every transition of a batch rotated at random."""
 

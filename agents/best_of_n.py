@@ -22,7 +22,7 @@ from torch import nn
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.episodes import Played
 from symsteer.agents.options import CriticKind, EitherOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import Drawn
 from symsteer.agents.standard import EitherAgent
@@ -43,7 +43,7 @@ class BestOfNOptions(EitherOptions):
     entropy_bonus = False
 
 
-@tuned
+@defaults_of("tuned")
 class BestOfNAgent(EitherAgent):
     """Plays the best of n chunks of the base policy, by its critics."""
 

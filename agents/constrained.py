@@ -25,7 +25,7 @@ from symsteer.agents.agent import Deterministic
 from symsteer.agents.asymmetry import AsymmetricAgent, TwoPaths
 from symsteer.agents.networks import Parameters, dense
 from symsteer.agents.options import SacOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.replay import Batch
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
@@ -60,7 +60,7 @@ class Constrained(TwoPaths):
         return weight + gamma.unsqueeze(-1) * parameters["free.weight"], bias
 
 
-@tuned
+@defaults_of("tuned")
 class ConstrainedAgent(AsymmetricAgent):
     """The equivariant agent with a plain part in every layer, which dual ascent removes."""
 

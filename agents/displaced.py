@@ -19,7 +19,7 @@ import torch
 
 from symsteer.agents.agent import AgentContext, Deterministic
 from symsteer.agents.options import EitherOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.standard import EitherAgent
 
 
@@ -38,7 +38,7 @@ class DisplacedOptions(EitherOptions):
         self._require("be positive", lambda value: value > 0, "displacement")
 
 
-@tuned
+@defaults_of("tuned")
 class DisplacedAgent(EitherAgent):
     """Moves the base policy's noise by a displacement whose size is limited."""
 

@@ -21,7 +21,7 @@ import torch
 
 from symsteer.agents.networks import Weights
 from symsteer.agents.options import SacOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.replay import Batch
 from symsteer.agents.standard import StandardAgent
 from symsteer.policies.geometry import Group, Layout
@@ -43,7 +43,7 @@ class GroupEnsembleOptions(SacOptions):
         )
 
 
-@tuned
+@defaults_of("tuned")
 class GroupEnsembleAgent(StandardAgent):
     """Plain networks whose outputs are averaged over the group."""
 

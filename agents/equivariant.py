@@ -15,7 +15,7 @@ from torch import nn
 
 from symsteer.agents.networks import Parameters, shrink_
 from symsteer.agents.options import SacOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.sac import SacAgent
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
@@ -41,7 +41,7 @@ class Pool(Project):
         return weight * self.group.order, bias
 
 
-@tuned
+@defaults_of("minimax")
 class EquivariantAgent(SacAgent):
     """Equivariant actor and invariant critics, exact for every element of ``group``."""
 

@@ -20,7 +20,7 @@ from torch import nn
 
 from symsteer.agents.asymmetry import AsymmetricLayer, PenaltyAgent, PenaltyOptions
 from symsteer.agents.networks import Parameters, dense, dense_of, within
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
 
@@ -47,7 +47,7 @@ class FreeBias(AsymmetricLayer):
         parameters["free_bias"].mul_(factor)
 
 
-@tuned
+@defaults_of("minimax")
 class FreeBiasAgent(PenaltyAgent):
     """The equivariant agent with free biases."""
 

@@ -23,7 +23,7 @@ class SacOptions(AgentOptions):
     """Options of all SAC agents.
 
     The defaults are the setting that tuning chose for most of the core agents (docs/tuning.md);
-    :func:`~symsteer.agents.presets.tuned` gives each of those agents its own.
+    :func:`~symsteer.agents.presets.defaults_of` gives an agent those of a preset.
     """
 
     critic_kind: CriticKind = "aliased"

@@ -41,7 +41,7 @@ from symsteer.agents.equivariant import equivariant_layers
 from symsteer.agents.generators import tensor_like
 from symsteer.agents.networks import Weights
 from symsteer.agents.options import SacOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import VALUE
 from symsteer.agents.standard import StandardAgent
@@ -75,7 +75,7 @@ class PartialOptions(SacOptions):
         self._require("not be negative", lambda value: value >= 0, "fence")
 
 
-@tuned
+@defaults_of("tuned")
 class PartialAgent(StandardAgent):
     """Equivariant and plain networks, mixed by a gate that sees where the symmetry is broken."""
 

@@ -12,7 +12,7 @@ from torch import nn
 
 from symsteer.agents.asymmetry import AsymmetricLayer, PenaltyAgent
 from symsteer.agents.networks import Parameters, dense
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.policies.networks.equivariant import EquivariantLayer
 
 
@@ -33,7 +33,7 @@ class Projected(AsymmetricLayer):
             tensor.lerp_(near, 1 - factor)
 
 
-@tuned
+@defaults_of("tuned")
 class ProjectedAgent(PenaltyAgent):
     """Plain layers that start equivariant and are pulled to their projections."""
 

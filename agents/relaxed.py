@@ -22,7 +22,7 @@ from torch import nn
 
 from symsteer.agents.asymmetry import AsymmetricLayer, PenaltyAgent, PenaltyOptions
 from symsteer.agents.networks import Parameters, dense_of, shrink_, within
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.policies.networks.equivariant import EquivariantLayer, Lift
 
 
@@ -72,7 +72,7 @@ class Relaxed(AsymmetricLayer):
         weights.lerp_(weights.mean(-1, keepdim=True), 1 - factor)
 
 
-@tuned
+@defaults_of("tuned")
 class RelaxedAgent(PenaltyAgent):
     """The equivariant agent with a weight for each filter and group element."""
 

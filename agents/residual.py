@@ -21,7 +21,7 @@ import torch
 from symsteer.agents.agent import AgentContext
 from symsteer.agents.distributions import SquashedGaussian
 from symsteer.agents.options import CriticKind, EitherOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.replay import Batch
 from symsteer.agents.sac import Drawn
 from symsteer.agents.standard import EitherAgent
@@ -50,7 +50,7 @@ class ResidualOptions(EitherOptions):
         self._require("not be negative", lambda value: value >= 0, "ramp")
 
 
-@tuned
+@defaults_of("tuned")
 class ResidualAgent(EitherAgent):
     """Corrects the actions of the base policy, within a bound."""
 

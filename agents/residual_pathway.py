@@ -11,7 +11,7 @@ import torch
 
 from symsteer.agents.asymmetry import PenaltyAgent, TwoPaths
 from symsteer.agents.networks import Parameters
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 
 
 class ResidualPathway(TwoPaths):
@@ -26,7 +26,7 @@ class ResidualPathway(TwoPaths):
             parameters[name].mul_(factor)
 
 
-@tuned
+@defaults_of("minimax")
 class ResidualPathwayAgent(PenaltyAgent):
     """The equivariant agent with a penalised plain path beside every layer."""
 

@@ -25,7 +25,7 @@ from symsteer.agents.asymmetry import PenaltyAgent, PenaltyOptions
 from symsteer.agents.episodes import Played
 from symsteer.agents.networks import Parameters
 from symsteer.agents.options import SacOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.replay import Transition
 from symsteer.agents.residual_pathway import ResidualPathway
 from symsteer.errors import UserError
@@ -61,7 +61,7 @@ class Screened(ResidualPathway):
         return weight + opened.unsqueeze(-1) * parameters["free.weight"], bias
 
 
-@tuned
+@defaults_of("minimax")
 class ScreenedAgent(PenaltyAgent):
     """Strict where the base policy's episodes look the same on all sides.
 

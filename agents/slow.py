@@ -21,7 +21,7 @@ from torch import nn
 from symsteer.agents.asymmetry import AsymmetricAgent, TwoPaths
 from symsteer.agents.networks import Parameters
 from symsteer.agents.options import SacOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.sac import VALUE
 from symsteer.policies.geometry import Layout
 
@@ -66,7 +66,7 @@ class Slow(TwoPaths):
         return weight, bias.add(parameters["free.bias"], alpha=self.bias_rate)
 
 
-@tuned
+@defaults_of("tuned")
 class SlowAgent(AsymmetricAgent):
     """The equivariant agent with a slow plain path beside every layer."""
 

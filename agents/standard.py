@@ -9,12 +9,12 @@ from torch import nn
 from symsteer.agents.equivariant import equivariant_layers
 from symsteer.agents.networks import Dense, count, shrink_
 from symsteer.agents.options import EitherOptions, SacOptions
-from symsteer.agents.presets import tuned
+from symsteer.agents.presets import defaults_of
 from symsteer.agents.sac import SacAgent
 from symsteer.policies.geometry import Layout
 
 
-@tuned
+@defaults_of("minimax")
 class StandardAgent(SacAgent):
     """SAC with a plain actor and plain critics."""
 
@@ -47,7 +47,7 @@ def plain_layers(
     return layers
 
 
-@tuned
+@defaults_of("minimax")
 class MatchedStandardAgent(StandardAgent):
     """The standard agent with as many parameters as the equivariant one.
 

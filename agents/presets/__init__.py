@@ -7,6 +7,7 @@ options for this agent only and has priority.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -40,15 +41,25 @@ def preset_options(name: str, agent: str, options: type) -> dict[str, Any]:
     return {key: value for key, value in tables.get("all", {}).items() if key in valid} | of_agent
 
 
-def tuned(agent: type[T]) -> type[T]:
-    """Class decorator: the agent's options have the defaults that tuning chose, ``tuned.toml``.
+def defaults_of(preset: str) -> Callable[[type[T]], type[T]]:
+    """Class decorator: the agent's options have the defaults that a preset has for it.
 
-    Agents without a table there keep their defaults.
+    Options that the preset does not set keep their defaults.
     """
-    base, chosen = agent.Options, preset_options("tuned", agent.name, agent.Options)
+
+    def decorate(agent: type[T]) -> type[T]:
+        chosen = preset_options(preset, agent.name, agent.Options)
+        agent.Options = _with_defaults(agent, chosen)
+        return agent
+
+    return decorate
+
+
+def _with_defaults(agent: type, chosen: dict[str, Any]) -> type:
+    base = agent.Options
     # As types: names of types mean nothing in the agent's module.
     types = get_type_hints(base)
-    agent.Options = dataclasses.make_dataclass(
+    options = dataclasses.make_dataclass(
         "Options",
         [
             (field.name, types[field.name], chosen[field.name])
@@ -61,5 +72,5 @@ def tuned(agent: type[T]) -> type[T]:
     )
     # Options that are sent to another process find their class by this and the qualified name.
     # Python 3.12 and later overwrite what a namespace says of it.
-    agent.Options.__module__ = agent.__module__
-    return agent
+    options.__module__ = agent.__module__
+    return options

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -177,7 +178,7 @@ def preview(plan: Plan, workforce: Workforce) -> str:
     bases = [task.label for task in tasks_of(plan, todo) if task.kind == "base policy"]
     lines = [title(plan.name, plan.description), "", _counts(seen), ""]
     lines.append(f"base policies to build: {len(bases) or 'none'}")
-    lines += [f"  {label}" for label in bases]
+    lines += [f"{count:5} {label}" for label, count in Counter(bases).items()]
     lines.append(f"time: {_time(seen, len(todo), workers, bool(bases))}")
     return "\n".join(lines)
 

@@ -137,6 +137,9 @@ def _check_names(study: Study, summary: Summary, audit: Audit) -> None:
     }
     if study.safe and study.safe.agent not in valid["agent"]:
         raise unknown("agent", study.safe.agent, valid["agent"], f"{study.source}, safe")
+    for name in study.kind.standard if study.kind else ():
+        if name not in variants:
+            raise unknown("variant", name, valid["variant"], f"{study.source}, kind")
     for claim in study.claims:
         named: list[tuple[str, tuple[str, ...]]] = [("agent", claim.agents)]
         for cells in (claim.cells, claim.minus or Cells()):

@@ -116,10 +116,11 @@ class Quick(StandardAgent):
     Options = SacOptions
 
 
-def test_tuned_options_are_the_defaults(tmp_path, monkeypatch):
+def test_a_preset_can_be_the_defaults(tmp_path, monkeypatch):
     monkeypatch.setattr(presets, "FOLDER", tmp_path)
-    (tmp_path / "tuned.toml").write_text("[quick]\nlr = 0.125\ncritics = 3\n")
-    kind = presets.tuned(type("Quick", (Quick,), {"__module__": __name__, "__qualname__": "Quick"}))
+    (tmp_path / "found.toml").write_text("[quick]\nlr = 0.125\ncritics = 3\n")
+    own = type("Quick", (Quick,), {"__module__": __name__, "__qualname__": "Quick"})
+    kind = presets.defaults_of("found")(own)
     options = kind.Options()
     assert isinstance(options, SacOptions)
     assert vars(options) == {**vars(SacOptions()), "lr": 0.125, "critics": 3}
@@ -127,19 +128,24 @@ def test_tuned_options_are_the_defaults(tmp_path, monkeypatch):
     assert Quick.Options().lr == SacOptions().lr
     with pytest.raises(UserError, match="lr must be positive"):
         kind.Options(lr=0)
-    (tmp_path / "tuned.toml").write_text("[quick]\nlearning_rate = 0.125\n")
+    (tmp_path / "found.toml").write_text("[quick]\nlearning_rate = 0.125\n")
     with pytest.raises(UserError, match="no option of quick 'learning_rate'"):
-        presets.tuned(Quick)
+        presets.defaults_of("found")(Quick)
+
+
+SEARCHED = ("standard", "standard-matched", "augmented", "equivariant", "wrong-group")
+SEARCHED += ("residual-pathway", "screened", "free-bias")
 
 
 @pytest.mark.parametrize("name", AGENTS.builtin)
 def test_agents_have_what_was_chosen_for_them_and_travel_to_other_processes(name):
     options = AGENTS.get(name).Options()
-    chosen = preset_options("tuned", name, type(options))
+    chosen = preset_options("minimax" if name in SEARCHED else "tuned", name, type(options))
     assert {key: getattr(options, key) for key in chosen} == chosen
     assert pickle.loads(pickle.dumps(options)) == options
-    tuned = name in tomllib.loads((presets.FOLDER / "tuned.toml").read_text())
-    assert not tuned or type(options).__qualname__ == f"{AGENTS.get(name).__qualname__}.Options"
+    own = name in tomllib.loads((presets.FOLDER / "tuned.toml").read_text())
+    controls = name == "wrong-group"
+    assert not own or controls or type(options).__qualname__.endswith("Agent.Options")
 
 
 def test_what_tuning_chose_is_the_committed_choice():
@@ -157,6 +163,8 @@ def test_what_tuning_chose_is_the_committed_choice():
 def test_the_control_has_the_settings_of_the_agent_that_it_controls():
     wrong, right = (AGENTS.get(name).Options() for name in ("wrong-group", "equivariant"))
     assert vars(wrong) == vars(right)
+    wrong, right = (preset_options("tuned", name, type(wrong)) for name in ("wrong-group", "equivariant"))
+    assert wrong == right
 
 
 def test_the_page_names_every_agent_option_and_preset():

@@ -206,7 +206,7 @@ def test_the_command_line(undisturbed, command, tmp_path):
     code, shown = command(*trial)
     assert code == 0
     assert re.search(r"env_steps +320 +1 +1 +0 +0 +0\n +321 +1 +0 +0 +0 +1\n", shown.out)
-    assert "base policies to build: 1\n  edp for PickCube-v1 floating, 3 diverse" in shown.out
+    assert "base policies to build: 1\n    1 edp for PickCube-v1 floating, 3 diverse" in shown.out
     assert "estimated from 1 finished run" in shown.out
     cluster = (*trial, "--ray", "no-such-head:6379")
     assert "time: depends on the size of the cluster" in command(*cluster)[1].out

@@ -13,7 +13,7 @@ from symsteer.leaderboard.defects import Audit
 from symsteer.leaderboard.records import RunRecord
 from symsteer.leaderboard.sections.claims import SECTION, ClaimOutcome, claims, verdict_text
 from symsteer.leaderboard.statistics import ShareDifference
-from symsteer.leaderboard.study import PAPER, Claim, Safe, Study, read_study
+from symsteer.leaderboard.study import PAPER, Claim, Kind, Safe, Study, read_study
 from tests.leaderboard.record_factory import (
     audit_of,
     diverging,
@@ -410,10 +410,23 @@ def test_a_claim_of_no_effect_says_so_wherever_it_is_named() -> None:
     assert "Symmetry prevents value divergence (predicted" not in text
 
 
-def test_the_agent_that_is_declared_safe_must_exist() -> None:
-    safe = Safe(agent="standrd", success=1, area=1)
-    study = Study("", "", "", (), (), "study.toml", "", safe=safe)
-    summary = summary_of(cells({"none": {"standard": 0.5, "equivariant": 0.6}}))
-    words = "study.toml, safe: there is no agent 'standrd'; did you mean 'standard'"
+@pytest.mark.parametrize(
+    ("declared", "words"),
+    [
+        (
+            {"safe": Safe(agent="standrd", success=1, area=1)},
+            "study.toml, safe: there is no agent 'standrd'; did you mean 'standard'",
+        ),
+        (
+            {"kind": Kind(standard=("win",))},
+            "study.toml, kind: there is no variant 'win'; did you mean 'wind'",
+        ),
+    ],
+)
+def test_the_safe_agent_and_the_kinds_of_a_rule_must_exist(
+    declared: dict[str, Any], words: str
+) -> None:
+    study = Study("", "", "", (), (), "study.toml", "", **declared)
+    worlds = dict.fromkeys(("none", "wind:1"), {"standard": 0.5, "equivariant": 0.6})
     with pytest.raises(UserError, match=words):
-        claims(study, summary, {})
+        claims(study, summary_of(cells(worlds)), {})
