@@ -25,6 +25,7 @@ import numpy as np
 from scipy import stats
 
 from symsteer.leaderboard.defects import dial_of
+from symsteer.leaderboard.keys import SYMMETRIC_EMBODIMENT
 from symsteer.leaderboard.known_agents import BASE, CONSTANT, STANDARD, STRICT, ZERO
 from symsteer.leaderboard.pairs import MEASURES, advantage
 from symsteer.leaderboard.regret import Cell, regrets
@@ -161,9 +162,11 @@ def direction_in(table: Table) -> float | None:
     """p-value of the base policies' episodes being alike on all sides (Fisher's over runs).
 
     Runs share their initial states, so that of several runs it is not exact. None if it was not
-    measured, or if the policy is not symmetric, which sides then show.
+    measured, or if policy or robot are not symmetric: sides then show that, and not the world.
     """
-    values = [] if table.key.base.startswith("plain") else _of_base(table, "direction_p")
+    key = table.key
+    symmetric = key.embodiment == SYMMETRIC_EMBODIMENT and not key.base.startswith("plain")
+    values = _of_base(table, "direction_p") if symmetric else []
     return float(stats.combine_pvalues(values).pvalue) if values else None
 
 

@@ -37,7 +37,8 @@ class Sides:
         direction: p-value: how likely means of vectors as large as these are in a symmetric world.
         axis: the same of products of two vectors.
         drift: what the tool moves in each decision without being told to, x + iy, in units of the
-            observation (metres). The tool is the vector whose changes the actions explain best.
+            observation (metres). The tool is the vector whose changes the actions explain best; if
+            it moves against the actions, its opposite.
     """
 
     direction: float
@@ -112,7 +113,11 @@ def _drift(actions: torch.Tensor, changes: torch.Tensor) -> complex:
     spread = changes.var(0)
     moves = spread.sqrt() > RESTING * spread.max().sqrt()
     explained = torch.where(moves, 1 - left / spread, -torch.inf)
-    return complex(factors[-1, explained.argmax()])
+    *told, drift = factors[:, explained.argmax()]
+    effects = torch.stack(told) * actions.abs().square().mean(0).sqrt()
+    # The way from the tool to an object is explained as well as the tool, but moves the other way.
+    along = effects[effects.abs().argmax()].real >= 0
+    return complex(drift if along else -drift)
 
 
 def _p_value(values: torch.Tensor, turns: torch.Tensor) -> float:

@@ -55,7 +55,7 @@ def defaults_of(preset: str) -> Callable[[type[T]], type[T]]:
     return decorate
 
 
-def _with_defaults(agent: type, chosen: dict[str, Any]) -> type:
+def _with_defaults(agent: Any, chosen: dict[str, Any]) -> type:
     base = agent.Options
     # As types: names of types mean nothing in the agent's module.
     types = get_type_hints(base)

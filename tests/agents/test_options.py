@@ -163,7 +163,9 @@ def test_what_tuning_chose_is_the_committed_choice():
 def test_the_control_has_the_settings_of_the_agent_that_it_controls():
     wrong, right = (AGENTS.get(name).Options() for name in ("wrong-group", "equivariant"))
     assert vars(wrong) == vars(right)
-    wrong, right = (preset_options("tuned", name, type(wrong)) for name in ("wrong-group", "equivariant"))
+    wrong, right = (
+        preset_options("tuned", name, type(wrong)) for name in ("wrong-group", "equivariant")
+    )
     assert wrong == right
 
 

@@ -127,9 +127,13 @@ def test_opposite_sides_that_are_unlike_call_for_no_symmetry(lessons: list[Lesso
         assert (answer.sign, len(answer.lessons)) == (sign, worlds)
 
 
-def test_sides_are_known_of_symmetric_policies_alone() -> None:
-    for policy, wanted in (("edp", 0.0199), ("plain", None)):
-        records = with_policies(make_cell({"base": 0.2}, seeds=2))
+def test_sides_are_known_of_symmetric_policies_and_robots_alone() -> None:
+    for policy, robot, wanted in (
+        ("edp", "floating", 0.0199),
+        ("plain", "floating", None),
+        ("edp", "panda", None),
+    ):
+        records = with_policies(make_cell({"base": 0.2}, seeds=2, embodiment=robot))
         for record, p in zip(records, (0.01, 0.3), strict=True):
             record.base_policy.name = policy
             record.evaluations[-1].diagnostics["direction_p"] = p

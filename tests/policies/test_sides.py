@@ -85,6 +85,17 @@ def test_a_drift_is_known_and_a_shift_of_what_is_seen_is_none():
     assert shifted.drift == pytest.approx(0j, abs=1e-9)
 
 
+def test_the_drift_is_the_tools_where_an_object_is_seen_from_it():
+    """The way to an object is explained as well as the tool's place, and has the opposite sign."""
+    layout = Layout([Field("object_xy", 1)])
+    generator = torch.Generator().manual_seed(0)
+    steps = torch.randn(40, 1, 3, generator=generator, dtype=torch.float64)
+    way = torch.randn(40, 2, generator=generator, dtype=torch.float64)
+    following = way - 0.03 * steps[:, 0, :2] - torch.tensor([0.01, 0.0])
+    found = sides(layout, ACT, way, steps, following, torch.arange(40), generator)
+    assert found.drift == pytest.approx(0.01 + 0j)
+
+
 def test_errors_of_rounding_have_no_say():
     """A tilt of 1e-8 to one side, in every episode."""
     flat = Layout([Field("axis_xy", 1), Field("tool_xy", 1)])

@@ -427,6 +427,6 @@ def test_the_safe_agent_and_the_kinds_of_a_rule_must_exist(
     declared: dict[str, Any], words: str
 ) -> None:
     study = Study("", "", "", (), (), "study.toml", "", **declared)
-    worlds = dict.fromkeys(("none", "wind:1"), {"standard": 0.5, "equivariant": 0.6})
+    worlds = {name: {"standard": 0.5, "equivariant": 0.6} for name in ("none", "wind:1")}
     with pytest.raises(UserError, match=words):
         claims(study, summary_of(cells(worlds)), {})
