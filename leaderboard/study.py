@@ -112,6 +112,8 @@ class _Rule(_Table):
 
     right: Annotated[float, Field(gt=0, le=1)] = 0.9
     """Share of the decided worlds in which the rule is right."""
+    found_on: tuple[str, ...] = ()
+    """Tasks on whose earlier records the rule was found. They do not count."""
 
 
 class Probe(_Rule):

@@ -44,25 +44,38 @@ def verdict(lessons: Sequence[Lesson], rule: Probe | Kind) -> str:
             f"where the best constant noise gains at least {number(rule.gain, 3)} over the better "
             f"of `{BASE}` and `{ZERO}`"
         )
-        broken = [lesson.gain.value >= rule.gain if lesson.gain else None for lesson in lessons]
+        worlds = [(one, one.gain.value >= rule.gain) for one in lessons if one.gain]
     else:
         where = f"in worlds with {', '.join(map(code, rule.standard))}"
-        broken = [lesson.kind in rule.standard for lesson in lessons]
+        worlds = [(lesson, lesson.kind in rule.standard) for lesson in lessons]
+    known = ", ".join(map(code, rule.found_on))
     declared = (
         f"Declared before the runs: {where}, `{STANDARD}` is better, elsewhere `{STRICT}`; in at "
-        f"least {number(100 * rule.right, 0)} % of the decided worlds."
+        f"least {number(100 * rule.right, 0)} % of the decided worlds"
+        f"{f' of tasks on which it was not found (it was on {known})' if known else ''}."
     )
-    texts, holds = [], []
-    for measure in MEASURES:
-        right = [
-            is_broken == (sign < 0)
-            for lesson, is_broken in zip(lessons, broken, strict=True)
-            if is_broken is not None and (sign := lesson.sign(measure))
-        ]
-        texts.append(f"{share(sum(right), len(right))} by {SHORT_NAMES[measure]}")
-        holds += [sum(right) >= rule.right * len(right)] if right else []
+    new = [(lesson, is_broken) for lesson, is_broken in worlds if lesson.task not in rule.found_on]
+    right = [_right(new, measure) for measure in MEASURES]
+    holds = [sum(each) >= rule.right * len(each) for each in right if each]
     result = ("Supported" if all(holds) else "Contradicted") if holds else "Not tested"
-    return f"{declared} **{result}**: right in {' and in '.join(texts)}."
+    text = f"{declared} **{result}**: right in {_shares(right)}."
+    if known:
+        text += f" Of all tasks: {_shares([_right(worlds, measure) for measure in MEASURES])}."
+    return text
+
+
+def _right(worlds: Sequence[tuple[Lesson, bool]], measure: str) -> list[bool]:
+    """Whether a rule is right, in each decided world."""
+    return [
+        is_broken == (sign < 0) for lesson, is_broken in worlds if (sign := lesson.sign(measure))
+    ]
+
+
+def _shares(right: Sequence[list[bool]]) -> str:
+    return " and in ".join(
+        f"{share(sum(each), len(each))} by {SHORT_NAMES[measure]}"
+        for each, measure in zip(right, MEASURES, strict=True)
+    )
 
 
 def render(found: Found, view: View) -> list[str]:

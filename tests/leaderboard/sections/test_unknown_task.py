@@ -55,6 +55,18 @@ def test_a_declared_rule_is_tested_in_decided_worlds(rule: Probe | Kind, said: s
     assert verdict(lessons_of(summary_of(*cells)), rule).endswith(said)
 
 
+def test_tasks_on_which_a_rule_was_found_do_not_count() -> None:
+    known, new = {"equivariant": 0.5, "standard": 0.8}, {"equivariant": 0.8, "standard": 0.5}
+    cells = [
+        with_policies(make_cell({"base": 0.2, **rates}, task=task, variant="wind:1"))
+        for task, rates in (("A-v1", known), ("B-v1", new), ("C-v1", new))
+    ]
+    text = verdict(lessons_of(summary_of(*cells)), Kind(standard=("wind",), found_on=("A-v1",)))
+    assert "tasks on which it was not found (it was on `A-v1`)." in text
+    assert "**Contradicted**: right in 0/2 by AUC and in 0/2 by success." in text
+    assert text.endswith(" Of all tasks: 1/3 by AUC and in 1/3 by success.")
+
+
 def test_without_a_constant_noise_the_rule_is_not_tested() -> None:
     cell = with_policies(make_cell({"base": 0.2, "equivariant": 0.8, "standard": 0.5}))
     assert "**Not tested**" in verdict(lessons_of(summary_of(cell)), Probe(gain=0.1))
