@@ -130,9 +130,9 @@ def test_the_zoo_is_compared_in_cells_of_the_suite_second():
     zoo, second = load_suite("zoo").runs, load_suite("second").runs
 
     def cell(run):
-        return replace(run, agent="standard", agent_options=AGENTS.get("standard").Options())
+        return replace(run, agent="base", agent_options=AGENTS.get("base").Options())
 
-    assert {cell(run) for run in zoo} <= {run for run in second if run.agent == "standard"}
+    assert {cell(run) for run in zoo} <= {run for run in second if run.agent == "base"}
     claimed = {agent for claim in read_study("zoo").claims for agent in claim.agents}
     others = {"standard", "equivariant", "residual-pathway", "best-of-n-kernel"}  # this is no more
     assert {run.agent for run in zoo} == claimed - others
