@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,9 +61,10 @@ class Regret:
     nothing: dict[str, tuple[float, float]]
 
 
-def compute(summary: Summary) -> Regret | None:
-    """None if no two learners share a cell."""
-    learners = {id(table): table.decisive for table in summary.usual_tables}
+def compute(summary: Summary, without: Collection[str] = ()) -> Regret | None:
+    """Of cells of other tasks than ``without``; None if no two learners share one."""
+    tables = [table for table in summary.usual_tables if table.key.task not in without]
+    learners = {id(table): table.decisive for table in tables}
     counts = Counter(names for names in learners.values() if len(names) > 1)
     if not counts:
         return None
@@ -72,7 +73,7 @@ def compute(summary: Summary) -> Regret | None:
     names = [agent for agent in summary.agents if agent in wanted]
     cells: list[Table] = []
     values: dict[str, list[Cell]] = {measure: [] for measure in MEASURES}
-    for table in summary.usual_tables:
+    for table in tables:
         each = [_values(table, names, m) for m in MEASURES] if wanted <= learners[id(table)] else []
         if each and len(each[0].policies) >= MIN_SEEDS:
             cells.append(table)
@@ -117,22 +118,31 @@ def render(regret: Regret | None, view: View) -> list[str]:
     safe = view.findings.study.safe
     return [
         f"{EXPLAINED} Cells: {len(regret.cells)}.",
-        *([verdict(regret, safe)] if safe else []),
+        *([verdict(regret, safe, view.summary)] if safe else []),
         table_text([*rows, last], sparse=True),
         *view.drawn(kind="regret"),
         *folded("How it is measured", [HOW]),
     ]
 
 
-def verdict(regret: Regret, safe: Safe) -> str:
+def verdict(regret: Regret, safe: Safe, summary: Summary) -> str:
     """Whether the agent that is declared safe is so, in both measures."""
     allowed = f"{number(safe.success)} of success and {number(safe.area)} of area"
     declared = (
         f"Declared before the runs: in its worst cell {code(safe.agent)} loses at most {allowed} "
         "more than an agent without regret, and less than every other learner."
     )
-    if safe.agent not in regret.learners:
-        return f"{declared} **Not tested**: it is not in all of these cells."
+    text = f"{declared} {_judged(regret, safe)}"
+    if safe.found_on:
+        known = ", ".join(map(code, safe.found_on))
+        text += f" Without {known}, where it was tested before: "
+        text += _judged(compute(summary, safe.found_on), safe)
+    return text
+
+
+def _judged(regret: Regret | None, safe: Safe) -> str:
+    if regret is None or safe.agent not in regret.learners:
+        return "**Not tested**: it is not in all of these cells."
     holds, texts = [], []
     for measure, most in (("success", safe.success), ("area", safe.area)):
         values = [each.value for each in regret.worst[measure]]
@@ -146,7 +156,7 @@ def verdict(regret: Regret, safe: Safe) -> str:
             f"{number(least, 3, sign=True)})"
         )
     result = "Supported" if all(holds) else "Contradicted"
-    return f"{declared} **{result}**: above an agent without regret by {' and '.join(texts)}."
+    return f"**{result}**: above an agent without regret by {' and '.join(texts)}."
 
 
 def _columns(of: Mapping[str, tuple[Interval | float, Interval | float]]) -> dict[str, str]:

@@ -8,7 +8,7 @@ import pytest
 from symsteer.leaderboard.regret import Cell, intervals, of_an_agent_without_regret, regrets
 from symsteer.leaderboard.sections import regret
 from symsteer.leaderboard.study import Safe
-from tests.leaderboard.record_factory import make_cell, view_of
+from tests.leaderboard.record_factory import make_cell, summary_of, view_of
 
 GAPS = np.array([[0.0], [0.1], [0.3]])
 """By how much three agents are below the best one."""
@@ -147,8 +147,24 @@ def test_the_table_orders_learners_by_their_worst_cell():
 )
 def test_a_declared_agent_is_safe_or_not(agent, success, verdict):
     """The worst cells of the two lose .1 and .4; nothing scatters."""
-    result = two_worlds().findings.of(regret.SECTION)
-    assert verdict in regret.verdict(result, Safe(agent=agent, success=success, area=0.5))
+    view = two_worlds()
+    safe = Safe(agent=agent, success=success, area=0.5)
+    assert verdict in regret.verdict(view.findings.of(regret.SECTION), safe, view.summary)
+
+
+def test_a_declared_agent_is_judged_without_the_tasks_that_proved_it():
+    """`standard` loses .1 in the known task, and .3 in the new one."""
+    worlds = [("A-v1", 0.7), ("B-v1", 0.5)]
+    cells = [make_cell({"standard": s, "equivariant": 0.8}, task=t) for t, s in worlds]
+    safe = Safe(agent="standard", success=0.9, area=0.9, found_on=("A-v1",))
+    for cell in cells:
+        for record in cell:
+            record.base_policy.content_hash = f"{record.settings.seed:064d}"
+    summary = summary_of(*cells)
+    everywhere = regret.compute(summary)
+    _, without = regret.verdict(everywhere, safe, summary).split(" Without `A-v1`, where")
+    assert "agent without regret by +0.300 of success" in without
+    assert [table.key.task for table in regret.compute(summary, ["A-v1"]).cells] == ["B-v1"]
 
 
 def test_the_page_tells_the_verdict():
