@@ -190,3 +190,13 @@ def test_the_figure_has_every_learner_in_every_cell():
 def test_one_learner_has_no_regret():
     view = view_of(make_cell({"base": 0.2, "standard": 0.5}))
     assert regret.render(view.findings.of(regret.SECTION), view) == []
+
+
+def test_cells_of_every_budget_count():
+    cells = [make_cell({"standard": 0.5, "equivariant": 0.8}, env_steps=s) for s in (240, 240, 1200)]
+    cells[1] = make_cell({"standard": 0.5, "equivariant": 0.8}, env_steps=240, variant="wind:1")
+    for cell in cells:
+        for record in cell:
+            record.base_policy.content_hash = f"{record.settings.seed:064d}"
+    budgets = [table.key.env_steps for table in regret.compute(summary_of(*cells)).cells]
+    assert sorted(budgets) == [240, 240, 1200]
