@@ -194,10 +194,19 @@ class Summary:
         return f"{newest:%Y-%m-%d}.{hashlib.sha256(digests.encode()).hexdigest()[:8]}"
 
     @cached_property
-    def usual_budget(self) -> int:
-        """The budget of most tables."""
-        budgets = Counter(table.key.env_steps for table in self._trusted_tables)
-        return max(budgets, key=lambda steps: (budgets[steps], steps), default=0)
+    def _usual_budgets(self) -> dict[str, int]:
+        """Of each task the budget of most tables; of several, the largest."""
+        budgets: dict[str, Counter[int]] = defaultdict(Counter)
+        for table in self._trusted_tables:
+            budgets[table.key.task][table.key.env_steps] += 1
+        return {
+            task: max(of_task, key=lambda steps: (of_task[steps], steps))
+            for task, of_task in budgets.items()
+        }
+
+    def has_usual_budget(self, key: Key) -> bool:
+        """Whether most tables of the task have this budget."""
+        return key.env_steps == self._usual_budgets.get(key.task)
 
     @property
     def _trusted_tables(self) -> list[Table]:
@@ -215,12 +224,11 @@ class Summary:
 
     @cached_property
     def usual_tables(self) -> list[Table]:
-        """Those with the budget of most, and the most demonstrations of their place."""
+        """Those with the budget of most of their task, and the most demonstrations there."""
         return [
             table
             for table in self.tables
-            if table.key.env_steps == self.usual_budget
-            and not self.has_few_demonstrations(table.key)
+            if self.has_usual_budget(table.key) and not self.has_few_demonstrations(table.key)
         ]
 
     @property

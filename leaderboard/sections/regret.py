@@ -62,7 +62,7 @@ class Regret:
 
 
 def compute(summary: Summary, without: Collection[str] = ()) -> Regret | None:
-    """Of cells of other tasks than ``without``, of any budget; None if no two learners share one."""
+    """Of cells of any budget, of tasks not in ``without``; None if no two learners share one."""
     tables = [table for table in summary.tables if table.key.task not in without]
     learners = {id(table): table.decisive for table in tables}
     counts = Counter(names for names in learners.values() if len(names) > 1)

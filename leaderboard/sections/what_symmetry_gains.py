@@ -98,8 +98,8 @@ def _gain(
 def kinds(summary: Summary, words: Mapping[str, str] | None = None) -> dict[str, list[Table]]:
     """Tables by the kind of break: unbroken, each dial, each dial with an arm.
 
-    Cells with another budget than most, with fewer demonstrations than the most of their place, or
-    whose break begins in mid-run are kinds of their own.
+    Cells with another budget than most of their task, with fewer demonstrations than the most of
+    their place, or whose break begins in mid-run are kinds of their own.
 
     Args:
         summary: with the tables.
@@ -107,7 +107,7 @@ def kinds(summary: Summary, words: Mapping[str, str] | None = None) -> dict[str,
     """
 
     def others(key: Key) -> tuple[bool, bool]:
-        return key.env_steps != summary.usual_budget, summary.has_few_demonstrations(key)
+        return not summary.has_usual_budget(key), summary.has_few_demonstrations(key)
 
     def order(key: Key) -> tuple[object, ...]:
         arm = key.embodiment != SYMMETRIC_EMBODIMENT

@@ -53,12 +53,14 @@ def test_cells_have_the_usual_budget_and_demonstrations() -> None:
         make_cell(rates, variant="wind:1"),
         make_cell(rates, variant="wind:1", env_steps=500_000),
         make_cell(rates, demonstrations={"mode": "diverse", "count": 5, "seed": 0}),
+        make_cell(rates, task="PushT-v1", variant="wind:1", env_steps=500_000),
     )
-    audit = audit_of({"none": 0.0, "wind:1": 0.4})
+    audit = audit_of({"none": 0.0, "wind:1": 0.4}) | audit_of({"wind:1": 0.4}, task="PushT-v1")
     keys = [p.table.key for p in points_of(summary, audit, "floating", "equivariant", "auc")]
     assert [(k.variant, k.env_steps, k.demonstrations) for k in keys] == [
         ("none", 50_000, 50),
         ("wind:1", 50_000, 50),
+        ("wind:1", 500_000, 50),
     ]
 
 

@@ -193,7 +193,9 @@ def test_one_learner_has_no_regret():
 
 
 def test_cells_of_every_budget_count():
-    cells = [make_cell({"standard": 0.5, "equivariant": 0.8}, env_steps=s) for s in (240, 240, 1200)]
+    cells = [
+        make_cell({"standard": 0.5, "equivariant": 0.8}, env_steps=s) for s in (240, 240, 1200)
+    ]
     cells[1] = make_cell({"standard": 0.5, "equivariant": 0.8}, env_steps=240, variant="wind:1")
     for cell in cells:
         for record in cell:
