@@ -36,7 +36,7 @@ ROOM = 0.2, 0.8
 """Unbroken success outside of this leaves no room below or above."""
 
 Successes = Mapping[str, Mapping[str, Mapping[int, float]]]
-"""Final success by task and embodiment, variant and seed."""
+"""Final success by task, embodiment and number of demonstrations, variant and seed."""
 
 
 def read(folders: Sequence[Path]) -> Successes:
@@ -48,7 +48,8 @@ def read(folders: Sequence[Path]) -> Successes:
         record = read_record(path)
         config = record.settings
         if config.agent == "base" and record.status == "finished" and record.final:
-            place = f"{config.task} {config.embodiment}"
+            count = config.demonstrations.count
+            place = f"{config.task} {config.embodiment}, {count} demonstrations"
             found[place][config.variant][config.seed] = record.final.success_once
     if not found:
         names = ", ".join(map(str, folders))

@@ -43,7 +43,7 @@ def test_the_table_of_runs(tmp_path, capsys):
     *_, row = capsys.readouterr().out.splitlines()
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells[:4] == [
-        "PickCube-v1 floating",
+        "PickCube-v1 floating, 50 demonstrations",
         "0.90, no room",
         "`wind`",
         "0.67 at 0.5, 0.33 at 1",

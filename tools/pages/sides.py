@@ -28,7 +28,7 @@ LEVEL = 0.01
 
 def render(records: Sequence[RunRecord]) -> str:
     """Shares of runs, by embodiment and break; the drift in centimetres, mean over runs."""
-    found: dict[tuple[str, str], dict[tuple[str, int], dict[str, float]]] = defaultdict(dict)
+    found: dict[tuple[str, str], dict[tuple[str, ...], dict[str, float]]] = defaultdict(dict)
     for record in records:
         config = record.settings
         last = record.evaluations[-1].diagnostics if record.evaluations else {}
@@ -36,12 +36,13 @@ def render(records: Sequence[RunRecord]) -> str:
             continue
         values = {name: value for name in last if (value := last[name]) is not None}
         # A longer budget has the same episodes.
-        found[config.embodiment, config.variant][config.task, config.seed] = values
+        policy = config.task, str(config.seed), str(config.demonstrations.count)
+        found[config.embodiment, config.variant][policy] = values
     if not found:
         raise UserError("no finished run of base has the test of sides; run the suite strengths")
     rows = []
     for world, by_policy in sorted(found.items()):
-        runs, tasks = list(by_policy.values()), {task for task, _ in by_policy}
+        runs, tasks = list(by_policy.values()), {task for task, *_ in by_policy}
         share = {
             name: np.mean([run[name] <= LEVEL for run in runs])
             for name in ("direction_p", "axis_p")
