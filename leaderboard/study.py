@@ -105,7 +105,7 @@ class Safe(_Table):
     agent: str
     success: Annotated[float, Field(gt=0)]
     area: Annotated[float, Field(gt=0)]
-    found_on: tuple[str, ...] = ()
+    tested_on: tuple[str, ...] = ()
     """Tasks on which it was tested before: the page also judges it without them."""
 
 

@@ -113,10 +113,10 @@ def _drift(actions: torch.Tensor, changes: torch.Tensor) -> complex:
     spread = changes.var(0)
     moves = spread.sqrt() > RESTING * spread.max().sqrt()
     explained = torch.where(moves, 1 - left / spread, -torch.inf)
-    *told, drift = factors[:, explained.argmax()]
-    effects = torch.stack(told) * actions.abs().square().mean(0).sqrt()
+    found = factors[:, explained.argmax()]
+    drift, effects = found[-1], found[:-1] * actions.abs().square().mean(0).sqrt()
     # The way from the tool to an object is explained as well as the tool, but moves the other way.
-    along = effects[effects.abs().argmax()].real >= 0
+    along = not len(effects) or effects[effects.abs().argmax()].real >= 0
     return complex(drift if along else -drift)
 
 

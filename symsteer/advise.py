@@ -164,8 +164,8 @@ def _found(table: Table) -> tuple[Interval | None, float | None]:
     gain, direction = gain_in(table), direction_in(table)
     if gain is None and direction is None:
         raise UserError(
-            "the probe needs runs of base, zero and golden-ticket on the same base policy; without "
-            "the arm, a run of base with this version does"
+            "the probe needs runs of base, zero and golden-ticket on the same base policy; with "
+            "the gripper, a run of base with this version is enough"
         )
     return gain, direction
 

@@ -21,13 +21,11 @@ from pathlib import Path
 import numpy as np
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import read_record
 from symsteer.tables import markdown
 from symsteer.terminal import complain
 from symsteer.variant import UNBROKEN, parse_variant
-
-RECORDS = "*/record.json", "*.json"
-"""Of runs, and of the committed ones."""
 
 HALF = 0.5
 """Share of the unbroken success that a base policy shall keep."""
@@ -42,9 +40,7 @@ Successes = Mapping[str, Mapping[str, Mapping[int, float]]]
 def read(folders: Sequence[Path]) -> Successes:
     """Final success of the finished runs of ``base``."""
     found: dict[str, dict[str, dict[int, float]]] = defaultdict(lambda: defaultdict(dict))
-    for path in sorted(
-        path for folder in folders for name in RECORDS for path in folder.glob(name)
-    ):
+    for path in record_files(folders):
         record = read_record(path)
         config = record.settings
         if config.agent == "base" and record.status == "finished" and record.final:

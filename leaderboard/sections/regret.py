@@ -133,10 +133,10 @@ def verdict(regret: Regret, safe: Safe, summary: Summary) -> str:
         "more than an agent without regret, and less than every other learner."
     )
     text = f"{declared} {_judged(regret, safe)}"
-    if safe.found_on:
-        known = ", ".join(map(code, safe.found_on))
+    if safe.tested_on:
+        known = ", ".join(map(code, safe.tested_on))
         text += f" Without {known}, where it was tested before: "
-        text += _judged(compute(summary, safe.found_on), safe)
+        text += _judged(compute(summary, safe.tested_on), safe)
     return text
 
 

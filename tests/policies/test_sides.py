@@ -96,6 +96,16 @@ def test_the_drift_is_the_tools_where_an_object_is_seen_from_it():
     assert found.drift == pytest.approx(0.01 + 0j)
 
 
+def test_what_moves_without_actions_drifts():
+    layout, scalars = Layout([Field("object_xy", 1)]), Layout([Field("gripper", 0)])
+    way = torch.randn(20, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    still = torch.zeros(20, 1, 1, dtype=torch.float64)
+    moved = way + torch.tensor([0.02, 0.0])
+    numbers, generator = torch.arange(20), torch.Generator().manual_seed(0)
+    found = sides(layout, scalars, way, still, moved, numbers, generator)
+    assert found.drift == pytest.approx(0.02 + 0j)
+
+
 def test_errors_of_rounding_have_no_say():
     """A tilt of 1e-8 to one side, in every episode."""
     flat = Layout([Field("axis_xy", 1), Field("tool_xy", 1)])

@@ -57,5 +57,9 @@ def test_the_table_of_runs(tmp_path, capsys):
 
 
 def test_without_runs_there_is_one_sentence(tmp_path):
+    with pytest.raises(UserError, match="holds no record"):
+        read([tmp_path])
+    (learner,) = make_cell({"standard": 0.5}, seeds=1)
+    write_record(learner, tmp_path / "record.json")
     with pytest.raises(UserError, match="no finished run of base; run the suite strengths first"):
         read([tmp_path])

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.paths import record_files
 from symsteer.leaderboard.records import RunRecord, read_record
 from symsteer.tables import markdown
 from tools.pages.marks import CHECKOUT, write_tables
@@ -54,19 +55,10 @@ def render(records: Sequence[RunRecord]) -> str:
     return markdown(heads, rows, left=2)
 
 
-def _read(places: Sequence[Path]) -> list[RunRecord]:
-    paths = [
-        path
-        for place in places
-        for path in ([place] if place.is_file() else sorted(place.rglob("*.json")))
-    ]
-    return [read_record(path) for path in paths]
-
-
 def main(arguments: Sequence[str]) -> int:
     """Write the table."""
     places = [Path(argument) for argument in arguments] or RECORDS
-    return write_tables(PAGE, lambda: render(_read(places)))
+    return write_tables(PAGE, lambda: render([read_record(p) for p in record_files(places)]))
 
 
 if __name__ == "__main__":

@@ -152,11 +152,11 @@ def test_a_declared_agent_is_safe_or_not(agent, success, verdict):
     assert verdict in regret.verdict(view.findings.of(regret.SECTION), safe, view.summary)
 
 
-def test_a_declared_agent_is_judged_without_the_tasks_that_proved_it():
+def test_a_declared_agent_is_judged_without_the_tasks_that_tested_it():
     """`standard` loses .1 in the known task, and .3 in the new one."""
     worlds = [("A-v1", 0.7), ("B-v1", 0.5)]
     cells = [make_cell({"standard": s, "equivariant": 0.8}, task=t) for t, s in worlds]
-    safe = Safe(agent="standard", success=0.9, area=0.9, found_on=("A-v1",))
+    safe = Safe(agent="standard", success=0.9, area=0.9, tested_on=("A-v1",))
     for cell in cells:
         for record in cell:
             record.base_policy.content_hash = f"{record.settings.seed:064d}"
