@@ -33,7 +33,17 @@ SHARED = ROOT / "leaderboard" / "site" / "static"
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md"}
 """Files of the repository's root that are pages, too."""
 
-PICTURES = {"leaderboard/figures/answer.svg": "assets/answer.svg"}
+PICTURES = {
+    "leaderboard/figures/answer.svg": "assets/answer.svg",
+    **{
+        f"leaderboard/dial/figures/{name}.svg": f"assets/dial-{name}.svg"
+        for name in (
+            "regret",
+            "success-pickcube-v1-floating-7fa3e0",
+            "success-pushcube-v1-floating-5d7ac0",
+        )
+    },
+}
 """Pictures outside of `docs/` that these pages show."""
 
 RESULTS = "leaderboard/LEADERBOARD.md"
