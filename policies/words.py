@@ -43,8 +43,8 @@ def _data() -> dict[str, Any]:
 
 
 @functools.cache
-def sentences(task: str, held_out: bool = False) -> tuple[str, ...]:
-    """What the task can be called, with every way to fill the slots.
+def wordings(task: str, held_out: bool = False) -> tuple[tuple[str, ...], ...]:
+    """What the task can be called: for each wording, every way to fill its slots.
 
     Args:
         task: its name.
@@ -56,12 +56,17 @@ def sentences(task: str, held_out: bool = False) -> tuple[str, ...]:
     data = _data()
     if task not in data["tasks"]:
         raise unknown("task with sentences", task, data["tasks"])
-    filled = []
+    found = []
     for wording in data["tasks"][task]["held_out" if held_out else "training"]:
         slots = sorted(set(re.findall(r"{(\w+)}", wording)))
-        for words in itertools.product(*(data["slots"][slot] for slot in slots)):
-            filled.append(wording.format(**dict(zip(slots, words, strict=True))))
-    return tuple(filled)
+        filled = itertools.product(*(data["slots"][slot] for slot in slots))
+        found.append(tuple(wording.format(**dict(zip(slots, w, strict=True))) for w in filled))
+    return tuple(found)
+
+
+def sentences(task: str, held_out: bool = False) -> tuple[str, ...]:
+    """All that the task can be called, wording after wording; see :func:`wordings`."""
+    return tuple(itertools.chain.from_iterable(wordings(task, held_out)))
 
 
 def words_of(sentence: str) -> list[str]:

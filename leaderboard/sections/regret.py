@@ -140,22 +140,46 @@ def verdict(regret: Regret, safe: Safe, summary: Summary) -> str:
     return text
 
 
+@dataclass(frozen=True)
+class Standing:
+    """The worst regret of an agent, by one measure, above that of an agent without regret.
+
+    Attributes:
+        above: of the agent.
+        best: the learner of all others that is least above.
+        least: of this one.
+        holds: the agent is above by no more than it may be, and by less than every other learner.
+    """
+
+    above: float
+    best: str
+    least: float
+    holds: bool
+
+
+def standings(regret: Regret, safe: Safe) -> dict[str, Standing]:
+    """Of the safe agent, which must be one of the learners, by measure."""
+    found = {}
+    for measure, most in (("success", safe.success), ("area", safe.area)):
+        nothing = regret.nothing[measure][1]
+        values = [each.value - nothing for each in regret.worst[measure]]
+        worst = dict(zip(regret.learners, values, strict=True))
+        above = worst.pop(safe.agent)
+        best = min(worst, key=lambda agent: worst[agent])
+        found[measure] = Standing(above, best, worst[best], above <= most and above < worst[best])
+    return found
+
+
 def _judged(regret: Regret | None, safe: Safe) -> str:
     if regret is None or safe.agent not in regret.learners:
         return "**Not tested**: it is not in all of these cells."
-    holds, texts = [], []
-    for measure, most in (("success", safe.success), ("area", safe.area)):
-        values = [each.value for each in regret.worst[measure]]
-        worst = dict(zip(regret.learners, values, strict=True))
-        above = worst.pop(safe.agent) - regret.nothing[measure][1]
-        best = min(worst, key=lambda agent: worst[agent])
-        least = worst[best] - regret.nothing[measure][1]
-        holds.append(above <= most and above < least)
-        texts.append(
-            f"{number(above, 3, sign=True)} of {measure} ({code(best)}, the best of the others: "
-            f"{number(least, 3, sign=True)})"
-        )
-    result = "Supported" if all(holds) else "Contradicted"
+    found = standings(regret, safe)
+    texts = [
+        f"{number(each.above, 3, sign=True)} of {measure} ({code(each.best)}, the best of the "
+        f"others: {number(each.least, 3, sign=True)})"
+        for measure, each in found.items()
+    ]
+    result = "Supported" if all(each.holds for each in found.values()) else "Contradicted"
     return f"**{result}**: above an agent without regret by {' and '.join(texts)}."
 
 

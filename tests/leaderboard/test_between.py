@@ -4,20 +4,30 @@ import csv
 import re
 from statistics import mean
 
+import numpy as np
 import pytest
+from scipy import stats
 
-from symsteer.leaderboard.paths import PAGE_FOLDER
+from symsteer.leaderboard.paths import PAGE_FOLDER, RESULTS
+from symsteer.leaderboard.runs import load_runs
 
 FOLDER = PAGE_FOLDER / "dial"
 NUMBER = r"[+-]?\d?\.\d+"
 INTERVAL = re.compile(rf"({NUMBER}) \[({NUMBER}),\s+({NUMBER})\]")
 
 
+NEXT = "\n## The next designs"
+
+
 @pytest.fixture(scope="module")
-def text() -> str:
+def page() -> str:
+    return (PAGE_FOLDER.parent / "docs" / "between.md").read_text()
+
+
+@pytest.fixture
+def text(page) -> str:
     """The page up to the next designs."""
-    page = (PAGE_FOLDER.parent / "docs" / "between.md").read_text()
-    return page.split("\n## The next designs", 1)[0]
+    return page.split(NEXT, 1)[0]
 
 
 def as_on_the_page(number: str) -> str:
@@ -78,3 +88,36 @@ def test_what_is_counted_is_in_the_records(text):
         world = (task, "action_gain:1")
         ours, best = (of(x, "success", *world) for x in ("residual-pathway", "equivariant"))
         assert mean(best.values()) - mean(ours.values()) == pytest.approx(0.07, abs=0.006)
+
+
+def test_the_next_designs_where_the_first_one_failed(page):
+    """Means over base policies; paired differences from `standard` with Student's intervals."""
+    cell = {"task": "PickCube-v1", "variant": "actuator_offset:0.5", "env_steps": "24000"}
+    with (FOLDER / "records.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if cell.items() <= row.items()]
+    values = {
+        (row["agent"], measure, int(row["seed"])): float(row[measure])
+        for row in rows
+        for measure in ("auc", "success")
+    }
+    records = RESULTS.glob("dial-next/PickCube-v1-floating-actuator_offset=0.5-*.json")
+    for run in load_runs(records, area_from="first update"):
+        for measure, value in (("auc", run.area), ("success", run.success)):
+            values[run.agent, measure, run.seed] = value
+
+    def of(agent, measure):
+        return np.array([values[agent, measure, seed] for seed in range(150, 162)])
+
+    table = re.findall(r"^\| `([a-z-]+)` \|( \..*)\|$", page.split(NEXT, 1)[1], re.MULTILINE)
+    assert len(table) == 6
+    for agent, cells in table:
+        found = []
+        for measure in ("auc", "success"):
+            minus = of(agent, measure) - of("standard", measure)
+            half = stats.t.ppf(0.975, 11) * minus.std(ddof=1) / np.sqrt(12)
+            low, high = minus.mean() - half, minus.mean() + half
+            found += [of(agent, measure).mean(), minus.mean(), low, high]
+        shown = re.findall(r"[+-]?\.\d+", cells)
+        if agent == "standard":
+            found = found[::4]
+        assert [float(number) for number in shown] == pytest.approx(found, abs=0.00501), agent

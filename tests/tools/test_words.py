@@ -7,19 +7,35 @@ import json
 import pytest
 
 from symsteer.bench.steering.seeds import held_out_seeds
+from symsteer.bench.sweep.suite import load_suite
 from symsteer.leaderboard.text import MINUS, SPACE
-from symsteer.policies.words import sentences
+from symsteer.policies.words import _data, wordings
 from tools import words
 from tools.pages import words as page
 
 
-def test_some_sentences_are_of_several_wordings():
+def test_some_sentences_are_of_several_wordings_and_name_the_things_alike():
+    slots = _data()["slots"].values()
     for task in words.TASKS:
+        named = []
         for held_out in (False, True):
             said = words.some(task, held_out)
             assert len(set(said)) == words.SENTENCES
-            assert set(said) <= set(sentences(task, held_out))
-        assert len({sentence.split()[0] for sentence in words.some(task)}) >= 3
+            used = {[s in filled for filled in wordings(task, held_out)].index(True) for s in said}
+            assert len(used) == min(words.SENTENCES, len(wordings(task, held_out)))
+            named.append([{each for slot in slots for each in slot if each in s} for s in said])
+        assert named[0] == named[1]
+
+
+def test_the_suite_steers_what_the_tool_trains(monkeypatch, tmp_path):
+    """So that both have the same files in RUNS/base."""
+    given = words.parsed([str(tmp_path)])
+    monkeypatch.setattr(words, "prepare_base", lambda config, execution: config)
+    for run in load_suite("words").runs:
+        made = words._prepared("edp-told", run.task, run.seed, given)
+        assert (made.policy, made.demonstrations) == (run.policy, run.demonstrations)
+        assert run.seed in given.seeds
+        assert run.task in given.tasks
 
 
 @pytest.mark.parametrize("tasks", [["PushCube-v1"], ["PushCube-v1"] * 2, ["PushCube-v1", "PushT"]])

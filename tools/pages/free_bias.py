@@ -1,4 +1,4 @@
-"""Writes the table of docs/between.md: what free biases say of a displaced camera.
+"""Writes the table of docs/agents/asymmetry.md: what free biases say of a displaced camera.
 
 python -m tools.pages.free_bias          # from the committed records
 python -m tools.pages.free_bias RUNS     # copies the finished records of the suite free-bias first
@@ -24,7 +24,7 @@ from symsteer.tables import markdown
 from symsteer.variant import UNBROKEN, parse_variant
 from tools.pages.marks import CHECKOUT, write_tables
 
-PAGE = CHECKOUT / "docs" / "between.md"
+PAGE = CHECKOUT / "docs" / "agents" / "asymmetry.md"
 RECORDS = CHECKOUT / "leaderboard" / "results" / "free-bias"
 
 MEASURES = {
