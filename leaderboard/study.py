@@ -106,7 +106,7 @@ class Safe(_Table):
     success: Annotated[float, Field(gt=0)]
     area: Annotated[float, Field(gt=0)]
     tested_on: tuple[str, ...] = ()
-    """Tasks on which it was tested before: the page also judges it without them."""
+    """Tasks on which it was tested before. The verdict is that of the others."""
 
 
 class _Rule(_Table):
@@ -114,6 +114,8 @@ class _Rule(_Table):
 
     right: Annotated[float, Field(gt=0, le=1)] = 0.9
     """Share of the decided worlds in which the rule is right."""
+    least: Annotated[int, Field(gt=0)] = 1
+    """Decided worlds without which it is not tested, by each measure."""
     found_on: tuple[str, ...] = ()
     """Tasks on whose earlier records the rule was found. They do not count."""
 

@@ -24,7 +24,7 @@ from statistics import fmean
 import numpy as np
 from scipy import stats
 
-from symsteer.leaderboard.defects import dial_of
+from symsteer.leaderboard.defects import dial_of, parts_of
 from symsteer.leaderboard.keys import SYMMETRIC_EMBODIMENT
 from symsteer.leaderboard.known_agents import BASE, CONSTANT, STANDARD, STRICT, ZERO
 from symsteer.leaderboard.pairs import MEASURES, advantage
@@ -111,8 +111,16 @@ Rule = Callable[[Sequence[Lesson], Question, str], Answer]
 
 
 def lessons_of(summary: Summary) -> list[Lesson]:
-    """Of all cells with the usual budget in which `STRICT` and `STANDARD` have enough policies."""
-    return [_lesson(t) for t in summary.usual_tables if {STRICT, STANDARD} <= t.decisive]
+    """Of the cells with the usual budget in which `STRICT` and `STANDARD` have enough policies.
+
+    A world that changes in mid-run teaches nothing: its area is one of two worlds.
+    """
+    return [
+        _lesson(table)
+        for table in summary.usual_tables
+        if {STRICT, STANDARD} <= table.decisive
+        and all(spec.is_constant for spec in parts_of(table.key.variant) or ())
+    ]
 
 
 def _lesson(table: Table) -> Lesson:

@@ -46,7 +46,8 @@ within base policies. *Supported* and *contradicted* need p < 0.05 for "no effec
 needs it for "an effect of at least the smallest one of interest"; otherwise a claim is *undecided*.
 Below a difference: the means of both agents (of an interaction, in the first cells).
 Both p-values are corrected for the number of tests of a family (Holm), the intervals are not. *But
-not without* names each task without whose cells the interval holds 0."""
+not without* names each task without whose cells the interval holds 0, *but not in* each in which
+the effect is at least the smallest one of interest, and its interval does not hold 0."""
 
 MEASURE_WORDS = {
     "auc": "area under the curve",
@@ -88,6 +89,17 @@ class ClaimOutcome:
     def needs(self) -> tuple[str, ...]:
         """The tasks without which a decided claim would not be decided."""
         return self.rests_on if self.verdict in ("supported", "contradicted") else ()
+
+    @property
+    def apart(self) -> tuple[str, ...]:
+        """The tasks in which the effect clearly matters, though over all of them it does not."""
+        return tuple(
+            task
+            for task, effect in self.by_task.items()
+            if self.verdict == "equivalent"
+            and effect.sign
+            and abs(effect.value) >= self.claim.smallest
+        )
 
     @property
     def verdict(self) -> str:
@@ -425,6 +437,8 @@ def verdict_text(outcome: ClaimOutcome) -> str:
         return f"{text}: {outcome.reason}"
     if outcome.needs:
         text += f", but not without {' or '.join(map(code, outcome.needs))}"
+    if outcome.apart:
+        text += f" on average, but not in {' or '.join(map(code, outcome.apart))}"
     if outcome.policies >= MIN_SEEDS or outcome.verdict == "undecided":
         return text
     policies = "one base policy" if outcome.policies == 1 else f"{outcome.policies} base policies"

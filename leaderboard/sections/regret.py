@@ -132,12 +132,12 @@ def verdict(regret: Regret, safe: Safe, summary: Summary) -> str:
         f"Declared before the runs: in its worst cell {code(safe.agent)} loses at most {allowed} "
         "more than an agent without regret, and less than every other learner."
     )
-    text = f"{declared} {_judged(regret, safe)}"
-    if safe.tested_on:
-        known = ", ".join(map(code, safe.tested_on))
-        text += f" Without {known}, where it was tested before: "
-        text += _judged(compute(summary, safe.tested_on), safe)
-    return text
+    everywhere = _judged(regret, safe)
+    if not safe.tested_on:
+        return f"{declared} {everywhere}"
+    known = ", ".join(map(code, safe.tested_on))
+    new = _judged(compute(summary, safe.tested_on), safe)
+    return f"{declared} Without {known}, where it was tested before: {new} In all: {everywhere}"
 
 
 @dataclass(frozen=True)

@@ -52,12 +52,14 @@ def verdict(lessons: Sequence[Lesson], rule: Probe | Kind) -> str:
     declared = (
         f"Declared before the runs: {where}, `{STANDARD}` is better, elsewhere `{STRICT}`; in at "
         f"least {number(100 * rule.right, 0)} % of the decided worlds"
-        f"{f' of tasks on which it was not found (it was on {known})' if known else ''}."
+        f"{f' of tasks on which it was not found (it was on {known})' if known else ''}"
+        f"{f', of which there are at least {rule.least}' if rule.least > 1 else ''}."
     )
     new = [(lesson, is_broken) for lesson, is_broken in worlds if lesson.task not in rule.found_on]
     right = [_right(new, measure) for measure in MEASURES]
-    holds = [sum(each) >= rule.right * len(each) for each in right if each]
-    result = ("Supported" if all(holds) else "Contradicted") if holds else "Not tested"
+    enough = [each for each in right if len(each) >= rule.least]
+    holds = all(sum(each) >= rule.right * len(each) for each in enough)
+    result = ("Supported" if holds else "Contradicted") if enough else "Not tested"
     text = f"{declared} **{result}**: right in {_shares(right)}."
     if known:
         text += f" Of all tasks: {_shares([_right(worlds, measure) for measure in MEASURES])}."

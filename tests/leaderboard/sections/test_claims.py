@@ -111,6 +111,23 @@ def test_a_verdict_names_the_task_without_which_it_does_not_hold() -> None:
         assert verdict_text(one) == f"**supported**{words}"
 
 
+def test_what_is_equal_on_average_names_the_tasks_where_it_is_not() -> None:
+    """A gains .3, B loses .3."""
+    records = [
+        record
+        for task, rates in (("A-v1", (0.3, 0.6)), ("B-v1", (0.6, 0.3)))
+        for record in make_cell(
+            dict(zip(("standard", "equivariant"), rates, strict=True)), task=task
+        )
+    ]
+    claim = claim_of(predicted=0, smallest=0.2)
+    (one,) = outcomes(with_policies(records), claim)
+    assert (one.verdict, one.apart) == ("equivalent", ("A-v1", "B-v1"))
+    assert verdict_text(one) == "**equivalent** on average, but not in `A-v1` or `B-v1`"
+    (one,) = outcomes(with_policies(records), claim.model_copy(update={"smallest": 0.35}))
+    assert verdict_text(one) == "**equivalent**"
+
+
 def test_an_undecided_claim_needs_no_task() -> None:
     """The interval excludes 0, but not after correction: without A it holds 0."""
     one = ClaimOutcome(claim_of(), ShareDifference((9, 10), (1, 10)), p=0.2, rests_on=("A-v1",))

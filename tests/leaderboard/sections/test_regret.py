@@ -162,8 +162,10 @@ def test_a_declared_agent_is_judged_without_the_tasks_that_tested_it():
             record.base_policy.content_hash = f"{record.settings.seed:064d}"
     summary = summary_of(*cells)
     everywhere = regret.compute(summary)
-    _, without = regret.verdict(everywhere, safe, summary).split(" Without `A-v1`, where")
+    _, text = regret.verdict(everywhere, safe, summary).split(" Without `A-v1`, where")
+    without, in_all = text.split(" In all: ")
     assert "agent without regret by +0.300 of success" in without
+    assert "agent without regret by +0.300 of success" in in_all
     assert [table.key.task for table in regret.compute(summary, ["A-v1"]).cells] == ["B-v1"]
 
 

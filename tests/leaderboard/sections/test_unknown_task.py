@@ -52,7 +52,11 @@ def test_a_declared_rule_is_tested_in_decided_worlds(rule: Probe | Kind, said: s
         with_policies(make_cell({"base": 0.2, "zero": 0.4, **rates}, variant=variant))
         for variant, rates in worlds.items()
     ]
-    assert verdict(lessons_of(summary_of(*cells)), rule).endswith(said)
+    lessons = lessons_of(summary_of(*cells))
+    assert verdict(lessons, rule).endswith(said)
+    assert verdict(lessons, rule.model_copy(update={"least": 2})).endswith(said)
+    few = verdict(lessons, rule.model_copy(update={"least": 3}))
+    assert ", of which there are at least 3. **Not tested**: right in " in few
 
 
 def test_tasks_on_which_a_rule_was_found_do_not_count() -> None:
@@ -65,6 +69,14 @@ def test_tasks_on_which_a_rule_was_found_do_not_count() -> None:
     assert "tasks on which it was not found (it was on `A-v1`)." in text
     assert "**Contradicted**: right in 0/2 by AUC and in 0/2 by success." in text
     assert text.endswith(" Of all tasks: 1/3 by AUC and in 1/3 by success.")
+
+
+def test_a_world_that_changes_in_mid_run_teaches_nothing() -> None:
+    rates = {"equivariant": 0.5, "standard": 0.8}
+    cells = [
+        with_policies(make_cell(rates, variant=variant)) for variant in ("wind:1", "wind:1@0.3")
+    ]
+    assert [lesson.table.key.variant for lesson in lessons_of(summary_of(*cells))] == ["wind:1"]
 
 
 def test_without_a_constant_noise_the_rule_is_not_tested() -> None:
