@@ -173,8 +173,8 @@ class ChunkPolicy(nn.Module, abc.ABC):
     def see(self, obs: torch.Tensor) -> torch.Tensor:
         """Observations ``[B, task_layout.dim]`` of the task as ``[B, obs_layout.dim]``.
 
-        A policy with an encoder of pictures puts what it tells in their place. Once for each
-        decision; agents and replay know the result alone.
+        A policy with an encoder of clouds or pictures puts what it tells in their place. Once for
+        each decision; agents and replay know the result alone.
         """
         return obs
 

@@ -174,8 +174,8 @@ def load_policy(
         obs_layout = Layout.from_json(description["obs_layout"])
         act_layout = Layout.from_json(description["act_layout"])
         for side, layout in (("obs", obs_layout), ("act", act_layout)):
-            # The encoder of a picture decides how many numbers it becomes.
-            if not layout.picture and layout.dim != len(tensors[f"{side}_normalizer.scale"]):
+            # An encoder decides how many numbers a cloud or a picture becomes.
+            if not layout.is_seen and layout.dim != len(tensors[f"{side}_normalizer.scale"]):
                 raise ValueError(f"{side}_layout does not fit the normaliser")
         if description["extension"]:
             cure += f", or let the constructor of {kind.__name__} build all tensors that fit fills"

@@ -176,6 +176,11 @@ class Layout:
             torch.cat([index[self.slice(field.name)] for field in rest]),
         )
 
+    @property
+    def is_seen(self) -> bool:
+        """Whether it has a cloud of points or a picture, which policies encode."""
+        return bool(self.cloud or self.picture)
+
     @functools.cached_property
     def picture(self) -> Picture | None:
         """The picture, if there is one: the fields ``picture_...``, or ``hand_...``.

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Cloud, Layout
+from symsteer.policies.geometry import Layout
 
 MINIMUM_RANGE = 1e-2
 """A smaller half-range counts as constant (1 cm, or 0.6 degrees in a rotation column). Division
@@ -78,8 +78,6 @@ class Normalizer(nn.Module):
         (they change sign under reflections): scale = largest magnitude, no offset. Vectors: scale =
         largest norm, no offset. A range below ``MINIMUM_RANGE`` gives scale 1.
 
-        The points of a cloud share their statistics, so that their order does not matter.
-
         ``deviation`` of a scalar is its standard deviation. ``deviation`` of a vector is the root
         mean square of its components: the standard deviation over all rotations of the data.
 
@@ -94,8 +92,6 @@ class Normalizer(nn.Module):
         data = data.reshape(-1, layout.dim).double()
         if not data.isfinite().all():
             raise UserError("the data to normalise hold NaN or infinite numbers; remove them")
-        if cloud := layout.cloud:
-            return cls._fit_cloud(layout, cloud, data)
         low, high = data.min(dim=0).values, data.max(dim=0).values
         squares = (data * data) @ _same_block(layout, data.dtype, data.device)
         radius = squares.max(dim=0).values.sqrt()
@@ -109,15 +105,6 @@ class Normalizer(nn.Module):
             shiftable, data.var(dim=0, correction=0), squares.mean(dim=0) / sizes
         )
         return cls(layout, scale.float(), offset.float(), centered.sqrt().float())
-
-    @classmethod
-    def _fit_cloud(cls, layout: Layout, cloud: Cloud, data: torch.Tensor) -> Normalizer:
-        whole = cls(layout)
-        for part, columns in ((cloud.rest, cloud.rest_columns), (cloud.point, cloud.columns)):
-            fitted = cls.fit(part, data[:, columns.to(data.device)])
-            for name, value in fitted.state_dict().items():
-                getattr(whole, name)[columns] = value.to(whole.scale)
-        return whole.to(data.device)
 
     def normalize(self, x: torch.Tensor) -> torch.Tensor:
         """Data units to unit size; shapes ``[..., dim] -> [..., dim]``."""

@@ -164,7 +164,7 @@ class SymmetricTask(BaseEnv):
     @classmethod
     def is_seen(cls) -> bool:
         """Whether points or a picture take the place of the poses of bodies."""
-        return bool(cls.observation_layout.cloud or cls.observation_layout.picture)
+        return cls.observation_layout.is_seen
 
     # ------------------------------------------------------------------ scene
 

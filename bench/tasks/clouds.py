@@ -117,13 +117,9 @@ class Seen(SymmetricTask):
     def cloud(self) -> torch.Tensor:
         """What the cameras see now, ``[N, POINTS, 3]`` metres in the world's frame."""
         points, label = self.look()
-        unseen = [
-            index
-            for index, body in self.segmentation_id_map.items()
-            if isinstance(body, Link) or body in self._hidden_objects
-        ]
+        robot = [i for i, body in self.segmentation_id_map.items() if isinstance(body, Link)]
         valid = (points[:, :, 2] > TABLE) & (points[:, :, :2].norm(dim=2) < REACH)
-        valid &= ~torch.isin(label, torch.tensor([0, *unseen], device=self.device))
+        valid &= ~torch.isin(label, torch.tensor([0, *robot], device=self.device))
         return thinned(points, valid, POINTS)
 
     def look(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -133,8 +129,14 @@ class Seen(SymmetricTask):
             The points of all pixels, ``[N, CAMERAS * PIXELS * PIXELS, 3]`` metres in the world's
             frame, and ManiSkill's segmentation ids of what they belong to.
         """
+        # Marks such as a goal in the air would hide what is behind them.
+        marks = [body for body in self._hidden_objects if not body.hidden]
+        for body in marks:
+            body.hide_visual()
         self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         self.capture_sensor_data()
+        for body in marks:
+            body.show_visual()
         points, labels = [], []
         for sensor in self._sensors.values():
             picture = sensor.get_obs(rgb=False, depth=False, position=True, segmentation=True)

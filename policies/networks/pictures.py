@@ -4,20 +4,14 @@
     keypoint (g, k) = mean of all places under the weights of group element g, channel k
 
 The convolutions are steerable (escnn); over the trivial group they are ordinary. A turned picture
-turns the keypoints and permutes their group elements. So the numbers
-
-    z_j = mean over g of (cos j a_g, sin j a_g) (g^-1 keypoint (g, k))     (a complex product)
-
-are planar vectors that turn by j times the angle (frequency j). z_1 is the mean place of keypoint
-k; the others tell of its shape. Pixels turn into pixels under quarter turns only: these are exact,
-other turns up to the error of interpolation.
+turns the keypoints and permutes their group elements. Pixels turn into pixels under quarter turns
+only: these are exact, other turns up to the error of interpolation.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections import Counter
 from typing import Any, ClassVar, Self
 
 import torch
@@ -25,8 +19,8 @@ from torch import nn
 from torch.nn import functional
 
 from symsteer.errors import UserError
-from symsteer.policies.geometry import Field, Group, Layout, escnn_package
-from symsteer.policies.normalizer import MINIMUM_RANGE, Normalizer
+from symsteer.policies.geometry import Group, escnn_package
+from symsteer.policies.networks.keypoints import KeypointEncoder
 from symsteer.policies.picture import PIXEL, Picture
 
 KERNELS = ((10, 4, 3), (5, 1, 2))
@@ -35,10 +29,6 @@ of them."""
 
 SHRINK = 4
 """Pixels of the picture to a place of the last convolution."""
-
-REACH = 0.1
-"""Metres that have unit size for the networks. Most of a keypoint's weights lie elsewhere, so that
-it moves less than what it follows."""
 
 
 class PictureConvolution(nn.Module):
@@ -115,18 +105,12 @@ class FixedConvolution(nn.Module):
         return functional.conv2d(x, self.weight, self.bias, self.stride, self.padding)
 
 
-class PictureEncoder(nn.Module):
-    """Puts what a picture tells in its place in an observation.
+class PictureEncoder(KeypointEncoder):
+    """Puts what a picture tells in its place in an observation; shapes are in half sides.
 
     Args:
         picture: geometry of the picture.
         group: of rotations, C_n.
-
-    Attributes:
-        told: geometry of what the picture tells: for each keypoint its mean place in metres and,
-            there, the mean of each channel of the picture; then the shapes, in half sides.
-        layout: the same in its place in the observation.
-        scale: the largest value of each channel of the picture, ``[channels]``.
 
     Raises:
         UserError: if quarter turns do not keep the pixels that the last convolution has.
@@ -135,88 +119,25 @@ class PictureEncoder(nn.Module):
     counts: ClassVar[dict[bool, tuple[int, int]]] = {True: (4, 4), False: (6, 24)}
     """Channels and keypoints for each element of a group, and those of the trivial group: as many
     parameters as C8 has, about as many numbers (tests/policies/test_pictures.py)."""
-    scale: torch.Tensor
 
     def __init__(self, picture: Picture, group: Group):
-        super().__init__()
-        self.picture, self.group = picture, group
+        channels, keypoints = self.counts[group.order > 1]
+        super().__init__(picture, group, keypoints, picture.channels, picture.side * PIXEL / 2)
+        self.picture = picture
         if picture.side % SHRINK:
             raise UserError(
                 f"a picture of {picture.side} x {picture.side} pixels has no quarter turns after "
                 f"{SHRINK} of them became one; choose a multiple of {SHRINK}"
             )
-        channels, self.keypoints = self.counts[group.order > 1]
         colors = len(picture.channels)
         self.layers = nn.ModuleList(
             PictureConvolution(group, channels if i else colors, channels, shape, not i)
             for i, shape in enumerate(KERNELS)
         )
         self.weigh = PictureConvolution(group, channels, self.keypoints, (1, 1, 0), False)
-        self.register_buffer("scale", torch.ones(colors))
-        n = group.order
-        turns = sorted((j if 2 * j <= n else j - n for j in range(n)), key=abs) if n > 1 else [1]
-        self.turns = [1, *(j for j in turns if j != 1)]
-        self.told = Layout(self.told_fields())
-        # Numbers of the observation before the picture.
-        self.start = int(picture.columns[0])
-        before, after = picture.rest.split(self.start)
-        self.layout = Layout([*before, *self.told.fields, *after])
 
-    def told_fields(self) -> list[Field]:
-        """Geometry of what the picture tells."""
-        fields = [
-            field
-            for k in range(self.keypoints)
-            for field in (
-                Field(f"keypoint{k}_place", 1),
-                *(Field(f"keypoint{k}_{name}", 0) for name in self.picture.channels),
-            )
-        ]
-        count = Counter(abs(j) for j in self.turns[1:])
-        return fields + [
-            Field(f"shape{j}", j, times * self.keypoints * (1 if j else 2))
-            for j, times in count.items()
-        ]
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Observations with a picture as ``[B, layout.dim]``, environment units."""
-        rest = obs[:, self.picture.rest_columns.to(obs.device)]
-        told = self.encode(obs)
-        return torch.cat([rest[:, : self.start], told, rest[:, self.start :]], dim=1)
-
-    def statistics(self, obs: torch.Tensor, rest: Normalizer) -> Normalizer:
-        """Learn the scale from ``obs [M, dim]``; the normaliser of what is made of them.
-
-        What the picture tells has a size by itself. Statistics would change while it is learned.
-
-        Args:
-            obs: demonstrated observations.
-            rest: normaliser of the other fields.
-        """
-        self.scale.copy_(self.picture.of(obs).abs().amax(dim=(0, 2, 3)).clamp_min(MINIMUM_RANGE))
-        sizes = self.sizes()
-
-        def around(values: torch.Tensor, told: torch.Tensor) -> torch.Tensor:
-            return torch.cat([values[: self.start], told.to(values), values[self.start :]])
-
-        return Normalizer(
-            self.layout,
-            around(rest.scale, sizes),
-            around(rest.offset, 0 * sizes),
-            around(rest.deviation, sizes),
-        )
-
-    def sizes(self) -> torch.Tensor:
-        """What has unit size for the networks of what the picture tells, ``[told.dim]``."""
-        sizes = torch.full((self.told.dim,), REACH / (self.picture.side * PIXEL / 2))
-        for field in self.told.fields:
-            _, _, part = field.name.partition("_")
-            if part in self.picture.channels:
-                size = float(self.scale[self.picture.channels.index(part)])
-                sizes[self.told.slice(field.name)] = size
-            elif part:
-                sizes[self.told.slice(field.name)] = REACH
-        return sizes
+    def seen_values(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.picture.of(obs).flatten(2)
 
     def logits(self, picture: torch.Tensor) -> torch.Tensor:
         """How much each place of ``picture [B, channels, side, side]`` is looked at.
@@ -230,27 +151,12 @@ class PictureEncoder(nn.Module):
         return self.weigh(x).flatten(2).unflatten(1, (self.keypoints, -1))
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
-        """What the pictures of observations tell, ``[B, told.dim]``, environment units."""
         picture = self.picture.of(obs)
         weights = self.logits(picture).softmax(-1)
         seen = functional.avg_pool2d(picture, SHRINK).flatten(2)
-        places = _places(self.picture.side // SHRINK, weights)
-        n, half = self.group.order, self.picture.side * PIXEL / 2
-        # [B, keypoints, order]; `unit` turns each back by its element.
-        z = torch.view_as_complex((weights @ places).contiguous())
-        angle = torch.arange(n, device=z.device, dtype=weights.dtype) * (2 * math.pi / n)
-        values = weights.mean(2) @ seen.mT
-        parts = []
-        for j in self.turns:
-            unit = torch.polar(torch.ones_like(angle), angle * (j - 1)).to(z)
-            mean = torch.view_as_real((z * unit).mean(-1))
-            # The conjugate of a vector of frequency -j has frequency j.
-            parts.append(mean * mean.new_tensor([1, -1 if j < 0 else 1]))
-        first = torch.cat([half * parts[0], values], dim=-1)
-        return torch.cat([first.flatten(1), *(part.flatten(1) for part in parts[1:])], dim=1)
+        return self.tell(weights, _places(self.picture.side // SHRINK, weights), seen)
 
     def expanded(self) -> Self:
-        """A copy for inference with its filters ready."""
         fast = copy.deepcopy(self)
         fast.layers = nn.ModuleList(FixedConvolution(layer) for layer in self.layers)
         fast.register_module("weigh", FixedConvolution(self.weigh))

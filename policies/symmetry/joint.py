@@ -49,7 +49,7 @@ def merged_layout(layouts: Mapping[str, Layout]) -> Layout:
     """
     fields: dict[str, Field] = {}
     for task, layout in layouts.items():
-        if layout.cloud or layout.picture:
+        if layout.is_seen:
             shown = "cloud of points" if layout.cloud else "picture"
             raise UserError(
                 f"{task} shows a {shown}, which has no place in a policy for several tasks; train "

@@ -28,7 +28,6 @@ from symsteer.policies.networks.equivariant import (
     Project,
     RegularLinear,
 )
-from symsteer.policies.networks.points import PointEncoder
 from symsteer.policies.networks.slices import FixedResidualMLP, ResidualMLP, TemporalUNet
 from symsteer.policies.training.denoising import DenoisingOptions, DiffusionPolicy
 
@@ -37,8 +36,7 @@ class LiftedDenoiser(Denoiser):
     """A denoiser that commutes with a finite group.
 
     Args:
-        options: horizon and sizes, for each group element. A cloud of points in the observation
-            has an encoder of its own.
+        options: horizon and sizes, for each group element.
         obs_layout: geometry of one (normalised) observation.
         act_layout: geometry of one (normalised) action.
         group: a finite group.
@@ -54,11 +52,8 @@ class LiftedDenoiser(Denoiser):
         self.flat = options.network == "mlp"
         layout = act_layout.repeat(options.horizon) if self.flat else act_layout
         make = self.make_layer
-        self.cloud = obs_layout.cloud
-        told = self.cloud.rest if self.cloud else obs_layout
-        self.obs_lift = make(Lift(told, group, channels))
+        self.obs_lift = make(Lift(obs_layout, group, channels))
         self.obs_mix = make(RegularLinear(group, channels, channels))
-        self.points = PointEncoder(self.cloud.point, group, channels) if self.cloud else None
         self.chunk_lift = make(Lift(layout, group, width))
         self.slice_network = ResidualMLP(width, options.depth) if self.flat else TemporalUNet(width)
         self.project = make(Project(group, width, layout))
@@ -71,11 +66,7 @@ class LiftedDenoiser(Denoiser):
 
     def embed(self, obs: torch.Tensor) -> torch.Tensor:
         """Embedding of an observation; ``[B, obs_dim] -> [B, order, channels]``."""
-        if self.points is None or self.cloud is None:
-            return self.obs_mix(functional.silu(self.obs_lift(obs)))
-        known = self.obs_lift(obs[..., self.cloud.rest_columns.to(obs.device)])
-        seen = self.points(obs[..., self.cloud.columns.to(obs.device)], functional.silu(known))
-        return self.obs_mix(functional.silu(known + seen))
+        return self.obs_mix(functional.silu(self.obs_lift(obs)))
 
     def encode(self, obs: torch.Tensor) -> torch.Tensor:
         """What the network sees of it; ``[B, obs_dim] -> [B, order, condition]``."""
@@ -106,8 +97,6 @@ class LiftedDenoiser(Denoiser):
             layer = getattr(self, name)
             if hasattr(layer, "dense"):
                 fast.register_module(name, ExpandedLayer(layer))
-        if self.points is not None:
-            fast.points = self.points.expanded()
         if isinstance(self.slice_network, ResidualMLP):
             fast.register_module("slice_network", FixedResidualMLP(self.slice_network))
         return fast

@@ -90,9 +90,9 @@ class ToldEquivariantPolicy(Joint, EquivariantDiffusionPolicy):
 
     def make_denoiser(self) -> ToldDenoiser:
         """The network of all tasks, or of one; both hear."""
-        if self.obs_layout.cloud:
+        if self.eyes:
             raise UserError(
-                f"the policy {self.name} takes no clouds of points; choose another policy"
+                f"the policy {self.name} takes no clouds or pictures; choose another policy"
             )
         group = Group.parse(self.options.group)
         return ToldDenoiser(self.options, self.obs_layout, self.chunk_layout, group)

@@ -24,7 +24,9 @@ from symsteer.names import check
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.networks.in_hand import HandEncoder
+from symsteer.policies.networks.keypoints import KeypointEncoder
 from symsteer.policies.networks.pictures import PictureEncoder
+from symsteer.policies.networks.points import CloudEncoder
 from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.training.diffusion import Diffusion, Prediction, Process
 from symsteer.policies.training.frames import Frame
@@ -41,6 +43,9 @@ DECODE_FIELDS = (
 
 LATER_FIELDS = {"process": "diffusion", "action_frame": ""}
 """The same, of policies that have another value than this one, which earlier versions had."""
+
+Expanded = tuple[Denoiser, Sequence[torch.Tensor], KeypointEncoder | None]
+"""Ready for inference: the denoiser, what it sees of each noise level, and the encoder."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +143,9 @@ class DiffusionPolicy(GradientPolicy):
                 f"orbit_targets need a group, and the network of {self.name} has none; leave them "
                 "out, or choose another policy"
             )
-        self._expanded: tuple[Denoiser, Sequence[torch.Tensor], PictureEncoder | None] | None = None
+        self._expanded: tuple[Denoiser, Sequence[torch.Tensor], KeypointEncoder | None] | None = (
+            None
+        )
         self.freeze()
 
     def _zero_output(self) -> None:
@@ -158,13 +165,15 @@ class DiffusionPolicy(GradientPolicy):
 
     @classmethod
     def check(cls, options: Any, obs_layout: Layout) -> None:
-        """Pictures need an encoder; see :meth:`ChunkPolicy.check`."""
+        """Clouds and pictures need an encoder; see :meth:`ChunkPolicy.check`."""
         with torch.random.fork_rng(devices=[]):
             cls.make_eyes(options, obs_layout)
 
     @classmethod
-    def make_eyes(cls, options: Any, obs_layout: Layout) -> PictureEncoder | None:
-        """The encoder of the picture, untrained, if there is a picture."""
+    def make_eyes(cls, options: Any, obs_layout: Layout) -> KeypointEncoder | None:
+        """The encoder of the cloud or picture, untrained, if there is one."""
+        if obs_layout.cloud is not None:
+            return CloudEncoder(obs_layout.cloud, cls.picture_group(options))
         picture = obs_layout.picture
         if picture is None:
             return None
@@ -179,14 +188,14 @@ class DiffusionPolicy(GradientPolicy):
 
     @classmethod
     def picture_group(cls, options: Any) -> Group:
-        """Group of the encoder of pictures from above.
+        """Group of the encoder of clouds and of pictures from above.
 
         Raises:
             UserError: if the policy has none.
         """
         raise UserError(
-            f"the policy {cls.name} has no encoder of such pictures; choose one that has: edp, "
-            "escnn, plain or plain-augmented"
+            f"the policy {cls.name} has no encoder of what these cameras see; choose one that has: "
+            "edp, escnn, plain or plain-augmented"
         )
 
     @property
@@ -206,15 +215,15 @@ class DiffusionPolicy(GradientPolicy):
         return obs, chunks
 
     def observation_statistics(self, obs: torch.Tensor) -> Normalizer:
-        """Of demonstrated observations; those of pictures are the encoder's."""
+        """Of demonstrated observations; those of what cameras see are the encoder's."""
         if self.eyes is None:
             return super().observation_statistics(obs)
-        picture = self.eyes.picture
-        rest = Normalizer.fit(self.bounded_layout(picture.rest), obs[:, picture.rest_columns])
+        seen = self.eyes.seen
+        rest = Normalizer.fit(self.bounded_layout(seen.rest), obs[:, seen.rest_columns])
         return self.eyes.statistics(obs, rest)
 
     def see(self, obs: torch.Tensor) -> torch.Tensor:
-        """Encode the picture, if there is one; see :meth:`ChunkPolicy.see`."""
+        """Encode the cloud or picture, if there is one; see :meth:`ChunkPolicy.see`."""
         eyes = self._inference()[2]
         return obs if eyes is None else eyes(obs)
 
@@ -270,7 +279,7 @@ class DiffusionPolicy(GradientPolicy):
         values = {k: options[k] for k in (*DECODE_FIELDS, *LATER_FIELDS) if k in options}
         return {key: x for key, x in values.items() if LATER_FIELDS.get(key) != x}
 
-    def _inference(self) -> tuple[Denoiser, Sequence[torch.Tensor], PictureEncoder | None]:
+    def _inference(self) -> Expanded:
         """The denoiser with dense matrices, what it sees of each noise level, and the encoder."""
         if self._expanded is None:
             denoiser = self.denoiser.expanded()

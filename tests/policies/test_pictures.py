@@ -228,7 +228,9 @@ def test_augmentation_turns_the_picture_too() -> None:
 
 @pytest.mark.parametrize("name", ["canonical", "frame-averaged", "so2"])
 def test_policies_without_an_encoder_say_which_have_one(name) -> None:
-    with pytest.raises(UserError, match=f"{name} has no encoder of such pictures; .*edp, escnn"):
+    with pytest.raises(
+        UserError, match=f"{name} has no encoder of what these cameras see; .*edp, escnn"
+    ):
         fit(name)
 
 

@@ -8,7 +8,8 @@ import torch
 from symsteer.errors import UserError
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Field, Group, Layout
-from symsteer.policies.networks.points import PointEncoder
+from symsteer.policies.networks.denoiser import parameter_count
+from symsteer.policies.networks.points import CloudEncoder
 from symsteer.policies.normalizer import Normalizer
 from symsteer.policies.symmetry.joint import merged_layout
 from tests.marks import policy_class
@@ -71,63 +72,108 @@ def test_a_cloud_needs_as_many_heights_as_places_and_something_beside_it(fields)
         _ = Layout(fields).cloud
 
 
-def test_points_share_their_scale() -> None:
-    obs, _ = observe(50)
-    fitted, places = Normalizer.fit(SEEN, obs), SEEN.slice("cloud_xy")
-    assert (fitted.scale[places] == fitted.scale[places][0]).all()
-    assert fitted.scale[SEEN.slice("cloud_z")].unique().numel() == 1
-    farthest = obs[:, places].reshape(-1, 2).norm(dim=1).max().item()
-    assert fitted.scale[places][0] == pytest.approx(farthest)
-    alone = Normalizer.fit(SEEN.cloud.rest, obs[:, :3])
-    assert torch.equal(fitted.scale[:3], alone.scale)
-    assert torch.equal(fitted.offset[:3], alone.offset)
+def encoder_of(group: str) -> CloudEncoder:
+    torch.manual_seed(0)
+    encoder = CloudEncoder(SEEN.cloud, Group.parse(group)).double()
+    encoder.scale.fill_(0.1)
+    return encoder
 
 
-@pytest.mark.parametrize("group", ["C4", "C8", "D4"])
-def test_decoding_commutes_with_the_group_and_with_every_order(group) -> None:
-    policy = fit("edp", group=group)
-    obs, _ = observe(4, seed=1)
-    assert_exact(policy, obs=obs)
-    noise = noises(4)[:, :2]
-    chunk = policy.decode(obs, noise)
+@pytest.mark.parametrize("group", ["C4", "C8"])
+def test_the_encoder_commutes_with_the_group_and_with_every_order(group) -> None:
+    encoder, obs = encoder_of(group), observe(3)[0].double()
+    told = encoder(obs)
+    assert told.shape == (3, encoder.layout.dim)
+    for network in (encoder, encoder.expanded()):
+        for angle, _ in network.group.elements:
+            turned = network(SEEN.transform(obs, angle))
+            error = (turned - network.layout.transform(told, angle)).abs().max()
+            assert error < 1e-12
+            assert angle == 0 or (turned - told).abs().max() > 1e-4
     mixed, columns = obs.clone(), SEEN.cloud.columns
     mixed[:, columns] = obs[:, columns.flip(0)]
-    assert (policy.decode(mixed, noise) - chunk).abs().max() < 1e-5
+    torch.testing.assert_close(encoder(mixed), told)
     mixed[:, columns] = obs[:, columns].flip(0)
-    assert (policy.decode(mixed, noise) - chunk).abs().max() > 1e-4
+    assert (encoder(mixed) - told).abs().max() > 1e-4
 
 
-def test_a_point_that_occurs_twice_counts_once_and_is_met_with_the_rest() -> None:
+def test_a_point_that_occurs_several_times_counts_once() -> None:
     """Where few points are visible, some are repeated."""
-    encoder = PointEncoder(SEEN.cloud.point, Group.parse("C4"), 8)
-    generator = torch.Generator().manual_seed(0)
-    points = torch.randn(3, 5, 3, generator=generator)
-    known = torch.randn(3, 4, 8, generator=generator)
-    seen = encoder(points, known)
-    torch.testing.assert_close(encoder(points[:, [0, 1, 2, 3, 4, 4, 4]], known), seen)
-    assert not torch.allclose(encoder(points, 2 * known), seen)
-    fast = encoder.expanded()
-    torch.testing.assert_close(fast(points, known), seen)
-    assert not list(fast.parameters())
+    encoder, obs = encoder_of("C4"), observe(3)[0].double()
+    columns = SEEN.cloud.columns
+    once, twice = obs.clone(), obs.clone()
+    # The last two points are copies of one, or of two others.
+    once[:, columns[-2:]] = obs[:, columns[[0, 0]]]
+    twice[:, columns[-2:]] = obs[:, columns[[1, 2]]]
+    torch.testing.assert_close(encoder(twice), encoder(once))
+
+
+def test_what_the_keypoints_tell_is_about_the_points() -> None:
+    """Their mean is among the points; heights have a scale of their own."""
+    encoder, (obs, place) = encoder_of("C8"), observe(5)
+    told, layout = encoder(obs.double()), encoder.layout
+    assert (told[:, layout.slice("keypoint0_place")] - place).norm(dim=1).max() < 0.15
+    assert told[:, layout.slice("keypoint0_z")].abs().max() < 0.1
+    fitted = encoder.statistics(obs.double(), Normalizer.fit(SEEN.cloud.rest, obs[:, :3]))
+    assert encoder.scale.item() == pytest.approx(obs[:, SEEN.cloud.columns][..., 2].abs().max())
+    assert torch.equal(fitted.scale[:3], Normalizer.fit(SEEN.cloud.rest, obs[:, :3]).scale)
+
+
+def test_the_plain_encoder_has_as_many_parameters_and_tells_as_much() -> None:
+    equivariant, plain = (CloudEncoder(SEEN.cloud, Group.parse(group)) for group in ("C8", "C1"))
+    assert parameter_count(plain) == pytest.approx(parameter_count(equivariant), rel=0.1)
+    assert plain.told.dim == pytest.approx(equivariant.told.dim, rel=0.1)
+
+
+def test_a_point_has_a_place_and_a_height() -> None:
+    cloud = Layout([Field("tcp", 1), Field("cloud_xy", 1, 3), Field("cloud_red", 0, 3)]).cloud
+    with pytest.raises(UserError, match=r"needs the fields cloud_xy .* and cloud_z"):
+        CloudEncoder(cloud, Group.parse("C4"))
+
+
+@pytest.mark.parametrize("group", ["C4", "C8"])
+def test_decoding_commutes_with_the_group_in_what_the_task_shows(group) -> None:
+    policy = fit("edp", group=group)
+    obs, noise = observe(4, seed=1)[0], noises(4)[:, :2]
+    seen = policy.see(obs)
+    assert_exact(policy, obs=seen)
+    for angle, _ in policy.group.elements:
+        turned = policy.see(SEEN.transform(obs, angle))
+        torch.testing.assert_close(turned, policy.obs_layout.transform(seen, angle))
+    assert policy.obs_layout.cloud is None
+    assert policy.task_layout == SEEN
+    assert policy.decode(seen, noise).shape == noise.shape
 
 
 def test_the_place_of_the_points_is_learned() -> None:
     policy = fit("edp", steps=120, count=60, batch_size=64)
     obs, place = observe(64, seed=2)
-    chunk = policy.decode(obs, torch.zeros(64, 2, ACT.dim))
+    chunk = policy.decode(policy.see(obs), torch.zeros(64, 2, ACT.dim))
     moved = chunk[:, 0, ACT.slice("xy")]
     reach = place - obs[:, :2]
     wanted = reach / reach.norm(dim=1, keepdim=True).clamp_min(0.25)
     assert (moved - wanted).norm(dim=1).mean() < 0.35 * wanted.norm(dim=1).mean()
 
 
-@pytest.mark.parametrize("name", ["plain", "escnn", "frame-averaged"])
+@pytest.mark.parametrize("name", ["plain", "plain-augmented", "escnn"])
 def test_other_policies_take_clouds_and_can_be_saved(name, tmp_path) -> None:
     policy = fit(name)
-    obs, _ = observe(3)
-    noise = noises(3)[:, :2]
+    seen, noise = policy.see(observe(3)[0]), noises(3)[:, :2]
     loaded = load_policy(save_policy(policy, tmp_path))
-    assert torch.equal(loaded.decode(obs, noise), policy.decode(obs, noise))
+    assert torch.equal(loaded.see(observe(3)[0]), seen)
+    assert torch.equal(loaded.decode(seen, noise), policy.decode(seen, noise))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "problem"),
+    [
+        ("frame-averaged", {}, "has no encoder of what these cameras see"),
+        ("edp", {"group": "D4"}, "commutes with rotations alone"),
+    ],
+)
+def test_policies_without_an_encoder_refuse_clouds(name, options, problem) -> None:
+    with pytest.raises(UserError, match=problem):
+        fit(name, **options)
 
 
 def test_clouds_have_no_place_among_several_tasks() -> None:

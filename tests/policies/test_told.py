@@ -192,7 +192,7 @@ def test_clouds_of_points_are_refused():
     cloud = Layout(
         [*OBS.fields, Field("cloud_xy", 1, multiplicity=5), Field("cloud_z", 0, multiplicity=5)]
     )
-    with pytest.raises(UserError, match="edp-told takes no clouds of points"):
+    with pytest.raises(UserError, match="edp-told takes no clouds or pictures"):
         untrained("edp-told", (cloud, ACT))
 
 

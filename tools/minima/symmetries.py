@@ -121,7 +121,7 @@ class Geometry:
         denoiser = policy.denoiser
         # A subclass may have other layers.
         other = type(denoiser) is not LiftedDenoiser or not denoiser.flat
-        if other or denoiser.cloud or policy.task_layout.picture:
+        if other or policy.eyes:
             raise UserError(
                 f"the parameter symmetries of this network of {policy.name} are not known; use "
                 "edp, plain or plain-augmented with network=mlp and a task that is seen as poses"

@@ -59,8 +59,9 @@ def measure(
     Returns:
         A row for each device, policy and number of ``chunks``: ``device``, ``policy``, ``options``
         (those that are not the default), ``parameters``, ``sampling_steps`` (None for policies
-        without them), milliseconds of one call ``median``, ``min``, ``max``, and ``products``, the
-        median of the matrix products alone. They are of CPU time, with a GPU of wall-clock time.
+        without them), milliseconds of one call ``median``, ``min``, ``max``, ``products``, the
+        median of the matrix products alone, and ``see``, that of encoding as many observations,
+        once for each decision. They are of CPU time, with a GPU of wall-clock time.
     """
     rows: list[dict[str, Any]] = []
     contenders: list[Callable[[], Any]] = []
@@ -73,7 +74,8 @@ def measure(
             report(f"without {name}: {error}")
             continue
         for chunks in CHUNKS:
-            decode = functools.partial(policy.decode, *_inputs(policy, chunks))
+            seen, noise, shown = _inputs(policy, chunks)
+            decode = functools.partial(policy.decode, seen, noise)
             rows.append(
                 {
                     "device": device,
@@ -84,11 +86,11 @@ def measure(
                     "chunks": chunks,
                 }
             )
-            contenders += [decode, products_of(decode)]
+            contenders += [decode, products_of(decode), functools.partial(policy.see, shown)]
     times = in_turns(contenders, calls, repeats, report, clock_of(devices))
-    for row, found, products in zip(rows, times[::2], times[1::2], strict=True):
+    for row, found, products, see in zip(rows, times[::3], times[1::3], times[2::3], strict=True):
         row |= {"median": statistics.median(found), "min": min(found), "max": max(found)}
-        row |= {"products": statistics.median(products)}
+        row |= {"products": statistics.median(products), "see": statistics.median(see)}
     return rows
 
 
@@ -97,10 +99,11 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     units = {row["chunks"]: row["median"] for row in reversed(rows)}
     lines = [
         f"{time_on([row['device'] for row in rows])} of one call of decode, one thread; "
-        "median of the measurements (smallest to largest), and of its matrix products alone",
+        "median of the measurements (smallest to largest), of its products alone, and of see",
         "",
         f"{'device':6s} {'policy':30s} {'parameters':>10s} {'steps':>5s} {'chunks':>6s} "
-        f"{'ms':>7s} {'':18s} {'ratio':>5s} {'products':>8s} {'share':>5s}",
+        f"{'ms':>7s} {'':18s} {'ratio':>5s} {'products':>8s} {'share':>5s} "
+        f"{'see':>6s}",
     ]
     for row in rows:
         spread = f"({row['min']:.1f} to {row['max']:.1f})"
@@ -111,13 +114,14 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             f"{row['device']:6s} {name:30s} {row['parameters']:10,d} "
             f"{row['sampling_steps'] or '':>5} {row['chunks']:6d} {row['median']:7.2f} "
             f"{spread:18s} {row['median'] / units[row['chunks']]:5.2f} {row['products']:8.2f} "
-            f"{row['products'] / row['median']:5.0%}"
+            f"{row['products'] / row['median']:5.0%} {row['see']:6.2f}"
         )
     return "\n".join(lines)
 
 
-def _inputs(policy: ChunkPolicy, chunks: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _inputs(policy: ChunkPolicy, chunks: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     obs = 0.1 * torch.randn(chunks, policy.obs_layout.dim, generator=generator)
     noise = torch.randn(chunks, policy.horizon, policy.act_layout.dim, generator=generator)
-    return obs.to(policy.device), noise.to(policy.device)
+    shown = 0.1 * torch.rand(chunks, policy.task_layout.dim, generator=generator)
+    return obs.to(policy.device), noise.to(policy.device), shown.to(policy.device)

@@ -118,6 +118,19 @@ def test_points_lie_on_the_cube(seen):
 
 @needs_vulkan
 @pytest.mark.slow
+def test_the_goal_hides_nothing():
+    """Wherever it is drawn, the cube's points stay."""
+    env = make("SeenPickCube-v1", num_envs=1)
+    env.reset(seed=[3])
+    apart, there = env.cloud(), env.cube.pose
+    env.goal_site.set_pose(there)
+    assert torch.equal(env.cloud(), apart)
+    assert not env.goal_site.hidden
+    env.close()
+
+
+@needs_vulkan
+@pytest.mark.slow
 def test_what_is_seen_turns_with_the_scene(seen):
     """Exactly under quarter turns, up to a picture's rounding; else up to its pixels."""
     seen.reset(seed=[3, 4])
