@@ -31,6 +31,18 @@ class Page(NamedTuple):
     blocks: list[str]
 
 
+def one_page(
+    word: str, title: str, render: Callable[[Result, View], list[str]]
+) -> Callable[[Result, View], list[Page]]:
+    """The blocks of a section as a page whose file is called by a word, for `Section.apart`."""
+
+    def pages(result: Result, view: View) -> list[Page]:
+        blocks = render(result, view)
+        return [Page([word], title, blocks)] if blocks else []
+
+    return pages
+
+
 @dataclass(frozen=True)
 class Section(Generic[Result]):
     """One statistic, or one view of the records.

@@ -17,7 +17,7 @@ from symsteer.leaderboard.known_agents import STANDARD, USING_SYMMETRY
 from symsteer.leaderboard.pairs import MEASURES, SHORT_NAMES
 from symsteer.leaderboard.plots import GREY, Axis, Dot, Figure, Look, Plot, Rule, Trace, cut
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
-from symsteer.leaderboard.sections import Section, View
+from symsteer.leaderboard.sections import Section, View, one_page
 from symsteer.leaderboard.text import (
     MARKS,
     NOTHING,
@@ -322,11 +322,14 @@ def _lines(fit: Fit) -> list[Trace]:
     return traces
 
 
+TITLE = "The advantage of symmetry against the defect"
+
 SECTION = Section(
-    "The advantage of symmetry against the defect",
+    TITLE,
     lambda findings: defect_map(findings.summary, findings.audit),
     render,
     figures=lambda advantages, summary: [
         figure(advantages, embodiment) for embodiment in advantages.embodiments
     ],
+    apart=one_page("defects", TITLE, render),
 )

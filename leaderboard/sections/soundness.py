@@ -16,7 +16,7 @@ from symsteer.leaderboard.known_agents import BASE
 from symsteer.leaderboard.pairs import reference_success
 from symsteer.leaderboard.rows import AgentRow, Summary, Table
 from symsteer.leaderboard.runs import Run, episode_success
-from symsteer.leaderboard.sections import Page, Section, View
+from symsteer.leaderboard.sections import Section, View, one_page
 from symsteer.leaderboard.statistics import paired_differences
 from symsteer.leaderboard.text import NOTHING, code, compact, number, table_text
 
@@ -132,12 +132,11 @@ def of_learners(summary: Summary) -> list[tuple[Table, AgentRow, Soundness]]:
     ]
 
 
-def pages(learners: Sequence[tuple[Table, AgentRow, Soundness]], view: View) -> list[Page]:
-    """The same as one page."""
-    blocks = render(learners, view)
-    return [Page(["soundness"], TITLE, blocks)] if blocks else []
-
-
 TITLE = "Are the learners sound"
 
-SECTION = Section(TITLE, lambda findings: of_learners(findings.summary), render, apart=pages)
+SECTION = Section(
+    TITLE,
+    lambda findings: of_learners(findings.summary),
+    render,
+    apart=one_page("soundness", TITLE, render),
+)
