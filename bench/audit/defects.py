@@ -85,8 +85,7 @@ def audit(
         settings: what to measure.
         reference: the unbroken task, from :func:`reference_task`.
         visited: its states, from :func:`visit_all`; the same for all variants of a task.
-        policy: visited states, and makes of pictures what agents see; the result stores its
-            content hash.
+        policy: visited states, and encodes what cameras see; the result stores its content hash.
 
     Raises:
         UserError: see :meth:`AuditSettings.check`.
@@ -94,8 +93,8 @@ def audit(
     settings.check()
     begin, seed = time.perf_counter(), settings.seed
     group = check_group(settings.group)
-    # What a picture shows is compared as agents see it, after the encoder of the base policy.
-    eyes = policy if reference.observation_layout.picture else None
+    # What cameras see is compared as agents see it, after the encoder of the base policy.
+    eyes = policy if reference.observation_layout.is_seen else None
     with Experiment(reference, settings.variant, group, visited, seed, eyes) as experiment:
         copies, resets = experiment.copies(), experiment.resets(settings.resets)
         centre, corners, layout = experiment.centre, experiment.corners, experiment.layout

@@ -82,14 +82,9 @@ class AuditSettings:
             UserError: an unknown task, embodiment, variant or group, or a number is out of range.
         """
         task = task_class(self.task)
-        if task.needs_cameras:
+        if task.is_seen() and self.states == "expert":
             raise UserError(
-                f"what cameras see of {self.task} cannot be compared point by point; audit the "
-                "task that tells the poses of its bodies: its physics are the same"
-            )
-        if task.observation_layout.picture and self.states == "expert":
-            raise UserError(
-                f"the pictures of {self.task} are compared after the encoder of a base policy; "
+                f"what cameras see of {self.task} is compared after the encoder of a base policy; "
                 "leave --base-policy none out, so that one is trained, or name its file there"
             )
         check_embodiment(self.embodiment)
@@ -100,9 +95,9 @@ class AuditSettings:
                     f"give a number, e.g. {spec.name}:{spec.strength}"
                 )
         group = check_group(self.group)
-        if task.observation_layout.picture and group.reflections:
+        if task.is_seen() and group.reflections:
             raise UserError(
-                f"no encoder of pictures has mirror symmetry, so that under {group} the encoder "
+                f"no encoder of what is seen has mirror symmetry, so that under {group} the encoder "
                 f"would be measured, not {self.task}; choose C_n, e.g. C{group.rotations}"
             )
         if self.count < LEAST_STATES:
@@ -181,7 +176,7 @@ class AuditResult:
 
     settings: AuditSettings
     base_policy: str | None
-    """Beginning of the content hash of the policy that visited states and encoded pictures."""
+    """Beginning of the content hash of the policy that visited states and encoded what is seen."""
     states: int
     moving: int
     unreachable: float

@@ -81,13 +81,15 @@ def test_variants_of_perception_turn_points_too():
 
 
 @pytest.mark.parametrize("task", SEEN)
-def test_the_layout_has_no_pose_of_what_is_seen_and_an_audit_names_the_task_to_take(task):
+def test_the_layout_has_no_pose_of_what_is_seen_and_an_audit_needs_an_encoder(task):
     names = [field.name for field in task_class(task).observation_layout.fields]
     assert names[-2:] == ["cloud_xy", "cloud_z"]
     assert not any("cube" in name for name in names)
     assert task_class(task).observation_layout.cloud.columns.shape == (POINTS, 3)
-    with pytest.raises(UserError, match="audit the task that tells the poses of its bodies"):
-        AuditSettings(task=task).check()
+    with pytest.raises(UserError, match="compared after the encoder of a base policy"):
+        AuditSettings(task=task, states="expert").check()
+    with pytest.raises(UserError, match="no encoder of what is seen has mirror symmetry"):
+        AuditSettings(task=task, states="both", group="D4").check()
 
 
 @pytest.mark.skipif(rendering_works(), reason="there is a Vulkan driver here")
