@@ -97,7 +97,7 @@ class AuditSettings:
         group = check_group(self.group)
         if task.is_seen() and group.reflections:
             raise UserError(
-                f"no encoder of what is seen has mirror symmetry, so that under {group} the encoder "
+                f"no encoder of what is seen has mirror symmetry, so under {group} the encoder "
                 f"would be measured, not {self.task}; choose C_n, e.g. C{group.rotations}"
             )
         if self.count < LEAST_STATES:
