@@ -34,6 +34,10 @@ DAMAGE = (
 """What a description or tensors of the wrong form raise while something is built from them."""
 
 
+class OutdatedError(UserError):
+    """A file is whole, but what it holds is no longer what the policy is."""
+
+
 Count = Annotated[int, Field(ge=0, le=10**12)]
 Size = Annotated[float, Field(ge=0, le=1e30)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -173,6 +177,8 @@ def load_policy(
         kind = POLICIES.get(description["name"])
         obs_layout = Layout.from_json(description["obs_layout"])
         act_layout = Layout.from_json(description["act_layout"])
+        if obs_layout.cloud and not any(name.startswith("eyes.") for name in tensors):
+            raise OutdatedError(f"{path} is of a time when clouds had no encoder; train it again")
         for side, layout in (("obs", obs_layout), ("act", act_layout)):
             # An encoder decides how many numbers a cloud or a picture becomes.
             if not layout.is_seen and layout.dim != len(tensors[f"{side}_normalizer.scale"]):
@@ -187,7 +193,7 @@ def load_policy(
         stored_hash = description["content_hash"]
         policy.training_record = description["training_record"]
         policy.report = description["report"]
-    except (NotAllowedError, NotInstalledError):
+    except (NotAllowedError, NotInstalledError, OutdatedError):
         raise
     except DAMAGE as error:
         reason = " ".join(first_problem(error).split())[:200]

@@ -137,7 +137,8 @@ def verdict(regret: Regret, safe: Safe, summary: Summary) -> str:
         return f"{declared} {everywhere}"
     known = ", ".join(map(code, safe.tested_on))
     new = _judged(compute(summary, safe.tested_on), safe)
-    return f"{declared} Without {known}, where it was tested before: {new} In all: {everywhere}"
+    in_all = everywhere.replace("**", "")
+    return f"{declared} Without {known}, where it was tested before: {new} In all: {in_all}"
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,9 @@ def verdict(lessons: Sequence[Lesson], rule: Probe | Kind) -> str:
     new = [(lesson, is_broken) for lesson, is_broken in worlds if lesson.task not in rule.found_on]
     right = [_right(new, measure) for measure in MEASURES]
     enough = [each for each in right if len(each) >= rule.least]
-    holds = all(sum(each) >= rule.right * len(each) for each in enough)
-    result = ("Supported" if holds else "Contradicted") if enough else "Not tested"
+    result = "Supported" if len(enough) == len(right) else "Not tested"
+    if any(sum(each) < rule.right * len(each) for each in enough):
+        result = "Contradicted"
     text = f"{declared} **{result}**: right in {_shares(right)}."
     if known:
         text += f" Of all tasks: {_shares([_right(worlds, measure) for measure in MEASURES])}."

@@ -68,7 +68,7 @@ class CloudEncoder(KeypointEncoder):
         hidden = functional.silu(self.mix(hidden) + self.all(hidden.amax(1))[:, None])
         # A point that occurs several times counts once.
         times = (points[:, :, None] == points[:, None]).all(-1).sum(-1)
-        logits = self.weigh(hidden) - times.log()[..., None, None]
+        logits = self.weigh(hidden) - times.to(points).log()[..., None, None]
         weights = logits.permute(0, 3, 2, 1).softmax(-1)
         return self.tell(weights, points[:, None, :, :2], points[:, None, :, 2])
 

@@ -10,11 +10,12 @@ import torch
 
 from symsteer.agents.asymmetry import asymmetry
 from symsteer.agents.diagnostics import actor_equivariance_error
+from symsteer.agents.free_bias import displaced
 from symsteer.agents.networks import dense, dense_of, within
 from symsteer.agents.replay import Transition
 from symsteer.policies.geometry import Field, Group, Layout
 from symsteer.policies.networks.equivariant import Lift, Project, RegularLinear
-from tests.agents.conftest import ACT, OBS, errors, trained
+from tests.agents.conftest import ACT, DOUBLE, EXECUTE, OBS, Problem, errors, trained
 
 WITH_DIAL = ("residual-pathway", "relaxed", "projected")
 ALL = (*WITH_DIAL, "constrained", "slow", "free-bias")
@@ -245,3 +246,37 @@ def test_the_truncated_actor_is_equivariant(problem):
     assert errors(agent, problem)["deterministic"] > 1e-4
     agent.mode = lambda obs: agent.alternatives()["truncated"](obs)
     assert errors(agent, problem)["deterministic"] < 1e-10
+
+
+def test_a_displacement_is_told_by_the_names_of_fields():
+    names = ("cube_xy", "tcp_to_cube_xy", "cube_to_goal_xy", "cube_to_peg_xy", "goal_xy", "tcp_xy")
+    layout = Layout([Field("cube_z", 0), *(Field(name, 1) for name in names), Field("rod_xy", 2)])
+    moves = displaced(layout)
+    assert [moves[layout.slice(name)].diagonal().tolist() for name in names] == [
+        *([1, 1], [1, 1], [-1, -1], [0, 0], [0, 0], [0, 0])
+    ]
+    assert not moves[layout.slice("rod_xy")].any()
+
+
+def test_free_biases_say_which_shift_they_undo():
+    """Critics of a symmetric world, whose inputs are displaced; each has a bias of its own, too."""
+    layout = Layout([Field("tcp_xy", 1), Field("cube_xy", 1), Field("tcp_to_cube_xy", 1)])
+    problem = Problem(layout)
+    agent = problem.agent("free-bias", **DOUBLE, normalize_obs=lambda obs: 5 * obs)
+    nothing = {"displacement_x": 0, "displacement_y": 0, "motion_x": 0, "motion_y": 0}
+    assert agent.shifts() == nothing
+    away = torch.tensor([0, 0, 0.02, -0.01, 0.02, -0.01], dtype=torch.float64)
+    step = torch.zeros(ACT.dim, dtype=torch.float64)
+    step[ACT.slice("xy")] = torch.tensor([0.15, 0.3], dtype=torch.float64)
+    layer, parameters = next(agent.critic.layers())
+    with torch.no_grad():
+        weight, _ = dense_of(layer, parameters)
+        inputs = torch.cat([-5 * away, step.repeat(EXECUTE)])
+        parameters["free_bias"].add_(weight @ inputs + 0.1)
+    wanted = {"displacement_x": 0.02, "displacement_y": -0.01, "motion_x": 0.15, "motion_y": 0.3}
+    assert agent.shifts() == pytest.approx(wanted)
+
+
+def test_without_the_place_of_a_body_no_shift_is_told(problem):
+    assert problem.agent("free-bias").shifts() == {}
+    assert Problem(BANDIT_OBS).agent("free-bias", critic_kind="noise").shifts() == {}

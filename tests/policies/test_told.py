@@ -94,8 +94,9 @@ def test_the_same_words_are_the_same_actions_and_others_are_not(both, tmp_path):
     assert 0 < (first - other).norm() < (first - wrong).norm()
     assert len(hashes) == 3
     assert said(policy, policy.options.instruction) is policy
-    policy.report.update(world="flat", steerability=1)
-    assert said(policy, held_out).report == {"world": "flat"}
+    measured = load_policy(save_policy(policy, tmp_path))
+    measured.report.update(world="flat", steerability=1)
+    assert said(measured, held_out).report == {"world": "flat"}
 
 
 @pytest.mark.long

@@ -152,6 +152,7 @@ def test_decoders_are_timed_beside_their_products():
     ]
     for row in rows:
         assert row["products"] > 0
+        assert row["see"] >= 0
         assert 0 < row["min"] <= row["median"] <= row["max"]
         assert row["sampling_steps"] == row["options"].get("sampling_steps", 2)
     assert "\ncpu    edp width 32 channels 32 " in decode.table(rows)

@@ -21,61 +21,90 @@ from symsteer.files import write_atomically
 from symsteer.leaderboard.catalogue import BIAS_CENTIMETRES
 from symsteer.leaderboard.records import RunRecord, read_record
 from symsteer.tables import markdown
-from symsteer.variant import UNBROKEN, parse_variant
+from symsteer.variant import UNBROKEN, VariantSpec, parse_variant
 from tools.pages.marks import CHECKOUT, write_tables
 
 PAGE = CHECKOUT / "docs" / "agents" / "asymmetry.md"
 RECORDS = CHECKOUT / "leaderboard" / "results" / "free-bias"
 
 MEASURES = {
-    "asymmetry_actor": "asymmetry of the actor",
-    "asymmetry_critic": "of the critics",
-    "equivariance_actor": "equivariance error of the actor",
+    "displacement_x": ("displacement x (cm)", 100, 2),
+    "displacement_y": ("y (cm)", 100, 2),
+    "motion_x": ("motion x (steps)", 1, 3),
+    "motion_y": ("y (steps)", 1, 3),
+    "asymmetry_actor": ("asymmetry of the actor", 1, 3),
+    "asymmetry_critic": ("of the critics", 1, 3),
 }
-
-
-def displacement(record: RunRecord) -> float:
-    """Centimetres along x by which what is seen is displaced."""
-    variant = record.settings.variant
-    strengths = [spec.strength for spec in parse_variant(variant)] if variant != UNBROKEN else []
-    return BIAS_CENTIMETRES * sum(each for each in strengths if isinstance(each, float))
+"""Heading, factor and digits of each diagnostic."""
 
 
 def render(records: Sequence[RunRecord]) -> str:
-    """Mean and standard deviation over base policies, and rank correlations over all runs."""
-    found: dict[str, dict[float, list[dict[str, float]]]] = defaultdict(lambda: defaultdict(list))
+    """Mean and standard deviation over base policies, and rank correlations with the displacement.
+
+    Raises:
+        UserError: for a record of another agent, or none.
+    """
+    found: dict[str, dict[tuple[float, str], list[dict[str, float]]]] = {}
     for record in records:
         last = record.evaluations[-1].diagnostics
         values = {name: x for name in MEASURES if (x := last.get(name)) is not None}
-        if len(values) < len(MEASURES):
-            raise UserError(f"{record.run_id} has no asymmetry: it is no run of free-bias")
-        found[record.settings.task][displacement(record)].append(values)
+        if record.settings.agent != "free-bias" or len(values) < len(MEASURES):
+            raise UserError(f"{record.run_id} is no run of free-bias that has its shifts")
+        variant = record.settings.variant
+        shift = displacement(variant)
+        # Other breaks come after the displacements.
+        place = float("inf") if shift is None else shift
+        of_task = found.setdefault(record.settings.task, defaultdict(list))
+        of_task[place, variant].append(values)
     if not found:
         raise UserError("no finished run of free-bias; run the suite free-bias")
     rows = []
     for task, of_task in sorted(found.items()):
-        for shift, runs in sorted(of_task.items()):
-            cells = [_spread([run[name] for run in runs]) for name in MEASURES]
-            rows.append([f"`{task}`", f"{shift:g} cm", str(len(runs)), *cells])
-        pairs = [(shift, run) for shift, runs in of_task.items() for run in runs]
+        for (_, variant), runs in sorted(of_task.items()):
+            shift = displacement(variant)
+            truth = "" if shift is None else f"{shift:g} cm"
+            cells = [_spread([run[name] for run in runs], name) for name in MEASURES]
+            rows.append([f"`{task}`", f"`{variant}`", truth, str(len(runs)), *cells])
+        pairs = [
+            (shift, run)
+            for (shift, _), runs in of_task.items()
+            for run in runs
+            if shift != float("inf")
+        ]
         shifts = [shift for shift, _ in pairs]
         ranks = [spearmanr(shifts, [run[name] for _, run in pairs]).statistic for name in MEASURES]
-        rows.append([f"`{task}`", "rank correlation", "", *(f"{rank:+.2f}" for rank in ranks)])
-    return markdown(["task", "displaced by", "runs", *MEASURES.values()], rows, left=2)
+        correlations = [f"{rank:+.2f}" for rank in ranks]
+        rows.append([f"`{task}`", "rank correlation", "", str(len(pairs)), *correlations])
+    heads = [heading for heading, _, _ in MEASURES.values()]
+    return markdown(["task", "world", "displaced by", "runs", *heads], rows, left=2)
 
 
-def _spread(values: Sequence[float]) -> str:
+def displacement(variant: str) -> float | None:
+    """Centimetres along x by which what is seen is displaced; None in worlds with other breaks."""
+    if variant == UNBROKEN:
+        return 0.0
+    match parse_variant(variant):
+        case (VariantSpec("perception_bias", float() as strength),):
+            return BIAS_CENTIMETRES * strength
+    return None
+
+
+def _spread(values: Sequence[float], name: str) -> str:
+    _, factor, digits = MEASURES[name]
+    values = [factor * value for value in values]
     deviation = statistics.stdev(values) if len(values) > 1 else 0.0
-    return f"{statistics.mean(values):.3f} ({deviation:.3f})"
+    return f"{statistics.mean(values):.{digits}f} ({deviation:.{digits}f})"
 
 
 def _collected(arguments: Sequence[str]) -> list[RunRecord]:
-    for folder in map(Path, arguments):
-        paths = [folder] if folder.is_file() else sorted(folder.glob("*/record.json"))
-        for path in paths:
-            if read_record(path).status == "finished":
-                RECORDS.mkdir(parents=True, exist_ok=True)
-                write_atomically(RECORDS / f"{path.parent.name}.json", path.read_bytes())
+    places = [Path(argument) for argument in arguments]
+    new = [f for p in places for f in ([p] if p.is_file() else sorted(p.glob("*/record.json")))]
+    finished = {path: record for path in new if (record := read_record(path)).status == "finished"}
+    if finished:
+        render([*finished.values()])  # refuses other runs before any is copied
+    for path in finished:
+        RECORDS.mkdir(parents=True, exist_ok=True)
+        write_atomically(RECORDS / f"{path.parent.name}.json", path.read_bytes())
     return [read_record(path) for path in sorted(RECORDS.glob("*.json"))]
 
 

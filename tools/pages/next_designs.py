@@ -1,10 +1,11 @@
-"""Writes a table of docs/between.md: are the next designs safe to take?
+"""Writes a table of docs/between.md: do the next designs meet the criterion of a safe agent?
 
 python -m tools.pages.next_designs            # from the committed records
 python -m tools.pages.next_designs RUNS...    # from other records, a folder or a record each
 
 Each design is judged beside the learners of the suite dial, without the other designs, by what the
-claims of that suite ask of the agent that they call safe.
+claims of that suite ask of the agent that they call safe: in all its worlds, and without the one in
+which the designs were chosen.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.row_numbers import summarize
 from symsteer.leaderboard.runs import Run, load_runs
 from symsteer.leaderboard.sections.regret import MEASURES, compute, standings
-from symsteer.leaderboard.study import read_study
+from symsteer.leaderboard.study import Safe, read_study
 from symsteer.leaderboard.text import code, interval, number
 from symsteer.tables import markdown
 from tools.pages.marks import CHECKOUT, write_tables
@@ -30,29 +31,53 @@ RECORDS = RESULTS / "dial", RESULTS / "dial-next"
 DESIGNS = ("slow", "free-bias")
 """Those that went on to all worlds."""
 
+CHOSEN_IN = ("PickCube-v1", "actuator_offset:0.5")
+"""Task and variant of the world in which they were chosen."""
+
 STUDY = read_study("dial")
 
 
 def render(runs: Sequence[Run]) -> str:
-    """A row for each design, and one for the agent that the suite dial tested."""
-    safe, rows = STUDY.safe, []
+    """Rows of each design, and of the agent that the suite dial tested.
+
+    Raises:
+        UserError: a design lacks a run of the suite dial.
+    """
+    safe = STUDY.safe
     assert safe
-    for design in (*DESIGNS, safe.agent):
-        others = {*BETWEEN} - {design}
-        regret = compute(summarize([run for run in runs if run.agent not in others]))
-        if regret is None or design not in regret.learners:
-            raise UserError(f"{design} is not in all worlds of the suite dial; run dial-next")
-        found = standings(regret, safe.model_copy(update={"agent": design}))
-        place, cells = regret.learners.index(design), []
-        for measure in MEASURES:
-            each = found[measure]
-            cells += [interval(of[measure][place]) for of in (regret.mean, regret.worst)]
-            cells.append(f"{number(each.above, 3)} ({number(each.least, 3)})")
-        passed = "yes" if all(each.holds for each in found.values()) else "no"
-        rows.append([code(design), str(len(regret.cells)), *cells, passed])
+    for design in DESIGNS:
+        if missing := _settings(runs, safe.agent) - _settings(runs, design):
+            raise UserError(f"{design} lacks {len(missing)} runs; finish the suite dial-next")
+    agents = [safe.model_copy(update={"agent": name}) for name in (*DESIGNS, safe.agent)]
+    elsewhere = [run for run in runs if _world(run) != CHOSEN_IN]
+    rows = [_row(part, agent) for part in (runs, elsewhere) for agent in agents]
     heads = ["mean", "worst", "above an agent without regret (best of the others)"]
     columns = [f"{measure}: {head}" for measure in MEASURES for head in heads]
-    return markdown(["learner", "worlds", *columns, "safe"], rows, left=1)
+    return markdown(["learner", "worlds", *columns, "meets it"], rows, left=1)
+
+
+def _world(run: Run) -> tuple[str, str]:
+    return run.record.settings.task, run.record.settings.variant
+
+
+def _settings(runs: Sequence[Run], agent: str) -> set[tuple[str, str, int, int]]:
+    """World, budget and base policy of an agent's finished runs."""
+    own = [run for run in runs if run.agent == agent and run.finished]
+    return {(*_world(run), run.record.settings.env_steps, run.seed) for run in own}
+
+
+def _row(runs: Sequence[Run], safe: Safe) -> list[str]:
+    """How the agent does beside the learners of the suite dial."""
+    others = {*BETWEEN} - {safe.agent}
+    regret = compute(summarize([run for run in runs if run.agent not in others]))
+    assert regret
+    found, place, cells = standings(regret, safe), regret.learners.index(safe.agent), []
+    for measure in MEASURES:
+        each = found[measure]
+        cells += [interval(of[measure][place]) for of in (regret.mean, regret.worst)]
+        cells.append(f"{number(each.above, 3)} ({number(each.least, 3)})")
+    met = "yes" if all(each.holds for each in found.values()) else "no"
+    return [code(safe.agent), str(len(regret.cells)), *cells, met]
 
 
 def main(arguments: Sequence[str]) -> int:

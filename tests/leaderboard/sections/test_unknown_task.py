@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from symsteer.leaderboard.sections.unknown_task import SECTION, verdict
 from symsteer.leaderboard.study import Kind, Probe
+from symsteer.leaderboard.text import NOTHING
 from symsteer.leaderboard.which_agent import lessons_of
 from tests.leaderboard.record_factory import make_cell, summary_of, view_of, with_policies
 
@@ -69,6 +72,20 @@ def test_tasks_on_which_a_rule_was_found_do_not_count() -> None:
     assert "tasks on which it was not found (it was on `A-v1`)." in text
     assert "**Contradicted**: right in 0/2 by AUC and in 0/2 by success." in text
     assert text.endswith(" Of all tasks: 1/3 by AUC and in 1/3 by success.")
+
+
+def test_a_rule_needs_enough_decided_worlds_by_each_measure() -> None:
+    cells = [
+        with_policies(make_cell({"equivariant": 0.2, "standard": 0.9}, variant=variant))
+        for variant in ("wind:1", "wind:0.5")
+    ]
+    lessons = [
+        replace(lesson, advantage={"success": lesson.advantage["success"]})
+        for lesson in lessons_of(summary_of(*cells))
+    ]
+    right, wrong = (verdict(lessons, Kind(standard=(name,))) for name in ("wind", "obstacle"))
+    assert right.endswith(f"**Not tested**: right in {NOTHING} by AUC and in 2/2 by success.")
+    assert wrong.endswith(f"**Contradicted**: right in {NOTHING} by AUC and in 0/2 by success.")
 
 
 def test_a_world_that_changes_in_mid_run_teaches_nothing() -> None:

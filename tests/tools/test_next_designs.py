@@ -1,0 +1,22 @@
+"""The table of the next designs: what the suite dial says of its own safe agent, and what is missing."""
+
+import pytest
+
+from symsteer.errors import UserError
+from symsteer.leaderboard.runs import load_runs
+from symsteer.leaderboard.text import SPACE
+from tools.pages import next_designs
+
+
+@pytest.mark.long
+def test_the_safe_agent_of_the_suite_dial_is_judged_as_on_its_page(monkeypatch):
+    """Its page has .020 and .048, and .187 and .137 of the best of the others."""
+    runs = load_runs([next_designs.RECORDS[0]], area_from=next_designs.STUDY.area_from)
+    with pytest.raises(UserError, match="slow lacks 108 runs; finish the suite dial-next"):
+        next_designs.render(runs)
+    monkeypatch.setattr(next_designs, "DESIGNS", ())
+    rows = next_designs.render(runs).replace(SPACE, " ").splitlines()[2:]
+    everywhere, elsewhere = ([cell.strip() for cell in row.split("|")[1:-1]] for row in rows)
+    assert everywhere[:2] == ["`residual-pathway`", "10"]
+    assert [everywhere[index] for index in (4, 7, 8)] == ["0.020 (0.187)", "0.048 (0.137)", "no"]
+    assert elsewhere[1] == "9"
