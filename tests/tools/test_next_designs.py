@@ -1,4 +1,4 @@
-"""The table of the next designs: what the suite dial says of its own safe agent, and what is missing."""
+"""The table of the next designs: the verdict of the suite dial on its own agent; missing runs."""
 
 import pytest
 
