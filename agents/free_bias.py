@@ -1,4 +1,4 @@
-"""Equivariant weights, free biases (ours): what a constant shift of the world breaks comes first.
+"""Equivariant weights and free biases (ours), which easily undo a constant shift of the world.
 
 The bias of an equivariant layer is the same for all group elements. Here the biases may differ,
 
