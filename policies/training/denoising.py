@@ -143,9 +143,7 @@ class DiffusionPolicy(GradientPolicy):
                 f"orbit_targets need a group, and the network of {self.name} has none; leave them "
                 "out, or choose another policy"
             )
-        self._expanded: tuple[Denoiser, Sequence[torch.Tensor], KeypointEncoder | None] | None = (
-            None
-        )
+        self._expanded: Expanded | None = None
         self.freeze()
 
     def _zero_output(self) -> None:

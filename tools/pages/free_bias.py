@@ -44,35 +44,28 @@ def render(records: Sequence[RunRecord]) -> str:
     Raises:
         UserError: for a record of another agent, or none.
     """
-    found: dict[str, dict[tuple[float, str], list[dict[str, float]]]] = {}
+    found: dict[str, dict[str, list[dict[str, float]]]] = defaultdict(lambda: defaultdict(list))
     for record in records:
         last = record.evaluations[-1].diagnostics
         values = {name: x for name in MEASURES if (x := last.get(name)) is not None}
         if record.settings.agent != "free-bias" or len(values) < len(MEASURES):
             raise UserError(f"{record.run_id} is no run of free-bias that has its shifts")
-        variant = record.settings.variant
-        shift = displacement(variant)
-        # Other breaks come after the displacements.
-        place = float("inf") if shift is None else shift
-        of_task = found.setdefault(record.settings.task, defaultdict(list))
-        of_task[place, variant].append(values)
+        found[record.settings.task][record.settings.variant].append(values)
     if not found:
         raise UserError("no finished run of free-bias; run the suite free-bias")
     rows = []
     for task, of_task in sorted(found.items()):
-        for (_, variant), runs in sorted(of_task.items()):
-            shift = displacement(variant)
-            truth = "" if shift is None else f"{shift:g} cm"
+        shifts = {variant: displacement(variant) for variant in of_task}
+        known = sorted((shift, variant) for variant, shift in shifts.items() if shift is not None)
+        others = sorted(variant for variant, shift in shifts.items() if shift is None)
+        truths = {variant: f"{shift:g} cm" for shift, variant in known} | dict.fromkeys(others, "")
+        for variant, truth in truths.items():
+            runs = of_task[variant]
             cells = [_spread([run[name] for run in runs], name) for name in MEASURES]
             rows.append([f"`{task}`", f"`{variant}`", truth, str(len(runs)), *cells])
-        pairs = [
-            (shift, run)
-            for (shift, _), runs in of_task.items()
-            for run in runs
-            if shift != float("inf")
-        ]
-        shifts = [shift for shift, _ in pairs]
-        ranks = [spearmanr(shifts, [run[name] for _, run in pairs]).statistic for name in MEASURES]
+        pairs = [(shift, run) for shift, variant in known for run in of_task[variant]]
+        true = [shift for shift, _ in pairs]
+        ranks = [spearmanr(true, [run[name] for _, run in pairs]).statistic for name in MEASURES]
         correlations = [f"{rank:+.2f}" for rank in ranks]
         rows.append([f"`{task}`", "rank correlation", "", str(len(pairs)), *correlations])
     heads = [heading for heading, _, _ in MEASURES.values()]
