@@ -63,7 +63,6 @@ AGENTS: Registry[type[Agent]] = Registry(
         "residual-pathway": "symsteer.agents.residual_pathway:ResidualPathwayAgent",
         "slow": "symsteer.agents.slow:SlowAgent",
         "free-bias": "symsteer.agents.free_bias:FreeBiasAgent",
-        "screened": "symsteer.agents.screened:ScreenedAgent",
         "relaxed": "symsteer.agents.relaxed:RelaxedAgent",
         "projected": "symsteer.agents.projected:ProjectedAgent",
         "constrained": "symsteer.agents.constrained:ConstrainedAgent",

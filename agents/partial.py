@@ -22,7 +22,6 @@ Found in the paper: the gate, its loss, both mixtures. Our choices, for they wer
   acting needs no samples.
 
 Upper-tail outliers are relative: where the symmetry is broken everywhere alike, nothing stands out.
-Whether it is, ``screened`` asks.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ REFERENCES = ("base", "zero", "golden-ticket")
 
 RETIRED_AGENTS: dict[str, Role] = {
     **dict.fromkeys(("approximate", "best-of-n-kernel"), "learner"),
-    **dict.fromkeys(("resilient", "chooser", "balanced"), "learner"),
+    **dict.fromkeys(("resilient", "chooser", "balanced", "screened"), "learner"),
 }
 """Agents whose records stay when SymSteer has them no more; `approximate` is of version 0.1."""
 
@@ -64,7 +64,7 @@ AGENTS: dict[str, Role] = {
     **dict.fromkeys(REFERENCES, "reference"),
     **dict.fromkeys(("standard", "standard-matched", "augmented", "equivariant"), "learner"),
     **dict.fromkeys(("residual-pathway", "relaxed", "projected", "constrained"), "learner"),
-    **dict.fromkeys(("slow", "free-bias", "screened"), "learner"),
+    **dict.fromkeys(("slow", "free-bias"), "learner"),
     **dict.fromkeys(("partial", "ensemble", "displaced"), "learner"),
     **dict.fromkeys(("residual", "best-of-n"), "learner"),
     **{"wrong-group": "control"},

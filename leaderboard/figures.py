@@ -23,7 +23,6 @@ STYLES: dict[str, tuple[str, str, Dash]] = {
     "approximate": ("#009E73", "^", "-"),
     "slow": ("#6A3D9A", "^", "-"),
     "free-bias": ("#B15928", "v", "-"),
-    "screened": ("#E7298A", "D", "-"),
     "relaxed": ("#44AA99", "P", "-"),
     "projected": ("#999933", "<", "-"),
     "constrained": ("#332288", "h", "-"),

@@ -26,7 +26,7 @@ USING_SYMMETRY = ("augmented", *WITH_SYMMETRY)
 """The agents whose advantage over `STANDARD` is shown by kind of break and on the map: the fair
 rival has the symmetry from data, the others have it in their networks."""
 
-BETWEEN = ("slow", "free-bias", "screened")
+BETWEEN = ("slow", "free-bias")
 """Agents that may leave the symmetry, or choose whether to."""
 
 ROW_ORDER = (

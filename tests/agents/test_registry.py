@@ -71,7 +71,7 @@ def test_the_order_is_that_of_a_comparison():
     learners = ["standard", "standard-matched", "augmented", "equivariant", "residual-pathway"]
     assert AGENTS.names()[:5] == learners
     roles = [AGENTS.get(name).role for name in AGENTS.builtin]
-    assert roles == ["learner"] * 16 + ["control"] + ["reference"] * 3
+    assert roles == ["learner"] * 15 + ["control"] + ["reference"] * 3
 
 
 @pytest.mark.parametrize("name", AGENTS.builtin)

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from symsteer.errors import UserError
-from symsteer.leaderboard.known_agents import BETWEEN
 from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.row_numbers import summarize
 from symsteer.leaderboard.runs import Run, load_runs
@@ -30,6 +29,9 @@ RECORDS = RESULTS / "dial", RESULTS / "dial-next"
 
 DESIGNS = ("slow", "free-bias")
 """Those that went on to all worlds."""
+
+DROPPED = ("screened",)
+"""Those that did not."""
 
 CHOSEN_IN = ("PickCube-v1", "actuator_offset:0.5")
 """Task and variant of the world in which they were chosen."""
@@ -68,7 +70,7 @@ def _settings(runs: Sequence[Run], agent: str) -> set[tuple[str, str, int, int]]
 
 def _row(runs: Sequence[Run], safe: Safe) -> list[str]:
     """How the agent does beside the learners of the suite dial."""
-    others = {*BETWEEN} - {safe.agent}
+    others = {*DESIGNS, *DROPPED} - {safe.agent}
     regret = compute(summarize([run for run in runs if run.agent not in others]))
     assert regret
     found, place, cells = standings(regret, safe), regret.learners.index(safe.agent), []
