@@ -98,11 +98,13 @@ class Answer:
     Attributes:
         sign: +1: `STRICT`; -1: `STANDARD`; 0: it refuses.
         reason: what it rests on, or why it refuses.
+        change: what would change it.
         lessons: worlds like this one, by the rule.
     """
 
     sign: int
     reason: str
+    change: str
     lessons: tuple[Lesson, ...] = ()
 
 
@@ -199,17 +201,22 @@ def by_kind(lessons: Sequence[Lesson], question: Question, measure: str) -> Answ
     It refuses if there are too few of them, if none is decided, or if the decided ones disagree.
     """
     if not question.kind:
-        return Answer(0, "the kind of break is not known")
+        return Answer(0, "the kind of break is not known", "to know how the world is broken")
     like = tuple(lesson for lesson in lessons if lesson.kind == question.kind)
     tasks = {lesson.task for lesson in like}
+    more = "more such worlds in which one agent is clearly better"
     if len(tasks) < LEAST_TASKS:
-        return Answer(0, f"other tasks with such a world: {len(tasks)}, {LEAST_TASKS} are needed")
+        few = f"other tasks with such a world: {len(tasks)}, {LEAST_TASKS} are needed"
+        return Answer(0, few, more)
     signs = [sign for lesson in like if (sign := lesson.sign(measure))]
     if not signs:
-        return Answer(0, f"no difference is clear in {len(like)} such worlds", like)
+        return Answer(0, f"no difference is clear in {len(like)} such worlds", more, like)
     if len(set(signs)) > 1:
-        return Answer(0, f"of {len(like)} such worlds, some are won by either", like)
-    return Answer(signs[0], f"{len(signs)} of {len(like)} such worlds are decided, and agree", like)
+        either = f"of {len(like)} such worlds, some are won by either"
+        return Answer(0, either, "nothing: it stays so while they are in the records", like)
+    reason = f"{len(signs)} of {len(like)} such worlds are decided, and agree"
+    other = STANDARD if signs[0] > 0 else STRICT
+    return Answer(signs[0], reason, f"one such world in which {other} is clearly better", like)
 
 
 def by_probe(lessons: Sequence[Lesson], question: Question, measure: str) -> Answer:
@@ -217,21 +224,24 @@ def by_probe(lessons: Sequence[Lesson], question: Question, measure: str) -> Ans
 
     It refuses if the interval of the gain holds the threshold.
     """
-    if question.gain is None:
-        return Answer(0, "the world was not probed")
     known = [lesson for lesson in lessons if lesson.gain]
-    if len({lesson.task for lesson in known}) < LEAST_TASKS:
-        return Answer(0, f"fewer than {LEAST_TASKS} other tasks were probed")
     limit = threshold(known, measure)
+    more = "records of more probed worlds"
+    if len({lesson.task for lesson in known}) < LEAST_TASKS:
+        return Answer(0, f"fewer than {LEAST_TASKS} other tasks were probed", more)
     if limit is None:
-        return Answer(0, "in the probed worlds that are decided, one agent always wins")
+        return Answer(0, "in the probed worlds that are decided, one agent always wins", more)
+    if question.gain is None:
+        return Answer(0, "the world was not probed", f"a gain clearly above or below {limit:+.3f}")
     low, high = question.gain.low, question.gain.high
     if low < limit <= high:
-        return Answer(0, f"the gain may lie on either side of {limit:+.3f}")
+        unclear = f"the gain may lie on either side of {limit:+.3f}"
+        return Answer(0, unclear, "a narrower interval: more base policies, or more episodes")
     above = low >= limit
     like = tuple(one for one in known if one.gain and (one.gain.value >= limit) == above)
-    word = "at least" if above else "less than"
-    return Answer(-1 if above else 1, f"a constant noise gains {word} {limit:+.3f}", like)
+    word, side = ("at least", "below") if above else ("less than", "above")
+    reason, change = f"a constant noise gains {word} {limit:+.3f}", f"a gain clearly {side} it"
+    return Answer(-1 if above else 1, reason, change, like)
 
 
 def by_decisions(lessons: Sequence[Lesson], question: Question, measure: str) -> Answer:
@@ -240,16 +250,19 @@ def by_decisions(lessons: Sequence[Lesson], question: Question, measure: str) ->
     It refuses if the p-value lies between the two limits.
     """
     p = question.direction
+    unlike, alike = f"unlike sides (p below {UNLIKE})", f"sides that look alike (p above {ALIKE})"
     if p is None:
-        return Answer(0, "no decisions are known")
+        change = f"a run of base, not of an arm: {unlike}, or {alike}"
+        return Answer(0, "no decisions are known", change)
     if UNLIKE <= p <= ALIKE:
-        return Answer(0, f"whether opposite sides are alike is unclear (p = {p:.3f})")
+        unclear = f"whether opposite sides are alike is unclear (p = {p:.3f})"
+        return Answer(0, unclear, f"more episodes: {unlike}, or {alike}")
     known = tuple(one for one in lessons if one.direction is not None)
     if p < UNLIKE:
         like = tuple(one for one in known if (one.direction or 0.0) < UNLIKE)
-        return Answer(-1, f"opposite sides are unlike (p = {p:.3f})", like)
+        return Answer(-1, f"opposite sides are unlike (p = {p:.3f})", alike, like)
     like = tuple(one for one in known if (one.direction or 0.0) > ALIKE)
-    return Answer(1, f"opposite sides look alike (p = {p:.3f})", like)
+    return Answer(1, f"opposite sides look alike (p = {p:.3f})", unlike, like)
 
 
 RULES: dict[str, Rule] = {"kind": by_kind, "probe": by_probe, "decisions": by_decisions}
@@ -334,11 +347,13 @@ def advise(
 
 def _measured(lesson: Lesson, measure: str) -> Answer:
     effect = lesson.advantage.get(measure)
+    change = "more runs in this world"
     if effect is None:
-        return Answer(0, "no paired runs")
+        return Answer(0, "no paired runs", change)
     bounds = f"[{effect.low:+.3f}, {effect.high:+.3f}]"
     text = f"{STRICT} minus {STANDARD} is {effect.value:+.3f} {bounds}"
-    return Answer(effect.sign, text if effect.sign else f"undecided: {text}", (lesson,))
+    reason = text if effect.sign else f"undecided: {text}"
+    return Answer(effect.sign, reason, change, (lesson,))
 
 
 def _predicted(values: Sequence[float]) -> Interval | None:

@@ -184,7 +184,12 @@ def _here(lessons: list[Lesson], task: str | None, embodiment: str, variant: str
 
 def _as_data(advice: Advice) -> dict[str, object]:
     answers = {
-        rule: {"sign": answer.sign, "reason": answer.reason, "worlds": len(answer.lessons)}
+        rule: {
+            "sign": answer.sign,
+            "reason": answer.reason,
+            "change": answer.change,
+            "worlds": len(answer.lessons),
+        }
         for rule, answer in advice.answers.items()
     }
     return {**vars(advice), "answers": answers}
@@ -217,6 +222,8 @@ def _text(advice: Advice) -> str:
         lines.append(f"  below the best learner: {_interval(advice.regret)}")
     if advice.rise or advice.regret:
         lines.append(f"  (in brackets: 95 % of such worlds, estimated from {advice.worlds})")
+    changes = [[f"    {rule}", one.change] for rule, one in advice.answers.items()]
+    lines += ["  what would change these answers", *aligned([], changes, left=2).splitlines()]
     return "\n".join(lines)
 
 

@@ -50,6 +50,7 @@ def test_a_world_of_the_records(advise):
     assert code == 0
     assert "success: take standard\n  records  take standard" in shown.out
     assert "From 6 worlds of 3 tasks, of 1 study." in shown.out
+    assert "  what would change these answers\n    records  more runs in this world" in shown.out
 
 
 def test_rules_learn_from_the_other_tasks_alone(advise):

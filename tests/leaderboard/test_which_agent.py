@@ -76,6 +76,8 @@ def test_the_kind_refuses_what_it_cannot_know(lessons: list[Lesson]) -> None:
     assert by_kind(lessons, Question(), "success").sign == 0
     one_task = [lesson for lesson in lessons if lesson.task == "A-v1"]
     assert by_kind(one_task, Question("none"), "success").sign == 0
+    said = by_kind(lessons, Question("none"), "success").change
+    assert said == "one such world in which standard is clearly better"
     other = lessons_in("D-v1", {"none": (0.0, "standard")})
     contradicted = by_kind([*lessons, *other], Question("none"), "success")
     assert (contradicted.sign, "either" in contradicted.reason) == (0, True)
@@ -95,19 +97,20 @@ def test_the_threshold_lies_between_the_worlds_of_either_agent(lessons: list[Les
 
 
 @pytest.mark.parametrize(
-    ("gain", "sign", "worlds"),
+    ("gain", "sign", "worlds", "change"),
     [
-        (Interval(0.0, -0.1, 0.1), 1, 6),
-        (Interval(0.2, 0.15, 0.3), -1, 6),
-        (Interval(0.2, 0.1, 0.3), 0, 0),
-        (None, 0, 0),
+        (Interval(0.0, -0.1, 0.1), 1, 6, "clearly above it"),
+        (Interval(0.2, 0.15, 0.3), -1, 6, "clearly below it"),
+        (Interval(0.2, 0.1, 0.3), 0, 0, "a narrower interval"),
+        (None, 0, 0, "clearly above or below +0.125"),
     ],
 )
 def test_a_probe_is_answered_where_it_is_clear(
-    lessons: list[Lesson], gain: Interval | None, sign: int, worlds: int
+    lessons: list[Lesson], gain: Interval | None, sign: int, worlds: int, change: str
 ) -> None:
     answer = by_probe(lessons, Question(gain=gain), "success")
     assert (answer.sign, len(answer.lessons)) == (sign, worlds)
+    assert change in answer.change
 
 
 def test_a_probe_needs_other_tasks_that_were_probed(lessons: list[Lesson]) -> None:
