@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from random import Random
 from typing import Any, ClassVar, Self
 
 import torch
@@ -87,6 +88,8 @@ class ToldEquivariantPolicy(Joint, EquivariantDiffusionPolicy):
     Options = ToldOptions
     options: ToldOptions
     denoiser: ToldDenoiser
+    said = 0
+    """Batches of the training until now."""
 
     def make_denoiser(self) -> ToldDenoiser:
         """The network of all tasks, or of one; both hear."""
@@ -106,11 +109,10 @@ class ToldEquivariantPolicy(Joint, EquivariantDiffusionPolicy):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Say something else in every batch: for each task one of its sentences of the training."""
         if len(self.options.tasks) == len(self.denoiser.heard):
-            drawn = []
-            for known in map(sentences, self.options.tasks):
-                number = int(torch.randint(len(known), (), generator=generator))
-                drawn.append(embedding(known[number]))
-            self.hear(drawn)
+            # Not from the generator: batches shall be those of a policy with a one-hot vector.
+            self.said += 1
+            draw = Random(f"{generator.initial_seed()} {self.said}").choice
+            self.hear([embedding(draw(sentences(task))) for task in self.options.tasks])
         return super().augment(obs, chunks, generator)
 
     def options_of(self, task: int) -> Any:

@@ -120,10 +120,10 @@ def spread(values: Sequence[float]) -> str:
     return f"{mean} [{low}, {high}]"
 
 
-def interval(values: Sequence[float]) -> str:
-    """Mean [95 % interval] by Student's t, marked where it is on one side of 0."""
+def interval(values: Sequence[float], confidence: float = 0.95) -> str:
+    """Mean [interval] by Student's t, marked where it is on one side of 0."""
     mean = statistics.mean(values)
-    half = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
+    half = stats.t.ppf((1 + confidence) / 2, len(values) - 1) * stats.sem(values)
     return difference(Interval(mean, mean - half, mean + half))
 
 
