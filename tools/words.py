@@ -117,7 +117,7 @@ def parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), help="two or more")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(30, 40)))
     parser.add_argument("--episodes", type=int, default=384, help=f"a multiple of {SENTENCES}")
-    parser.add_argument("--demonstrations", type=int, default=100, help="of each task")
+    parser.add_argument("--demonstrations", type=int, default=50, help="of each task")
     parser.add_argument("--steps", type=int, default=1500, help="gradient steps for each task")
     return parser.parse_args(arguments)
 

@@ -65,9 +65,7 @@ ROWS = [row(1, "A", 0.5, 0.6), row(1, "B", 0.3, 0.2), row(2, "A", 0.5, 0.8), row
 
 def write(folder, rows):
     path = folder / "words.json"
-    path.write_text(
-        json.dumps({"episodes": 12, "demonstrations": 100, "steps": 1500, "rows": rows})
-    )
+    path.write_text(json.dumps({"episodes": 12, "demonstrations": 50, "steps": 1500, "rows": rows}))
     return path
 
 
