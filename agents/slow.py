@@ -30,43 +30,32 @@ from symsteer.policies.geometry import Layout
 class SlowOptions(SacOptions):
     """Options of the slow agent."""
 
-    rate: float = 0.03
+    rate: float = 0.3
     """The dial: speed of the plain path relative to the strict one. 0: strict; 1: equally fast."""
-    bias_speed: float = 1.0
-    """Factor on the rate of the biases."""
-    critic_speed: float = 1.0
+    critic_speed: float = 0.1
     """Factor on the rate of the critics."""
-    start: int = 0
-    """Updates of a network before its plain path moves."""
-    shared: bool = False
-    """Whether Adam divides steps of the plain path by the gradients of the strict one: a gradient
-    that is as small as noise then makes a small step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require(
-            "not be negative",
-            lambda value: value >= 0,
-            *("rate", "bias_speed", "critic_speed", "start"),
-        )
+        self._require("not be negative", lambda value: value >= 0, "rate", "critic_speed")
 
 
 class Slow(TwoPaths):
     """The sum of both paths.
 
     Attributes:
-        rate, bias_rate: factors on the matrix and the bias of the plain path.
+        rate: factor on the plain path.
     """
 
-    rate = bias_rate = 1.0
+    rate = 1.0
 
     def dense_of(self, parameters: Parameters) -> tuple[torch.Tensor, torch.Tensor]:
         weight, bias = self.strict_of(parameters)
         weight = weight.add(parameters["free.weight"], alpha=self.rate)
-        return weight, bias.add(parameters["free.bias"], alpha=self.bias_rate)
+        return weight, bias.add(parameters["free.bias"], alpha=self.rate)
 
 
-@defaults_of("tuned")
+@defaults_of("minimax")
 class SlowAgent(AsymmetricAgent):
     """The equivariant agent with a slow plain path beside every layer."""
 
@@ -81,23 +70,5 @@ class SlowAgent(AsymmetricAgent):
         layers = super().layers(inputs, outputs, scale)
         for layer in layers:
             assert isinstance(layer, Slow)
-            layer.rate, layer.bias_rate = rate, rate * self.options.bias_speed
+            layer.rate = rate
         return layers
-
-    def settle(self, name: str) -> None:
-        """Hold the plain path at 0 before its start; give it the strict path's second moments."""
-        optimizer = self.optimizers[name]
-        begun = optimizer.steps > self.options.start
-        squares = iter(optimizer.moments["exp_avg_sq"])
-        for _, parameters in self.networks[name].layers():
-            mean = {}
-            for part, numbers in parameters.items():
-                path, kind = part.split(".", 1)
-                square = next(squares)
-                if path == "strict":
-                    dims = tuple(range(1, square.dim()))
-                    mean[kind] = square.mean(dims)
-                    continue
-                numbers.mul_(begun)
-                if self.options.shared:
-                    square.copy_(mean[kind].view(-1, *[1] * (square.dim() - 1)).expand_as(square))

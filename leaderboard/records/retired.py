@@ -27,6 +27,7 @@ RETIRED: dict[str, JsonValue] = {
 RETIRED_BESIDE: dict[str, dict[str, JsonValue]] = {
     "penalty": {"actor_penalty": None, "critic_penalty": None},
     "dual_lr": {"slack_price": 1.0},
+    "rate": {"bias_speed": 1.0, "start": 0, "shared": False},
 }
 """Options of those of them that have another option."""
 

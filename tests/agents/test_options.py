@@ -134,7 +134,7 @@ def test_a_preset_can_be_the_defaults(tmp_path, monkeypatch):
 
 
 SEARCHED = ("standard", "standard-matched", "augmented", "equivariant", "wrong-group")
-SEARCHED += ("residual-pathway", "free-bias")
+SEARCHED += ("residual-pathway", "slow", "free-bias")
 
 
 @pytest.mark.parametrize("name", AGENTS.builtin)

@@ -1,4 +1,4 @@
-"""Trials of the suites dial-a to dial-f: collects them, and chooses by minimax regret.
+"""Trials of the suites dial-a to dial-d: collects them, and chooses by minimax regret.
 
 python -m tools.pages.dial                       # the tables of the committed trials
 python -m tools.pages.dial RUNS [RUNS ...]       # adds finished runs of these folders
