@@ -27,12 +27,14 @@ RETIRED: dict[str, JsonValue] = {
 RETIRED_BESIDE: dict[str, dict[str, JsonValue]] = {
     "penalty": {"actor_penalty": None, "critic_penalty": None},
     "dual_lr": {"slack_price": 1.0},
-    "rate": {"bias_speed": 1.0, "start": 0, "shared": False},
 }
 """Options of those of them that have another option."""
 
-RETIRED_OF_AUGMENTED: dict[str, JsonValue] = {"augmentation": "C8"}
-"""Options of the agent `augmented`."""
+RETIRED_OF_AGENTS: dict[str, dict[str, JsonValue]] = {
+    "augmented": {"augmentation": "C8"},
+    "slow": {"bias_speed": 1.0, "start": 0, "shared": False},
+}
+"""Options of one agent alone."""
 
 RETIRED_OF_RUNS: dict[str, JsonValue] = {"keep_replay": False}
 """Options of runs of any agent."""
@@ -95,7 +97,7 @@ def _retired_of(config: Mapping[str, Any]) -> dict[str, JsonValue]:
     retired = dict(RETIRED)
     for option, beside in RETIRED_BESIDE.items():
         retired |= beside if option in options else {}
-    return retired | (RETIRED_OF_AUGMENTED if config.get("agent") == "augmented" else {})
+    return retired | RETIRED_OF_AGENTS.get(config.get("agent", ""), {})
 
 
 def _without(
