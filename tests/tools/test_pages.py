@@ -5,10 +5,19 @@ from __future__ import annotations
 import pytest
 
 from symsteer.files import write_together
-from tools.pages import audit, base_policies, marks, minima, next_designs, sides, tuning
+from tools.pages import (
+    audit,
+    base_policies,
+    free_bias,
+    marks,
+    minima,
+    next_designs,
+    sides,
+    tuning,
+)
 from tools.pages.marks import BEGIN, END, with_tables
 
-TOOLS = (audit, base_policies, minima, next_designs, sides, tuning)
+TOOLS = (audit, base_policies, free_bias, minima, next_designs, sides, tuning)
 
 
 @pytest.fixture
