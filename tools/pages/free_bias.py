@@ -1,4 +1,4 @@
-"""Writes the table of docs/agents/asymmetry.md: what free biases say of a displaced camera.
+"""Writes the tables of docs/agents/asymmetry.md: what free biases say of a displaced camera.
 
 python -m tools.pages.free_bias          # from the committed records
 python -m tools.pages.free_bias RUNS     # copies the finished records of the suite free-bias first
@@ -20,6 +20,7 @@ from symsteer.errors import UserError
 from symsteer.files import write_atomically
 from symsteer.leaderboard.catalogue import BIAS_CENTIMETRES
 from symsteer.leaderboard.records import RunRecord, read_record
+from symsteer.leaderboard.text import SPACE, number
 from symsteer.tables import markdown
 from symsteer.variant import UNBROKEN, VariantSpec, parse_variant
 from tools.pages.marks import CHECKOUT, write_tables
@@ -30,16 +31,15 @@ RECORDS = CHECKOUT / "leaderboard" / "results" / "free-bias"
 MEASURES = {
     "displacement_x": ("displacement x (cm)", 100, 2),
     "displacement_y": ("y (cm)", 100, 2),
-    "motion_x": ("motion x (steps)", 1, 3),
-    "motion_y": ("y (steps)", 1, 3),
-    "asymmetry_actor": ("asymmetry of the actor", 1, 3),
-    "asymmetry_critic": ("of the critics", 1, 3),
+    "motion_x": ("motion x (steps)", 1, 2),
+    "motion_y": ("y (steps)", 1, 2),
+    "asymmetry_critic": ("norm", 1, 2),
 }
 """Heading, factor and digits of each diagnostic."""
 
 
 def render(records: Sequence[RunRecord]) -> str:
-    """Mean and standard deviation over base policies, and rank correlations with the displacement.
+    """A table a task: mean and standard deviation over base policies, and rank correlations.
 
     Raises:
         UserError: for a record of another agent, or none.
@@ -53,23 +53,25 @@ def render(records: Sequence[RunRecord]) -> str:
         found[record.settings.task][record.settings.variant].append(values)
     if not found:
         raise UserError("no finished run of free-bias; run the suite free-bias")
-    rows = []
+    heads = ["world", "displaced by", *(heading for heading, _, _ in MEASURES.values())]
+    parts = []
     for task, of_task in sorted(found.items()):
+        rows = []
         shifts = {variant: displacement(variant) for variant in of_task}
         known = sorted((shift, variant) for variant, shift in shifts.items() if shift is not None)
         others = sorted(variant for variant, shift in shifts.items() if shift is None)
-        truths = {variant: f"{shift:g} cm" for shift, variant in known} | dict.fromkeys(others, "")
+        truths = {v: f"{shift:g}{SPACE}cm" for shift, v in known} | dict.fromkeys(others, "")
         for variant, truth in truths.items():
             runs = of_task[variant]
             cells = [_spread([run[name] for run in runs], name) for name in MEASURES]
-            rows.append([f"`{task}`", f"`{variant}`", truth, str(len(runs)), *cells])
+            rows.append([f"`{variant}`", truth, *cells])
         pairs = [(shift, run) for shift, variant in known for run in of_task[variant]]
         true = [shift for shift, _ in pairs]
         ranks = [spearmanr(true, [run[name] for _, run in pairs]).statistic for name in MEASURES]
-        correlations = [f"{rank:+.2f}" for rank in ranks]
-        rows.append([f"`{task}`", "rank correlation", "", str(len(pairs)), *correlations])
-    heads = [heading for heading, _, _ in MEASURES.values()]
-    return markdown(["task", "world", "displaced by", "runs", *heads], rows, left=2)
+        rows.append(["rank correlation", "", *(number(rank, sign=True) for rank in ranks)])
+        count = sum(map(len, of_task.values()))
+        parts.append(f"`{task}`, {count} runs:\n\n{markdown(heads, rows)}")
+    return "\n\n".join(parts)
 
 
 def displacement(variant: str) -> float | None:
@@ -86,7 +88,9 @@ def _spread(values: Sequence[float], name: str) -> str:
     _, factor, digits = MEASURES[name]
     values = [factor * value for value in values]
     deviation = statistics.stdev(values) if len(values) > 1 else 0.0
-    return f"{statistics.mean(values):.{digits}f} ({deviation:.{digits}f})"
+    return f"{number(statistics.mean(values), digits)} ({number(deviation, digits)})".replace(
+        " ", SPACE
+    )
 
 
 def _collected(arguments: Sequence[str]) -> list[RunRecord]:
@@ -102,7 +106,7 @@ def _collected(arguments: Sequence[str]) -> list[RunRecord]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write the table."""
+    """Write the tables."""
     return write_tables(PAGE, lambda: render(_collected(arguments)))
 
 
