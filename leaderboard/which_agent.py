@@ -213,7 +213,7 @@ def by_kind(lessons: Sequence[Lesson], question: Question, measure: str) -> Answ
         return Answer(0, f"no difference is clear in {len(like)} such worlds", more, like)
     if len(set(signs)) > 1:
         either = f"of {len(like)} such worlds, some are won by either"
-        return Answer(0, either, "nothing: it stays so while they are in the records", like)
+        return Answer(0, either, "nothing, as long as the records have these worlds", like)
     reason = f"{len(signs)} of {len(like)} such worlds are decided, and agree"
     other = STANDARD if signs[0] > 0 else STRICT
     return Answer(signs[0], reason, f"one such world in which {other} is clearly better", like)

@@ -8,13 +8,13 @@ import pytest
 
 from symsteer.bench.runs.arguments import parse_run
 from symsteer.bench.runs.config import RunConfig, build_config
-from symsteer.leaderboard.paths import PAGE_FOLDER
+from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.records import config_hash, read_record
 from symsteer.leaderboard.records.repeat import DERIVED, FILES, KEYS, repeat_command
 from symsteer.leaderboard.records.retired import RETIRED
 from tests.bench.tiny_run import tiny_config
 
-LEARNERS = PAGE_FOLDER / "results" / "learners"
+LEARNERS = RESULTS / "learners"
 
 
 def again(command: str | None) -> RunConfig:
@@ -44,6 +44,17 @@ def test_the_command_holds_every_option() -> None:
     old = config.to_json()
     old["agent_options"] |= RETIRED
     assert "--agent.n-step" not in (repeat_command(old) or "")
+
+
+def test_old_options_of_one_agent_are_left_out_where_they_mean_the_same() -> None:
+    path = next((RESULTS / "dial-next").glob("PickCube-v1-floating-none-slow-s150-*.json"))
+    options = read_record(path).config["agent_options"]
+    assert {"bias_speed", "start", "shared"} <= options.keys()
+    config = RunConfig(agent="slow").to_json()
+    assert repeat_command(config | {"agent_options": options}) == repeat_command(config)
+    assert "--agent.start 1000" in (
+        repeat_command(config | {"agent_options": {**options, "start": 1000}}) or ""
+    )
 
 
 @pytest.mark.parametrize("path", sorted(LEARNERS.glob("PickCube-v1-floating-none-*-s10-*.json")))

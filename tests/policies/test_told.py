@@ -1,5 +1,6 @@
 """A policy that is told in words what to do: exact symmetry, the same words the same actions."""
 
+import copy
 import dataclasses
 import re
 import subprocess
@@ -112,6 +113,20 @@ def test_it_obeys():
         policy = said(policies[PUSH], words.sentences(task, held_out=True)[0])
         chunk = policy.decode(observed("near"), noises(16))[:, 0, ACT.slice("xy")]
         assert ((sign * chunk * wanted).sum(dim=1) > 0).float().mean() > 0.8
+
+
+def test_sentences_take_nothing_from_the_generator_of_the_batches(both):
+    """So a policy with a one-hot vector and the same seed sees the same batches."""
+    policy, generator = copy.deepcopy(both[0]), torch.Generator().manual_seed(3)
+    before, heard = generator.get_state(), []
+    for _ in range(8):
+        policy.augment(observed("near"), noises(16), generator)
+        heard.append(policy.denoiser.heard)
+    assert torch.equal(generator.get_state(), before)
+    assert any(not torch.equal(heard[0], other) for other in heard)
+    again = copy.deepcopy(both[0])
+    again.augment(observed("near"), noises(16), torch.Generator().manual_seed(3))
+    assert torch.equal(again.denoiser.heard, heard[0])
 
 
 def test_without_words_it_is_the_ordinary_policy():
