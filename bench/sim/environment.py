@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import sapien
 import sapien.physx as physx
+import sapien.render
 import torch
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.envs.sapien_env import BaseEnv
@@ -87,8 +88,11 @@ class _OnSimulator(Unique, BaseEnv):
         cameras = visual or render_mode is not None or getattr(self, "needs_cameras", False)
         if warning := first_warning():
             warnings.warn(warning, stacklevel=2)
-        prepare_headless()
+        can_render = prepare_headless()
         backends = self._prepare(cameras, render_backend)
+        # SAPIEN's renderer ends with the last object that needs it, and starts anew for the next
+        # material. On a GPU this is slow, and fails after some hundred times.
+        self._renderer = sapien.render.RenderMaterial() if can_render and not cameras else None
         super().__init__(*args, obs_mode=obs_mode, render_mode=render_mode, **backends, **kwargs)
 
     looks = True

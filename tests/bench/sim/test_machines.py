@@ -13,6 +13,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import sapien.render
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
@@ -87,6 +88,15 @@ def test_cameras_with_vulkan():
     env.scene._gpu_apply_all()
     env.scene._gpu_fetch_all()
     assert (env.render()[0] != first).any()
+
+
+def test_the_renderer_is_started_once_for_each_environment():
+    """Not for each material of an environment without cameras."""
+    if not rendering_works():
+        pytest.skip("no Vulkan device")
+    env = create(PickCubeEnv, 1)
+    assert isinstance(env._renderer, sapien.render.RenderMaterial)
+    assert create(PickCubeEnv, 1, obs_mode="rgb")._renderer is None
 
 
 def test_another_release_gives_one_warning(monkeypatch):
