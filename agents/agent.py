@@ -79,7 +79,7 @@ class AgentContext:
             policy.horizon,
             policy.execute,
             policy.decode,
-            policy.normalized_observation,
+            policy.observation_for_agents,
             torch.device(device),
             seed=seed,
         )

@@ -232,6 +232,13 @@ class ChunkPolicy(nn.Module, abc.ABC):
         layout = self.bounded_layout(self.obs_layout)
         return clip_blocks(self.obs_normalizer.normalize(obs), layout, OBSERVATION_RADIUS)
 
+    def observation_for_agents(self, obs: torch.Tensor) -> torch.Tensor:
+        """What the networks of agents see of ``obs [..., obs_dim]``: unit size, too.
+
+        It differs where the policy's own networks were trained with another scale.
+        """
+        return self.normalized_observation(obs)
+
     def used_with(self, options: PolicyOptions) -> Self:
         """The policy with the options ``IN_USE`` of others, unmeasured; itself if it has them."""
         own = dataclasses.replace(

@@ -71,12 +71,12 @@ class Normalizer(nn.Module):
         )
 
     @classmethod
-    def fit(cls, layout: Layout, data: torch.Tensor) -> Normalizer:
+    def fit(cls, layout: Layout, data: torch.Tensor, smallest: float = MINIMUM_RANGE) -> Normalizer:
         """Statistics of ``data [..., dim]``.
 
         Scalars: offset = middle, scale = half the range between minimum and maximum. Odd scalars
         (they change sign under reflections): scale = largest magnitude, no offset. Vectors: scale =
-        largest norm, no offset. A range below ``MINIMUM_RANGE`` gives scale 1.
+        largest norm, no offset. A range below ``smallest`` gives scale 1.
 
         ``deviation`` of a scalar is its standard deviation. ``deviation`` of a vector is the root
         mean square of its components: the standard deviation over all rotations of the data.
@@ -99,7 +99,7 @@ class Normalizer(nn.Module):
         shiftable = layout.invariant_mask(reflections=True).to(data.device)
         offset = torch.where(shiftable, (low + high) / 2, 0.0)
         scale = torch.where(shiftable, (high - low) / 2, radius)
-        scale = torch.where(scale < MINIMUM_RANGE, 1.0, scale)
+        scale = torch.where(scale < smallest, 1.0, scale)
         sizes = layout.block_index.bincount()[layout.block_index].to(data.device)
         centered = torch.where(
             shiftable, data.var(dim=0, correction=0), squares.mean(dim=0) / sizes

@@ -11,6 +11,10 @@ H are the spherical harmonics of degree 0, 1 and 2, R turns them by Wigner's mat
 points that are seen. A picture does not change when scene and hand turn together, so what is told
 turns with them: exactly, by any angle, whatever the convolutions are.
 
+Degree 2 does not tell how a cube is turned, which has frequency 4. So these are told, too, of the
+seen points z, complex numbers in the world's horizontal plane: the mean of (z - mean z)^4 over that
+of |z - mean z|^4.
+
 They matter when the hand alone rolls about the camera's axis, which turns the picture. Steerable
 ones commute with it (:class:`HandEncoder`), ordinary ones do in the mean over the quarter turns of
 the picture (:class:`AveragedHandEncoder`): both exactly for quarter turns, else roughly.
@@ -38,6 +42,9 @@ LEAST = 0.01
 
 IRREPS = SpatialIrreps()
 
+SMALL = 1e-9
+"""Fourth powers of metres that are too few to divide by: 0.3 of that of 1 cm."""
+
 PLANAR = {0: [8], 1: [6, 5], 2: [7, 4]}
 """The parts of degree 2 by their frequency, where the vertical is fixed."""
 
@@ -51,7 +58,8 @@ class HandEncoder(PictureEncoder):
 
     Attributes:
         told: for each keypoint the mean direction from the camera, the mean distance, and the mean
-            of the points from the camera on, in metres; then the parts of degree 2.
+            of the points from the camera on, in metres; then the parts of degree 2, and of
+            frequency 4.
 
     Raises:
         UserError: if the picture has other channels than its distance, the observation does not
@@ -75,7 +83,8 @@ class HandEncoder(PictureEncoder):
             fields += [Field(f"keypoint{k}_axis_xy", 1), Field(f"keypoint{k}_axis_z", 0)]
             fields += [Field(f"keypoint{k}_distance", 0)]
             fields += [Field(f"camera_to_keypoint{k}_xy", 1), Field(f"camera_to_keypoint{k}_z", 0)]
-        return fields + [Field(f"shape{j}", j, 2 * self.keypoints) for j in PLANAR]
+        fields += [Field(f"shape{j}", j, 2 * self.keypoints) for j in PLANAR]
+        return [*fields, Field("shape4", 4, self.keypoints)]
 
     def sizes(self) -> torch.Tensor:
         sizes = torch.ones(self.told.dim)
@@ -102,14 +111,17 @@ class HandEncoder(PictureEncoder):
     def in_world(self, picture: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
         """What pictures ``[B, 1, side, side]`` of hands turned by ``turn [B, 3, 3]`` tell."""
         signals = _by_place(torch.cat([(picture > 0).to(picture), picture], dim=1))
+        weights = self.weights(picture)
         # [B, places, signals, harmonics], summed over the pixels of a place.
         harmonics = _harmonics(self.picture.side, picture.dtype, picture.device)
         sums = torch.einsum("bspi,pih->bpsh", signals, harmonics)
-        sums = torch.einsum("bkp,bpsh->bksh", self.weights(picture), sums)
+        sums = torch.einsum("bkp,bpsh->bksh", weights, sums)
         means = sums / (sums[:, :, :1, :1] + LEAST)
         means = means @ IRREPS.rotation(turn).mT[:, None]
         near = [means[:, :, 0, 1:4], means[:, :, 1, :4]]
         shapes = [means[..., parts] for parts in PLANAR.values()]
+        level = torch.einsum("bij,bpx,pxj->bpxi", turn[:, :2], signals[:, 1], harmonics[..., 1:4])
+        shapes.append(_frequency_4(weights[..., None] * signals[:, :1], level))
         return torch.cat([torch.cat(near, -1).flatten(1), *(s.flatten(1) for s in shapes)], dim=1)
 
 
@@ -132,6 +144,21 @@ class AveragedHandEncoder(HandEncoder):
         weights = super().weights(turned).unflatten(-1, (side, side)).chunk(len(self.quarters))
         back = [torch.rot90(w, -q, (-2, -1)) for q, w in zip(self.quarters, weights, strict=True)]
         return torch.stack(back).mean(0).flatten(2)
+
+
+def _frequency_4(weights: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
+    """Of the horizontal places of points about their mean, ``[B, keypoints, 2]``, norm 1 at most.
+
+    Args:
+        weights: ``[B, keypoints, places, pixels]``.
+        level: ``[B, places, pixels, 2]``, metres.
+    """
+    z = torch.view_as_complex(level.contiguous()).flatten(1)[:, None]
+    weights = weights.flatten(2)
+    mean = (weights * z).sum(-1, keepdim=True) / (weights.sum(-1, keepdim=True) + LEAST)
+    squares = (z - mean).square()
+    size = (weights * torch.view_as_real(squares).square().sum(-1)).sum(-1) + SMALL
+    return torch.view_as_real((weights * squares.square()).sum(-1) / size)
 
 
 def _by_place(pixels: torch.Tensor) -> torch.Tensor:

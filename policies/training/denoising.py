@@ -21,13 +21,14 @@ from torch import nn
 
 from symsteer.errors import UserError
 from symsteer.names import check
+from symsteer.policies.contract import OBSERVATION_RADIUS
 from symsteer.policies.geometry import Group, Layout
 from symsteer.policies.networks.denoiser import Denoiser
 from symsteer.policies.networks.in_hand import HandEncoder
 from symsteer.policies.networks.keypoints import KeypointEncoder
 from symsteer.policies.networks.pictures import PictureEncoder
 from symsteer.policies.networks.points import CloudEncoder
-from symsteer.policies.normalizer import Normalizer
+from symsteer.policies.normalizer import Normalizer, clip_blocks
 from symsteer.policies.training.diffusion import Diffusion, Prediction, Process
 from symsteer.policies.training.frames import Frame
 from symsteer.policies.training.gradient import GradientOptions, GradientPolicy
@@ -43,6 +44,9 @@ DECODE_FIELDS = (
 
 LATER_FIELDS = {"process": "diffusion", "action_frame": ""}
 """The same, of policies that have another value than this one, which earlier versions had."""
+
+SMALLEST_TOLD = 1e-3
+"""A smaller half-range of what an encoder tells, in its unit sizes, counts as constant."""
 
 Expanded = tuple[Denoiser, Sequence[torch.Tensor], KeypointEncoder | None]
 """Ready for inference: the denoiser, what it sees of each noise level, and the encoder."""
@@ -132,6 +136,8 @@ class DiffusionPolicy(GradientPolicy):
         options = options.resolved(seen_layout, act_layout)
         super().__init__(options, seen_layout, act_layout)
         self.task_layout, self.eyes = obs_layout, eyes
+        if eyes is not None:
+            self.agent_normalizer = Normalizer(self.bounded_layout(seen_layout))
         self.diffusion = options.diffusion
         self.frame = Frame(options.action_frame, self.obs_layout, act_layout)
         self.denoiser = self.make_denoiser()
@@ -219,6 +225,23 @@ class DiffusionPolicy(GradientPolicy):
         seen = self.eyes.seen
         rest = Normalizer.fit(self.bounded_layout(seen.rest), obs[:, seen.rest_columns])
         return self.eyes.statistics(obs, rest)
+
+    def finish(self, obs: torch.Tensor) -> None:
+        """Learn how large the encoder's numbers became."""
+        if self.eyes is None:
+            return
+        seen = [self.normalized_observation(self.see(part)) for part in obs.split(256)]
+        layout = self.agent_normalizer.layout
+        fitted = Normalizer.fit(layout, torch.cat(seen), smallest=SMALLEST_TOLD)
+        self.agent_normalizer.load_state_dict(fitted.state_dict())
+
+    def observation_for_agents(self, obs: torch.Tensor) -> torch.Tensor:
+        """What an encoder tells is scaled to unit size once more, as it became in training."""
+        seen = super().observation_for_agents(obs)
+        if self.eyes is None:
+            return seen
+        normalizer = self.agent_normalizer
+        return clip_blocks(normalizer.normalize(seen), normalizer.layout, OBSERVATION_RADIUS)
 
     def see(self, obs: torch.Tensor) -> torch.Tensor:
         """Encode the cloud or picture, if there is one; see :meth:`ChunkPolicy.see`."""

@@ -90,6 +90,9 @@ class GradientPolicy(ChunkPolicy):
         """Of demonstrated observations ``[M, task_layout.dim]``."""
         return Normalizer.fit(self.bounded_layout(self.obs_layout), obs)
 
+    def finish(self, obs: torch.Tensor) -> None:
+        """What is to be learned from demonstrated observations after the training."""
+
     @classmethod
     def fit(
         cls,
@@ -121,6 +124,7 @@ class GradientPolicy(ChunkPolicy):
             return policy.loss(obs[rows], chunks[rows], generator)
 
         losses = optimize(policy, batch_loss, options, progress)
+        policy.freeze().finish(obs)
         policy.training_record = {
             "seed": seed,
             "episodes": len(episodes),
@@ -132,7 +136,7 @@ class GradientPolicy(ChunkPolicy):
             "device": str(device),
             "parameters": policy.parameter_count(),
         }
-        return policy.freeze()
+        return policy
 
 
 def optimize(

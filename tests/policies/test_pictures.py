@@ -8,6 +8,7 @@ import sys
 import pytest
 import torch
 
+from symsteer.agents.agent import AgentContext
 from symsteer.errors import UserError
 from symsteer.policies.files import load_policy, save_policy
 from symsteer.policies.geometry import Field, Group, Layout
@@ -196,6 +197,21 @@ def test_what_a_picture_tells_has_unit_size() -> None:
     known = policy.normalized_observation(policy.see(obs))
     assert known.abs().max() <= 1.0 + 1e-6
     torch.testing.assert_close(policy.eyes.scale, torch.tensor([0.05, 0.025]), atol=0.002, rtol=0)
+
+
+def test_agents_see_what_is_told_at_the_size_that_it_has_after_training() -> None:
+    policy = fit("edp", count=4)
+    seen, layout = policy.see(observe(36)[0]), policy.obs_layout
+    known = policy.normalized_observation(seen)
+    agents = AgentContext.of(policy).normalize_obs
+    # With random weights some heights, which have no frequency, are constant.
+    for field in (field for field in policy.eyes.told.fields if field.frequency):
+        before, after = (x[:, layout.slice(field.name)] for x in (known, agents(seen)))
+        assert before.abs().max() < 0.7
+        assert after.abs().max() > 0.7
+    turned = agents(layout.transform(seen, math.pi / 4))
+    wanted = layout.transform(agents(seen), math.pi / 4)
+    torch.testing.assert_close(turned, wanted, atol=1e-5, rtol=0)
 
 
 @pytest.mark.long

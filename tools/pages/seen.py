@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import statistics
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from symsteer.errors import UserError
 from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT
 from symsteer.leaderboard.pairs import advantage
 from symsteer.leaderboard.paths import RESULTS
@@ -30,10 +32,16 @@ RECORDS = RESULTS / "seen"
 WAYS = {"Seen": "a cloud of points", "Height": "heights from above", "Hand": "from the hand"}
 """What a policy sees, by how the names of its tasks begin; else poses."""
 
+TASKS = ("PushCube-v1", "PickCube-v1")
+"""How the names of the tasks end."""
+
+ASIDE = ("perception_bias:1", "actuator_offset:0.5")
+"""Worlds in which something is displaced to one side."""
+
 APPROXIMATE = "residual-pathway"
 LEARNERS = (STANDARD, STRICT, APPROXIMATE)
 
-Cells = Mapping[str, Mapping[Pair, Sample]]
+Cells = dict[str, Mapping[Pair, Sample]]
 """Differences of pairs of runs, by task."""
 
 
@@ -43,9 +51,30 @@ def way_of(task: str) -> str:
 
 
 def render(runs: Sequence[Run]) -> str:
-    """Both tables, in markdown."""
+    """All tables, in markdown: base policies, success of agents, three differences.
+
+    Raises:
+        UserError: if two tables of runs are of one task and world.
+    """
     tables = summarize(runs).tables
-    return f"{base_policies(tables)}\n\n{steering(tables)}"
+    worlds = [t for t in tables if {*LEARNERS} <= {row.agent for row in t.learners}]
+    named = Counter((table.key.task, table.key.variant) for table in worlds)
+    if twice := [name for name, count in named.items() if count > 1]:
+        raise UserError(
+            f"there are several kinds of runs of {twice[0][0]} in the world {twice[0][1]}, with "
+            "other settings; name the folders of one kind"
+        )
+    parts = (
+        ("", base_policies(tables)),
+        ("Success in the last fifth of the steps", success(worlds)),
+        (f"Success: {STRICT} minus {STANDARD}", differences(worlds, STRICT, STANDARD, "success")),
+        (f"Area: {STRICT} minus {STANDARD}", differences(worlds, STRICT, STANDARD, "auc")),
+        (
+            f"Success: {APPROXIMATE} minus {STRICT}",
+            differences(worlds, APPROXIMATE, STRICT, "success"),
+        ),
+    )
+    return "\n\n".join(f"**{head}**\n\n{table}" if head else table for head, table in parts)
 
 
 def base_policies(tables: Sequence[Table]) -> str:
@@ -61,62 +90,80 @@ def base_policies(tables: Sequence[Table]) -> str:
             [
                 code(table.key.task),
                 way_of(table.key.task),
+                str(table.key.demonstrations),
                 str(len(policies)),
                 spread(list(row.by_policy("success").values())),
                 f"{statistics.mean(seconds):.0f}" if seconds else NOTHING,
                 f"{policies[0].parameters or 0:,}",
             ]
         )
-    heads = ["task", "sees", "trainings", "success", "seconds of a training", "parameters"]
-    return markdown(heads, rows, left=2)
+    heads = ["task", "sees", "demonstrations", "trainings", "success [lowest, highest]"]
+    return markdown([*heads, "seconds of a training", "parameters"], rows, left=2)
 
 
-def steering(tables: Sequence[Table]) -> str:
-    """By what is seen and world, mean over the tasks: success and differences of learners."""
-    found: dict[tuple[str, str], list[Table]] = {}
-    for table in tables:
-        if {*LEARNERS} <= {row.agent for row in table.learners}:
-            found.setdefault((way_of(table.key.task), table.key.variant), []).append(table)
+def success(tables: Sequence[Table]) -> str:
+    """Of each agent in each task and world."""
     rows = []
-    for (way, world), worlds in found.items():
-        unbroken = found.get((way, UNBROKEN), [])
-        strict = _pairs(worlds, STRICT, STANDARD, "success")
-        whole = _pairs(unbroken, STRICT, STANDARD, "success")
+    for table in sorted(tables, key=lambda t: (_rank(way_of(t.key.task)), t.key.task)):
+        shares = (_success(table, agent) for agent in (BASE, *LEARNERS))
         rows.append(
-            [
-                way,
-                code(world),
-                *(_success(worlds, agent) for agent in LEARNERS),
-                difference(_mean(_pairs(worlds, STRICT, STANDARD, "auc"))),
-                difference(_mean(strict)),
-                NOTHING if world == UNBROKEN else difference(_mean(_beyond(strict, whole))),
-                difference(_mean(_pairs(worlds, APPROXIMATE, STRICT, "success"))),
-            ]
+            [way_of(table.key.task), code(table.key.task), code(table.key.variant), *shares]
         )
-    strict_minus = f"{code(STRICT)} minus {code(STANDARD)}"
-    heads = ["sees", "world", *map(code, LEARNERS), f"area: {strict_minus}", strict_minus]
-    heads += ["less that of the unbroken world", f"{code(APPROXIMATE)} minus {code(STRICT)}"]
-    return markdown(heads, rows, left=2)
+    return markdown(["sees", "task", "world", *map(code, (BASE, *LEARNERS))], rows, left=3)
 
 
-def _success(tables: Sequence[Table], agent: str) -> str:
-    rows = [row for table in tables if (row := table.row_of(agent))]
-    return number(statistics.mean(row.success.value for row in rows if row.success))
+def differences(tables: Sequence[Table], first: str, second: str, measure: str) -> str:
+    """Of two agents, in pairs of runs on one base policy, by what is seen and world.
+
+    In each task, over both, and over both less that of the unbroken world. `ASIDE` is the mean over
+    the two worlds in which something is displaced.
+    """
+    found: dict[str, dict[str, Cells]] = {}
+    for table in tables:
+        cells = found.setdefault(way_of(table.key.task), {}).setdefault(table.key.variant, {})
+        cells[table.key.task] = advantage(table, first, second, measure)
+    rows = []
+    for way in sorted(found, key=_rank):
+        worlds = dict(found[way])
+        if {*ASIDE} <= worlds.keys():
+            worlds[" and ".join(ASIDE)] = _combined(worlds[ASIDE[0]], worlds[ASIDE[1]], [0.5, 0.5])
+        for world, cells in worlds.items():
+            by_task = [
+                {task: pairs for task, pairs in cells.items() if task.endswith(name)}
+                for name in TASKS
+            ]
+            beyond = _combined(cells, worlds.get(UNBROKEN, {}), [1, -1])
+            rows.append(
+                [
+                    way,
+                    " and ".join(map(code, world.split(" and "))),
+                    *(difference(_mean(part)) for part in by_task),
+                    difference(_mean(cells)) if all(by_task) else NOTHING,
+                    difference(_mean(beyond)) if all(by_task) and world != UNBROKEN else NOTHING,
+                ]
+            )
+    heads = [name.removesuffix("-v1") for name in TASKS]
+    return markdown(["sees", "world", *heads, "both", "both, less unbroken"], rows, left=2)
 
 
-def _pairs(tables: Sequence[Table], first: str, second: str, measure: str) -> Cells:
-    return {table.key.task: advantage(table, first, second, measure) for table in tables}
+def _rank(way: str) -> int:
+    return ["poses", *WAYS.values()].index(way)
 
 
-def _beyond(world: Cells, unbroken: Cells) -> Cells:
-    """The difference less that of the unbroken world, on the same base policies."""
+def _success(table: Table, agent: str) -> str:
+    row = table.row_of(agent)
+    return number(row.success.value) if row and row.success else NOTHING
+
+
+def _combined(one: Cells, other: Cells, factors: Sequence[float]) -> Cells:
+    """Of two worlds, pair by pair: the sum of both differences, each times its factor."""
     return {
         task: {
-            pair: Sample.weighted([sample, unbroken[task][pair]], [1, -1])
+            pair: Sample.weighted([sample, other[task][pair]], factors)
             for pair, sample in pairs.items()
-            if pair in unbroken.get(task, {})
+            if pair in other.get(task, {})
         }
-        for task, pairs in world.items()
+        for task, pairs in one.items()
     }
 
 
@@ -129,7 +176,7 @@ def _mean(cells: Cells) -> Interval | None:
 def main(arguments: Sequence[str]) -> int:
     """Write the tables."""
     places = [Path(argument) for argument in arguments] or [RECORDS]
-    return write_tables(PAGE, lambda: render(load_runs(places)))
+    return write_tables(PAGE, lambda: render(load_runs(places, area_from="first update")))
 
 
 if __name__ == "__main__":
