@@ -22,12 +22,12 @@ WITH_SYMMETRY = (STRICT, "residual-pathway", "approximate")
 """All of it, and nearly all. The last is that of the first leaderboard, which `residual-pathway`
 has replaced."""
 
-USING_SYMMETRY = ("augmented", *WITH_SYMMETRY)
-"""The agents whose advantage over `STANDARD` is shown by kind of break and on the map: the fair
-rival has the symmetry from data, the others have it in their networks."""
-
 BETWEEN = ("slow", "free-bias")
 """Agents that may leave the symmetry, or choose whether to."""
+
+USING_SYMMETRY = ("augmented", *WITH_SYMMETRY, *BETWEEN)
+"""The agents whose advantage over `STANDARD` is shown by kind of break and on the map: the fair
+rival has the symmetry from data, the others have it in their networks."""
 
 ROW_ORDER = (
     *(BASE, ZERO, CONSTANT),

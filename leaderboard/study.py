@@ -147,6 +147,7 @@ class _File(_Table):
     probe: Probe | None = None
     kind: Kind | None = None
     area_from: AreaFrom = "start"
+    chosen_on: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _names_fit(self) -> _File:
@@ -177,6 +178,8 @@ class Study:
         safe: the agent that is declared safe, if there is one.
         probe, kind: the rules that are declared.
         area_from: where areas under success curves begin.
+        chosen_on: tasks on which the designs of agents were chosen: each effect is shown without
+            them, too.
     """
 
     notice: str
@@ -191,6 +194,7 @@ class Study:
     probe: Probe | None = None
     kind: Kind | None = None
     area_from: AreaFrom = "start"
+    chosen_on: tuple[str, ...] = ()
 
 
 def read_study(name_or_path: str) -> Study:
@@ -226,6 +230,7 @@ def read_study(name_or_path: str) -> Study:
         probe=file.probe,
         kind=file.kind,
         area_from=file.area_from,
+        chosen_on=file.chosen_on,
         source=source.name,
         sha256=hashlib.sha256(source.read_bytes()).hexdigest(),
         listed=read_list(path),

@@ -60,6 +60,7 @@ def advise(
     from symsteer.leaderboard.paths import REPRODUCTIONS, STUDY, chosen_records
     from symsteer.leaderboard.row_numbers import summarize
     from symsteer.leaderboard.runs import load_runs
+    from symsteer.leaderboard.sections.regret import fallback
     from symsteer.leaderboard.study import FOLDER, read_list, read_study
     from symsteer.leaderboard.which_agent import (
         Question,
@@ -78,15 +79,11 @@ def advise(
     # Of the committed records, submitted ones that nobody has made again give no advice.
     listed = None if runs else read_list(FOLDER / f"{STUDY}.toml")
     marks = None if runs else REPRODUCTIONS
-    lessons = [
-        lesson
-        for folder in folders
-        for lesson in lessons_of(summarize(load_runs([folder], marks, listed)))
-    ]
+    summaries = [summarize(load_runs([folder], marks, listed)) for folder in folders]
+    lessons = [lesson for summary in summaries for lesson in lessons_of(summary)]
     if not lessons:
         raise UserError("no cell of these records has 5 base policies of equivariant and standard")
-    safe = None if runs else read_study(STUDY).safe
-    fallback = safe.agent if safe else STANDARD
+    otherwise = STANDARD if runs else fallback(summaries[0], read_study(STUDY).safe)
     here = _here(lessons, task, embodiment, variant)
     others = [lesson for lesson in lessons if lesson.task != task]
     gain, direction = (here.gain, here.direction) if here else (None, None)
@@ -94,8 +91,8 @@ def advise(
     if probed:
         gain, direction = _found(probed)
     question = dataclasses.replace(question, gain=gain, direction=direction, measured=here)
-    advices = [advise(others, question, measure, fallback) for measure in MEASURES]
-    scores = leave_tasks_out(lessons, fallback)
+    advices = [advise(others, question, measure, otherwise) for measure in MEASURES]
+    scores = leave_tasks_out(lessons, otherwise)
     if json:
         data = {
             "worlds": len(lessons),

@@ -82,8 +82,12 @@ class ClaimOutcome:
     """Of an effect at least as large as the smallest of interest, corrected in the same way."""
     by_task: Mapping[str, Interval] = field(default_factory=dict)
     """The effect in the cells of each task, if there are several."""
+    behind_by_task: Mapping[str, str] = field(default_factory=dict)
+    """The numbers behind these differences."""
     rests_on: tuple[str, ...] = ()
     """The tasks without whose cells the interval does not exclude 0 on the same side."""
+    without_chosen: Interval | None = None
+    """The effect without the tasks on which the designs were chosen (`Study.chosen_on`)."""
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -123,7 +127,7 @@ def claims(study: Study, summary: Summary, audit: Audit) -> list[ClaimOutcome]:
             nor SymSteer has.
     """
     _check_names(study, summary, audit)
-    outcomes = [_outcome(claim, summary, audit) for claim in study.claims]
+    outcomes = [_outcome(claim, summary, audit, study.chosen_on) for claim in study.claims]
     families: dict[str, list[int]] = defaultdict(list)
     for index, outcome in enumerate(outcomes):
         if not outcome.reason:
@@ -174,7 +178,9 @@ def _parts(variant: str) -> list[str]:
     return [part.partition(":")[0] for part in variant.split("+")]
 
 
-def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
+def _outcome(
+    claim: Claim, summary: Summary, audit: Audit, chosen_on: tuple[str, ...]
+) -> ClaimOutcome:
     sides: list[Used] = []
     for cells in (claim.cells, claim.minus):
         if cells is None:
@@ -193,7 +199,9 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
     effect: Effect | None
     behind = ""
     by_task: dict[str, Interval] = {}
+    behind_by_task: dict[str, str] = {}
     rests_on: list[str] = []
+    without_chosen: Interval | None = None
     if claim.effect == "slope":
         points = [
             Point(table, defect, pairs)
@@ -214,6 +222,14 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
         else:
             behind = _means(sides[0], claim)
             by_task, without = _tasks(sides)
+            behind_by_task = {
+                task: _means([cell for cell in sides[0] if cell[0].key.task == task], claim)
+                for task in by_task
+            }
+            chosen = " and ".join(chosen_on)
+            others = [[cell for cell in s if cell[0].key.task not in chosen_on] for s in sides]
+            if chosen and others != sides and all(others):
+                without_chosen = without[chosen] = _mean(others).interval()
             sign = drawn.interval().sign
             rests_on = [task for task, left in without.items() if sign and left.sign != sign]
     pairs_used = {pair for _, pairs in everything for pair in pairs}
@@ -226,7 +242,9 @@ def _outcome(claim: Claim, summary: Summary, audit: Audit) -> ClaimOutcome:
         reason=reason,
         behind=behind,
         by_task=by_task,
+        behind_by_task=behind_by_task,
         rests_on=tuple(rests_on),
+        without_chosen=without_chosen,
     )
 
 
@@ -393,26 +411,31 @@ def render(outcomes: list[ClaimOutcome], view: View) -> list[str]:
         if outcome.effect is None:
             untested.setdefault(outcome.reason, []).append(title(claim))
             continue
-        size = size_text(outcome) + (f"<br>{outcome.behind}" if outcome.behind else "")
         p_values = f"{p_text(outcome.p)}<br>{p_text(outcome.p_equal)}"
         rows.append(
             {
                 "Claim (family)": f"{title(claim)} ({claim.family})",
                 "Verdict": verdict_text(outcome),
                 "Effect": test_text(claim),
-                "Size, 95 % interval": size,
+                "Size, 95 % interval": size_text(outcome),
                 "Smallest of interest": f"{claim.smallest:g}",
                 "p: none; at least that": NOTHING if outcome.reason else p_values,
                 "Cells, pairs, policies": f"{outcome.cells}, {outcome.pairs}, {outcome.policies}",
             }
         )
+    if study.chosen_on:
+        known = " and ".join(map(code, study.chosen_on))
+        origin += f" *In new tasks*: without {known}, on which designs of agents were chosen."
     parts = [EXPLAINED, origin]
     if rows:
         parts.append(table_text(rows, left=3))
     if several := [outcome for outcome in outcomes if outcome.by_task]:
         by_task = [
             {"Claim": title(outcome.claim)}
-            | {code(task): interval(each, sign=True) for task, each in outcome.by_task.items()}
+            | {
+                code(task): f"{interval(each, sign=True)}<br>{outcome.behind_by_task[task]}"
+                for task, each in outcome.by_task.items()
+            }
             for outcome in several
         ]
         parts += ["The same effects in each task:", table_text(by_task, sparse=True)]
@@ -428,7 +451,11 @@ def title(claim: Claim) -> str:
 
 
 def size_text(outcome: ClaimOutcome) -> str:
-    return stacked(outcome.effect.interval() if outcome.effect else None, sign=True, digits=3)
+    """The effect, without the tasks of the designs, and the numbers behind it."""
+    text = stacked(outcome.effect.interval() if outcome.effect else None, sign=True, digits=3)
+    if left := outcome.without_chosen:
+        text += f"<br>in new tasks: {interval(left, sign=True, digits=3)}"
+    return text + (f"<br>{outcome.behind}" if outcome.behind else "")
 
 
 def verdict_text(outcome: ClaimOutcome) -> str:

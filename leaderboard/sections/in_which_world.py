@@ -22,7 +22,7 @@ from symsteer.variant import UNBROKEN
 EXPLAINED = """\
 Success at the end of the budget, mean over the cells of each kind of world (tasks and strengths).
 **Bold**: the best learner, and every learner that is not clearly below it (paired by base policy
-and episode, 95 %)."""
+and episode, 95 %), also without any one of several tasks."""
 
 CAMERA = """\
 **What a camera error costs**: change of final success where objects are seen so far from their
@@ -99,13 +99,29 @@ def world_of(kind: str, tables: Sequence[Table], agents: Sequence[str]) -> World
 
 
 def _above(tables: Sequence[Table], first: str, second: str) -> bool:
-    """Whether an agent's final success is clearly above that of another one."""
-    pairs = [list(advantage(table, first, second, "success").values()) for table in tables]
-    return any(pairs) and stratified_bootstrap([each for each in pairs if each]).sign > 0
+    """Whether an agent's final success is clearly above that of another one.
+
+    Without any one of several tasks, too.
+    """
+    pairs = [
+        (table.key.task, each)
+        for table in tables
+        if (each := list(advantage(table, first, second, "success").values()))
+    ]
+    tasks = {task for task, _ in pairs}
+    parts = [pairs]
+    if len(tasks) > 1:
+        parts += [[each for each in pairs if each[0] != task] for task in sorted(tasks)]
+    return bool(pairs) and all(
+        stratified_bootstrap([each for _, each in part]).sign > 0 for part in parts
+    )
 
 
 def camera_errors(summary: Summary) -> list[CameraError]:
-    """By distance, in the places with the most distances and with the agents that all have."""
+    """By distance, in the places with the most distances and with the agents that all have.
+
+    Where all places have one distance alone, each distance has its own places.
+    """
     unbroken = {_place(t.key): t for t in summary.usual_tables if t.key.variant == UNBROKEN}
     places: dict[tuple[str, ...], dict[float, Table]] = defaultdict(dict)
     for table in summary.usual_tables:
@@ -113,29 +129,32 @@ def camera_errors(summary: Summary) -> list[CameraError]:
             places[_place(table.key)][distance] = table
     most = max(map(len, places.values()), default=0)
     used = {place: tables for place, tables in places.items() if len(tables) == most}
-    shared = set.intersection(*map(set, used.values())) if used else set()
+    shared = [*map(set, used.values())]
+    distances = set.union(set(), *shared) if most < 2 else set.intersection(*shared)
+    changes = {
+        distance: [
+            (unbroken[p], tables[distance]) for p, tables in used.items() if distance in tables
+        ]
+        for distance in sorted(distances)
+    }
     agents = [
         agent
         for agent, role in summary.roles.items()
         if (agent == BASE or role == "learner")
         and all(
-            len(_changes(unbroken[place], tables[distance], agent)) >= MIN_SEEDS
-            for place, tables in used.items()
-            for distance in shared
+            len(_changes(*worlds, agent)) >= MIN_SEEDS for of in changes.values() for worlds in of
         )
     ]
     return [
         CameraError(
             distance,
-            len(used),
+            len(cells),
             {
-                agent: stratified_bootstrap(
-                    [_changes(unbroken[place], used[place][distance], agent) for place in used]
-                )
+                agent: stratified_bootstrap([_changes(*worlds, agent) for worlds in cells])
                 for agent in agents
             },
         )
-        for distance in sorted(shared if STANDARD in agents else ())
+        for distance, cells in (changes.items() if STANDARD in agents else ())
     ]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from symsteer.leaderboard.cell_names import cell_name
 from symsteer.leaderboard.figures import by_rows, look_of
+from symsteer.leaderboard.known_agents import STANDARD
 from symsteer.leaderboard.plots import Axis, Dot, Figure
 from symsteer.leaderboard.regret import (
     Cell,
@@ -169,6 +170,17 @@ def standings(regret: Regret, safe: Safe) -> dict[str, Standing]:
         best = min(worst, key=lambda agent: worst[agent])
         found[measure] = Standing(above, best, worst[best], above <= most and above < worst[best])
     return found
+
+
+def fallback(summary: Summary, safe: Safe | None) -> str:
+    """What to take where nothing is known: the agent that was declared safe and is, else plain."""
+    if safe is None:
+        return STANDARD
+    regret = compute(summary, safe.tested_on)
+    if regret is None or safe.agent not in regret.learners:
+        return STANDARD
+    proven = all(each.holds for each in standings(regret, safe).values())
+    return safe.agent if proven else STANDARD
 
 
 def _judged(regret: Regret | None, safe: Safe) -> str:

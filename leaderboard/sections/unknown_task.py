@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT, ZERO
 from symsteer.leaderboard.pairs import MEASURES, SHORT_NAMES
 from symsteer.leaderboard.sections import Findings, Section, View
+from symsteer.leaderboard.sections.regret import fallback
 from symsteer.leaderboard.study import Kind, Probe
 from symsteer.leaderboard.text import code, number, share, table_text
 from symsteer.leaderboard.which_agent import Lesson, Score, leave_tasks_out, lessons_of
@@ -92,9 +93,9 @@ def render(found: Found, view: View) -> list[str]:
 
 
 def compute(findings: Findings) -> Found:
-    """With the declared safe agent as the fallback, if there is one."""
-    safe, lessons = findings.study.safe, lessons_of(findings.summary)
-    return lessons, leave_tasks_out(lessons, safe.agent if safe else STANDARD)
+    """With the safe agent as the fallback, if one is proven."""
+    lessons = lessons_of(findings.summary)
+    return lessons, leave_tasks_out(lessons, fallback(findings.summary, findings.study.safe))
 
 
 SECTION = Section("Advice for a task without records", compute, render)

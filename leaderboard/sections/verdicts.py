@@ -45,15 +45,25 @@ def statements(findings: Findings) -> dict[str, list[ClaimOutcome]]:
 
 
 def render(said: dict[str, list[ClaimOutcome]], view: View) -> list[str]:
-    """Their verdicts as a list, or else those of all claims by name."""
+    """Their verdicts as a list, then those of all other claims by name."""
+    outcomes = view.findings.of(claims.SECTION)
     if said:
         lines = [f"- {text}: {standing(tested)}." for text, tested in said.items()]
         meaning = (
             "*Equivalent*: the effect is shown to be smaller than the smallest one of interest."
         )
-        return [meaning, "\n".join(lines), "Each with its tests: [the paper's claims](PAPER.md)."]
+        told = "Each with its tests: [the paper's claims](PAPER.md)."
+        tested = {outcome.claim.name for of in said.values() for outcome in of}
+        rest = [outcome for outcome in outcomes if outcome.claim.name not in tested]
+        others = ["What else was declared:", _by_verdict(rest)] if rest else []
+        return [meaning, "\n".join(lines), told, *others]
+    return [_by_verdict(outcomes)] if outcomes else []
+
+
+def _by_verdict(outcomes: Sequence[ClaimOutcome]) -> str:
+    """Names of claims, a line for each verdict."""
     named: dict[str, list[str]] = {}
-    for outcome in view.findings.of(claims.SECTION):
+    for outcome in outcomes:
         rest = (
             f" (but not without {' or '.join(map(code, outcome.needs))})" if outcome.needs else ""
         )
@@ -64,15 +74,25 @@ def render(said: dict[str, list[ClaimOutcome]], view: View) -> list[str]:
         for verdict in order
         if verdict in named
     ]
-    return ["\n".join(lines)] if lines else []
+    return "\n".join(lines)
 
 
 def standing(outcomes: Sequence[ClaimOutcome]) -> str:
-    """The verdict of several claims: one word if they agree, else how often each was found."""
+    """The verdict of several claims: one word if they agree, else how often each was found.
+
+    And how many of them would not be decided without a task.
+    """
     verdicts = Counter(outcome.verdict for outcome in outcomes)
-    if len(verdicts) == 1:
-        return f"**{next(iter(verdicts))}**"
-    return ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+    found = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+    text = f"**{next(iter(verdicts))}**" if len(verdicts) == 1 else found
+    resting = [outcome.needs for outcome in outcomes if outcome.needs]
+    if not resting:
+        return text
+    tasks = " or ".join(
+        code(task) for task in sorted({task for needs in resting for task in needs})
+    )
+    which = f"{len(resting)} of {len(outcomes)}, but not" if len(outcomes) > 1 else "but not"
+    return f"{text} ({which} without {tasks})"
 
 
 def paper_page(said: dict[str, list[ClaimOutcome]], view: View) -> str:

@@ -11,7 +11,13 @@ import pytest
 from symsteer.errors import UserError
 from symsteer.leaderboard.defects import Audit
 from symsteer.leaderboard.records import RunRecord
-from symsteer.leaderboard.sections.claims import SECTION, ClaimOutcome, claims, verdict_text
+from symsteer.leaderboard.sections.claims import (
+    SECTION,
+    ClaimOutcome,
+    claims,
+    size_text,
+    verdict_text,
+)
 from symsteer.leaderboard.statistics import ShareDifference
 from symsteer.leaderboard.study import PAPER, Claim, Kind, Safe, Study, read_study
 from tests.leaderboard.record_factory import (
@@ -107,8 +113,29 @@ def test_a_verdict_names_the_task_without_which_it_does_not_hold() -> None:
         assert {task: each.value for task, each in one.by_task.items()} == pytest.approx(
             {task: rate - 0.3 for task, rate in gains.items()}
         )
+        assert one.behind_by_task["A-v1"] == f"{gains['A-v1']:.2f} against 0.30"
         words = ", but not without `A-v1`" if rests_on else ""
         assert verdict_text(one) == f"**supported**{words}"
+
+
+def test_an_effect_is_shown_without_the_tasks_on_which_designs_were_chosen() -> None:
+    """A and B gain .6, C nothing: no task alone decides, these two do."""
+    records = [
+        record
+        for task, rate in {"A-v1": 0.9, "B-v1": 0.9, "C-v1": 0.3}.items()
+        for record in make_cell({"standard": 0.3, "equivariant": rate}, task=task)
+    ]
+    summary = summary_of(with_policies(records))
+    for chosen, rests_on, left in (
+        ((), (), None),
+        (("A-v1", "B-v1"), ("A-v1 and B-v1",), 0.0),
+        (("D-v1",), (), None),
+    ):
+        study = Study("", "", "", (claim_of(),), (), "", "", chosen_on=chosen)
+        (one,) = claims(study, summary, {})
+        assert (one.verdict, one.rests_on) == ("supported", rests_on)
+        assert left == (one.without_chosen.value if one.without_chosen else None)
+        assert ("in new tasks:" in size_text(one)) == (left is not None)
 
 
 def test_what_is_equal_on_average_names_the_tasks_where_it_is_not() -> None:

@@ -37,6 +37,17 @@ def test_of_two_that_are_equally_good_both_are_what_others_are_compared_with(mon
     assert world.best == ["standard", "augmented", "equivariant"]
 
 
+def test_what_is_below_the_best_in_one_task_alone_is_bold_too():
+    """`standard` is far below in A and as good in B; in both it is below, but not without A."""
+    tasks = {"A-v1": (0.3, 0.9), "B-v1": (0.5, 0.5)}
+    seen = view(
+        *(({"standard": s, "equivariant": e}, {"task": task}) for task, (s, e) in tasks.items())
+    )
+    assert rows(seen)[0][2:] == ["**0.40**", "**0.70**", "2"]
+    seen = view(*(({"standard": 0.3, "equivariant": 0.9}, {"task": task}) for task in tasks))
+    assert rows(seen)[0][2:] == ["0.30", "**0.90**", "2"]
+
+
 def test_worlds_are_said_in_words_and_strengths_are_pooled():
     weak = {"standard": 0.5, "equivariant": 0.9}
     strong = {"standard": 0.7, "equivariant": 0.3}
@@ -96,6 +107,15 @@ def test_what_a_camera_error_costs():
     assert far.change["standard"].value == pytest.approx(-0.2)
     assert far.change["equivariant"].value == pytest.approx(0.0)
     assert [row[0] for row in rows(seen, 3)] == ["1 cm", "2 cm"]
+
+
+def test_places_with_one_distance_each_have_rows_of_their_own():
+    both = {"standard": 0.5, "equivariant": 0.5}
+    worlds = [("A-v1", "perception_bias:1"), ("B-v1", "perception_bias:0.8")]
+    seen = view(
+        *((both, {"task": task, "variant": v}) for task, far in worlds for v in ("none", far))
+    )
+    assert [row[0] for row in rows(seen, 3)] == ["1.6 cm", "2 cm"]
 
 
 def test_camera_errors_compare_agents_in_the_same_cells():

@@ -169,6 +169,26 @@ def test_a_declared_agent_is_judged_without_the_tasks_that_tested_it():
     assert [table.key.task for table in regret.compute(summary, ["A-v1"]).cells] == ["B-v1"]
 
 
+@pytest.mark.parametrize(
+    ("safe", "agent"),
+    [
+        (None, "standard"),
+        (Safe(agent="equivariant", success=0.5, area=0.5), "standard"),  # contradicted
+        (Safe(agent="slow", success=0.5, area=0.5), "standard"),  # not tested
+    ],
+)
+def test_without_a_proven_agent_the_plain_one_is_taken(safe, agent):
+    assert regret.fallback(two_worlds().summary, safe) == agent
+
+
+def test_a_proven_agent_is_taken_where_nothing_is_known():
+    cells = [make_cell({"standard": s, "slow": 0.8}, variant=v) for s, v in ((0.5, "none"),)]
+    for record in cells[0]:
+        record.base_policy.content_hash = f"{record.settings.seed:064d}"
+    safe = Safe(agent="slow", success=0.1, area=0.1)
+    assert regret.fallback(summary_of(*cells), safe) == "slow"
+
+
 def test_the_page_tells_the_verdict():
     view = two_worlds()
     study = replace(view.findings.study, safe=Safe(agent="standard", success=0.11, area=0.5))

@@ -11,7 +11,13 @@ from scipy.stats import norm
 from symsteer.leaderboard.page import other_files
 from symsteer.leaderboard.sections import View, claims
 from symsteer.leaderboard.sections.claims import ClaimOutcome
-from symsteer.leaderboard.sections.verdicts import SECTION, needed, standard_error, statements
+from symsteer.leaderboard.sections.verdicts import (
+    SECTION,
+    needed,
+    standard_error,
+    standing,
+    statements,
+)
 from symsteer.leaderboard.statistics import Interval, p_difference, p_equivalence
 from symsteer.leaderboard.study import Statement, Study
 from symsteer.leaderboard.text import compact
@@ -86,6 +92,20 @@ def test_the_page_says_what_an_undecided_claim_needs() -> None:
     assert last(ClaimOutcome(CLAIM, Normal(0.2), p=0.01)) == "\u2013"
 
 
+def test_the_front_says_on_which_tasks_verdicts_rest_and_what_else_was_declared() -> None:
+    other = CLAIM.model_copy(update={"name": "other"})
+    statement = Statement(says="it", claims=(CLAIM.name,))
+    study = Study("", "", "", (CLAIM, other), (statement,), "", "")
+    findings = replace(view_of(make_cell({"base": 0.5}, 1)).findings, study=study, _results={})
+    rests = ClaimOutcome(CLAIM, Normal(0.2), policies=5, p=0.01, rests_on=("A-v1", "B-v1"))
+    findings._results[claims.SECTION] = [rests, ClaimOutcome(other, reason="no runs")]
+    _, verdicts, _, _, others = View(findings).blocks(SECTION)
+    assert verdicts == "- it: **supported** (but not without `A-v1` or `B-v1`)."
+    assert others == "- **Not tested** (1): other."
+    assert standing([rests, ClaimOutcome(other, reason="no runs")]).startswith("1 supported, 1 not")
+    assert standing([rests, rests]).endswith("(2 of 2, but not without `A-v1` or `B-v1`)")
+
+
 def test_the_papers_statements_have_their_tests() -> None:
     rates = {"base": 0.3, "standard": 0.5, "standard-matched": 0.5, "equivariant": 0.8}
     view = view_of(make_cell(rates, episodes=100))
@@ -96,7 +116,7 @@ def test_the_papers_statements_have_their_tests() -> None:
     efficiency, divergence, *_ = said
     assert overall[efficiency] == "2 supported, 1 not tested"
     assert overall[divergence] == "**not tested**"
-    _, verdicts, link = view.blocks(SECTION)
+    _, verdicts, link, *_ = view.blocks(SECTION)
     assert f"- {efficiency}: 2 supported, 1 not tested.\n" in verdicts
     assert "(PAPER.md)" in link
     for statement, tested in said.items():
