@@ -115,8 +115,8 @@ def success(tables: Sequence[Table]) -> str:
 def differences(tables: Sequence[Table], first: str, second: str, measure: str) -> str:
     """Of two agents, in pairs of runs on one base policy, by what is seen and world.
 
-    In each task, over both, and over both less that of the unbroken world. `ASIDE` is the mean over
-    the two worlds in which something is displaced.
+    In each task, over both, and over both less that of the unbroken world. A last row for what is
+    seen has the mean over the two worlds of `ASIDE`.
     """
     found: dict[str, dict[str, Cells]] = {}
     for table in tables:
