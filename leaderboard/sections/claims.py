@@ -308,18 +308,19 @@ def where(cells: Cells) -> str:
     if cells == Cells():
         return "all cells"
     words = {None: "", True: "broken ", False: "unbroken "}[cells.broken] + "cells"
+    have = []
     if cells.defect is not None:
-        words += f" with a defect of {cells.defect[0]:g} to {cells.defect[1]:g}"
+        have.append(f"a defect of {cells.defect[0]:g} to {cells.defect[1]:g}")
     for names in (cells.task, cells.embodiment, cells.variant):
         if names is not None:
-            words += f" of {' or '.join(map(code, names))}"
+            have.append(" or ".join(map(code, names)))
     if isinstance(cells.demonstrations, tuple):
-        words += f" with {_listed(cells.demonstrations)} demonstrations"
+        have.append(f"{_listed(cells.demonstrations)} demonstrations")
     elif cells.demonstrations is not None:
-        words += f" with the {cells.demonstrations} demonstrations"
+        have.append(f"the {cells.demonstrations} demonstrations")
     if cells.env_steps is not None:
-        words += f" of {_listed(cells.env_steps)} steps"
-    return words
+        have.append(f"{_listed(cells.env_steps)} steps")
+    return words + (f" with {', '.join(have)}" if have else "")
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -4,6 +4,8 @@
   those on a tilted table and those that cameras see, whose scenes are the same.
 - ``python -m tools.pictures.tasks docs/tasks/pull-cube.png PullCube-v1``: one task.
 - ``... docs/tasks/seen-push-cube.png SeenPushCube-v1``: what the cameras see, and the cloud.
+- ``... docs/seen.png HeightPushCube-v1 HandPushCube-v1 SeenPushCube-v1``: what is seen in the
+  worlds of docs/seen.md, a row for each task.
 
 Needs a Vulkan driver; ``symsteer doctor`` says whether there is one.
 """
@@ -11,6 +13,7 @@ Needs a Vulkan driver; ``symsteer doctor`` says whether there is one.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +23,10 @@ from PIL import Image, ImageDraw
 
 from symsteer.bench.runs.film import CAMERA, SIZE, captioned
 from symsteer.bench.tasks import EMBODIMENTS, TASKS, make, task_class
-from symsteer.bench.tasks.clouds import CAMERAS, PIXELS
+from symsteer.bench.tasks.base import SymmetricTask
+from symsteer.bench.tasks.clouds import CAMERAS, PIXELS, Seen
 from symsteer.bench.tasks.experts import Expert
+from symsteer.bench.tasks.heights import Above
 from symsteer.bench.tasks.in_hand import InHand
 from symsteer.bench.tasks.tilted import Tilted
 from symsteer.errors import UserError
@@ -36,6 +41,8 @@ SHOWN = 0.2
 """Half of the width of what a view of a cloud shows, and the height that is white, metres."""
 DEEP = 0.25
 """Distance from a camera in the hand that is almost black, metres."""
+WORLDS = ("none", "perception_bias:1", "camera_rotation:1")
+"""In which the cameras see differently; ``worlds_picture`` takes one more."""
 
 
 def snapshot(task: str, embodiment: str, seed: int, steps: int) -> np.ndarray:
@@ -97,26 +104,32 @@ def seen_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
     return np.concatenate(parts, axis=1)
 
 
-def worlds_picture(task: str, seed: int = 1, steps: int = 8) -> np.ndarray:
-    """The picture of the same state in several worlds, uint8; what is near is light."""
+def worlds_picture(task: str, world: str, seed: int = 1, steps: int = 8) -> np.ndarray:
+    """What is seen of a state, in `WORLDS` and one more, uint8; what is near is light."""
     parts = []
-    for variant in ("none", "perception_bias:1", "camera_rotation:1", "obstacle:1"):
+    for variant in (*WORLDS, world):
         env = make(task, num_envs=1, variant=variant)
         env.reset(seed=[seed])
         expert = Expert(env)
         for _ in range(steps):
             env.step(expert.act())
-        if isinstance(env, InHand):
-            seen = env.distances()[0]
-            light = torch.where(seen > 0, (1.2 - seen / DEEP).clamp(0.2, 1), 0)
-        else:
-            # The root shows low things, too.
-            light = (env.heights()[0] / SHOWN).clamp(0, 1).sqrt()
+        parts.append(captioned(_seen(env), variant))
         env.close()
-        grey = Image.fromarray((255 * light).byte().numpy())
-        large = grey.resize((VIEW, VIEW), Image.Resampling.NEAREST)
-        parts.append(captioned(np.asarray(large.convert("RGB")), variant))
     return np.concatenate(parts, axis=1)
+
+
+def _seen(env: SymmetricTask) -> np.ndarray:
+    if isinstance(env, Seen):
+        return _view(env._observe_task()["cloud_xy"].view(-1, 2).numpy())
+    if isinstance(env, InHand):
+        distance = env.distances()[0]
+        light = torch.where(distance > 0, (1.2 - distance / DEEP).clamp(0.2, 1), 0)
+    else:
+        assert isinstance(env, Above)
+        # The root shows low things, too.
+        light = (env.heights()[0] / SHOWN).clamp(0, 1).sqrt()
+    grey = Image.fromarray((255 * light).byte().numpy())
+    return np.asarray(grey.resize((VIEW, VIEW), Image.Resampling.NEAREST).convert("RGB"))
 
 
 def _view(places: np.ndarray) -> np.ndarray:
@@ -143,18 +156,26 @@ def contact_sheet() -> np.ndarray:
     return np.concatenate(rows, axis=0)
 
 
+def picture_of(tasks: Sequence[str]) -> np.ndarray:
+    """What the command line asks for, uint8."""
+    if not tasks:
+        return contact_sheet()
+    if len(tasks) > 1:
+        return np.concatenate([worlds_picture(task, "actuator_offset:0.5") for task in tasks])
+    (task,) = tasks
+    kind = task_class(task)
+    if kind.observation_layout.picture:
+        return worlds_picture(task, "obstacle:1")
+    return (seen_picture if kind.is_seen() else task_picture)(task)
+
+
 def main() -> int:
     """Write the picture to the path given on the command line."""
-    if len(sys.argv) not in (2, 3):
-        print("usage: python -m tools.pictures.tasks FILE.png [TASK]", file=sys.stderr)
+    if len(sys.argv) < 2:
+        print("usage: python -m tools.pictures.tasks FILE.png [TASK ...]", file=sys.stderr)
         return 2
     try:
-        if len(sys.argv) == 2:
-            picture = contact_sheet()
-        else:
-            kind = task_class(sys.argv[2])
-            seen = worlds_picture if kind.observation_layout.picture else seen_picture
-            picture = (seen if kind.is_seen() else task_picture)(sys.argv[2])
+        picture = picture_of(sys.argv[2:])
         # The texture of the table would take most of the bytes.
         small = Image.fromarray(picture).quantize(COLOURS, dither=Image.Dither.NONE)
         with staged(Path(sys.argv[1])) as file:

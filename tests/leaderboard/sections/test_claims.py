@@ -260,14 +260,14 @@ def test_without_enough_pairs_the_effect_is_shown_and_nothing_decided() -> None:
         ({"cells": {"broken": True}}, "there are no broken cells"),
         ({"cells": {"defect": [0.2, 0.3]}}, "there are no cells with a defect of 0.2 to 0.3"),
         ({"cells": {"demonstrations": [5]}}, "there are no cells with 5 demonstrations"),
-        ({"cells": {"env_steps": [1000, 2000]}}, "there are no cells of 1,000 or 2,000 steps"),
+        ({"cells": {"env_steps": [1000, 2000]}}, "there are no cells with 1,000 or 2,000 steps"),
         ({"agents": ["augmented", "standard"]}, "no runs of `augmented`"),
         ({"measure": "bias"}, "not measured over all decisions"),
         ({"measure": "diverged"}, "nobody diverged"),
         ({"effect": "slope"}, "no base policy was steered at two defects"),
         ({"cells": {"demonstrations": "most"}}, "no cell was run with more than one number"),
         # A study can be reported before its runs that break in the middle exist.
-        ({"cells": {"variant": ["wind:1@0.5", "wind:1@0.3..0.7"]}}, "there are no cells of "),
+        ({"cells": {"variant": ["wind:1@0.5", "wind:1@0.3..0.7"]}}, "there are no cells with "),
     ],
 )
 def test_what_is_not_tested_says_why(changes: dict[str, Any], reason: str) -> None:
@@ -430,7 +430,7 @@ def test_the_page_has_every_claim_of_the_paper_tested_or_not() -> None:
     assert [row[1] for row in rows] == [supported, few, few, supported]
     _, _, effect, size, smallest, p_values, counts = rows[-1]
     assert effect == (
-        "success, `residual-pathway` minus `equivariant`, broken cells of `floating` minus the "
+        "success, `residual-pathway` minus `equivariant`, broken cells with `floating` minus the "
         "same in unbroken cells"
     )
     # -0.1 in the unbroken cell; -0.1 + the defect in the broken ones, 0.233 on average.
