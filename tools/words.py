@@ -132,6 +132,10 @@ def main(arguments: Sequence[str]) -> int:
             raise UserError(f"--episodes must be a multiple of {SENTENCES}, not {given.episodes}")
         if len(set(given.tasks)) < max(2, len(given.tasks)):
             raise UserError("--tasks needs two or more tasks, each once")
+        if len(set(given.seeds)) < len(given.seeds):
+            raise UserError("--seeds needs each seed once")
+        for task in given.tasks:
+            wordings(task)
         _measure_all(given)
     except UserError as error:
         return complain(error, f"error: {error}", 2)
@@ -139,12 +143,14 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _measure_all(given: argparse.Namespace) -> None:
-    settings = {name: getattr(given, name) for name in ("episodes", "demonstrations", "steps")}
+    names = ("tasks", "episodes", "demonstrations", "steps")
+    settings = {name: getattr(given, name) for name in names}
     rows = []
     if given.out.exists():
         try:
             found = json.loads(given.out.read_text("utf-8-sig"))
             rows = found.pop("rows")
+            del found["seeds"]
             there = {(row["seed"], row["task"]) for row in rows}
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"{given.out} cannot be read ({error}); name another --out") from None
@@ -158,7 +164,7 @@ def _measure_all(given: argparse.Namespace) -> None:
             if (seed, task) in there:
                 continue
             rows.append(measure(seed, task, other, given))
-            text = json.dumps({**settings, "rows": rows}, indent=1)
+            text = json.dumps({**settings, "seeds": given.seeds, "rows": rows}, indent=1)
             write_atomically(given.out, f"{text}\n".encode())
             print(f"seed {seed}, {task}: measured", flush=True)
 

@@ -138,13 +138,19 @@ def test_without_words_it_is_the_ordinary_policy():
     assert not torch.equal(alone.decode(obs, noise), ordinary.decode(obs, noise))
 
 
+def directions(sentences):
+    """Their embeddings, of length 1."""
+    embedded = torch.stack([words.embedding(sentence) for sentence in sentences])
+    assert torch.allclose(embedded.abs().sum(dim=1), torch.tensor(4.0))
+    return embedded / embedded.norm(dim=1, keepdim=True)
+
+
 @pytest.mark.parametrize("held_out", [False, True])
 def test_wordings_are_nearer_within_a_task_than_between_tasks(held_out):
-    known = {t: torch.stack([words.embedding(s) for s in words.sentences(t)]) for t in TASKS}
+    known = {task: directions(words.sentences(task)) for task in TASKS}
     for task in TASKS:
-        own = torch.stack([words.embedding(s) for s in words.sentences(task, held_out)])
-        assert torch.allclose(own.norm(dim=1), torch.tensor(words.SIZE**0.5))
-        near = {other: (own @ known[other].T).mean() / words.SIZE for other in TASKS}
+        own = directions(words.sentences(task, held_out))
+        near = {other: (own @ known[other].T).mean() for other in TASKS}
         others = [value for other, value in near.items() if other != task]
         assert near[task] > 0.1 + sum(others) / len(others)
         assert near[task] >= max(others)
@@ -180,11 +186,15 @@ def test_the_sentences():
             # This refuses directions of the plane, too.
             words.check_instruction(sentence)
         # Whatever order its words have, no held-out wording is one of the training.
-        told, new = (
-            torch.stack([words.embedding(sentence) for sentence in words.sentences(task, held_out)])
-            for held_out in (False, True)
-        )
-        assert (new @ told.T).max() < 0.99 * words.SIZE
+        told, new = (directions(words.sentences(task, held_out)) for held_out in (False, True))
+        assert (new @ told.T).max() < 0.99
+        # As the file says.
+        known = {
+            word[:4] for sentence in words.sentences(task) for word in words.words_of(sentence)
+        }
+        for number, filled in enumerate(words.wordings(task, held_out=True)):
+            beginnings = {word[:4] for sentence in filled for word in words.words_of(sentence)}
+            assert bool(beginnings - known) == (number == 2)
     assert set(data["slots"]) == set(re.findall(r"{(\w+)}", " ".join(seen)))
 
 
@@ -195,6 +205,7 @@ def test_the_sentences():
         ("Push the cube\x1b[2J", "an instruction is an English sentence of letters"),
         ("Push " + "on " * 99, "200 characters at most"),
         ("Push the cube to the left.", "names a direction \\('left'\\)"),
+        ("Push the leftmost cube northwards.", "names a direction \\('leftmost'\\)"),
         ("Do it to the xyzzy.", "'Do it to the xyzzy.' has no word that tells a task"),
     ],
 )

@@ -51,6 +51,12 @@ def test_symmetries_keep_the_function(name, options):
         assert sum(float((parts[key] - other[key]).square().sum()) for key in parts) > 10
 
 
+@pytest.mark.parametrize("name", barriers.NAMES)
+def test_all_policies_take_as_many_steps(name):
+    kind = POLICIES.get(name)
+    assert kind(barriers._options(kind, 12), OBS, ACT).options.steps == 12
+
+
 @pytest.mark.parametrize(("name", "options"), LIFTED)
 def test_alignment_finds_a_move(name, options):
     policy = untrained(name, **options)

@@ -10,8 +10,11 @@ import pytest
 from symsteer.bench.steering.seeds import held_out_seeds
 from symsteer.bench.sweep.suite import load_suite
 from symsteer.errors import UserError
+from symsteer.leaderboard.records import write_record
+from symsteer.leaderboard.runs import load_runs
 from symsteer.leaderboard.text import MINUS, SPACE
 from symsteer.policies.words import _data, wordings
+from tests.leaderboard.record_factory import edited, make_cell
 from tools import words
 from tools.pages import words as page
 
@@ -46,7 +49,9 @@ def test_the_suite_steers_what_the_tool_trains(monkeypatch, tmp_path):
         ("--tasks", "PushCube-v1"),
         ("--tasks", "PushCube-v1", "PushCube-v1"),
         ("--tasks", "PushCube-v1", "PushT"),
+        ("--tasks", "PushCube-v1", "TiltedPushCube-v1"),
         ("--episodes", "100"),
+        ("--seeds", "3", "3"),
     ],
 )
 def test_wrong_arguments(wrong, tmp_path, capsys):
@@ -54,18 +59,26 @@ def test_wrong_arguments(wrong, tmp_path, capsys):
     assert capsys.readouterr().err.startswith("error: ")
 
 
+TASKS = ("PushCube-v1", "PullCube-v1")
+
+
 def row(seed, task, one_hot, training):
-    told = {"training": [training] * 6, "another_task": [0.0] * 6}
-    told["held_out"] = [training, training, training - 0.3] * 2
-    return {"seed": seed, "task": task, "one_hot": [one_hot] * 6, **told}
+    """With shares that differ by sentence: the third and sixth are ahead by .06."""
+    shares = {"one_hot": one_hot, "training": training, "another_task": 0.1}
+    shares = {
+        kind: [share - 0.03, share - 0.03, share + 0.06] * 2 for kind, share in shares.items()
+    }
+    held_out = [training + 0.12, training - 0.03, training - 0.24] * 2
+    return {"seed": seed, "task": TASKS[task], **shares, "held_out": held_out}
 
 
-ROWS = [row(1, "A", 0.5, 0.6), row(1, "B", 0.3, 0.2), row(2, "A", 0.5, 0.8), row(2, "B", 0, 0)]
+ROWS = [row(1, 0, 0.5, 0.6), row(1, 1, 0.3, 0.2), row(2, 0, 0.5, 0.8), row(2, 1, 0.1, 0.1)]
 
 
 def write(folder, rows):
     path = folder / "words.json"
-    path.write_text(json.dumps({"episodes": 12, "demonstrations": 50, "steps": 1500, "rows": rows}))
+    settings = {"tasks": TASKS, "episodes": 12, "demonstrations": 50, "steps": 1500}
+    path.write_text(json.dumps({**settings, "seeds": [1, 2], "rows": rows}))
     return path
 
 
@@ -74,16 +87,19 @@ def test_it_goes_on_with_what_is_missing(tmp_path, monkeypatch, capsys):
 
     def measure(seed, task, other, given):
         measured.append((seed, task, other))
-        return row(seed, task, 0.5, 0.5)
+        return row(seed, TASKS.index(task), 0.5, 0.5)
 
     monkeypatch.setattr(words, "measure", measure)
-    again = [str(tmp_path), "--out", str(path), "--tasks", "A", "B", "--seeds", "1", "2"]
+    push, pull = TASKS
+    again = [str(tmp_path), "--out", str(path), "--tasks", push, pull, "--seeds", "1", "2"]
     assert words.main([*again, "--episodes", "12"]) == 0
-    assert measured == [(1, "B", "A"), (2, "A", "B"), (2, "B", "A")]
+    assert measured == [(1, pull, push), (2, push, pull), (2, pull, push)]
     assert json.loads(path.read_text())["rows"][0] == ROWS[0]
     before = path.read_bytes()
-    assert words.main([*again, "--episodes", "6"]) == 2
-    assert "other settings" in capsys.readouterr().err
+    other_tasks = [*again, "--episodes", "12", "--tasks", push, pull, "PickCube-v1"]
+    for other in ([*again, "--episodes", "6"], other_tasks):
+        assert words.main(other) == 2
+        assert "other settings" in capsys.readouterr().err
     path.write_text("{")
     assert words.main([*again, "--episodes", "12"]) == 2
     assert "cannot be read" in capsys.readouterr().err
@@ -93,16 +109,48 @@ def test_it_goes_on_with_what_is_missing(tmp_path, monkeypatch, capsys):
 def test_tables(tmp_path):
     rows = page.read(write(tmp_path, ROWS))
     lines = page.successes(rows).replace(SPACE, " ").splitlines()[2:]
-    assert lines[0].split(" | ")[1:3] == ["0.50 [0.50, 0.50]", "0.70 [0.60, 0.80]"]
-    assert lines[-1].split(" | ")[1:3] == ["0.33 [0.25, 0.40]", "0.40 [0.40, 0.40]"]
+    assert lines[0].strip("| ").split(" | ")[1:] == [
+        *("0.50 [0.50, 0.50]", "0.70 [0.60, 0.80]", "0.65 [0.55, 0.75]", "0.46 [0.36, 0.56]"),
+        "0.10 [0.10, 0.10]",
+    ]
+    assert lines[-1].split(" | ")[1:3] == ["0.35 [0.30, 0.40]", "0.43 [0.40, 0.45]"]
     # The means over the tasks differ by 0 and .15; t with one degree of freedom is 12.7 and 6.3.
-    first, held_out, verb, _ = page.differences(rows).replace(SPACE, " ").splitlines()[2:]
-    assert f"+0.08 [{MINUS}0.88, +1.03] | +0.08 [{MINUS}0.40, +0.55]" in first
-    assert f"{MINUS}0.10 [{MINUS}0.10, {MINUS}0.10]" in held_out
-    assert f"{MINUS}0.30 [{MINUS}0.30, {MINUS}0.30]" in verb
+    found = page.differences(rows).replace(SPACE, " ").splitlines()[2:]
+    first, held_out, verb, another = (line.strip("| ").split(" | ") for line in found)
+    assert first[1:] == [f"+0.08 [{MINUS}0.88, +1.03]", f"+0.08 [{MINUS}0.40, +0.55]"]
+    # A sum of two sentences in three would be another number, and so would another third.
+    assert held_out[1].startswith(f"{MINUS}0.05 [{MINUS}0.05, {MINUS}0.05]")
+    assert verb[1].startswith(f"{MINUS}0.30 [{MINUS}0.30, {MINUS}0.30]")
+    assert another[1].startswith(f"{MINUS}0.33 [{MINUS}0.64, {MINUS}0.01]")
 
 
-@pytest.mark.parametrize("rows", [ROWS[:3], ROWS[:2]], ids=["a task", "one training"])
+def records(folder, told):
+    """Five runs of two agents of each kind on two tasks; `base` solves .5 of all of them."""
+    for name, rate in (("edp-joint", 0.25), ("edp-told", told)):
+        for task in ("PickCube-v1", "PlaceSphere-v1"):
+            for record in make_cell({"base": 0.5, "standard": rate}, task=task):
+                made = edited(record, {"base_policy/name": name})
+                write_record(made, folder / f"{name}-{task}-{record.run_id}.json")
+    return load_runs([folder])
+
+
+def test_steered(tmp_path):
+    runs = records(tmp_path, 0.75)
+    reached, gaps = page.steered(runs).replace(SPACE, " ").split("\n\n")
+    rows = [line.strip("| ").split(" | ") for line in reached.splitlines()[2:]]
+    joint, told = (
+        ["0.50 [0.50, 0.50]", "0.25 [0.25, 0.25]"],
+        ["0.50 [0.50, 0.50]", "0.75 [0.75, 0.75]"],
+    )
+    assert [row[2:] for row in rows] == [joint, told, joint, told]
+    base, standard = gaps.splitlines()[2:]
+    assert "`base` | 0.00 [0.00, 0.00]" in base
+    assert "`standard` | +0.50 [+0.50, +0.50]" in standard
+    with pytest.raises(UserError, match="are not all there"):
+        page.steered(runs[1:])
+
+
+@pytest.mark.parametrize("rows", [ROWS[:3], ROWS[:2]], ids=["a task", "a training"])
 def test_what_is_not_finished_is_no_table(rows, tmp_path):
     with pytest.raises(UserError, match="is not finished"):
         page.read(write(tmp_path, rows))

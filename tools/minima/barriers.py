@@ -80,7 +80,7 @@ def train(
 
     Args:
         name: of a diffusion policy.
-        steps: option of the policy.
+        steps: of the gradient.
         demos: what it is trained on.
         normalised_by: what the normalisers are fitted to.
         start: seed of the first weights.
@@ -90,7 +90,7 @@ def train(
     layouts = (demos.observation_layout, demos.action_layout)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(start)
-        policy: DiffusionPolicy = kind(kind.Options(steps=steps), *layouts)
+        policy: DiffusionPolicy = kind(_options(kind, steps), *layouts)
     obs, chunks = (
         torch.cat(x) for x in zip(*(pairs(policy, d) for d in normalised_by), strict=True)
     )
@@ -106,6 +106,12 @@ def train(
 
     optimize(policy, batch_loss, policy.options)
     return policy.freeze()
+
+
+def _options(kind: Any, steps: int) -> Any:
+    """Plain networks take as many steps as equivariant ones: a longer training moves further."""
+    equal = {"match_compute": False} if hasattr(kind.Options, "match_compute") else {}
+    return kind.Options(steps=steps, **equal)
 
 
 def pairs(policy: DiffusionPolicy, demos: Demonstrations) -> tuple[torch.Tensor, torch.Tensor]:
@@ -135,7 +141,7 @@ class Study:
         config: of the task and the first demonstrations.
         count: number of policies that are compared with others; the demonstrations of the seed
             after theirs are held out.
-        steps: option of the policies.
+        steps: of the gradient, of every policy.
     """
 
     def __init__(self, folder: Path, config: RunConfig, count: int, steps: int):
@@ -226,7 +232,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--count", type=int, default=5, help="comparisons of each kind")
     parser.add_argument("--first", type=int, default=60, help="seed of the first demonstrations")
     parser.add_argument("--demonstrations", type=int, default=50, help="number for each policy")
-    parser.add_argument("--steps", type=int, default=1500, help="option of the policies")
+    parser.add_argument("--steps", type=int, default=1500, help="of the gradient, of every policy")
     given = parser.parse_args(arguments)
     rows = []
     try:

@@ -28,6 +28,7 @@ RESULTS = CHECKOUT / "leaderboard" / "results" / "minima"
 
 Row = Mapping[str, Any]
 
+SPREAD = "mean [lowest, highest]"
 
 WAYS = {"as trained": "trained", "permuted": "permuted", "aligned": "aligned"}
 WAYS["balanced and aligned"] = "balanced"
@@ -135,14 +136,14 @@ def render(folder: Path) -> str:
     """
     parts = {
         "barriers.json": {
-            "The barrier": barriers,
-            "The distance": distances,
-            "The middle of the line, played": middles,
+            f"The barrier: {SPREAD}": barriers,
+            f"The distance: {SPREAD}": distances,
+            f"The middle of the line, played: {SPREAD}": middles,
         },
         "transfer.json": {
-            "Success with the actor of another policy": transfers,
-            "Differences": gains,
-            "Do two policies do the same with the same noise?": agreements,
+            f"Success with the actor of another policy: {SPREAD}": transfers,
+            "Differences, with 95 % intervals": gains,
+            f"Correlation of the actions of two policies with the same noise: {SPREAD}": agreements,
         },
     }
     text = []

@@ -1,4 +1,4 @@
-"""Writes the table of docs/tasks/clutter-pick.md: how agents steer the base policies of a task.
+"""Writes the tables of docs/tasks/clutter-pick.md: how agents steer the base policies of a task.
 
 python -m tools.pages.steered        # from leaderboard/results/clutter
 python -m tools.pages.steered RUNS   # from other runs, a folder or a record each
@@ -10,61 +10,62 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from symsteer.leaderboard.known_agents import STANDARD, STRICT
-from symsteer.leaderboard.pairs import compare
+from symsteer.errors import UserError
+from symsteer.leaderboard.known_agents import BASE, STANDARD, STRICT
+from symsteer.leaderboard.pairs import advantage
 from symsteer.leaderboard.paths import RESULTS
 from symsteer.leaderboard.row_numbers import summarize
-from symsteer.leaderboard.rows import Table
 from symsteer.leaderboard.runs import Run, load_runs
-from symsteer.leaderboard.statistics import Interval
-from symsteer.leaderboard.text import code, difference, interval
+from symsteer.leaderboard.text import code
 from symsteer.tables import markdown
 from tools.pages.marks import CHECKOUT, write_tables
+from tools.pages.minima import interval, spread
 
 PAGE = CHECKOUT / "docs" / "tasks" / "clutter-pick.md"
 RECORDS = RESULTS / "clutter"
 
-PAIRS = ((STRICT, STANDARD), ("residual-pathway", STRICT))
+ZERO = "zero"
+LEARNERS = (STANDARD, STRICT, "residual-pathway")
+
+PAIRS = (
+    (STRICT, STANDARD),
+    ("residual-pathway", STRICT),
+    *((learner, reference) for reference in (BASE, ZERO) for learner in LEARNERS),
+)
 """Agents whose differences are shown."""
 
 
 def steering(runs: Sequence[Run]) -> str:
-    """Two tables, a row for each task, policy and world: success by agent, and differences.
+    """Two tables: success of each agent in the last fifth of the steps, and differences of pairs.
 
-    Success is that of the last fifth of the steps, with 95 % intervals over base policies and
-    episodes.
+    Raises:
+        UserError: if the runs are of several kinds, or some are not finished.
     """
     summary = summarize(runs)
-    agents, tables = summary.agents, summary.tables
-    reached = [[*_place(t), *(interval(_success(t, a)) for a in agents)] for t in tables]
-    gaps = [[*_place(t), *(_gap(t, *pair) for pair in PAIRS)] for t in tables]
-    heads = ["task", "policy", "world", "base policies"]
-    titles = [f"{code(first)} minus {code(second)}" for first, second in PAIRS]
+    if len(summary.tables) != 1 or summary.set_aside or not all(run.finished for run in runs):
+        raise UserError(
+            "runs of one task and world are needed, each once, and all of them finished"
+        )
+    (table,) = summary.tables
+    reached = []
+    for row in table.rows:
+        values = list(row.by_policy("success").values())
+        reached.append([code(row.agent), spread(values), str(len(values))])
+    gaps = []
+    for first, second in PAIRS:
+        pairs = advantage(table, first, second, "success")
+        values = [sample.value for sample in pairs.values()]
+        gaps.append([f"{code(first)} minus {code(second)}", interval(values), str(len(values))])
     return "\n\n".join(
         (
-            markdown([*heads, *map(code, agents)], reached, left=3),
-            markdown([*heads, *titles], gaps, left=3),
+            markdown(["agent", "success [lowest, highest]", "base policies"], reached),
+            markdown(["difference", "success, 95 % interval", "pairs"], gaps),
         )
     )
 
 
-def _place(table: Table) -> list[str]:
-    policies = {run.policy for run in table.counted if run.finished}
-    return [*map(code, (table.key.task, table.key.base, table.key.variant)), str(len(policies))]
-
-
-def _success(table: Table, agent: str) -> Interval | None:
-    row = table.row_of(agent)
-    return row.success if row else None
-
-
-def _gap(table: Table, first: str, second: str) -> str:
-    one, two = table.row_of(first), table.row_of(second)
-    return difference(compare(one, two) if one and two else None)
-
-
 def main(arguments: Sequence[str]) -> int:
-    """Write the table."""
+    """Write the tables."""
     places = [Path(argument) for argument in arguments] or [RECORDS]
     return write_tables(PAGE, lambda: steering(load_runs(places)))
 

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from symsteer.errors import UserError
+from symsteer.leaderboard.known_agents import row_place
 from symsteer.leaderboard.paths import RESULTS
-from symsteer.leaderboard.runs import load_runs
+from symsteer.leaderboard.runs import Run, load_runs
+from symsteer.leaderboard.text import code
 from symsteer.tables import markdown
 from tools.pages.marks import CHECKOUT, write_tables
 from tools.pages.minima import interval, spread
-from tools.pages.steered import steering
 
 PAGE = CHECKOUT / "docs" / "words.md"
 
@@ -34,6 +35,8 @@ SHOWN = {
     "words of another task": "another_task",
 }
 
+INTERVALS = ("success, 95 % interval", "90 % interval")
+
 NEW_VERB = 2
 """Every third held-out wording has a verb that no wording of the training has."""
 
@@ -42,11 +45,12 @@ def read(path: Path) -> list[Row]:
     """The rows of a file, with the mean over the sentences of each kind.
 
     Raises:
-        UserError: a task lacks a training, or there are fewer than two trainings.
+        UserError: a task lacks a training.
     """
-    found = json.loads(path.read_text("utf-8-sig"))["rows"]
-    seeds, tasks = ({row[key] for row in found} for key in ("seed", "task"))
-    if len(seeds) < 2 or len(found) != len(seeds) * len(tasks):
+    file = json.loads(path.read_text("utf-8-sig"))
+    found = file["rows"]
+    planned = {(seed, task) for seed in file["seeds"] for task in file["tasks"]}
+    if {(row["seed"], row["task"]) for row in found} != planned:
         raise UserError(f"{path} is not finished; go on with `python -m tools.words`")
     rows: list[Row] = []
     for row in found:
@@ -83,7 +87,46 @@ def differences(rows: Sequence[Row]) -> str:
     for title, (more, less) in pairs.items():
         gaps = [a - b for a, b in zip(means(rows, more), means(rows, less), strict=True)]
         lines.append([title, interval(gaps), interval(gaps, 0.9)])
-    return markdown(["difference", "success, 95 % interval", "90 % interval"], lines)
+    return markdown(["difference of the means over the tasks", *INTERVALS], lines)
+
+
+def steered(runs: Sequence[Run]) -> str:
+    """Two tables: success of the final evaluation by agent, and by how much that of `edp-told` is
+    higher.
+
+    Raises:
+        UserError: an agent lacks a run that others have, or a run is not finished.
+    """
+    reached: dict[tuple[str, str, str], dict[int, float]] = {}
+    for run in runs:
+        settings = run.record.settings
+        place = (settings.task, run.record.base_policy.name, run.agent)
+        solved = run.final_success.values()
+        reached.setdefault(place, {})[run.seed] = statistics.mean(solved) if solved else -1
+    tasks, kinds = (sorted({place[k] for place in reached}) for k in range(2))
+    roles = {run.agent: run.record.role for run in runs}
+    agents = sorted(roles, key=lambda agent: row_place(agent, roles[agent]))
+    seeds = sorted({run.seed for run in runs})
+    whole = len(tasks) * len(kinds) * len(agents) * len(seeds)
+    every = [value for of_seed in reached.values() for value in of_seed.values()]
+    if len(every) != whole or len(runs) != whole or min(every) < 0:
+        raise UserError("the runs of the suite words are not all there; go on with the sweep")
+    lines = [
+        [task, code(kind), *(spread(list(reached[task, kind, a].values())) for a in agents)]
+        for task in tasks
+        for kind in kinds
+    ]
+    gaps = []
+    for agent in agents:
+        told, one_hot = (
+            [statistics.mean(reached[task, kind, agent][seed] for task in tasks) for seed in seeds]
+            for kind in ("edp-told", "edp-joint")
+        )
+        gap = [a - b for a, b in zip(told, one_hot, strict=True)]
+        gaps.append([code(agent), interval(gap), interval(gap, 0.9)])
+    heads = ["`edp-told` minus `edp-joint`, mean of the tasks", *INTERVALS]
+    named = ["task", "policy", *map(code, agents)]
+    return f"{markdown(named, lines, left=2)}\n\n{markdown(heads, gaps)}"
 
 
 def means(rows: Sequence[Row], key: str) -> list[float]:
@@ -101,8 +144,18 @@ def render(folder: Path) -> str:
     path = folder / "words.json"
     try:
         rows = read(path)
-        tables = successes(rows), differences(rows), steering(load_runs([folder / "records"]))
-        return "\n\n".join(tables)
+        trainings = len({row["seed"] for row in rows})
+        runs = load_runs([folder / "records"])
+        policies = len({run.seed for run in runs})
+        return "\n\n".join(
+            (
+                f"**Without steering**, {trainings} trainings of each: mean [lowest, highest].",
+                successes(rows),
+                differences(rows),
+                f"**Steered**, {policies} policies of each: mean [lowest, highest].",
+                steered(runs),
+            )
+        )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{path} cannot be read ({error}); write it again with `python -m tools.words`"
