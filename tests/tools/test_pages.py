@@ -13,11 +13,12 @@ from tools.pages import (
     minima,
     next_designs,
     sides,
+    steered,
     tuning,
 )
 from tools.pages.marks import BEGIN, END, with_tables
 
-TOOLS = (audit, base_policies, free_bias, minima, next_designs, sides, tuning)
+TOOLS = (audit, base_policies, free_bias, minima, next_designs, sides, steered, tuning)
 
 
 @pytest.fixture
