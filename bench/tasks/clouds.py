@@ -15,11 +15,13 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar
 
+import numpy as np
 import torch
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.sapien_utils import look_at
 from mani_skill.utils.structs import Link, Pose
-from sapien.render import RenderBodyComponent
+from sapien.physx import PhysxCollisionShapeConvexMesh
+from sapien.render import RenderBodyComponent, RenderMaterial, RenderShapeTriangleMesh
 
 from symsteer.bench.sim.rotations import quaternion_multiply, quaternion_to_matrix
 from symsteer.bench.tasks.base import SymmetricTask
@@ -64,6 +66,8 @@ class Seen(SymmetricTask):
 
     needs_cameras: ClassVar[bool] = True
     _last_cloud: torch.Tensor | None = None
+    _in_pictures: dict[RenderBodyComponent, bool]
+    """Whether a part is drawn for the cameras (or for films, which need it to look right)."""
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -86,11 +90,27 @@ class Seen(SymmetricTask):
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
-        if self.render_mode is None:
-            # No cloud has points of them, and drawing them takes three quarters of the time.
-            for furniture in (self.table_scene.table, self.table_scene.ground):
-                for entity in furniture._objs:
-                    entity.find_component_by_type(RenderBodyComponent).visibility = 0
+        # No cloud has points of table, ground and robot, and drawing them would take most of the
+        # time. The robot hides what is behind it: its hulls do so, which have few triangles.
+        self._in_pictures = {}
+        for furniture in (self.table_scene.table, self.table_scene.ground):
+            for entity in furniture._objs:
+                self._in_pictures[entity.find_component_by_type(RenderBodyComponent)] = False
+        for link in self.agent.robot.links:
+            for body in link._objs:
+                mesh = body.entity.find_component_by_type(RenderBodyComponent)
+                shapes = body.collision_shapes
+                # The boxes of fingers would hide more.
+                convex = {isinstance(shape, PhysxCollisionShapeConvexMesh) for shape in shapes}
+                if mesh and convex == {True}:
+                    hulls = drawn(shapes)
+                    body.entity.add_component(hulls)
+                    self._in_pictures |= {mesh: False, hulls: True}
+        self._draw(for_pictures=False)
+
+    def _draw(self, for_pictures: bool) -> None:
+        for component, in_pictures in self._in_pictures.items():
+            component.visibility = float(in_pictures == for_pictures)
 
     def _observe_task(self) -> dict[str, torch.Tensor]:
         true = self.manipulated.pose
@@ -133,8 +153,10 @@ class Seen(SymmetricTask):
         marks = [body for body in self._hidden_objects if not body.hidden]
         for body in marks:
             body.hide_visual()
+        self._draw(for_pictures=True)
         self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         self.capture_sensor_data()
+        self._draw(for_pictures=False)
         for body in marks:
             body.show_visual()
         points, labels = [], []
@@ -145,6 +167,23 @@ class Seen(SymmetricTask):
             points.append(local @ to_world[:, :3, :3].transpose(1, 2) + to_world[:, None, :3, 3])
             labels.append(picture["segmentation"].flatten(1).to(self.device))
         return torch.cat(points, dim=1), torch.cat(labels, dim=1)
+
+
+def drawn(shapes: Sequence[PhysxCollisionShapeConvexMesh]) -> RenderBodyComponent:
+    """What is drawn where convex collision shapes are."""
+    component = RenderBodyComponent()
+    for shape in shapes:
+        vertices = shape.scale * shape.vertices
+        surface = RenderShapeTriangleMesh(
+            vertices,
+            shape.triangles,
+            np.zeros_like(vertices),
+            np.zeros_like(vertices[:, :2]),
+            RenderMaterial(),
+        )
+        surface.local_pose = shape.local_pose
+        component.attach(surface)
+    return component
 
 
 def moved(points: torch.Tensor, true: Pose, seen: Pose) -> torch.Tensor:

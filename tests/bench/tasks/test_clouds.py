@@ -4,12 +4,14 @@ import math
 
 import pytest
 import torch
+from mani_skill.utils.structs import Link
 
 from symsteer.bench.audit.result import AuditSettings
 from symsteer.bench.demos import collect, load
 from symsteer.bench.sim.headless import rendering_works
-from symsteer.bench.tasks import make, task_class
+from symsteer.bench.tasks import EMBODIMENTS, make, task_class
 from symsteer.bench.tasks.clouds import POINTS, moved, thinned
+from symsteer.bench.tasks.experts import Expert
 from symsteer.errors import UserError
 from symsteer.leaderboard.records import read_record
 from tests.bench.tiny_run import execute, tiny_config
@@ -129,6 +131,32 @@ def test_the_goal_hides_nothing():
     assert torch.equal(env.cloud(), apart)
     assert not env.goal_site.hidden
     env.close()
+
+
+@needs_vulkan
+@pytest.mark.slow
+@pytest.mark.parametrize("embodiment", EMBODIMENTS)
+def test_the_robot_hides_what_its_meshes_would_hide_and_films_show_them(embodiment):
+    env = make(SEEN[0], num_envs=8, embodiment=embodiment)
+    env.reset(seed=range(8))
+    expert = Expert(env)
+    for _ in range(8):
+        env.step(expert.act())
+    ids = {"cube": [], "robot": []}
+    for number, body in env.segmentation_id_map.items():
+        if isinstance(body, Link) or body is env.manipulated:
+            ids["robot" if isinstance(body, Link) else "cube"].append(number)
+    pixels = []
+    for _ in range(2):
+        label = env.look()[1]
+        pixels.append([int(torch.isin(label, torch.tensor(each)).sum()) for each in ids.values()])
+        assert all(part.visibility != seen for part, seen in env._in_pictures.items())
+        # The second time all is drawn as in films.
+        env._draw = lambda for_pictures: None
+    env.close()
+    (cube, robot), (true_cube, true_robot) = pixels
+    assert 0.97 * true_cube < cube < 1.01 * true_cube
+    assert 0.97 * true_robot < robot < 1.15 * true_robot
 
 
 @needs_vulkan
