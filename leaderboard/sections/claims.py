@@ -45,9 +45,9 @@ episode, too), mean over cells with {MIN_SEEDS} pairs; slopes are per {SLOPE_UNI
 within base policies. *Supported* and *contradicted* need p < 0.05 for "no effect", *equivalent*
 needs it for "an effect of at least the smallest one of interest"; otherwise a claim is *undecided*.
 Below a difference: the means of both agents (of an interaction, in the first cells).
-Both p-values are corrected for the number of tests of a family (Holm), the intervals are not. *But
-not without* names each task without whose cells the interval holds 0, *but not in* each in which
-the effect is at least the smallest one of interest, and its interval does not hold 0."""
+Both p-values are corrected for the number of tests of a family (Holm), the intervals are not.
+*Rests on* names each task without whose cells the interval holds 0, *but not in* each in which the
+effect is at least the smallest one of interest, and its interval does not hold 0."""
 
 MEASURE_WORDS = {
     "auc": "area under the curve",
@@ -464,7 +464,7 @@ def verdict_text(outcome: ClaimOutcome) -> str:
     if outcome.reason:
         return f"{text}: {outcome.reason}"
     if outcome.needs:
-        text += f", but not without {' or '.join(map(code, outcome.needs))}"
+        text += f", rests on {', '.join(map(code, outcome.needs))}"
     if outcome.apart:
         text += f" on average, but not in {' or '.join(map(code, outcome.apart))}"
     if outcome.policies >= MIN_SEEDS or outcome.verdict == "undecided":

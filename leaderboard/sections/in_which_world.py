@@ -7,7 +7,7 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-from symsteer.leaderboard.catalogue import BIAS, BIAS_CENTIMETRES, IN_WORDS
+from symsteer.leaderboard.catalogue import BIAS, BIAS_CENTIMETRES
 from symsteer.leaderboard.defects import parts_of
 from symsteer.leaderboard.keys import Key
 from symsteer.leaderboard.known_agents import BASE, STANDARD
@@ -21,12 +21,12 @@ from symsteer.variant import UNBROKEN
 
 EXPLAINED = """\
 Success at the end of the budget, mean over the cells of each kind of world (tasks and strengths).
-**Bold**: the best learner, and every learner that is not clearly below it (paired by base policy
-and episode, 95 %), also without any one of several tasks."""
+**Bold**: the best learner, and every learner that is not shown to be below it (pairs by base policy
+and episode, 95 %; of several tasks, also without any one of them)."""
 
 CAMERA = """\
-**What a camera error costs**: change of final success where objects are seen so far from their
-place, on the same base policies, with 95 % intervals."""
+**What a camera error costs**: final success where objects are seen so far from their place, and
+below it the change from the unbroken world, on the same base policies, with 95 % intervals."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,13 @@ class CameraError:
     Attributes:
         centimetres: by which they are displaced.
         cells: their number.
-        change: of final success from the unbroken world, by agent.
+        success: final success, mean over them, by agent.
+        change: of it from the unbroken world.
     """
 
     centimetres: float
     cells: int
+    success: dict[str, float]
     change: dict[str, Interval]
 
 
@@ -72,7 +74,7 @@ class InWorlds:
 def compute(summary: Summary) -> InWorlds:
     """Kinds without a cell in which `STANDARD` and another learner have enough base policies are
     left out."""
-    each = kinds(summary, IN_WORDS).items()
+    each = kinds(summary).items()
     worlds = (world_of(kind, tables, summary.agents) for kind, tables in each)
     return InWorlds([world for world in worlds if world], camera_errors(summary))
 
@@ -88,14 +90,20 @@ def world_of(kind: str, tables: Sequence[Table], agents: Sequence[str]) -> World
     used = [table for table in tables if wanted <= table.decisive]
     names = [agent for agent in agents if agent in wanted]
     success = {
-        agent: fmean(fmean(row.by_policy("success").values()) for row in rows if row)
+        agent: success_in(used, agent)
         for agent in (BASE, *names)
-        if all(rows := [table.row_of(agent) for table in used])
+        if all(table.row_of(agent) for table in used)
     }
     top = max(success[agent] for agent in names)
     tops = [agent for agent in names if success[agent] == top]
     best = [a for a in names if a in tops or not any(_above(used, one, a) for one in tops)]
     return World(kind, used, success, best)
+
+
+def success_in(tables: Sequence[Table], agent: str) -> float:
+    """Final success, mean over base policies, then over the cells that have the agent."""
+    rows = (table.row_of(agent) for table in tables)
+    return fmean(fmean(row.by_policy("success").values()) for row in rows if row)
 
 
 def _above(tables: Sequence[Table], first: str, second: str) -> bool:
@@ -149,6 +157,7 @@ def camera_errors(summary: Summary) -> list[CameraError]:
         CameraError(
             distance,
             len(cells),
+            {agent: success_in([far for _, far in cells], agent) for agent in agents},
             {
                 agent: stratified_bootstrap([_changes(*worlds, agent) for worlds in cells])
                 for agent in agents
@@ -194,7 +203,10 @@ def render(found: InWorlds, view: View) -> list[str]:
     ]
     errors = [
         {"Camera error": f"{error.centimetres:g} cm".replace(" ", SPACE)}
-        | {code(agent): interval(error.change[agent], sign=True) for agent in columns(error.change)}
+        | {
+            code(a): f"{number(error.success[a])}<br>{interval(error.change[a], sign=True)}"
+            for a in columns(error.change)
+        }
         | {"Cells": str(error.cells)}
         for error in found.errors
     ]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from statistics import fmean
 
-from symsteer.leaderboard.catalogue import IN_WORDS
 from symsteer.leaderboard.known_agents import STANDARD, STRICT
 from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
 from symsteer.leaderboard.runs import Run
@@ -61,7 +60,7 @@ def measured(run: Run, name: str) -> float | None:
 def compute(summary: Summary) -> list[Row]:
     """Kinds without a measure in a cell with enough base policies are left out."""
     rows = []
-    for kind, tables in kinds(summary, IN_WORDS).items():
+    for kind, tables in kinds(summary).items():
         cells = {name: [c for t in tables if (c := _pairs(t, name))] for name in MEASURES}
         effects = {name: stratified_bootstrap(each) for name, each in cells.items() if each}
         if effects:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from symsteer.leaderboard.rows import MIN_SEEDS, Summary, Table
 from symsteer.leaderboard.sections import Section, View
 from symsteer.leaderboard.statistics import Interval
 from symsteer.leaderboard.study import Safe
-from symsteer.leaderboard.text import code, folded, interval, number, table_text
+from symsteer.leaderboard.text import code, count, folded, interval, number, table_text
 
 EXPLAINED = """\
 What a learner loses against the best learner of the same cell (one world, one budget), on average
@@ -37,6 +37,10 @@ The cells are those in which all these learners have {MIN_SEEDS} base policies. 
 agent that loses nothing, simulated with the scatter of these cells. The cell that is named is the
 one with the largest regret. Intervals: [jackknife](https://doi.org/10.1214/aos/1176345462) over
 base policies."""
+
+PICTURE = """\
+The largest loss in the picture may exceed *worst* in the table: the table chooses the worst cell
+on other base policies than those on which it measures."""
 
 MEASURES = ("success", "area")
 
@@ -118,12 +122,17 @@ def render(regret: Regret | None, view: View) -> list[str]:
     last = {"Learner": "*without regret*"} | _columns(regret.nothing)
     safe = view.findings.study.safe
     return [
-        f"{EXPLAINED} Cells: {len(regret.cells)}.",
+        f"{EXPLAINED} Cells: {len(regret.cells)}, of {_budgets(regret.cells)} steps.",
         *([verdict(regret, safe, view.summary)] if safe else []),
         table_text([*rows, last], sparse=True),
         *view.drawn(kind="regret"),
+        PICTURE,
         *folded("How it is measured", [HOW]),
     ]
+
+
+def _budgets(tables: Sequence[Table]) -> str:
+    return " and ".join(map(count, sorted({table.key.env_steps for table in tables})))
 
 
 def verdict(regret: Regret, safe: Safe, summary: Summary) -> str:

@@ -64,9 +64,7 @@ def _by_verdict(outcomes: Sequence[ClaimOutcome]) -> str:
     """Names of claims, a line for each verdict."""
     named: dict[str, list[str]] = {}
     for outcome in outcomes:
-        rest = (
-            f" (but not without {' or '.join(map(code, outcome.needs))})" if outcome.needs else ""
-        )
+        rest = f" (rests on {', '.join(map(code, outcome.needs))})" if outcome.needs else ""
         named.setdefault(outcome.verdict, []).append(title(outcome.claim) + rest)
     order = ("supported", "contradicted", "equivalent", "undecided", "not tested")
     lines = [
@@ -80,7 +78,7 @@ def _by_verdict(outcomes: Sequence[ClaimOutcome]) -> str:
 def standing(outcomes: Sequence[ClaimOutcome]) -> str:
     """The verdict of several claims: one word if they agree, else how often each was found.
 
-    And how many of them would not be decided without a task.
+    And how many of them rest on a task.
     """
     verdicts = Counter(outcome.verdict for outcome in outcomes)
     found = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
@@ -88,11 +86,10 @@ def standing(outcomes: Sequence[ClaimOutcome]) -> str:
     resting = [outcome.needs for outcome in outcomes if outcome.needs]
     if not resting:
         return text
-    tasks = " or ".join(
-        code(task) for task in sorted({task for needs in resting for task in needs})
-    )
-    which = f"{len(resting)} of {len(outcomes)}, but not" if len(outcomes) > 1 else "but not"
-    return f"{text} ({which} without {tasks})"
+    tasks = ", ".join(map(code, sorted({task for needs in resting for task in needs})))
+    verb = "rest" if len(resting) > 1 else "rests"
+    which = f"{len(resting)} of {len(outcomes)} {verb}" if len(outcomes) > 1 else verb
+    return f"{text} ({which} on {tasks})"
 
 
 def paper_page(said: dict[str, list[ClaimOutcome]], view: View) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
+from symsteer.leaderboard.catalogue import IN_WORDS
 from symsteer.leaderboard.defects import Audit, defect_of, dial_of, parts_of
 from symsteer.leaderboard.figures import MEASURE_NAMES, by_rows, look_of
 from symsteer.leaderboard.keys import SYMMETRIC_EMBODIMENT, Key
@@ -95,15 +96,11 @@ def _gain(
     )
 
 
-def kinds(summary: Summary, words: Mapping[str, str] | None = None) -> dict[str, list[Table]]:
-    """Tables by the kind of break: unbroken, each dial, each dial with an arm.
+def kinds(summary: Summary) -> dict[str, list[Table]]:
+    """Tables by the kind of break, in words: unbroken, each dial, each dial with an arm.
 
     Cells with another budget than most of their task, with fewer demonstrations than the most of
     their place, or whose break begins in mid-run are kinds of their own.
-
-    Args:
-        summary: with the tables.
-        words: what to call a dial; else it is called by its name.
     """
 
     def others(key: Key) -> tuple[bool, bool]:
@@ -116,21 +113,20 @@ def kinds(summary: Summary, words: Mapping[str, str] | None = None) -> dict[str,
     tables_by_kind: dict[str, list[Table]] = defaultdict(list)
     for table in sorted(summary.tables, key=lambda table: order(table.key)):
         longer, fewer = others(table.key)
-        kind = [_break(table.key, words or {})]
+        kind = [_break(table.key)]
         kind += [f"{count(table.key.env_steps)} steps"] if longer else []
         kind += ["few demonstrations"] if fewer else []
         tables_by_kind[", ".join(kind)].append(table)
     return dict(tables_by_kind)
 
 
-def _break(key: Key, words: Mapping[str, str]) -> str:
+def _break(key: Key) -> str:
     """What breaks the symmetry, without strengths."""
     arm = [] if key.embodiment == SYMMETRIC_EMBODIMENT else ["arm"]
     if key.variant == UNBROKEN:
         return "".join(arm) or "unbroken"
     constant = all(spec.is_constant for spec in parts_of(key.variant) or ())
-    dials = dial_of(key.variant)
-    known = [words.get(dial, code(dial)) for dial in dials.split("+")] if words else [code(dials)]
+    known = [IN_WORDS.get(dial, code(dial)) for dial in dial_of(key.variant).split("+")]
     return ", ".join([*arm, " and ".join(known), *([] if constant else ["changing"])])
 
 

@@ -24,7 +24,7 @@ ROWS = {
     "that of `equivariant` is {}": "Strictness loses to the plain agent there",
     "(two tasks) {}": "With five times the budget the strict agent loses, broken",
     "That of `residual-pathway` is {}": "Approximate equivariance beats the plain agent there",
-    "and then {}. At 24,000 steps": "`perception_bias`, 120 k steps",
+    "and then {}. At 24,000 steps": "objects are seen displaced, 120 k steps",
     "`standard` {}. With the most": "Symmetry helps with the fewest demonstrations",
     "two gains differ by {}": "Symmetry helps most with the fewest demonstrations",
 }

@@ -114,7 +114,7 @@ def test_a_verdict_names_the_task_without_which_it_does_not_hold() -> None:
             {task: rate - 0.3 for task, rate in gains.items()}
         )
         assert one.behind_by_task["A-v1"] == f"{gains['A-v1']:.2f} against 0.30"
-        words = ", but not without `A-v1`" if rests_on else ""
+        words = ", rests on `A-v1`" if rests_on else ""
         assert verdict_text(one) == f"**supported**{words}"
 
 

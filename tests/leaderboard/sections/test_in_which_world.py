@@ -107,6 +107,7 @@ def test_what_a_camera_error_costs():
     assert far.change["standard"].value == pytest.approx(-0.2)
     assert far.change["equivariant"].value == pytest.approx(0.0)
     assert [row[0] for row in rows(seen, 3)] == ["1 cm", "2 cm"]
+    assert rows(seen, 3)[1][1].startswith("0.60<br>\u22120.20 [")
 
 
 def test_places_with_one_distance_each_have_rows_of_their_own():

@@ -126,7 +126,7 @@ def test_the_table_orders_learners_by_their_worst_cell():
     result = view.findings.of(regret.SECTION)
     np.testing.assert_allclose(result.success, [[0.0, 0.1], [0.4, 0.0]], atol=1e-9)
     explained, table, *_ = regret.render(result, view)
-    assert explained.endswith("Cells: 2.")
+    assert explained.endswith("Cells: 2, of 50\u00a0k steps.")
     first, second, last = table.splitlines()[2:]
     assert first.replace("\u00a0", " ").startswith(
         "| `standard` | 0.05 [0.05, 0.05] | 0.10 [0.10, 0.10] |"

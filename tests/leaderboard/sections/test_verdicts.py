@@ -100,10 +100,10 @@ def test_the_front_says_on_which_tasks_verdicts_rest_and_what_else_was_declared(
     rests = ClaimOutcome(CLAIM, Normal(0.2), policies=5, p=0.01, rests_on=("A-v1", "B-v1"))
     findings._results[claims.SECTION] = [rests, ClaimOutcome(other, reason="no runs")]
     _, verdicts, _, _, others = View(findings).blocks(SECTION)
-    assert verdicts == "- it: **supported** (but not without `A-v1` or `B-v1`)."
+    assert verdicts == "- it: **supported** (rests on `A-v1`, `B-v1`)."
     assert others == "- **Not tested** (1): other."
     assert standing([rests, ClaimOutcome(other, reason="no runs")]).startswith("1 supported, 1 not")
-    assert standing([rests, rests]).endswith("(2 of 2, but not without `A-v1` or `B-v1`)")
+    assert standing([rests, rests]).endswith("(2 of 2 rest on `A-v1`, `B-v1`)")
 
 
 def test_the_papers_statements_have_their_tests() -> None:

@@ -17,6 +17,7 @@ def test_kinds_keep_apart_what_breaks_budgets_demonstrations_and_times() -> None
         {"variant": "wind:0.5"},
         {"variant": "wind:1"},
         {"variant": "wind:1@0.5"},
+        {"variant": "lab_break:1"},
         {"variant": "none", "embodiment": "panda"},
         {"variant": "wind:1", "embodiment": "panda"},
         {"variant": "wind:1", "env_steps": 500_000},
@@ -26,11 +27,12 @@ def test_kinds_keep_apart_what_breaks_budgets_demonstrations_and_times() -> None
     assert {kind: len(tables) for kind, tables in found.items()} == {
         "unbroken": 2,
         "unbroken, few demonstrations": 1,
-        "`wind`": 2,
-        "`wind`, changing": 1,
+        "wind on the object": 2,
+        "wind on the object, changing": 1,
+        "`lab_break`": 1,
         "arm": 1,
-        "arm, `wind`": 1,
-        "`wind`, 500\u00a0k steps": 1,
+        "arm, wind on the object": 1,
+        "wind on the object, 500\u00a0k steps": 1,
     }
     assert next(iter(found)) == "unbroken"
 
@@ -55,8 +57,9 @@ def test_gains_have_the_audited_defects_of_their_cells() -> None:
     audit = audit_of({"none": 0.02, "wind:0.5": 0.1, "wind:1": 0.31})
     page = "\n".join(view_of(*records, audit=audit).blocks(SECTION))
     # Results first: the defects and the number of cells come last.
-    assert re.search(r"\| `wind` \| [+\u2212]0.*\| 0\.10\u00a0to\u00a00\.31 \| 2 \|", page)
+    wind = r"\| wind on the object \| [+\u2212]0.*\| 0\.10\u00a0to\u00a00\.31 \| 2 \|"
+    assert re.search(wind, page)
     assert re.search(r"\| unbroken \| .*\| 0\.02 \| 1 \|", page)
     # One cell that was not audited: then the range would not be that of all.
     found = {gain.kind: gain for gain in gains(summary_of(*records), audit_of({"wind:1": 0.31}))}
-    assert found["`wind`"].defects is None
+    assert found["wind on the object"].defects is None
