@@ -165,13 +165,12 @@ def figure(measured: Sequence[Gain]) -> Figure:
         text = f"{gain.cells} cells, {gain.pairs} pairs of runs"
         dot = Dot(gain.agent, gain.effect, names.index(gain.kind) + 0.24 * shift, look, text)
         columns[MEASURE_NAMES[gain.measure]].append(dot)
-    columns = {f"advantage over {STANDARD}: {name}": dots for name, dots in columns.items()}
     # A kind's marks of code are for markdown.
     plain = [cut(name.replace("`", ""), 44) for name in names]
     brackets = [f" ({ends(between)})" if between else "" for between in defects.values()]
     labels = [name + bracket for name, bracket in zip(plain, brackets, strict=True)]
     return replace(
-        by_rows(labels, columns, Axis(), 0, grid=False),
+        by_rows(labels, columns, Axis(f"advantage over {STANDARD}"), 0, grid=False),
         legend={agent: look_of(agent) for agent in agents},
         height=0.9 + 0.28 * len(names),
         kind="answer",
